@@ -1,0 +1,156 @@
+//! What crosses between an arm's device thread and the tick: the latest state one way, the latest command the
+//! other. Plain data of fixed size, so that neither side ever allocates or waits.
+
+use crate::clock::Mono;
+use crate::joint::{ControlMode, Joints, MAX_DOF};
+
+/// Where a velocity came from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum VelocitySource {
+    /// Not known at all (yet).
+    #[default]
+    Absent,
+    /// The arm measured it.
+    Measured,
+    /// Filtered finite differences of its positions.
+    Estimated,
+}
+
+impl VelocitySource {
+    /// The name used in tables, rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Absent => "absent",
+            Self::Measured => "measured",
+            Self::Estimated => "estimated",
+        }
+    }
+}
+
+/// How the device thread's connection to the arm is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Link {
+    /// Not connected, or not any more.
+    #[default]
+    Down,
+    /// Connected; states arrive.
+    Up,
+    /// Connected, but three reads in a row failed or the last one is too old.
+    Stale,
+    /// The arm reports an error, or its connection broke.
+    Faulted,
+}
+
+impl Link {
+    /// The name used in tables, rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Down => "down",
+            Self::Up => "up",
+            Self::Stale => "stale",
+            Self::Faulted => "faulted",
+        }
+    }
+}
+
+/// An end-effector pose in the arm's base frame, as the arm's controller states it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Pose {
+    /// x, y, z [m].
+    pub xyz: [f64; 3],
+    /// roll, pitch, yaw [rad]: fixed axes, R = Rz(yaw)·Ry(pitch)·Rx(roll).
+    pub rpy: [f64; 3],
+}
+
+/// The latest that is known of an arm. Device thread → tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ArmState {
+    /// Counts the states published by the device thread; 0 = none yet.
+    pub seq: u64,
+    /// When the joint positions were measured (or, where the arm gives no time, received).
+    pub stamp: Mono,
+    /// Number of joints.
+    pub dof: usize,
+    /// Joint positions [rad].
+    pub position: Joints,
+    /// Joint velocities [rad/s]; meaningless when `velocity_source` is `Absent`.
+    pub velocity: Joints,
+    /// Whether and how the velocities are known.
+    pub velocity_source: VelocitySource,
+    /// Joint torques [Nm], where the arm reports them.
+    pub effort: Option<Joints>,
+    /// Gripper opening [m], where there is a gripper.
+    pub gripper: Option<f64>,
+    /// End-effector pose, where the arm reports it.
+    pub pose: Option<Pose>,
+    /// Force and torque at the sensor [N, N, N, Nm, Nm, Nm], where there is one.
+    pub wrench: Option<[f64; 6]>,
+    /// The mode the arm is in.
+    pub mode: ControlMode,
+    /// Whether the motors are enabled.
+    pub enabled: bool,
+    /// The arm's own error code; 0 = none. Its text is in the device status.
+    pub error: i32,
+    /// State of the connection.
+    pub link: Link,
+    /// The device thread saw no heartbeat of the tick and held the arm by itself.
+    pub self_held: bool,
+    /// `ArmCommand::seq` of the newest command that was written to the wire.
+    pub written: u64,
+}
+
+impl Default for ArmState {
+    fn default() -> Self {
+        Self {
+            seq: 0,
+            stamp: Mono::ZERO,
+            dof: 0,
+            position: [0.0; MAX_DOF],
+            velocity: [0.0; MAX_DOF],
+            velocity_source: VelocitySource::Absent,
+            effort: None,
+            gripper: None,
+            pose: None,
+            wrench: None,
+            mode: ControlMode::Position,
+            enabled: false,
+            error: 0,
+            link: Link::Down,
+            self_held: false,
+            written: 0,
+        }
+    }
+}
+
+/// What the tick wants of an arm. Tick → device thread.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ArmCommand {
+    /// Counts the commands of this arm; 0 = none yet.
+    pub seq: u64,
+    /// `None` leaves the arm alone (not enabled, not known, handed over); otherwise how to read `values`.
+    pub mode: Option<ControlMode>,
+    /// Joint positions [rad] or velocities [rad/s], by `mode`.
+    pub values: Joints,
+    /// Gripper opening [m]; written when `gripper_seq` changes.
+    pub gripper: f64,
+    /// Counts the gripper commands; 0 = none yet.
+    pub gripper_seq: u32,
+    /// Ask the arm to stop by its own means (a latched hold was entered); acted on when the count changes.
+    pub stop_seq: u32,
+    /// When the tick will read states next: the device thread reads shortly before.
+    pub next_tick: Mono,
+}
+
+impl Default for ArmCommand {
+    fn default() -> Self {
+        Self {
+            seq: 0,
+            mode: None,
+            values: [0.0; MAX_DOF],
+            gripper: 0.0,
+            gripper_seq: 0,
+            stop_seq: 0,
+            next_tick: Mono::ZERO,
+        }
+    }
+}

@@ -1,0 +1,6 @@
+//! The arms in the box, one folder each. A new arm is one folder and one line here.
+
+use crate::hardware::registry::AdapterSpec;
+
+/// The compile-time adapter table.
+pub const TABLE: &[AdapterSpec] = &[];

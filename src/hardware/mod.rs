@@ -1,0 +1,5 @@
+//! Everything that talks to an arm: the adapter protocol, the table of adapters, the arms, one device thread each.
+
+pub mod arms;
+pub mod registry;
+pub mod spec;

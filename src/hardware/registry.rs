@@ -1,0 +1,178 @@
+//! The compile-time adapter table: one row per arm, in `arms/mod.rs`. `dimos list-adapters` prints it.
+
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::de::DeserializeOwned;
+
+use crate::hardware::spec::{AdapterError, ManipulatorAdapter};
+use crate::joint::{ControlMode, JointLimits};
+use crate::yaml;
+
+/// How far an adapter has been proven without its hardware.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Level {
+    /// Compiles and connects.
+    Works,
+    /// Passes the conformance suite against a double at its SDK or wire boundary.
+    Conformant,
+    /// Has an emulator of its real wire format, and passes the suite against it.
+    Emulated,
+}
+
+impl Level {
+    /// The name used in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Works => "works",
+            Self::Conformant => "conformant",
+            Self::Emulated => "emulated",
+        }
+    }
+}
+
+/// The form of an adapter's `address`.
+#[derive(Debug, Clone, Copy)]
+pub struct AddressForm {
+    /// For people, as in a usage line: `HOST[:PORT]`.
+    pub form: &'static str,
+    /// Whether a blueprint must give one.
+    pub required: bool,
+    /// Says what is wrong with an address, in a sentence without full stop. Never asks the network.
+    pub check: fn(&str) -> Result<(), String>,
+}
+
+/// The adapter's own options: how to check them in a blueprint, and their JSON Schema.
+#[derive(Debug, Clone, Copy)]
+pub struct OptionsSpec {
+    /// Reports every mistake in the options at `node` into the tree's diagnostics.
+    pub check: fn(tree: &mut yaml::Tree, node: yaml::NodeId),
+    /// The options' JSON Schema.
+    pub schema: fn(&mut SchemaGenerator) -> Schema,
+}
+
+impl OptionsSpec {
+    /// Options of type `T`, which should `deny_unknown_fields` and have a default for each.
+    pub const fn of<T: DeserializeOwned + JsonSchema>() -> Self {
+        Self { check: yaml::check::<T>, schema: |generator| T::json_schema(generator) }
+    }
+}
+
+/// What an adapter is made from.
+#[derive(Debug, Clone)]
+pub struct AdapterConfig {
+    /// The arm's name in the blueprint, for messages.
+    pub hardware_id: String,
+    /// Where the device is, in the adapter's own form; empty where none is needed.
+    pub address: String,
+    /// Number of joints the blueprint names.
+    pub dof: usize,
+    /// The adapter's own options, as given in the blueprint (an object).
+    pub options: serde_json::Value,
+}
+
+impl AdapterConfig {
+    /// The options as the adapter's own type.
+    pub fn options<T: DeserializeOwned>(&self) -> Result<T, AdapterError> {
+        let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
+        serde_json::from_value(given).map_err(|e| AdapterError::Rejected(format!("options of {}: {e}", self.hardware_id)))
+    }
+}
+
+/// A running emulator of one arm: the controller's side of the same wire, with a joint plant behind it.
+/// It ends when it is dropped.
+pub trait Emulator: Send {
+    /// The address at which the adapter reaches it.
+    fn address(&self) -> String;
+}
+
+/// One row of the table.
+#[derive(Debug, Clone, Copy)]
+pub struct AdapterSpec {
+    /// `adapter_type` in a blueprint.
+    pub name: &'static str,
+    /// One line: which arms this is for.
+    pub about: &'static str,
+    /// How far it has been proven.
+    pub level: Level,
+    /// `tcp`, `can`, `serial`, `memory` …
+    pub transport: &'static str,
+    /// Fewest and most joints.
+    pub dof: (usize, usize),
+    /// The modes it can be commanded in.
+    pub modes: &'static [ControlMode],
+    /// Units on the wire, for people: `deg, mm`.
+    pub wire_units: &'static str,
+    /// How often the device delivers its state [Hz].
+    pub native_rate: f64,
+    /// The form of `address`.
+    pub address: AddressForm,
+    /// Whether the arm keeps its pose when its motors are disabled (brakes), or falls.
+    pub holds_when_disabled: bool,
+    /// Whether it can have a gripper.
+    pub gripper: bool,
+    /// The adapter's own options.
+    pub options: OptionsSpec,
+    /// Nominal joint limits for a number of joints, known without the device.
+    pub limits: fn(dof: usize) -> JointLimits,
+    /// Makes an adapter. Does not connect.
+    pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
+    /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
+    pub emulate: Option<fn(&AdapterConfig) -> Result<Box<dyn Emulator>, AdapterError>>,
+}
+
+/// The address that asks for the emulator.
+pub const SIM: &str = "sim";
+
+/// An adapter table: the built-in rows and those of the program that embeds this crate.
+#[derive(Debug, Clone, Default)]
+pub struct Registry {
+    rows: Vec<AdapterSpec>,
+}
+
+impl Registry {
+    /// The arms in the box.
+    pub fn builtin() -> Self {
+        Self { rows: crate::hardware::arms::TABLE.to_vec() }
+    }
+
+    /// The arms in the box and `more`, which win over rows of the same name.
+    pub fn with(more: &[AdapterSpec]) -> Self {
+        let mut registry = Self::builtin();
+        registry.rows.retain(|row| !more.iter().any(|m| m.name == row.name));
+        registry.rows.extend_from_slice(more);
+        registry
+    }
+
+    /// All rows, in table order.
+    pub fn rows(&self) -> &[AdapterSpec] {
+        &self.rows
+    }
+
+    /// The row of a name.
+    pub fn get(&self, name: &str) -> Option<&AdapterSpec> {
+        self.rows.iter().find(|row| row.name == name)
+    }
+
+    /// All names, in table order.
+    pub fn names(&self) -> Vec<&'static str> {
+        self.rows.iter().map(|row| row.name).collect()
+    }
+}
+
+/// Names of the built-in adapters.
+pub fn available() -> Vec<&'static str> {
+    Registry::builtin().names()
+}
+
+/// Makes a built-in adapter by name; it is not connected yet.
+pub fn create(name: &str, address: &str, dof: usize) -> Result<Box<dyn ManipulatorAdapter>, AdapterError> {
+    let registry = Registry::builtin();
+    let row = registry.get(name).ok_or_else(|| {
+        AdapterError::Rejected(format!("no adapter named {name:?}; there are {}", registry.names().join(", ")))
+    })?;
+    (row.create)(&AdapterConfig {
+        hardware_id: name.to_owned(),
+        address: address.to_owned(),
+        dof,
+        options: serde_json::Value::Null,
+    })
+}

@@ -1,0 +1,110 @@
+//! The vocabulary that every layer shares: joints, control modes, limits. SI units only.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// The most joints one arm may have. Arrays of this size cross between threads without allocation.
+pub const MAX_DOF: usize = 16;
+
+/// One value per joint of an arm; entries past the arm's dof are zero.
+pub type Joints = [f64; MAX_DOF];
+
+/// Acceleration limit where neither the arm nor the blueprint gives one [rad/s²].
+pub const DEFAULT_ACCELERATION: f64 = 2.0;
+/// Jerk limit where neither the arm nor the blueprint gives one [rad/s³].
+pub const DEFAULT_JERK: f64 = 20.0;
+
+/// A slice as a fixed array; what does not fit is left out.
+pub fn joints_of(values: &[f64]) -> Joints {
+    let mut out = [0.0; MAX_DOF];
+    for (o, v) in out.iter_mut().zip(values) {
+        *o = *v;
+    }
+    out
+}
+
+/// `prefix_joint1 … prefix_jointN`: the guide's `make_joints`.
+pub fn make_joints(prefix: &str, count: usize) -> Vec<String> {
+    (1..=count).map(|i| format!("{prefix}_joint{i}")).collect()
+}
+
+/// How an arm interprets what is written to it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ControlMode {
+    /// Joint positions; the arm plans its own way there.
+    #[default]
+    Position,
+    /// Joint positions streamed at the control rate; the arm follows each at once.
+    ServoPosition,
+    /// Joint velocities.
+    Velocity,
+    /// Joint torques.
+    Torque,
+    /// End-effector poses; the arm plans its own way there.
+    Cartesian,
+    /// End-effector twists.
+    CartesianVelocity,
+    /// Joint positions with a stiffness.
+    Impedance,
+}
+
+impl ControlMode {
+    /// The name used in blueprints, tables and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Position => "position",
+            Self::ServoPosition => "servo_position",
+            Self::Velocity => "velocity",
+            Self::Torque => "torque",
+            Self::Cartesian => "cartesian",
+            Self::CartesianVelocity => "cartesian_velocity",
+            Self::Impedance => "impedance",
+        }
+    }
+
+    /// Whether commands in this mode are joint positions.
+    pub fn is_position(self) -> bool {
+        matches!(self, Self::Position | Self::ServoPosition | Self::Impedance)
+    }
+}
+
+/// Limits of an arm's joints, one entry per joint.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct JointLimits {
+    /// Lowest positions [rad].
+    pub position_lower: Vec<f64>,
+    /// Highest positions [rad].
+    pub position_upper: Vec<f64>,
+    /// Highest speeds [rad/s].
+    pub velocity_max: Vec<f64>,
+    /// Highest accelerations [rad/s²]; empty where the arm states none.
+    pub acceleration_max: Vec<f64>,
+    /// Highest jerks [rad/s³]; empty where the arm states none.
+    pub jerk_max: Vec<f64>,
+}
+
+impl JointLimits {
+    /// The same symmetric limits for every joint; acceleration and jerk left to the defaults.
+    pub fn uniform(dof: usize, position: f64, velocity: f64) -> Self {
+        Self {
+            position_lower: vec![-position; dof],
+            position_upper: vec![position; dof],
+            velocity_max: vec![velocity; dof],
+            acceleration_max: Vec::new(),
+            jerk_max: Vec::new(),
+        }
+    }
+
+    /// The same limits with the defaults in place of what the arm does not state.
+    pub fn with_defaults(mut self) -> Self {
+        let dof = self.position_lower.len();
+        if self.acceleration_max.len() != dof {
+            self.acceleration_max = vec![DEFAULT_ACCELERATION; dof];
+        }
+        if self.jerk_max.len() != dof {
+            self.jerk_max = vec![DEFAULT_JERK; dof];
+        }
+        self
+    }
+}

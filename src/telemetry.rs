@@ -1,0 +1,281 @@
+//! What the tick tells about itself: plain data of fixed size, pushed into one ring, read by the recorder thread,
+//! which logs it, and hands events on to rpc and the text log. Nothing here allocates.
+
+use crate::arm::{ArmCommand, ArmState};
+use crate::clock::Mono;
+
+/// One entry of the ring.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Sample {
+    /// What a tick read of one arm and what it commands. One per arm and tick, before the tick's `Tick`.
+    Arm(ArmSample),
+    /// Closes a tick.
+    Tick(TickSample),
+    /// Something happened in the tick with this index.
+    Event(u64, Event),
+}
+
+/// What a tick read of one arm and what it commands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ArmSample {
+    /// Index of the arm, in the blueprint's order.
+    pub arm: u16,
+    /// The state as the tick read it (with estimated velocities filled in).
+    pub state: ArmState,
+    /// The command as it went to the device thread.
+    pub command: ArmCommand,
+    /// The arm's phase after the tick.
+    pub phase: Phase,
+    /// Why it is in that phase.
+    pub cause: Cause,
+}
+
+/// Timing of a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TickSample {
+    /// Index of the tick, counted from 0.
+    pub tick: u64,
+    /// The tick's deadline: the time it works with.
+    pub deadline: Mono,
+    /// Wake-up after the deadline [ns].
+    pub late_ns: u64,
+    /// Time from wake-up to the last command handed over [ns].
+    pub compute_ns: u64,
+    /// Whole periods skipped before this tick.
+    pub skipped: u32,
+    /// Samples that found the ring full since the last tick that got through.
+    pub dropped: u32,
+}
+
+/// What an arm is ready for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Phase {
+    /// No state yet.
+    #[default]
+    Unknown,
+    /// Motors off: nothing is sent.
+    Disabled,
+    /// Just enabled: holds where it is, for the length of the ramp.
+    Activating,
+    /// Holds or follows its tasks.
+    Ready,
+    /// Latched hold after a stop or a fault: waits for `reset`.
+    Held,
+    /// Reset after a latched hold: waits for `enable`. Holds, if powered.
+    Standby,
+}
+
+impl Phase {
+    /// The name used in tables, rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Unknown => "unknown",
+            Self::Disabled => "disabled",
+            Self::Activating => "activating",
+            Self::Ready => "ready",
+            Self::Held => "held",
+            Self::Standby => "standby",
+        }
+    }
+}
+
+/// Why an arm is held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Cause {
+    /// Nothing happened.
+    #[default]
+    None,
+    /// An operator's `stop`.
+    Operator,
+    /// Its states stopped coming.
+    Stale,
+    /// The arm reports an error.
+    Fault(i32),
+    /// The device thread lost the arm.
+    LinkLost,
+    /// A command was not finite.
+    NonFinite,
+    /// A command jumped further than a joint may.
+    Jump,
+    /// The tick lost too much time.
+    Overrun,
+    /// The device thread held the arm by itself.
+    HeartbeatLost,
+    /// The motors went off without being asked.
+    PowerLost,
+    /// The run is ending.
+    Shutdown,
+}
+
+impl Cause {
+    /// The name used in rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Operator => "operator_stop",
+            Self::Stale => "stale",
+            Self::Fault(_) => "arm_fault",
+            Self::LinkLost => "link_lost",
+            Self::NonFinite => "non_finite_command",
+            Self::Jump => "jump_refused",
+            Self::Overrun => "overrun",
+            Self::HeartbeatLost => "heartbeat_lost",
+            Self::PowerLost => "power_lost",
+            Self::Shutdown => "shutdown",
+        }
+    }
+}
+
+/// State of a task, with the reference system's names.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum TaskState {
+    /// Nothing to do.
+    #[default]
+    Idle,
+    /// In motion, or following a stream.
+    Executing,
+    /// Slowing down after a cancel.
+    Cancelling,
+    /// Ended where it should.
+    Completed,
+    /// Ended elsewhere.
+    Aborted,
+    /// A command of it was refused as unfit for the arm.
+    Fault,
+}
+
+impl TaskState {
+    /// The name used in tables, rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Idle => "IDLE",
+            Self::Executing => "EXECUTING",
+            Self::Cancelling => "CANCELLING",
+            Self::Completed => "COMPLETED",
+            Self::Aborted => "ABORTED",
+            Self::Fault => "FAULT",
+        }
+    }
+}
+
+/// Why a task is in its state.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Reason {
+    /// Nothing special.
+    #[default]
+    None,
+    /// An operator's cancel.
+    Cancelled,
+    /// Its stream of targets stopped.
+    Timeout,
+    /// A joint was further from the path than the path tolerance: joint, error [rad].
+    PathTolerance(u16, f64),
+    /// A joint did not arrive within the goal time: joint, error [rad].
+    GoalTolerance(u16, f64),
+    /// Another task took a joint: the other task, the joint.
+    Preempted(u16, u16),
+    /// The arm is held: arm, cause.
+    ArmHeld(u16, Cause),
+    /// A command was not finite: joint.
+    NonFinite(u16),
+    /// A command jumped: joint, step [rad].
+    Jump(u16, f64),
+}
+
+/// What a limit did to a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LimitKind {
+    /// Position held inside its range.
+    Position,
+    /// Velocity reduced.
+    Velocity,
+    /// Acceleration reduced.
+    Acceleration,
+}
+
+impl LimitKind {
+    /// The name used in rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Position => "position",
+            Self::Velocity => "velocity",
+            Self::Acceleration => "acceleration",
+        }
+    }
+}
+
+/// Something that happened in a tick. Indices are those of the blueprint: arms, tasks, joints (over all arms).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Event {
+    /// A request was handled: its id and what came of it.
+    Request(u64, Outcome),
+    /// A task changed its state.
+    Task(u16, TaskState, Reason),
+    /// A task lost a joint: loser, winner, joint, whether both have the same priority.
+    Preempted(u16, u16, u16, bool),
+    /// A task's command was refused because a better one on the same arm uses another mode: loser, winner, arm.
+    ModeConflict(u16, u16, u16),
+    /// An arm changed its phase.
+    Arm(u16, Phase, Cause),
+    /// Commands of a joint began to be limited: joint, which limit, what was asked [rad, rad/s or rad/s²].
+    Limited(u16, LimitKind, f64),
+    /// Periods were skipped: how many, how late the tick was [ns].
+    Overrun(u32, u64),
+    /// Ten ticks in a row were late by a period or more.
+    Degraded,
+}
+
+/// What came of a request, with the reference system's names where it has one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Outcome {
+    /// Taken on.
+    Accepted,
+    /// Motion is being ended.
+    Cancelled,
+    /// There was no motion to end.
+    AlreadyStopped,
+    /// The task is executing already: the task.
+    AlreadyExecuting(u16),
+    /// The trajectory does not start where the arm is: joint, distance [rad].
+    StartStateMismatch(u16, f64),
+    /// No fresh state of the arm: the arm.
+    StartStateUnavailable(u16),
+    /// The arm is not ready for motion: arm, its phase and cause.
+    ArmNotReady(u16, Phase, Cause),
+    /// The arm's latch must be reset first: arm, cause.
+    ArmLatched(u16, Cause),
+    /// The thing that latched the arm still stands: arm, cause.
+    StillFaulted(u16, Cause),
+    /// The task cannot do that.
+    WrongTask(u16),
+    /// A target is not finite: joint.
+    NonFinite(u16),
+    /// A target is outside the joint's limits: joint, by how much [rad or rad/s].
+    OutOfLimits(u16, f64),
+    /// The arm has no gripper: the arm.
+    NoGripper(u16),
+    /// The run is ending.
+    ShuttingDown,
+}
+
+impl Outcome {
+    /// The status word used in rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Accepted => "ACCEPTED",
+            Self::Cancelled => "CANCELLED",
+            Self::AlreadyStopped => "ALREADY_STOPPED",
+            Self::AlreadyExecuting(_) => "ALREADY_EXECUTING",
+            Self::StartStateMismatch(..) => "START_STATE_MISMATCH",
+            Self::StartStateUnavailable(_) => "START_STATE_UNAVAILABLE",
+            Self::ArmNotReady(..) => "ARM_NOT_READY",
+            Self::ArmLatched(..) => "ARM_LATCHED",
+            Self::StillFaulted(..) => "STILL_FAULTED",
+            Self::WrongTask(_) => "WRONG_TASK",
+            Self::NonFinite(_) => "NON_FINITE",
+            Self::OutOfLimits(..) => "OUT_OF_LIMITS",
+            Self::NoGripper(_) => "NO_GRIPPER",
+            Self::ShuttingDown => "SHUTTING_DOWN",
+        }
+    }
+}
