@@ -73,7 +73,8 @@ impl AdapterConfig {
     /// The options as the adapter's own type.
     pub fn options<T: DeserializeOwned>(&self) -> Result<T, AdapterError> {
         let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
-        serde_json::from_value(given).map_err(|e| AdapterError::Rejected(format!("options of {}: {e}", self.hardware_id)))
+        serde_json::from_value(given)
+            .map_err(|e| AdapterError::Rejected(format!("options of {}: {e}", self.hardware_id)))
     }
 }
 
