@@ -279,3 +279,20 @@ impl Outcome {
         }
     }
 }
+
+/// What is told of a task.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TaskView {
+    /// What it does.
+    pub state: TaskState,
+    /// Why.
+    pub reason: Reason,
+    /// Id of its present or last motion; 0 = none yet.
+    pub motion: u64,
+    /// How much of the motion is done (0–1).
+    pub progress: f64,
+    /// Time along the motion [s].
+    pub elapsed: f64,
+    /// Time to the motion's end [s].
+    pub remaining: f64,
+}

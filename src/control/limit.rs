@@ -1,0 +1,363 @@
+//! The last thing before the wire: every command of a joint is finite, inside its position range, and changes no
+//! faster than the joint's velocity and acceleration allow. What is possible passes unchanged, bit for bit; what
+//! is too fast is followed as well as the limits allow, without overshoot; a jump is refused.
+
+use super::config::{JUMP, POSITION_MARGIN};
+use crate::telemetry::LimitKind;
+
+/// Slack for rounding: a command at its limit is not "limited".
+const ROUNDING: f64 = 1e-9;
+
+/// Limits of one joint.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    /// Lowest position that is commanded [rad].
+    pub lower: f64,
+    /// Highest position that is commanded [rad].
+    pub upper: f64,
+    /// Highest speed [rad/s].
+    pub velocity: f64,
+    /// Highest acceleration [rad/s²].
+    pub acceleration: f64,
+}
+
+impl Bounds {
+    /// Bounds with the margin taken off the position range [rad].
+    pub fn inside(lower: f64, upper: f64, velocity: f64, acceleration: f64) -> Self {
+        let margin = POSITION_MARGIN.min((upper - lower) / 10.0);
+        Self { lower: lower + margin, upper: upper - margin, velocity, acceleration }
+    }
+
+    /// How far a position is outside [rad]; 0 inside.
+    pub fn excess(&self, position: f64) -> f64 {
+        (self.lower - position).max(position - self.upper).max(0.0)
+    }
+}
+
+/// Why a command is refused.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Refusal {
+    /// NaN or infinite.
+    NonFinite,
+    /// Too far from the command before it: the step [rad].
+    Jump(f64),
+}
+
+/// A command that may go to the wire.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limited {
+    /// The command [rad] or [rad/s].
+    pub value: f64,
+    /// Which limit changed it, and what was asked [rad, rad/s or rad/s²].
+    pub by: Option<(LimitKind, f64)>,
+}
+
+/// The limiter of one joint: knows what was commanded last.
+#[derive(Debug, Clone, Copy)]
+pub struct Limiter {
+    bounds: Bounds,
+    /// Last commanded position [rad].
+    position: f64,
+    /// Last commanded velocity [rad/s].
+    velocity: f64,
+    /// Last requested position, while the same task goes on requesting.
+    request: Option<f64>,
+    /// Filtered velocity of the requests [rad/s].
+    request_velocity: f64,
+}
+
+impl Limiter {
+    /// A joint at rest at 0; `seed` it before use.
+    pub fn new(bounds: Bounds) -> Self {
+        Self { bounds, position: 0.0, velocity: 0.0, request: None, request_velocity: 0.0 }
+    }
+
+    /// Its bounds.
+    pub fn bounds(&self) -> &Bounds {
+        &self.bounds
+    }
+
+    /// Last commanded position [rad].
+    pub fn position(&self) -> f64 {
+        self.position
+    }
+
+    /// Last commanded velocity [rad/s].
+    pub fn velocity(&self) -> f64 {
+        self.velocity
+    }
+
+    /// Starts at rest from a measured position [rad].
+    pub fn seed(&mut self, position: f64) {
+        *self = Self { position, ..Self::new(self.bounds) };
+    }
+
+    /// Whether nothing moves.
+    pub fn at_rest(&self) -> bool {
+        self.velocity == 0.0
+    }
+
+    /// The next request comes from someone else: its step counts from the last command.
+    pub fn hand_over(&mut self) {
+        self.request = None;
+        self.request_velocity = 0.0;
+    }
+
+    /// The position to command for a requested position [rad], `dt` [s] after the last.
+    pub fn follow_position(&mut self, target: f64, dt: f64) -> Result<Limited, Refusal> {
+        if !target.is_finite() {
+            return Err(Refusal::NonFinite);
+        }
+        let step = target - self.request.unwrap_or(self.position);
+        if step.abs() > JUMP {
+            return Err(Refusal::Jump(step));
+        }
+        // In step with the requests, what comes next is their business; out of step, meet them at their own speed.
+        let in_step = self.request.is_none_or(|last| last == self.position);
+        if self.request.is_some() {
+            self.request_velocity += 0.5 * (step / dt - self.request_velocity);
+        }
+        self.request = Some(target);
+
+        let (lower, upper) = self.range();
+        let goal = target.clamp(lower, upper);
+        let asked = (goal - self.position) / dt;
+        let b = self.bounds;
+        let change = b.acceleration * dt;
+        let (slowest, fastest) = self.speeds_inside(lower, upper, self.position, dt);
+        let possible = asked.abs() <= b.velocity * (1.0 + ROUNDING)
+            && (asked - self.velocity).abs() <= change * (1.0 + ROUNDING) + ROUNDING
+            && (in_step || (asked - self.request_velocity).abs() <= change)
+            && asked >= slowest - ROUNDING
+            && asked <= fastest + ROUNDING;
+        let by = if goal != target {
+            Some((LimitKind::Position, target))
+        } else if possible {
+            None
+        } else if asked.abs() > b.velocity {
+            Some((LimitKind::Velocity, asked))
+        } else {
+            Some((LimitKind::Acceleration, (asked - self.velocity) / dt))
+        };
+        if possible {
+            self.velocity = asked;
+            self.position = goal;
+            return Ok(Limited { value: goal, by });
+        }
+        // Follow: go with the target, plus what can be slowed down again by the time it is met.
+        let pace = self.request_velocity.clamp(-b.velocity, b.velocity);
+        let behind = goal - self.position - pace * dt;
+        let wanted = pace + behind.signum() * self.braking_speed(behind.abs(), dt);
+        self.velocity = wanted
+            .clamp(-b.velocity, b.velocity)
+            .clamp(slowest, fastest)
+            .clamp(self.velocity - change, self.velocity + change);
+        self.position = (self.position + self.velocity * dt).clamp(lower, upper);
+        Ok(Limited { value: self.position, by })
+    }
+
+    /// The velocity to command for a requested velocity [rad/s] with the joint measured at `at` [rad].
+    pub fn follow_velocity(&mut self, target: f64, at: f64, dt: f64) -> Result<Limited, Refusal> {
+        if !target.is_finite() {
+            return Err(Refusal::NonFinite);
+        }
+        self.hand_over();
+        let b = self.bounds;
+        let change = b.acceleration * dt;
+        let (slowest, fastest) = self.speeds_inside(b.lower, b.upper, at, dt);
+        let capped = target.clamp(-b.velocity, b.velocity);
+        let inside = capped.clamp(slowest, fastest);
+        self.velocity = inside.clamp(self.velocity - change, self.velocity + change);
+        self.position = at;
+        let by = if capped != target {
+            Some((LimitKind::Velocity, target))
+        } else if inside != capped {
+            Some((LimitKind::Position, at))
+        } else if self.velocity != inside {
+            Some((LimitKind::Acceleration, target))
+        } else {
+            None
+        };
+        Ok(Limited { value: self.velocity, by })
+    }
+
+    /// Nobody asks anything: the position to command on the way to rest, then always the same.
+    pub fn hold_position(&mut self, dt: f64) -> f64 {
+        self.hand_over();
+        self.slow_down(dt);
+        let (lower, upper) = self.range();
+        self.position = (self.position + self.velocity * dt).clamp(lower, upper);
+        self.position
+    }
+
+    /// Nobody asks anything: the velocity to command on the way to zero, with the joint measured at `at` [rad].
+    pub fn hold_velocity(&mut self, at: f64, dt: f64) -> f64 {
+        self.hand_over();
+        self.slow_down(dt);
+        self.position = at;
+        self.velocity
+    }
+
+    fn slow_down(&mut self, dt: f64) {
+        let change = self.bounds.acceleration * dt;
+        self.velocity -= self.velocity.clamp(-change, change);
+    }
+
+    /// The range of positions that may be commanded: a joint that is outside may stay or come in, not go further.
+    fn range(&self) -> (f64, f64) {
+        (self.bounds.lower.min(self.position), self.bounds.upper.max(self.position))
+    }
+
+    /// The velocities from which the joint can still be stopped inside its range [rad/s].
+    fn speeds_inside(&self, lower: f64, upper: f64, at: f64, dt: f64) -> (f64, f64) {
+        (-self.braking_speed((at - lower).max(0.0), dt), self.braking_speed((upper - at).max(0.0), dt))
+    }
+
+    /// The highest speed [rad/s] of a step that ends no further than `distance` when the steps after it slow down
+    /// by the acceleration limit each. Exact in discrete time: with n more steps before the last one,
+    /// distance / dt = (n + 1) v − c n (n + 1) / 2, where c is the change of velocity per step.
+    fn braking_speed(&self, distance: f64, dt: f64) -> f64 {
+        let change = self.bounds.acceleration * dt;
+        let steps = distance / dt;
+        let n = ((((1.0 + 8.0 * steps / change).sqrt() - 3.0) / 2.0).ceil()).max(0.0);
+        steps / (n + 1.0) + change * n / 2.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const DT: f64 = 0.01;
+
+    fn limiter() -> Limiter {
+        Limiter::new(Bounds::inside(-2.0, 2.0, 1.5, 4.0))
+    }
+
+    #[test]
+    fn what_is_possible_passes_bit_for_bit() {
+        let mut l = limiter();
+        for k in 0..500 {
+            let t = k as f64 * DT;
+            let q = 0.5 * (1.0 - (1.2 * t).cos());
+            assert_eq!(l.follow_position(q, DT), Ok(Limited { value: q, by: None }));
+        }
+    }
+
+    #[test]
+    fn a_step_is_followed_within_limits_without_overshoot_and_met() {
+        let mut l = limiter();
+        let (mut last, mut last_v) = (0.0, 0.0);
+        for _ in 0..200 {
+            let out = l.follow_position(0.15, DT).unwrap();
+            let v = (out.value - last) / DT;
+            assert!(v.abs() <= 1.5 * (1.0 + 1e-9) && (v - last_v).abs() <= 4.0 * DT * (1.0 + 1e-6) + 1e-9);
+            assert!(out.value <= 0.15 + 1e-12);
+            (last, last_v) = (out.value, v);
+        }
+        assert_eq!(last, 0.15);
+    }
+
+    #[test]
+    fn a_stream_that_starts_at_speed_is_caught_up_with_and_not_refused() {
+        let mut l = limiter();
+        let mut gap = 0.0f64;
+        for k in 1..300 {
+            let target = 0.4 * DT * k as f64;
+            gap = (target - l.follow_position(target, DT).unwrap().value).abs();
+        }
+        assert!(gap < 1e-9, "{gap}");
+    }
+
+    #[test]
+    fn a_jump_is_refused_and_changes_nothing() {
+        let mut l = limiter();
+        l.follow_position(0.01, DT).unwrap();
+        let before = l;
+        assert_eq!(l.follow_position(0.3, DT), Err(Refusal::Jump(0.3 - 0.01)));
+        assert_eq!(l.follow_position(f64::NAN, DT), Err(Refusal::NonFinite));
+        assert_eq!((l.position, l.velocity), (before.position, before.velocity));
+    }
+
+    #[test]
+    fn a_joint_outside_its_range_may_stay_or_come_in() {
+        let mut l = limiter();
+        l.seed(2.3);
+        assert_eq!(l.follow_position(2.3, DT).unwrap().value, 2.3);
+        assert!(l.follow_position(2.35, DT).unwrap().value <= 2.3);
+        for k in 0..400 {
+            let q = l.follow_position(2.3 - 0.002 * k as f64, DT).unwrap().value;
+            assert!(q <= 2.3);
+        }
+        assert!(l.position() < 1.99);
+    }
+
+    #[test]
+    fn a_moving_joint_that_is_let_go_comes_to_rest_within_its_acceleration() {
+        let mut l = limiter();
+        for k in 1..100 {
+            l.follow_position(0.5 * (DT * k as f64).powi(2) * 2.0, DT).unwrap();
+        }
+        let mut v = l.velocity();
+        while !l.at_rest() {
+            l.hold_position(DT);
+            assert!((l.velocity() - v).abs() <= 4.0 * DT + 1e-12);
+            v = l.velocity();
+        }
+        let rest = l.position();
+        assert_eq!(l.hold_position(DT), rest);
+    }
+
+    proptest! {
+        /// F08 and F09: whatever is asked, what goes out keeps every limit.
+        #[test]
+        fn f08_f09_no_command_breaks_a_limit(
+            start in -1.9f64..1.9,
+            steps in prop::collection::vec(-0.25f64..0.25, 1..300),
+        ) {
+            let mut l = limiter();
+            l.seed(start);
+            let (mut target, mut last, mut last_v) = (start, start, 0.0);
+            for s in steps {
+                target += s;
+                let q = match l.follow_position(target, DT) {
+                    Ok(out) => out.value,
+                    Err(_) => { target = l.position(); l.hold_position(DT) }
+                };
+                let v = (q - last) / DT;
+                prop_assert!(v.abs() <= 1.5 * (1.0 + 1e-9) + 1e-9, "velocity {v}");
+                prop_assert!((v - last_v).abs() <= 4.0 * DT * (1.0 + 1e-6) + 1e-7, "acceleration {}", (v - last_v) / DT);
+                prop_assert!((-1.99 - 1e-12..=1.99 + 1e-12).contains(&q) || (q - start).abs() < 1e-12);
+                (last, last_v) = (q, v);
+            }
+        }
+
+        /// The same in velocity mode, with a joint that does exactly as it is told.
+        #[test]
+        fn f09_velocities_stop_inside_the_range(targets in prop::collection::vec(-5.0f64..5.0, 1..400)) {
+            let mut l = limiter();
+            l.seed(0.0);
+            let (mut q, mut last) = (0.0, 0.0);
+            for t in targets {
+                let v = l.follow_velocity(t, q, DT).unwrap().value;
+                prop_assert!(v.abs() <= 1.5 && (v - last).abs() <= 4.0 * DT + 1e-12);
+                q += v * DT;
+                last = v;
+                prop_assert!((-2.0..=2.0).contains(&q), "{q}");
+            }
+        }
+
+        /// F07: nothing that is not finite comes out, whatever comes in.
+        #[test]
+        fn f07_nothing_but_finite_numbers_comes_out(targets in prop::collection::vec(any::<f64>(), 1..50)) {
+            let mut l = limiter();
+            l.seed(0.1);
+            for t in targets {
+                if let Ok(out) = l.follow_position(t, DT) { prop_assert!(out.value.is_finite()); }
+                if let Ok(out) = l.follow_velocity(t, 0.1, DT) { prop_assert!(out.value.is_finite()); }
+                prop_assert!(l.hold_position(DT).is_finite());
+            }
+        }
+    }
+}

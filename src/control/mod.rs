@@ -1,0 +1,18 @@
+//! The coordinator: one pure `tick` that turns states and requests into commands, and the thread that runs it.
+//!
+//! ```text
+//! states ─▶ read ─▶ failsafe ─▶ requests ─▶ compute (tasks) ─▶ arbitrate ─▶ limit ─▶ route ─▶ commands
+//! ```
+
+pub mod arbitrate;
+pub mod arm_control;
+pub mod config;
+pub mod coordinator;
+pub mod estimate;
+pub mod failsafe;
+pub mod limit;
+pub mod point_to_point;
+pub mod request;
+pub mod task;
+pub mod tasks;
+pub mod tick_loop;

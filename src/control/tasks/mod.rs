@@ -1,0 +1,5 @@
+//! The types of tasks.
+
+pub mod servo;
+pub mod trajectory;
+pub mod velocity;

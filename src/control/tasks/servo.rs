@@ -1,0 +1,105 @@
+//! Follows a stream of joint positions. Targets that come less often than the tick are joined by straight lines
+//! over the stream's own period, so that a slow stream makes a smooth motion. When the stream stops, so do the
+//! joints.
+
+use crate::clock::Mono;
+use crate::control::config::ServoParams;
+use crate::control::task::{Claim, Context};
+use crate::joint::{Joints, MAX_DOF};
+
+/// A pause longer than this is no stream's period [s].
+const LONGEST_PERIOD: f64 = 0.1;
+
+/// State of a servo task.
+#[derive(Debug)]
+pub struct ServoTask {
+    params: ServoParams,
+    target: Option<Target>,
+    muted: [bool; MAX_DOF],
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Target {
+    from: Joints,
+    to: Joints,
+    at: Mono,
+    /// Time between two targets of the stream [s]; 0 until it is known.
+    period: f64,
+}
+
+impl Target {
+    fn reached(&self, cx: &Context<'_>) -> Joints {
+        // A target counts from its tick on, so the first step is made at once.
+        let done = if self.period > 1.5 * cx.dt {
+            ((cx.now.seconds_since(self.at) + cx.dt) / self.period).clamp(0.0, 1.0)
+        } else {
+            1.0
+        };
+        let mut out = self.to;
+        if done < 1.0 {
+            for (o, from) in out.iter_mut().zip(&self.from) {
+                *o = from + (*o - from) * done;
+            }
+        }
+        out
+    }
+}
+
+impl ServoTask {
+    /// A task without a target.
+    pub fn new(params: ServoParams) -> Self {
+        Self { params, target: None, muted: [false; MAX_DOF] }
+    }
+
+    /// Where it goes when it starts by itself.
+    pub fn default_positions(&self) -> Option<&[f64]> {
+        self.params.default_positions.as_deref()
+    }
+
+    /// A new target [rad], in the order of the task's joints.
+    pub fn set_target(&mut self, cx: &Context<'_>, to: &Joints) {
+        self.muted = [false; MAX_DOF];
+        let (from, period) = match &self.target {
+            None => (*to, 0.0),
+            Some(last) => {
+                let pause = cx.now.seconds_since(last.at);
+                let period = match last.period {
+                    _ if pause > LONGEST_PERIOD => 0.0,
+                    p if p > 0.0 => p + 0.25 * (pause - p),
+                    _ => pause,
+                };
+                let before = Context { now: cx.now.before(std::time::Duration::from_secs_f64(cx.dt)), ..*cx };
+                (last.reached(&before), period)
+            }
+        };
+        self.target = Some(Target { from, to: *to, at: cx.now, period });
+    }
+
+    /// Forgets the target.
+    pub fn drop_target(&mut self) {
+        self.target = None;
+    }
+
+    /// A joint is lost until the next target.
+    pub fn mute(&mut self, joints: &[u16], joint: u16) {
+        if let Some(m) = joints.iter().position(|&j| j == joint).and_then(|k| self.muted.get_mut(k)) {
+            *m = true;
+        }
+    }
+
+    /// Fills in the claims of this tick; `false` when the stream has stopped.
+    pub fn compute(&mut self, cx: &Context<'_>, joints: &[u16], claims: &mut Vec<Claim>) -> bool {
+        let Some(target) = &self.target else { return false };
+        let age = cx.now.seconds_since(target.at);
+        if self.params.timeout > 0.0 && age > self.params.timeout {
+            return false;
+        }
+        let values = target.reached(cx);
+        for ((&joint, &value), muted) in joints.iter().zip(&values).zip(&self.muted) {
+            if !muted {
+                claims.push(Claim { joint, value });
+            }
+        }
+        true
+    }
+}

@@ -1,0 +1,190 @@
+//! Executes a trajectory: positions along its curve, from where the arm is, until the arm has arrived.
+
+use crate::control::config::TrajectoryParams;
+use crate::control::request::Motion;
+use crate::control::task::{Claim, Context};
+use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
+use crate::trajectory::{Cursor, Sample};
+
+/// An arrived joint moves no faster than this [rad/s].
+const STANDSTILL: f64 = 0.05;
+/// The shortest time over which the difference between the first point and the last command is faded out [s].
+const SHORTEST_FADE: f64 = 0.2;
+
+/// State of a trajectory task.
+#[derive(Debug)]
+pub struct TrajectoryTask {
+    params: TrajectoryParams,
+    motion: Option<Box<Motion>>,
+    cursor: Cursor,
+    /// Time along the trajectory [s].
+    elapsed: f64,
+    /// Speed along the trajectory: 1, or less on the way to a stop.
+    rate: f64,
+    slowing: bool,
+    /// Time since the trajectory's end [s].
+    settling: f64,
+    /// What the last commands were ahead of the first point, joint by joint [rad].
+    offsets: Vec<f64>,
+    fade: f64,
+    samples: Vec<Sample>,
+    /// What was asked of the arm in the tick before, to compare its state with.
+    asked: Vec<f64>,
+    last: TaskView,
+}
+
+impl TrajectoryTask {
+    /// A task for up to `width` joints.
+    pub fn new(params: TrajectoryParams, width: usize) -> Self {
+        Self {
+            params,
+            motion: None,
+            cursor: Cursor::default(),
+            elapsed: 0.0,
+            rate: 1.0,
+            slowing: false,
+            settling: 0.0,
+            offsets: Vec::with_capacity(width),
+            fade: SHORTEST_FADE,
+            samples: Vec::with_capacity(width),
+            asked: Vec::with_capacity(width),
+            last: TaskView::default(),
+        }
+    }
+
+    /// Whether a motion may start from the present state.
+    pub fn check_start(&self, cx: &Context<'_>, motion: &Motion) -> Result<(), Outcome> {
+        for (k, &joint) in motion.joints.iter().enumerate() {
+            let distance = (motion.spline.start(k) - cx.joint(joint).position).abs();
+            // Not `>`: a distance that is not a number must not pass either.
+            if !(distance <= self.params.start_position_tolerance) {
+                return Err(Outcome::StartStateMismatch(joint, distance));
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes on a motion. Answers the one before, if any.
+    pub fn start(&mut self, cx: &Context<'_>, motion: Box<Motion>) -> Option<Box<Motion>> {
+        self.cursor = Cursor::default();
+        (self.elapsed, self.rate, self.slowing, self.settling) = (0.0, 1.0, false, 0.0);
+        self.fade = SHORTEST_FADE;
+        self.offsets.clear();
+        self.asked.clear();
+        self.samples.clear();
+        for (k, &joint) in motion.joints.iter().enumerate() {
+            let view = cx.joint(joint);
+            let offset = view.commanded - motion.spline.start(k);
+            self.offsets.push(offset);
+            self.asked.push(view.commanded);
+            self.samples.push(Sample::default());
+            // The fade may use a quarter of the joint's speed and acceleration: peaks of a quintic step are
+            // 1.875 offset / T and 5.774 offset / T².
+            let by_speed = 1.875 * offset.abs() / (0.25 * view.velocity_limit);
+            let by_acceleration = (5.774 * offset.abs() / (0.25 * view.acceleration)).sqrt();
+            self.fade = self.fade.max(by_speed).max(by_acceleration);
+        }
+        self.last = TaskView { motion: motion.id, remaining: motion.spline.duration(), ..TaskView::default() };
+        self.motion.replace(motion)
+    }
+
+    /// From now on slow down along the path.
+    pub fn slow_down(&mut self) {
+        self.slowing = true;
+    }
+
+    /// Gives the motion back.
+    pub fn take(&mut self) -> Option<Box<Motion>> {
+        self.motion.take()
+    }
+
+    /// Fills in the claims of this tick, or says how it ended. `granted`: the claims of the last tick went out.
+    pub fn compute(&mut self, cx: &Context<'_>, granted: bool, claims: &mut Vec<Claim>) -> Option<(TaskState, Reason)> {
+        let motion = self.motion.as_deref()?;
+        if granted {
+            if let Some(reason) = self.off_path(cx, motion) {
+                return Some((TaskState::Aborted, reason));
+            }
+            self.elapsed += cx.dt * self.rate;
+        }
+        let duration = motion.spline.duration();
+        motion.spline.sample(self.elapsed, &mut self.cursor, &mut self.samples);
+        if self.slowing && granted {
+            self.rate -= cx.dt * steepest_slowdown(cx, motion, &self.samples, self.rate);
+            if self.rate <= 0.0 || self.elapsed >= duration {
+                note_progress(&mut self.last, self.elapsed, duration);
+                return Some((TaskState::Aborted, Reason::Cancelled));
+            }
+        }
+        note_progress(&mut self.last, self.elapsed, duration);
+        if self.elapsed >= duration.max(self.fade) {
+            self.settling += cx.dt;
+            match self.away_from_goal(cx, motion) {
+                None => return Some((TaskState::Completed, Reason::None)),
+                Some((joint, error)) if self.settling > self.params.goal_time => {
+                    return Some((TaskState::Aborted, Reason::GoalTolerance(joint, error)));
+                }
+                Some(_) => {}
+            }
+        }
+        let left = 1.0 - smooth_step(self.elapsed / self.fade);
+        for (k, &joint) in motion.joints.iter().enumerate() {
+            let (Some(s), Some(offset), Some(asked)) = (self.samples.get(k), self.offsets.get(k), self.asked.get_mut(k))
+            else {
+                continue;
+            };
+            *asked = s.position + offset * left;
+            claims.push(Claim { joint, value: *asked });
+        }
+        None
+    }
+
+    fn off_path(&self, cx: &Context<'_>, motion: &Motion) -> Option<Reason> {
+        let tolerance = self.params.path_tolerance;
+        if tolerance <= 0.0 {
+            return None;
+        }
+        let errors = motion.joints.iter().zip(&self.asked).map(|(&j, asked)| (j, cx.joint(j).position - asked));
+        errors.into_iter().find(|(_, e)| e.abs() > tolerance).map(|(j, e)| Reason::PathTolerance(j, e))
+    }
+
+    /// The first joint that has not arrived, and its error [rad].
+    fn away_from_goal(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
+        motion.joints.iter().zip(&self.samples).find_map(|(&joint, sample)| {
+            let view = cx.joint(joint);
+            let error = view.position - sample.position;
+            let arrived = error.abs() <= self.params.goal_tolerance && view.velocity.abs() <= STANDSTILL;
+            (!arrived).then_some((joint, error))
+        })
+    }
+
+    /// Adds the motion's progress to what is told of the task.
+    pub fn describe(&self, view: &mut TaskView) {
+        (view.motion, view.progress) = (self.last.motion, self.last.progress);
+        (view.elapsed, view.remaining) = (self.last.elapsed, self.last.remaining);
+    }
+}
+
+fn note_progress(view: &mut TaskView, elapsed: f64, duration: f64) {
+    view.elapsed = elapsed;
+    view.remaining = (duration - elapsed).max(0.0);
+    view.progress = (elapsed / duration).min(1.0);
+}
+
+/// How fast the speed along the path may fall [1/s] so that no joint exceeds its acceleration: along a path q(s)
+/// with s' = r, q'' = q_ss r² + q_s r'. At least a tenth of the acceleration is used where the path itself needs all.
+fn steepest_slowdown(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate: f64) -> f64 {
+    let mut steepest = f64::MAX;
+    for (&joint, s) in motion.joints.iter().zip(samples) {
+        let limit = cx.joint(joint).acceleration;
+        let spare = (limit - s.acceleration.abs() * rate * rate).max(0.1 * limit);
+        steepest = steepest.min(spare / s.velocity.abs().max(1e-3));
+    }
+    steepest
+}
+
+/// 0 → 1 with zero velocity and acceleration at both ends.
+fn smooth_step(x: f64) -> f64 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * x * (10.0 + x * (6.0 * x - 15.0))
+}

@@ -1,0 +1,172 @@
+//! What the host grants a real-time thread: FIFO scheduling, locked memory, short wake-ups from idle states. Each
+//! is asked for; what is refused is told with its remedy and never stops a run. The reasons and figures are in
+//! `docs/realtime.md`.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write};
+use std::time::Duration;
+
+use crate::clock::Mono;
+
+/// FIFO priority of the watchdog: above everything it watches.
+pub const WATCHDOG_PRIORITY: i32 = 82;
+/// FIFO priority of the device threads: above the tick, so that a command is on the wire before the next one comes.
+pub const DEVICE_PRIORITY: i32 = 81;
+/// FIFO priority of the tick.
+pub const TICK_PRIORITY: i32 = 80;
+/// Stack of a timed thread [bytes].
+pub const STACK: usize = 256 * 1024;
+
+/// One thing that was asked of the host.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Grant {
+    /// What was asked for.
+    pub what: &'static str,
+    /// Whether it was granted.
+    pub granted: bool,
+    /// What was granted, or why not.
+    pub detail: String,
+    /// What to do when it was not; empty when it was.
+    pub remedy: &'static str,
+}
+
+const FIFO_REMEDY: &str = "allow it: add `@realtime - rtprio 95` to /etc/security/limits.d/ and yourself to that group, or `setcap cap_sys_nice,cap_ipc_lock+ep` on the binary";
+const MEMLOCK_REMEDY: &str = "allow it: `@realtime - memlock unlimited` in /etc/security/limits.d/ (LimitMEMLOCK=infinity under systemd)";
+const LATENCY_REMEDY: &str = "allow it: run as root or let your group write /dev/cpu_dma_latency by a udev rule; or give `realtime: false`";
+
+/// Holds idle states off for as long as it lives.
+#[derive(Debug)]
+pub struct LatencyHold(#[expect(dead_code, reason = "the kernel keeps the request while the file is open")] File);
+
+/// Asks for all that concerns the whole process. The hold must be kept for as long as the run lives.
+pub fn prepare_process(hold_latency: bool) -> (Vec<Grant>, Option<LatencyHold>) {
+    let mut grants = vec![probe_fifo(), lock_memory()];
+    let hold = hold_latency.then(hold_cpu_latency);
+    let kept = match hold {
+        None => {
+            let detail = "left on: the run asks for no real time".to_owned();
+            grants.push(Grant { what: "idle states held off", granted: false, detail, remedy: "" });
+            None
+        }
+        Some(Ok(file)) => {
+            let detail = "/dev/cpu_dma_latency at 0 µs".to_owned();
+            grants.push(Grant { what: "idle states held off", granted: true, detail, remedy: "" });
+            Some(file)
+        }
+        Some(Err(e)) => {
+            let detail = format!("/dev/cpu_dma_latency: {e}");
+            grants.push(Grant { what: "idle states held off", granted: false, detail, remedy: LATENCY_REMEDY });
+            None
+        }
+    };
+    (grants, kept)
+}
+
+/// Tries FIFO on the calling thread and goes back to the ordinary class.
+fn probe_fifo() -> Grant {
+    match set_fifo(TICK_PRIORITY) {
+        Ok(()) => {
+            set_other();
+            let detail = format!("SCHED_FIFO {TICK_PRIORITY}–{WATCHDOG_PRIORITY}");
+            Grant { what: "real-time scheduling", granted: true, detail, remedy: "" }
+        }
+        Err(e) => {
+            let detail = format!("SCHED_FIFO refused: {e}");
+            Grant { what: "real-time scheduling", granted: false, detail, remedy: FIFO_REMEDY }
+        }
+    }
+}
+
+/// Puts the calling thread into the FIFO class.
+pub fn set_fifo(priority: i32) -> io::Result<()> {
+    // SAFETY: sched_param is plain data, zero is a valid value for it.
+    let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
+    param.sched_priority = priority;
+    // SAFETY: pid 0 is the calling thread; the pointer is valid for the call.
+    match unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK, &param) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+fn set_other() {
+    // SAFETY: as in `set_fifo`.
+    let param: libc::sched_param = unsafe { std::mem::zeroed() };
+    // SAFETY: as in `set_fifo`; going back to the ordinary class is always allowed.
+    unsafe { libc::sched_setscheduler(0, libc::SCHED_OTHER, &param) };
+}
+
+/// Makes the calling thread fit for timed work: FIFO when permitted, otherwise the shortest timer slack; its stack
+/// is touched so that no page fault comes later. Returns whether it runs under FIFO.
+pub fn enter_realtime(priority: i32) -> bool {
+    let fifo = set_fifo(priority).is_ok();
+    // SAFETY: PR_SET_TIMERSLACK takes one integer and concerns the calling thread only.
+    unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, 1) };
+    touch_stack();
+    fifo
+}
+
+#[inline(never)]
+fn touch_stack() {
+    let mut pages = [0u8; STACK / 2];
+    for byte in pages.iter_mut().step_by(4096) {
+        *byte = 1;
+    }
+    std::hint::black_box(&mut pages);
+}
+
+/// Locks all memory of the process, but only where that cannot make a later allocation fail: locked virtual size
+/// counts against the limit.
+fn lock_memory() -> Grant {
+    let what = "memory locked";
+    if !may_lock_all() {
+        let detail = "only slots, rings and stacks, as far as the limit allows".to_owned();
+        return Grant { what, granted: false, detail, remedy: MEMLOCK_REMEDY };
+    }
+    // SAFETY: takes flags only; concerns the whole process and moves nothing.
+    match unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE | libc::MCL_ONFAULT) } {
+        0 => Grant { what, granted: true, detail: "all, as it is touched".to_owned(), remedy: "" },
+        _ => Grant { what, granted: false, detail: io::Error::last_os_error().to_string(), remedy: MEMLOCK_REMEDY },
+    }
+}
+
+fn may_lock_all() -> bool {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Memlock);
+    limit.current.is_none() || has_capability(14)
+}
+
+/// Whether the process has a capability in effect (14 = CAP_IPC_LOCK), as the kernel states it.
+fn has_capability(bit: u32) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("CapEff:"));
+    line.and_then(|hex| u64::from_str_radix(hex.trim(), 16).ok()).is_some_and(|caps| caps & (1 << bit) != 0)
+}
+
+/// Locks the pages of a buffer, as far as the limit allows; for processes that may not lock everything.
+pub fn lock_pages<T>(buffer: &[T]) {
+    let length = std::mem::size_of_val(buffer);
+    // SAFETY: the range is that of a live slice; locking changes nothing that Rust can see.
+    unsafe { libc::mlock2(buffer.as_ptr().cast(), length, libc::MLOCK_ONFAULT as libc::c_uint) };
+}
+
+fn hold_cpu_latency() -> io::Result<LatencyHold> {
+    let mut file = OpenOptions::new().write(true).open("/dev/cpu_dma_latency")?;
+    file.write_all(&0i32.to_ne_bytes())?;
+    Ok(LatencyHold(file))
+}
+
+/// Sleeps until a point of the monotonic clock; returns at once when it is past.
+pub fn sleep_until(deadline: Mono) {
+    let at = rustix::time::Timespec {
+        tv_sec: (deadline.0 / 1_000_000_000) as i64,
+        tv_nsec: (deadline.0 % 1_000_000_000) as i64,
+    };
+    // A signal that cuts the sleep short is slept through.
+    while rustix::thread::clock_nanosleep_absolute(rustix::thread::ClockId::Monotonic, &at).is_err() {}
+}
+
+/// Processor time used by the calling thread.
+pub fn thread_cpu_time() -> Duration {
+    let t = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    Duration::new(t.tv_sec as u64, t.tv_nsec as u32)
+}
