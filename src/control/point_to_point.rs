@@ -1,1 +1,178 @@
-//! point_to_point
+//! A jerk-limited, time-synchronized motion from rest to rest, for `move`. Computed outside the tick.
+//!
+//! Profiles by Ruckig (Berscheid and Kröger, "Jerk-limited real-time trajectory generation with arbitrary target
+//! states", RSS 2021). Between two changes of jerk each joint follows a cubic, so points at all changes, with
+//! positions and velocities, reproduce the motion exactly.
+
+use rsruckig::prelude::{
+    DataArrayOrVec, InputParameter, Ruckig, Synchronization, ThrowErrorHandler, Trajectory,
+};
+
+use crate::joint::JointLimits;
+use crate::trajectory::{JointTrajectory, TrajectoryPoint};
+
+/// Points closer together than this are one [s].
+const SAME_TIME: f64 = 1e-6;
+/// The shortest motion [s]; also that of an arm that is there already.
+const SHORTEST: f64 = 0.05;
+
+/// Why there is no such motion.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NoMotion {
+    /// A target is outside its joint's limits.
+    #[error("{joint} would go to {target:.4} rad, outside its limits {lower:.4} … {upper:.4} rad by {excess:.4} rad")]
+    OutOfLimits {
+        /// The joint.
+        joint: String,
+        /// Where it should go [rad].
+        target: f64,
+        /// The lowest position that is commanded [rad].
+        lower: f64,
+        /// The highest position that is commanded [rad].
+        upper: f64,
+        /// By how much the target is outside [rad].
+        excess: f64,
+    },
+    /// The generator found none.
+    #[error("no motion found: {0}")]
+    NotFound(String),
+}
+
+/// The fastest motion from `start` to `target` [rad] with `speed` (0–1] times the joints' velocities, and
+/// accelerations and jerks scaled to match (`speed²`, `speed³`), so that it is the same motion, slower.
+pub fn point_to_point(
+    joints: &[String],
+    start: &[f64],
+    target: &[f64],
+    limits: &JointLimits,
+    speed: f64,
+) -> Result<JointTrajectory, NoMotion> {
+    let n = joints.len();
+    for (j, joint) in joints.iter().enumerate() {
+        let bounds = super::limit::Bounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
+        // A joint that starts outside may stay or come in.
+        let (lower, upper) = (bounds.lower.min(start[j]), bounds.upper.max(start[j]));
+        let excess = (lower - target[j]).max(target[j] - upper);
+        // Not `>`: what is not a number is outside.
+        if !(excess <= 1e-9) {
+            return Err(NoMotion::OutOfLimits { joint: joint.clone(), target: target[j], lower, upper, excess });
+        }
+    }
+    let mut input = InputParameter::<0>::new(Some(n));
+    // A straight line in joint space, where the limits allow one: what people expect of a direct motion.
+    input.synchronization = Synchronization::Phase;
+    for j in 0..n {
+        input.current_position[j] = start[j];
+        input.target_position[j] = target[j];
+        input.max_velocity[j] = limits.velocity_max[j] * speed;
+        input.max_acceleration[j] = limits.acceleration_max[j] * speed * speed;
+        input.max_jerk[j] = limits.jerk_max[j] * speed.powi(3);
+    }
+    let mut generator = Ruckig::<0, ThrowErrorHandler>::new(Some(n), 0.01);
+    let mut found = Trajectory::<0>::new(Some(n));
+    generator.calculate(&input, &mut found).map_err(|e| NoMotion::NotFound(format!("{e:?}")))?;
+    let duration = found.get_duration();
+    if duration < SHORTEST {
+        return Ok(stay(joints, start, target));
+    }
+    let mut times = vec![0.0, duration];
+    for profile in found.get_profiles().iter().flat_map(|section| section.iter()) {
+        // Rest to rest has neither a brake nor an acceleration phase before the seven steps.
+        times.extend(profile.t_sum.iter().filter(|t| **t < duration));
+    }
+    times.sort_by(f64::total_cmp);
+    times.dedup_by(|a, b| (*a - *b).abs() < SAME_TIME);
+    if let Some(last) = times.last_mut() {
+        *last = duration;
+    }
+    let mut points = Vec::with_capacity(times.len());
+    for time in times {
+        let (mut p, mut v, mut a) = (array(n), array(n), array(n));
+        found.at_time(time, &mut Some(&mut p), &mut Some(&mut v), &mut Some(&mut a), &mut None, &mut None);
+        points.push(TrajectoryPoint {
+            time_from_start: time,
+            positions: p.iter().copied().collect(),
+            velocities: v.iter().copied().collect(),
+            accelerations: Vec::new(),
+        });
+    }
+    // The ends are what was asked for, not what rounding makes of it.
+    for (point, exact) in [(0, start), (points.len() - 1, target)] {
+        points[point].positions.copy_from_slice(exact);
+        points[point].velocities.fill(0.0);
+    }
+    Ok(JointTrajectory { joint_names: joints.to_vec(), points })
+}
+
+fn array(n: usize) -> DataArrayOrVec<f64, 0> {
+    DataArrayOrVec::new(Some(n), 0.0)
+}
+
+fn stay(joints: &[String], start: &[f64], target: &[f64]) -> JointTrajectory {
+    let point = |time_from_start, positions: &[f64]| TrajectoryPoint {
+        time_from_start,
+        positions: positions.to_vec(),
+        velocities: vec![0.0; joints.len()],
+        accelerations: Vec::new(),
+    };
+    JointTrajectory { joint_names: joints.to_vec(), points: vec![point(0.0, start), point(SHORTEST, target)] }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trajectory::{Cursor, Sample, Spline};
+    use proptest::prelude::*;
+
+    fn limits(n: usize) -> JointLimits {
+        JointLimits::uniform(n, 3.0, 1.5).with_defaults()
+    }
+
+    proptest! {
+        #[test]
+        fn every_motion_arrives_and_keeps_its_limits(
+            start in prop::collection::vec(-2.9f64..2.9, 6),
+            target in prop::collection::vec(-2.9f64..2.9, 6),
+            speed in 0.1f64..1.0,
+        ) {
+            let names = crate::joint::make_joints("arm", 6);
+            let l = limits(6);
+            let motion = point_to_point(&names, &start, &target, &l, speed).unwrap();
+            let spline = Spline::new(&motion).unwrap();
+            let (mut cursor, mut s) = (Cursor::default(), [Sample::default(); 6]);
+            let mut before: Option<[Sample; 6]> = None;
+            let h = 1e-3;
+            for k in 0..=(spline.duration() / h) as usize {
+                spline.sample(k as f64 * h, &mut cursor, &mut s);
+                for j in 0..6 {
+                    prop_assert!(s[j].velocity.abs() <= l.velocity_max[j] * speed * (1.0 + 1e-6));
+                    prop_assert!(s[j].acceleration.abs() <= l.acceleration_max[j] * speed * speed * (1.0 + 1e-4) + 1e-6);
+                    if let Some(b) = before {
+                        let jerk = (s[j].acceleration - b[j].acceleration).abs() / h;
+                        prop_assert!(jerk <= l.jerk_max[j] * speed.powi(3) * 1.01 + 1e-3, "jerk {jerk}");
+                    }
+                }
+                before = Some(s);
+            }
+            for j in 0..6 {
+                prop_assert_eq!(spline.start(j), start[j]);
+                prop_assert!((spline.goal(j) - target[j]).abs() < 1e-12);
+            }
+        }
+    }
+
+    #[test]
+    fn a_target_outside_names_the_joint_and_the_amount() {
+        let names = crate::joint::make_joints("arm", 2);
+        let said = point_to_point(&names, &[0.0, 0.0], &[0.0, 3.2], &limits(2), 1.0).unwrap_err().to_string();
+        assert!(said.contains("arm_joint2") && said.contains("by 0.2100 rad"), "{said}");
+        assert!(point_to_point(&names, &[0.0, 0.0], &[0.0, f64::NAN], &limits(2), 1.0).is_err());
+    }
+
+    #[test]
+    fn an_arm_that_is_there_already_stays() {
+        let names = crate::joint::make_joints("arm", 2);
+        let motion = point_to_point(&names, &[0.4, 0.1], &[0.4, 0.1], &limits(2), 1.0).unwrap();
+        assert!(Spline::new(&motion).is_ok());
+    }
+}

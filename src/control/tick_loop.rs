@@ -1,1 +1,211 @@
-//! tick_loop
+//! The thread that runs the coordinator: sleeps until each absolute deadline, reads the state slots, ticks, fills
+//! the command slots, wakes the device threads, and only then tells about it. Nothing here allocates, locks, logs
+//! or waits for anyone.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
+use std::time::Duration;
+
+use super::coordinator::{Coordinator, TickTime};
+use super::request::{Envelope, Motion};
+use crate::arm::{ArmCommand, ArmState};
+use crate::clock::{Clock, Mono};
+use crate::rt::beat::Beat;
+use crate::rt::histogram::Histogram;
+use crate::rt::host;
+use crate::rt::slot::{SlotReader, SlotWriter};
+use crate::rt::wake::Wake;
+use crate::telemetry::{ArmSample, Event, Outcome, Sample, TaskView, TickSample};
+
+/// What the tick thread shares with those who watch it.
+#[derive(Debug, Default)]
+pub struct Pulse {
+    /// The thread's heartbeat.
+    pub beat: Arc<Beat>,
+    /// Ticks made.
+    pub ticks: AtomicU64,
+    /// Whole periods skipped.
+    pub skipped: AtomicU64,
+    /// Whether the thread runs under FIFO.
+    pub fifo: AtomicBool,
+    /// Whether no arm is being moved by commands.
+    pub at_rest: AtomicBool,
+    /// Set to end the thread after its present tick.
+    pub stop: AtomicBool,
+    /// Samples that found the ring full.
+    pub dropped: AtomicU64,
+    /// Processor time of the thread [ns].
+    pub cpu_ns: AtomicU64,
+    /// Commands that replaced one that the device thread had not taken.
+    pub overwritten: AtomicU32,
+    /// Wake-up after the deadline.
+    pub lateness: Histogram,
+    /// Wake-up to the last command handed over.
+    pub compute: Histogram,
+}
+
+/// The tick's ends of everything it is connected with.
+pub struct TickPorts {
+    /// Latest states, one per arm.
+    pub states: Vec<SlotReader<ArmState>>,
+    /// Latest commands, one per arm.
+    pub commands: Vec<SlotWriter<ArmCommand>>,
+    /// Wakes the device threads, one per arm.
+    pub wakes: Vec<Wake>,
+    /// What it is told.
+    pub requests: rtrb::Consumer<Envelope>,
+    /// What came of it: id and outcome.
+    pub replies: rtrb::Producer<(u64, Outcome)>,
+    /// Wakes whoever waits for replies.
+    pub reply_wake: Wake,
+    /// Motions that are done.
+    pub retired: rtrb::Producer<Box<Motion>>,
+    /// What is logged.
+    pub samples: rtrb::Producer<Sample>,
+    /// Latest samples for rpc, one per arm.
+    pub arm_views: Vec<SlotWriter<ArmSample>>,
+    /// Latest views for rpc, one per task.
+    pub task_views: Vec<SlotWriter<TaskView>>,
+    /// Shared with the watchers.
+    pub pulse: Arc<Pulse>,
+}
+
+/// Called at the start of each tick. For tests and benchmarks, which delay, hang or end the thread with it.
+pub type Probe = Box<dyn FnMut(u64) + Send>;
+
+/// How many whole periods a late wake-up lost: the tick then takes the last deadline before it for "now".
+pub fn missed_periods(deadline: Mono, woke: Mono, period: Duration) -> u32 {
+    let period = (period.as_nanos() as u64).max(1);
+    (woke.0.saturating_sub(deadline.0) / period).min(u32::MAX as u64) as u32
+}
+
+/// The first deadline of the grid that is still ahead, and how many were passed over: never two ticks less than
+/// half a period apart, never a burst.
+pub fn next_deadline(deadline: Mono, woke: Mono, period: Duration) -> (Mono, u32) {
+    let period = (period.as_nanos() as u64).max(1);
+    let next = deadline.0.saturating_add(period);
+    let earliest = woke.0.saturating_add(period / 2);
+    let skipped = earliest.saturating_sub(next).div_ceil(period);
+    (Mono(next.saturating_add(skipped * period)), skipped.min(u32::MAX as u64) as u32)
+}
+
+/// Runs ticks until `pulse.stop`.
+pub fn run(
+    mut coordinator: Coordinator,
+    mut ports: TickPorts,
+    period: Duration,
+    clock: &dyn Clock,
+    mut probe: Option<Probe>,
+) {
+    let pulse = ports.pulse.clone();
+    pulse.fifo.store(host::enter_realtime(host::TICK_PRIORITY), Ordering::Relaxed);
+    let mut states = vec![ArmState::default(); ports.states.len()];
+    let mut deadline = clock.now().after(period);
+    let (mut tick, mut skips_before, mut dropped) = (0u64, 0u32, 0u32);
+    pulse.beat.beat(clock.now());
+    while !pulse.stop.load(Ordering::Relaxed) {
+        host::sleep_until(deadline);
+        let woke = clock.now();
+        if let Some(probe) = &mut probe {
+            probe(tick);
+        }
+        let late_ns = woke.0.saturating_sub(deadline.0);
+        let missed = missed_periods(deadline, woke, period);
+        deadline = deadline.after(period * missed);
+        let skipped = skips_before + missed;
+        let (next, skips_after) = next_deadline(deadline, woke, period);
+        for (state, slot) in states.iter_mut().zip(&mut ports.states) {
+            *state = slot.read();
+        }
+        let requests = &mut ports.requests;
+        let time = TickTime { now: deadline, next, skipped, late_ns };
+        let output = coordinator.tick(time, &states, || requests.pop().ok());
+        let mut overwritten = 0;
+        for (slot, command) in ports.commands.iter_mut().zip(&output.commands) {
+            overwritten += u32::from(slot.write(command));
+        }
+        // All wakes after all computing: a woken thread must not push the tick aside half-way.
+        ports.wakes.iter().for_each(Wake::raise);
+        let done = clock.now();
+        let compute_ns = done.0.saturating_sub(woke.0);
+        pulse.beat.beat(done);
+
+        let mut replied = false;
+        for event in &output.events {
+            if let Event::Request(id, outcome) = event {
+                replied |= ports.replies.push((*id, *outcome)).is_ok();
+            }
+        }
+        if replied {
+            ports.reply_wake.raise();
+        }
+        for motion in output.retired.drain(..) {
+            // The ring is as long as all motions that can exist; one that finds no room is leaked rather than freed.
+            if let Err(rtrb::PushError::Full(motion)) = ports.retired.push(motion) {
+                std::mem::forget(motion);
+            }
+        }
+        let timing = TickSample { tick, deadline, late_ns, compute_ns, skipped, dropped };
+        let wanted = output.arms.len() + output.events.len() + 1;
+        if ports.samples.slots() >= wanted {
+            let arms = output.arms.iter().map(|a| Sample::Arm(*a));
+            let events = output.events.iter().map(|e| Sample::Event(tick, *e));
+            for sample in arms.chain(events).chain([Sample::Tick(timing)]) {
+                let _ = ports.samples.push(sample);
+            }
+            dropped = 0;
+        } else {
+            // A tick is logged whole or not at all, and what is missing is counted.
+            dropped = dropped.saturating_add(wanted as u32);
+            pulse.dropped.fetch_add(wanted as u64, Ordering::Relaxed);
+        }
+        for (slot, sample) in ports.arm_views.iter_mut().zip(&output.arms) {
+            slot.write(sample);
+        }
+        for (slot, view) in ports.task_views.iter_mut().zip(&output.tasks) {
+            slot.write(view);
+        }
+        pulse.at_rest.store(coordinator.at_rest(), Ordering::Release);
+        pulse.lateness.record(late_ns);
+        pulse.compute.record(compute_ns);
+        pulse.overwritten.fetch_add(overwritten, Ordering::Relaxed);
+        pulse.skipped.fetch_add(skipped as u64, Ordering::Relaxed);
+        pulse.ticks.store(tick + 1, Ordering::Release);
+        pulse.cpu_ns.store(host::thread_cpu_time().as_nanos() as u64, Ordering::Relaxed);
+        tick += 1;
+        skips_before = skips_after;
+        deadline = next;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const P: Duration = Duration::from_millis(10);
+
+    fn ms(ms: f64) -> Mono {
+        Mono((ms * 1e6) as u64)
+    }
+
+    #[test]
+    fn f20_an_overrun_skips_whole_periods_and_never_bursts() {
+        for (woke, next, skipped) in [
+            (100.0, 110.0, 0),
+            (104.9, 110.0, 0),
+            (105.0, 110.0, 0),
+            (105.1, 120.0, 1),
+            (112.0, 120.0, 1),
+            (119.0, 130.0, 2),
+            (150.0, 160.0, 5),
+            (1234.0, 1240.0, 113),
+        ] {
+            let missed = missed_periods(ms(100.0), ms(woke), P);
+            let deadline = ms(100.0).after(P * missed);
+            let (n, s) = next_deadline(deadline, ms(woke), P);
+            assert_eq!((n, missed + s), (ms(next), skipped), "woke at {woke}");
+            assert!(deadline <= ms(woke) && ms(woke).since(deadline) < P);
+            assert!(n.since(ms(woke)) >= P / 2);
+        }
+    }
+}

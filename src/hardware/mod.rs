@@ -1,5 +1,6 @@
 //! Everything that talks to an arm: the adapter protocol, the table of adapters, the arms, one device thread each.
 
 pub mod arms;
+pub mod device;
 pub mod registry;
 pub mod spec;

@@ -61,6 +61,9 @@ pub struct ManipulatorInfo {
     pub modes: &'static [ControlMode],
     /// Whether the arm keeps its pose when its motors are disabled (brakes), or falls.
     pub holds_when_disabled: bool,
+    /// Whether `read_joints` brings the whole state, so that the other reads answer from memory. Otherwise each of
+    /// them costs a round trip, and they are made in turns, one a cycle.
+    pub whole_state_at_once: bool,
 }
 
 /// Joint positions, velocities and efforts of one moment, read in one go.

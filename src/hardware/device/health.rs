@@ -1,0 +1,119 @@
+//! What a device thread counts and remembers, for status and log. The tick never looks here.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use crate::clock::Mono;
+
+/// Episodes that are remembered.
+const EPISODES: usize = 16;
+
+/// A stretch of trouble of one kind.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Episode {
+    /// When it began.
+    pub since: Mono,
+    /// When it ended; `None`: it lasts.
+    pub until: Option<Mono>,
+    /// How often it was seen.
+    pub count: u64,
+    /// What it is.
+    pub text: String,
+}
+
+/// Something worth a line in the log.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Note {
+    /// Trouble began.
+    Began(String),
+    /// It is over.
+    Over(String),
+}
+
+/// Counters and texts of one device.
+#[derive(Debug, Default)]
+pub struct Health {
+    /// States read.
+    pub reads: AtomicU64,
+    /// Reads that failed.
+    pub read_errors: AtomicU64,
+    /// Commands written.
+    pub writes: AtomicU64,
+    /// Writes that failed.
+    pub write_errors: AtomicU64,
+    /// Times the connection was made again.
+    pub reconnects: AtomicU64,
+    /// `ArmCommand::stop_seq` of the last stop that the device confirmed.
+    pub stop_confirmed: AtomicU32,
+    /// `ArmCommand::stop_seq` of the last stop that was sent.
+    pub stop_sent: AtomicU32,
+    rate_mhz: AtomicU64,
+    text: Mutex<Text>,
+}
+
+#[derive(Debug, Default)]
+struct Text {
+    error: String,
+    episodes: VecDeque<Episode>,
+}
+
+impl Health {
+    /// How often states come [Hz].
+    pub fn rate(&self) -> f64 {
+        self.rate_mhz.load(Ordering::Relaxed) as f64 * 1e-3
+    }
+
+    /// A state came, so long after the one before [s].
+    pub(super) fn state_came(&self, interval: f64) {
+        self.reads.fetch_add(1, Ordering::Relaxed);
+        if interval > 0.0 {
+            let old = self.rate();
+            let new = if old > 0.0 { old + 0.05 * (1.0 / interval - old) } else { 1.0 / interval };
+            self.rate_mhz.store((new * 1e3) as u64, Ordering::Relaxed);
+        }
+    }
+
+    /// Text of the device's present error; empty when there is none.
+    pub fn error_text(&self) -> String {
+        self.lock().error.clone()
+    }
+
+    pub(super) fn set_error_text(&self, text: String) {
+        self.lock().error = text;
+    }
+
+    /// Recent episodes, the newest last.
+    pub fn episodes(&self) -> Vec<Episode> {
+        self.lock().episodes.iter().cloned().collect()
+    }
+
+    /// Trouble was seen. `true`: it is new, and worth a line.
+    pub(super) fn trouble(&self, now: Mono, text: &str) -> bool {
+        let mut all = self.lock();
+        if let Some(same) = all.episodes.back_mut().filter(|e| e.until.is_none()) {
+            same.count += 1;
+            if same.text == text {
+                return false;
+            }
+            same.until = Some(now);
+        }
+        if all.episodes.len() == EPISODES {
+            all.episodes.pop_front();
+        }
+        all.episodes.push_back(Episode { since: now, until: None, count: 1, text: text.to_owned() });
+        true
+    }
+
+    /// All is well again. Answers what is over.
+    pub(super) fn over(&self, now: Mono) -> Option<String> {
+        let mut all = self.lock();
+        let last = all.episodes.back_mut().filter(|e| e.until.is_none())?;
+        last.until = Some(now);
+        Some(last.text.clone())
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, Text> {
+        self.text.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}

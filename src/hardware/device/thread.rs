@@ -1,0 +1,434 @@
+//! The loop of a device thread.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::mpsc::{Receiver, TryRecvError};
+use std::time::Duration;
+
+use super::{Connected, DeviceConfig, Health, Note, Order};
+use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use crate::clock::Mono;
+use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, Stop};
+use crate::joint::ControlMode;
+use crate::rt::host;
+use crate::rt::slot::{SlotReader, SlotWriter};
+use crate::rt::wake::Wake;
+
+/// So many failed reads or writes in a row are more than a hiccup.
+const TOO_MANY: u32 = 3;
+/// Waits between two attempts to connect again.
+const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(5));
+/// So many readings in a row must agree before the motors are enabled.
+const PLAUSIBLE_AFTER: u32 = 3;
+/// How long `activate` waits for plausible states, and for the motors.
+const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
+
+pub(super) struct Worker {
+    config: DeviceConfig,
+    states: SlotWriter<ArmState>,
+    commands: SlotReader<ArmCommand>,
+    wake: Wake,
+    health: Arc<Health>,
+    state: ArmState,
+    reading: JointReading,
+    last: ArmCommand,
+    /// It was connected once and should be again.
+    wanted: bool,
+    connected: bool,
+    whole_state_at_once: bool,
+    turn: u8,
+    read_errors: u32,
+    write_errors: u32,
+    plausible: u32,
+    last_read: Mono,
+    next_read: Mono,
+    read_time: f64,
+    reconnect: (Mono, Duration),
+}
+
+impl Worker {
+    pub(super) fn new(
+        config: DeviceConfig,
+        states: SlotWriter<ArmState>,
+        commands: SlotReader<ArmCommand>,
+        wake: Wake,
+        health: Arc<Health>,
+    ) -> Self {
+        let state = ArmState { dof: config.dof, ..ArmState::default() };
+        Self {
+            config,
+            states,
+            commands,
+            wake,
+            health,
+            state,
+            reading: JointReading::default(),
+            last: ArmCommand::default(),
+            wanted: false,
+            connected: false,
+            whole_state_at_once: false,
+            turn: 0,
+            read_errors: 0,
+            write_errors: 0,
+            plausible: 0,
+            last_read: Mono::ZERO,
+            next_read: Mono::ZERO,
+            read_time: 0.0,
+            reconnect: (Mono::ZERO, BACK_OFF.0),
+        }
+    }
+
+    /// Runs until it is told to finish. A panic of the adapter costs this arm only.
+    pub(super) fn run(mut self, mut adapter: Box<dyn ManipulatorAdapter>, orders: Receiver<Order>) {
+        host::enter_realtime(host::DEVICE_PRIORITY);
+        let outcome = catch_unwind(AssertUnwindSafe(|| {
+            while !self.cycle(&mut *adapter, &orders) {}
+        }));
+        if let Err(panic) = outcome {
+            let what = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
+            let what = what.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
+            self.trouble(&format!("the adapter panicked: {what}"));
+            self.state.link = Link::Faulted;
+            self.states.write(&self.state);
+            let _ = catch_unwind(AssertUnwindSafe(|| adapter.write_stop()));
+            // Nothing more can be had of this adapter; orders are refused by hanging up.
+            let _ = catch_unwind(AssertUnwindSafe(move || drop(adapter)));
+        }
+    }
+
+    /// One cycle: wait, obey orders, pass a command on, read. `true`: it is over.
+    fn cycle(&mut self, adapter: &mut dyn ManipulatorAdapter, orders: &Receiver<Order>) -> bool {
+        let due = if self.connected { self.next_read } else { self.reconnect.0 };
+        let now = self.config.clock.now();
+        let idle = if self.wanted { due.since(now) } else { Duration::from_secs(1) };
+        self.wake.wait(idle.min(Duration::from_secs(1)));
+        loop {
+            match orders.try_recv() {
+                Ok(order) => {
+                    if self.obey(adapter, order) {
+                        return true;
+                    }
+                }
+                Err(TryRecvError::Empty) => break,
+                Err(TryRecvError::Disconnected) => {
+                    self.finish(adapter, false).ok();
+                    return true;
+                }
+            }
+        }
+        if self.connected {
+            self.pass_on_command(adapter);
+            self.watch_the_tick(adapter);
+            if self.config.clock.now() >= self.next_read {
+                self.read(adapter);
+            }
+        } else if self.wanted && self.config.clock.now() >= self.reconnect.0 {
+            self.connect_again(adapter);
+        }
+        false
+    }
+
+    fn obey(&mut self, adapter: &mut dyn ManipulatorAdapter, order: Order) -> bool {
+        match order {
+            Order::Connect(reply) => {
+                let _ = reply.send(self.connect(adapter));
+            }
+            Order::Activate(reply) => {
+                let _ = reply.send(self.activate(adapter));
+            }
+            Order::Disable(reply) => {
+                let result = self.while_connected(adapter, |a| a.write_enable(false));
+                self.read(adapter);
+                let _ = reply.send(result);
+            }
+            Order::ClearErrors(reply) => {
+                self.write_errors = 0;
+                let result = self.while_connected(adapter, |a| a.write_clear_errors());
+                self.read(adapter);
+                let _ = reply.send(result);
+            }
+            Order::Finish { disable, reply } => {
+                let _ = reply.send(self.finish(adapter, disable));
+                return true;
+            }
+        }
+        false
+    }
+
+    fn while_connected<T>(
+        &mut self,
+        adapter: &mut dyn ManipulatorAdapter,
+        act: impl FnOnce(&mut dyn ManipulatorAdapter) -> AdapterResult<T>,
+    ) -> AdapterResult<T> {
+        if self.connected { act(adapter) } else { Err(AdapterError::NotConnected) }
+    }
+
+    fn connect(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<Connected> {
+        adapter.connect()?;
+        let info = adapter.get_info();
+        if info.dof != self.config.dof {
+            adapter.disconnect();
+            let (expected, found) = (self.config.dof, info.dof);
+            let what = format!("expected an arm with {expected} joints, found {} with {found}", info.model);
+            return Err(AdapterError::Rejected(what));
+        }
+        let limits = adapter.get_limits().inspect_err(|_| adapter.disconnect())?;
+        self.whole_state_at_once = info.whole_state_at_once;
+        self.wanted = true;
+        self.connected = true;
+        self.reconnect.1 = BACK_OFF.0;
+        self.plausible = 0;
+        self.last = self.commands.read();
+        self.read(adapter);
+        Ok(Connected { info, limits })
+    }
+
+    fn connect_again(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        match self.connect(adapter) {
+            Ok(_) => {
+                self.health.reconnects.fetch_add(1, Relaxed);
+                self.state.self_held = true; // Whoever held it before, only `enable` lets it move again.
+                self.well_again();
+            }
+            Err(_) => {
+                let wait = self.reconnect.1;
+                self.reconnect = (self.config.clock.now().after(wait), (wait * 2).min(BACK_OFF.1));
+            }
+        }
+    }
+
+    /// Enables the motors: only with states that are fresh and agree with each other, and verified.
+    fn activate(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        if !self.connected {
+            return Err(AdapterError::NotConnected);
+        }
+        let limit = self.config.clock.now().after(ACTIVATION_LIMIT);
+        while self.plausible < PLAUSIBLE_AFTER {
+            if self.config.clock.now() >= limit {
+                return Err(AdapterError::Rejected(
+                    "its states are missing or jump: not enabled without a plausible pose".to_owned(),
+                ));
+            }
+            std::thread::sleep(self.config.read_period().min(Duration::from_millis(10)));
+            self.read(adapter);
+            if !self.connected {
+                return Err(AdapterError::NotConnected);
+            }
+        }
+        adapter.activate()?;
+        let limit = self.config.clock.now().after(ACTIVATION_LIMIT);
+        while !adapter.read_enabled()? {
+            if self.config.clock.now() >= limit {
+                return Err(AdapterError::Timeout("enabled, but the motors do not come on".to_owned()));
+            }
+            std::thread::sleep(Duration::from_millis(5));
+            self.read(adapter);
+        }
+        self.state.self_held = false;
+        self.write_errors = 0;
+        self.turn = 0;
+        for _ in 0..6 {
+            self.read(adapter);
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self, adapter: &mut dyn ManipulatorAdapter, disable: bool) -> AdapterResult<()> {
+        let mut result = Ok(());
+        if self.connected {
+            result = adapter.deactivate();
+            if disable {
+                result = result.and(adapter.write_enable(false));
+            }
+        }
+        adapter.disconnect();
+        self.connected = false;
+        self.wanted = false;
+        self.state.link = Link::Down;
+        self.states.write(&self.state);
+        result
+    }
+
+    fn pass_on_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let command = self.commands.read();
+        if command.seq == self.last.seq {
+            return;
+        }
+        let before = std::mem::replace(&mut self.last, command);
+        let lead = Duration::from_secs_f64((3.0 * self.read_time).max(1e-3)).min(self.config.tick_period / 2);
+        let earliest = self.last_read.after(self.config.read_period().mul_f64(0.8));
+        self.next_read = self.next_read.min(command.next_tick.before(lead)).max(earliest);
+        if self.state.self_held {
+            return;
+        }
+        let result = self.write(adapter, &before, &command);
+        match result {
+            Ok(()) => self.write_errors = 0,
+            Err(error) => {
+                self.health.write_errors.fetch_add(1, Relaxed);
+                self.write_errors += 1;
+                self.trouble(&format!("a command was not taken: {error}"));
+                self.after_error(adapter, &error);
+            }
+        }
+    }
+
+    fn write(
+        &mut self,
+        adapter: &mut dyn ManipulatorAdapter,
+        before: &ArmCommand,
+        command: &ArmCommand,
+    ) -> AdapterResult<()> {
+        if command.stop_seq != before.stop_seq {
+            let stop = adapter.write_stop()?;
+            self.health.stop_sent.store(command.stop_seq, Relaxed);
+            if stop == Stop::Confirmed {
+                self.health.stop_confirmed.store(command.stop_seq, Relaxed);
+            }
+        }
+        if command.gripper_seq != before.gripper_seq {
+            adapter.write_gripper_position(command.gripper)?;
+        }
+        let Some(mode) = command.mode else { return Ok(()) };
+        if adapter.get_control_mode() != mode {
+            adapter.set_control_mode(mode)?;
+        }
+        let values = command.values.get(..self.config.dof).unwrap_or_default();
+        match mode {
+            ControlMode::Velocity => adapter.write_joint_velocities(values)?,
+            _ => adapter.write_joint_positions(values, 1.0)?,
+        }
+        self.state.written = command.seq;
+        self.health.writes.fetch_add(1, Relaxed);
+        Ok(())
+    }
+
+    /// The checker is not the checked: when the tick falls silent, this thread holds the arm.
+    fn watch_the_tick(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        if self.last.mode.is_none() || self.state.self_held {
+            return;
+        }
+        let silence = self.config.beat.silence(self.config.clock.now());
+        if silence.is_some_and(|s| s > self.config.beat_timeout()) {
+            self.state.self_held = true;
+            let stopped = adapter.write_stop();
+            self.trouble("the tick fell silent: held by the device thread");
+            if let Err(error) = stopped {
+                self.trouble(&format!("the tick fell silent, and the arm did not take the stop: {error}"));
+                self.after_error(adapter, &error);
+            }
+            self.states.write(&self.state);
+        }
+    }
+
+    fn read(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        if !self.connected {
+            return;
+        }
+        let began = self.config.clock.now();
+        self.next_read = began.after(self.config.read_period());
+        match self.read_all(adapter) {
+            Ok(()) => {
+                let ended = self.config.clock.now();
+                self.read_time += 0.1 * (ended.seconds_since(began) - self.read_time);
+                self.take_reading(began);
+                self.read_errors = 0;
+                self.state.link = if self.write_errors >= TOO_MANY { Link::Faulted } else { Link::Up };
+                if self.state.link == Link::Up && self.write_errors == 0 && !self.state.self_held {
+                    self.well_again();
+                }
+            }
+            Err(error) => {
+                self.health.read_errors.fetch_add(1, Relaxed);
+                self.read_errors += 1;
+                self.plausible = 0;
+                self.trouble(&format!("no state: {error}"));
+                if self.read_errors >= TOO_MANY {
+                    self.state.link = Link::Stale;
+                }
+                self.after_error(adapter, &error);
+            }
+        }
+        self.states.write(&self.state);
+    }
+
+    fn read_all(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        adapter.read_joints(&mut self.reading)?;
+        let all = self.whole_state_at_once;
+        let turn = self.turn;
+        self.turn = (turn + 1) % 5;
+        if all || turn == 0 {
+            let (code, text) = adapter.read_error()?;
+            if code != self.state.error {
+                self.health.set_error_text(text.clone());
+                if code != 0 {
+                    self.trouble(&format!("the arm reports error {code}: {text}"));
+                }
+            }
+            self.state.error = code;
+        }
+        if all || turn == 1 {
+            self.state.enabled = adapter.read_enabled()?;
+        }
+        if all || turn == 2 {
+            self.state.gripper = adapter.read_gripper_position()?;
+        }
+        if all || turn == 3 {
+            self.state.wrench = adapter.read_force_torque()?;
+        }
+        if all || turn == 4 {
+            self.state.pose = adapter.read_cartesian_position()?;
+        }
+        self.state.mode = adapter.get_control_mode();
+        Ok(())
+    }
+
+    fn take_reading(&mut self, began: Mono) {
+        let stamp = self.reading.stamp.unwrap_or(began);
+        let interval = stamp.seconds_since(self.state.stamp);
+        let reach = self.config.velocity_max * 1.5 * interval.clamp(0.0, 0.1) + 0.02;
+        let dof = self.config.dof;
+        let mut moved = self.reading.position.iter().zip(&self.state.position).take(dof);
+        let agrees = self.state.seq != 0 && moved.all(|(new, old)| (new - old).abs() <= reach);
+        self.plausible = if agrees { self.plausible.saturating_add(1) } else { 1 };
+        self.health.state_came(if self.state.seq == 0 { 0.0 } else { began.seconds_since(self.last_read) });
+        self.last_read = began;
+        self.state.seq += 1;
+        self.state.stamp = stamp;
+        self.state.position = self.reading.position;
+        self.state.effort = self.reading.effort;
+        self.state.velocity = self.reading.velocity.unwrap_or_default();
+        self.state.velocity_source =
+            if self.reading.velocity.is_some() { VelocitySource::Measured } else { VelocitySource::Absent };
+    }
+
+    /// What an error means for the connection.
+    fn after_error(&mut self, adapter: &mut dyn ManipulatorAdapter, error: &AdapterError) {
+        if matches!(error, AdapterError::NotConnected) || !adapter.is_connected() {
+            adapter.disconnect();
+            self.connected = false;
+            self.plausible = 0;
+            self.state.link = Link::Faulted;
+            self.reconnect = (self.config.clock.now().after(BACK_OFF.0), BACK_OFF.0);
+        } else if self.write_errors >= TOO_MANY {
+            self.state.link = Link::Faulted;
+        }
+        self.states.write(&self.state);
+    }
+
+    fn trouble(&mut self, text: &str) {
+        if self.health.trouble(self.config.clock.now(), text) {
+            (self.config.notes)(Note::Began(text.to_owned()));
+        }
+    }
+
+    fn well_again(&mut self) {
+        // An arm that reports an error is not well, only reachable.
+        if self.state.error == 0
+            && let Some(text) = self.health.over(self.config.clock.now())
+        {
+            (self.config.notes)(Note::Over(text));
+        }
+    }
+}
