@@ -1,6 +1,8 @@
 //! What the tick tells about itself: plain data of fixed size, pushed into one ring, read by the recorder thread,
 //! which logs it, and hands events on to rpc and the text log. Nothing here allocates.
 
+pub mod describe;
+
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 
