@@ -150,9 +150,7 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
             d.values = vec![by];
         }
         Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) => d.arm = Some(names.arm(arm)),
-        Outcome::ArmNotReady(arm, _, cause)
-        | Outcome::ArmLatched(arm, cause)
-        | Outcome::StillFaulted(arm, cause) => {
+        Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
             d.arm = Some(names.arm(arm));
             d.values = code(cause);
         }
