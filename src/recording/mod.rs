@@ -7,10 +7,17 @@
 //!
 //! What is in a log, and what a reader may rely on: `docs/log-format.md`.
 
+mod arm_messages;
 pub mod cdr;
 pub mod files;
 pub mod log_writer;
 pub mod messages;
 pub mod recorder;
-pub mod tick_log;
+pub mod records;
+pub mod replay;
+mod tick_log;
 pub mod wire;
+mod worker;
+
+#[cfg(test)]
+mod tests;

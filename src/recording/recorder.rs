@@ -1,7 +1,7 @@
 //! The recorder thread: takes samples from the tick's ring and notes from everybody else, logs them, and hands
 //! events on in words. The only thread that waits for the disk; nobody waits for it.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -11,19 +11,16 @@ use std::sync::mpsc::Receiver;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use mcap::{McapError, McapResult};
 use thiserror::Error;
 
-use super::log_writer::{LogAttachment, LogWriter};
-use super::tick_log::TickLog;
+use super::log_writer::LogAttachment;
+use super::worker::Worker;
 use crate::clock::{Clock, Mono, MonotonicClock, WallOffset};
-use crate::telemetry::describe::{Described, Names, Severity, describe};
-use crate::telemetry::{Event, Sample, TickSample};
+use crate::telemetry::describe::{Described, Names, Severity};
+use crate::telemetry::{Event, Sample};
 
 /// How often the ring is emptied.
 const DRAIN_EVERY: Duration = Duration::from_millis(10);
-/// How often the disk is asked to keep what it was given, against a loss of power.
-const SYNC_EVERY: Duration = Duration::from_secs(1);
 /// Room for the write buffer: more than what a run logs between two flushes.
 const BUFFER: usize = 256 * 1024;
 
@@ -215,152 +212,6 @@ fn create_file(path: &Path) -> Result<File, RecordError> {
         File::create_new(path)
     };
     make().map_err(|source| RecordError::Create { path: path.to_owned(), source })
-}
-
-/// What the thread does, one step at a time: a test steps it on a clock of its own.
-struct Worker<W: Write + Seek, F> {
-    path: PathBuf,
-    log: Option<LogWriter<W>>,
-    /// The file once more, to be told to keep what it has.
-    disk: Option<File>,
-    synced: Mono,
-    ticks: TickLog,
-    names: Names,
-    ring: rtrb::Consumer<Sample>,
-    notes: Receiver<Note>,
-    on_notice: F,
-    stats: Arc<RecorderStats>,
-    ended: Option<RecordError>,
-}
-
-impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
-    fn new(
-        config: &RecorderConfig,
-        sink: Option<W>,
-        disk: Option<File>,
-        ring: rtrb::Consumer<Sample>,
-        notes: Receiver<Note>,
-        on_notice: F,
-        stats: Arc<RecorderStats>,
-    ) -> Result<Self, RecordError> {
-        let names = config.names.clone();
-        let ticks = TickLog::new(config.run.clone(), names.clone(), config.frame_id.clone(), config.wall);
-        let begin = |sink| {
-            let mut metadata = config.metadata.clone();
-            metadata.extend(ticks.metadata());
-            let now = config.wall.wall(MonotonicClock.now());
-            let mut log = LogWriter::create(sink, now, &config.attachments, metadata)?;
-            ticks.announce(&mut log)?;
-            Ok(log)
-        };
-        let path = config.path.clone().unwrap_or_default();
-        let log = sink.map(begin).transpose().map_err(|e| write_error(&path, &e))?;
-        Ok(Self { path, log, disk, synced: Mono::ZERO, ticks, names, ring, notes, on_notice, stats, ended: None })
-    }
-
-    /// Takes everything there is and logs it.
-    fn step(&mut self, now: Mono) {
-        // Counted before the notes are taken: a request is noted before it is told to the tick, so the note of every
-        // request that these samples answer is there, and stands before the answer in the log.
-        let waiting = self.ring.slots();
-        let notes: Vec<Note> = self.notes.try_iter().collect();
-        let samples: Vec<Sample> = self.ring.read_chunk(waiting).into_iter().flatten().collect();
-        // Events are told before anything waits for the disk.
-        let mut described = self.tell_events(&samples);
-        if let Err(e) = self.write(notes, &samples, &mut described, now) {
-            self.stop_log(&e);
-        }
-    }
-
-    fn tell_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
-        let mut all = VecDeque::new();
-        for sample in samples {
-            if let Sample::Event(tick, event) = sample {
-                let described = describe(event, &self.names);
-                (self.on_notice)(Notice::Event { tick: *tick, event, described: &described });
-                all.push_back(described);
-            }
-        }
-        all
-    }
-
-    fn write(
-        &mut self,
-        notes: Vec<Note>,
-        samples: &[Sample],
-        described: &mut VecDeque<Described>,
-        now: Mono,
-    ) -> McapResult<()> {
-        for note in notes {
-            self.note(note)?;
-        }
-        for sample in samples {
-            match sample {
-                Sample::Arm(arm) => self.ticks.arm(*arm),
-                Sample::Event(tick, _) => self.ticks.event(*tick, described.pop_front()),
-                Sample::Tick(tick) => self.close(tick)?,
-            }
-        }
-        let Some(log) = &mut self.log else { return Ok(()) };
-        if log.flush_if_due(now)? && now.since(self.synced) >= SYNC_EVERY {
-            self.disk.as_ref().map_or(Ok(()), File::sync_data)?;
-            self.synced = now;
-        }
-        self.stats.messages.store(log.written(), Ordering::Relaxed);
-        Ok(())
-    }
-
-    fn note(&mut self, note: Note) -> McapResult<()> {
-        let Some(log) = &mut self.log else { return Ok(()) };
-        match note {
-            Note::Request { id, stamp, json } => self.ticks.request(log, id, stamp, &json),
-            Note::Log { severity, stamp, text } => self.ticks.line(log, severity, stamp, &text),
-            Note::ArmText { arm, text } => {
-                self.ticks.arm_text(arm, text);
-                Ok(())
-            }
-        }
-    }
-
-    fn close(&mut self, tick: &TickSample) -> McapResult<()> {
-        let (lost, result) = match self.log.as_mut().map(|log| self.ticks.close(log, tick)) {
-            Some(Ok(lost)) => (lost, Ok(())),
-            Some(Err(e)) => (tick.dropped, Err(e)),
-            None => {
-                self.ticks.clear();
-                (tick.dropped, Ok(()))
-            }
-        };
-        if lost > 0 {
-            self.stats.dropped.fetch_add(u64::from(lost), Ordering::Relaxed);
-            (self.on_notice)(Notice::Lost(lost));
-        }
-        result
-    }
-
-    fn stop_log(&mut self, e: &McapError) {
-        self.log = None;
-        self.stats.failed.store(true, Ordering::Relaxed);
-        let error = write_error(&self.path, e);
-        (self.on_notice)(Notice::Stopped(&error));
-        self.ended = Some(error);
-    }
-
-    /// Takes what is left and closes the log.
-    fn finish(mut self, now: Mono) -> Result<(), RecordError> {
-        self.step(now);
-        let Some(log) = self.log.take() else { return self.ended.map_or(Ok(()), Err) };
-        let closed = log.finish().map(drop).and_then(|()| Ok(self.disk.as_ref().map_or(Ok(()), File::sync_data)?));
-        closed.map_err(|e| {
-            self.stop_log(&e);
-            write_error(&self.path, &e)
-        })
-    }
-}
-
-fn write_error(path: &Path, e: &McapError) -> RecordError {
-    let reason = if let McapError::Io(e) = e { e.to_string() } else { e.to_string() };
-    RecordError::Write { path: path.to_owned(), reason }
 }
 
 /// A sink that counts what goes through it.
