@@ -1,11 +1,33 @@
-//! dimos runs robot arms.
+//! dimos runs robot arms: a real-time control coordinator, recording and replay, from a YAML blueprint, for any arm.
+//!
+//! ```text
+//!  blueprint.yaml ─▶ blueprint (schema → resolve) ─▶ runtime: builds everything below, starts threads, stops them in order
+//!
+//!  CLI ──rpc──▶ runtime::service ──requests──▶ coordinator (real-time thread)
+//!                                              │ tick: read → compute → arbitrate → limit → route → write
+//!                                              ▼
+//!   tasks ─▶ arbitrate ─▶ limit ─▶ route ──(command slot)──▶ device thread ─▶ adapter ─▶ wire ─▶ arm | emulator
+//!     ▲ state slot: latest joint state, time-stamped  ◀───────────┘   one per arm
+//!     └──(ring, drop-counted)──▶ recorder ─▶ MCAP          └──▶ rpc: published joint state
+//! ```
+//!
+//! A module may use only those above it in this list; `tests/layering.rs` checks that.
 
 pub mod arm;
 pub mod clock;
-pub mod control;
-pub mod hardware;
 pub mod joint;
-pub mod rt;
 pub mod telemetry;
 pub mod trajectory;
 pub mod yaml;
+
+pub mod rt;
+
+pub mod hardware;
+
+pub mod control;
+
+
+pub mod recording;
+
+
+

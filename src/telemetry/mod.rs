@@ -1,10 +1,14 @@
 //! What the tick tells about itself: plain data of fixed size, pushed into one ring, read by the recorder thread,
 //! which logs it, and hands events on to rpc and the text log. Nothing here allocates.
 
+pub mod describe;
+
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 
 /// One entry of the ring.
+// The ring holds values: a box would be an allocation in the tick.
+#[allow(clippy::large_enum_variant)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Sample {
     /// What a tick read of one arm and what it commands. One per arm and tick, before the tick's `Tick`.

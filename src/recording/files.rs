@@ -1,0 +1,130 @@
+//! Where logs are kept, what they are called, and how many of them.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use jiff::fmt::strtime;
+
+/// How the time in a log's file name is written: `20261121T141630Z`.
+const STAMP: &str = "%Y%m%dT%H%M%SZ";
+/// Logs kept by default.
+pub const KEPT_LOGS: usize = 20;
+
+/// The folder logs go to: `$XDG_STATE_HOME/dimos`, else `~/.local/state/dimos`. `None` if neither is known.
+pub fn log_folder() -> Option<PathBuf> {
+    let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let state = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local/state")))?;
+    Some(state.join("dimos"))
+}
+
+/// The file name of a log that begins at a Unix time [ns]: `<run>-20261121T141630Z.mcap`.
+pub fn log_file_name(run: &str, wall_ns: u64) -> String {
+    let time = Timestamp::from_nanosecond(i128::from(wall_ns)).unwrap_or(Timestamp::UNIX_EPOCH);
+    format!("{run}-{}.mcap", time.strftime(STAMP))
+}
+
+/// A path in `folder` for a log that begins at a Unix time [ns]. A second log of the same run within a second gets
+/// `-2` after its time, and so on.
+pub fn new_log_path(folder: &Path, run: &str, wall_ns: u64) -> PathBuf {
+    let name = log_file_name(run, wall_ns);
+    let first = folder.join(&name);
+    let others = (2..).map(|n| folder.join(name.replace(".mcap", &format!("-{n}.mcap"))));
+    std::iter::once(first.clone()).chain(others).find(|path| !path.exists()).unwrap_or(first)
+}
+
+/// The newest log in `folder`, by the time in its name.
+pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
+    Ok(logs(folder)?.pop())
+}
+
+/// Removes all but the newest `keep` logs from `folder`, and nothing that is not named like a log. A log that cannot
+/// be removed is left. Gives the paths it removed.
+pub fn retain(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
+    let mut old = logs(folder)?;
+    old.truncate(old.len().saturating_sub(keep));
+    old.retain(|path| std::fs::remove_file(path).is_ok());
+    Ok(old)
+}
+
+/// All logs in `folder`, oldest first.
+fn logs(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let entries = match std::fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+        Err(e) => return Err(e),
+    };
+    let mut found = Vec::new();
+    for entry in entries {
+        let entry = entry?;
+        let key = entry.file_name().to_str().and_then(log_time);
+        if let Some(key) = key.filter(|_| entry.file_type().is_ok_and(|kind| kind.is_file())) {
+            found.push((key, entry.path()));
+        }
+    }
+    found.sort();
+    Ok(found.into_iter().map(|(_, path)| path).collect())
+}
+
+/// Time in the name of a log, and its number within that second; `None` if it is not named like a log.
+fn log_time(name: &str) -> Option<(jiff::civil::DateTime, u32)> {
+    let stem = name.strip_suffix(".mcap")?;
+    let (run_and_time, last) = stem.rsplit_once('-')?;
+    let (run, time, number) = match last.parse() {
+        Ok(number) if last.len() < 8 => {
+            let (run, time) = run_and_time.rsplit_once('-')?;
+            (run, time, number)
+        }
+        _ => (run_and_time, last, 1),
+    };
+    let time = strtime::parse(STAMP, time).ok()?.to_datetime().ok()?;
+    (!run.is_empty()).then_some((time, number))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOON: u64 = 1_795_270_590 * 1_000_000_000;
+
+    fn touch(folder: &Path, name: &str) -> PathBuf {
+        let path = folder.join(name);
+        std::fs::write(&path, b"").unwrap();
+        path
+    }
+
+    #[test]
+    fn a_log_is_named_after_its_run_and_utc_time() {
+        assert_eq!(log_file_name("coordinator-yourarm", NOON), "coordinator-yourarm-20261121T141630Z.mcap");
+        assert!(log_time("coordinator-yourarm-20261121T141630Z.mcap").is_some());
+    }
+
+    #[test]
+    fn a_second_log_in_the_same_second_is_newer() {
+        let folder = tempfile::tempdir().unwrap();
+        for number in ["", "-2", "-3"] {
+            let path = new_log_path(folder.path(), "run", NOON);
+            assert_eq!(path.file_name().unwrap().to_str().unwrap(), format!("run-20261121T141630Z{number}.mcap"));
+            std::fs::write(&path, b"").unwrap();
+            assert_eq!(newest(folder.path()).unwrap(), Some(path));
+        }
+    }
+
+    #[test]
+    fn only_old_logs_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let foreign = ["notes.mcap", "run-1.mcap", "-20261121T141630Z.mcap", "run-20261121T141630Z.txt", "x.yaml"];
+        let foreign = foreign.map(|name| touch(folder.path(), name));
+        let old = touch(folder.path(), "z-20251121T141630Z.mcap");
+        let kept = [touch(folder.path(), "b-20261121T141629Z.mcap"), touch(folder.path(), "a-20261121T141630Z.mcap")];
+        assert_eq!(retain(folder.path(), 2).unwrap(), std::slice::from_ref(&old));
+        assert!(!old.exists());
+        assert!(foreign.iter().chain(&kept).all(|path| path.exists()));
+        assert_eq!(newest(folder.path()).unwrap().as_ref(), Some(&kept[1]));
+    }
+
+    #[test]
+    fn no_folder_is_no_logs() {
+        assert_eq!(newest(Path::new("/nonexistent/dimos")).unwrap(), None);
+    }
+}

@@ -1,0 +1,238 @@
+//! Writes typed messages into an MCAP file, with the profile that strict readers want.
+//!
+//! The file only ever grows at its end: what was flushed stays readable whatever happens afterwards.
+
+use std::collections::{BTreeMap, HashMap};
+use std::io::{Seek, Write};
+use std::time::Duration;
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Attachment, McapResult, WriteOptions, Writer};
+
+use super::cdr::Encoder;
+use super::wire::Message;
+use crate::clock::Mono;
+
+/// Longest time that messages wait for the file.
+pub const FLUSH_EVERY: Duration = Duration::from_millis(100);
+/// A chunk is closed when it is this long, even before it is time to flush [bytes].
+const CHUNK_SIZE: u64 = 768 * 1024;
+
+/// QoS of every channel, as rosbag2 writes it: keep last 10, reliable, volatile. `ros2 bag play` offers this.
+const QOS: &str = "- history: 1
+  depth: 10
+  reliability: 1
+  durability: 2
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false
+";
+
+/// A file that goes along with a log, e.g. the blueprint.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LogAttachment {
+    /// File name.
+    pub name: String,
+    /// Media type, e.g. `application/yaml`.
+    pub media_type: String,
+    /// Contents.
+    pub data: Vec<u8>,
+}
+
+/// An open log. Dropping it closes it as `finish` does, without telling of errors.
+pub struct LogWriter<W: Write + Seek> {
+    mcap: Writer<W>,
+    channels: HashMap<String, Channel>,
+    encoder: Encoder,
+    flush: FlushTimer,
+    written: u64,
+}
+
+struct Channel {
+    id: u16,
+    sequence: u32,
+}
+
+impl<W: Write + Seek> LogWriter<W> {
+    /// Begins a log: header, attachments and metadata (under the name `dimos`) come first, so that they survive a
+    /// crash. `now` is in Unix time [ns].
+    pub fn create(
+        sink: W,
+        now: u64,
+        attachments: &[LogAttachment],
+        metadata: BTreeMap<String, String>,
+    ) -> McapResult<Self> {
+        let mut mcap = WriteOptions::new()
+            .profile("ros2")
+            .library(concat!("dimos/", env!("CARGO_PKG_VERSION")))
+            .chunk_size(Some(CHUNK_SIZE))
+            // Worker threads would compete with the tick, and seeking back would leave half a chunk after a crash.
+            .compression_threads(0)
+            .disable_seeking(true)
+            .create(sink)?;
+        for a in attachments {
+            mcap.attach(&Attachment {
+                log_time: now,
+                create_time: now,
+                name: a.name.clone(),
+                media_type: a.media_type.clone(),
+                data: a.data.as_slice().into(),
+            })?;
+        }
+        mcap.write_metadata(&Metadata { name: "dimos".into(), metadata })?;
+        mcap.flush()?;
+        Ok(Self {
+            mcap,
+            channels: HashMap::new(),
+            encoder: Encoder::default(),
+            flush: FlushTimer::default(),
+            written: 0,
+        })
+    }
+
+    /// Makes a topic known, so that it is listed even if nothing is ever said on it.
+    pub fn announce<M: Message>(&mut self, topic: &str) -> McapResult<()> {
+        if !self.channels.contains_key(topic) {
+            let schema = self.mcap.add_schema(M::SCHEMA, "ros2msg", M::schema_text().as_bytes())?;
+            let metadata = BTreeMap::from([("offered_qos_profiles".to_owned(), QOS.to_owned())]);
+            let id = self.mcap.add_channel(schema, topic, "cdr", &metadata)?;
+            self.channels.insert(topic.to_owned(), Channel { id, sequence: 0 });
+        }
+        Ok(())
+    }
+
+    /// Logs a message at a Unix time [ns].
+    pub fn publish<M: Message>(&mut self, topic: &str, time: u64, message: &M) -> McapResult<()> {
+        self.announce::<M>(topic)?;
+        let Some(channel) = self.channels.get_mut(topic) else { return Ok(()) };
+        self.encoder.restart();
+        message.put(&mut self.encoder);
+        let header =
+            MessageHeader { channel_id: channel.id, sequence: channel.sequence, log_time: time, publish_time: time };
+        channel.sequence = channel.sequence.wrapping_add(1);
+        self.mcap.write_to_known_channel(&header, self.encoder.bytes())?;
+        self.written += 1;
+        self.flush.pending = true;
+        Ok(())
+    }
+
+    /// Hands everything to the operating system if it is time to: what it has survives the end of this process.
+    /// Says whether it did.
+    pub fn flush_if_due(&mut self, now: Mono) -> McapResult<bool> {
+        let due = self.flush.due(now);
+        if due {
+            self.mcap.flush()?;
+        }
+        Ok(due)
+    }
+
+    /// Messages logged so far.
+    pub fn written(&self) -> u64 {
+        self.written
+    }
+
+    /// Closes the log: indexes, statistics, summary. Gives the sink back.
+    pub fn finish(mut self) -> McapResult<W> {
+        self.mcap.finish()?;
+        let mut sink = self.mcap.into_inner();
+        sink.flush()?;
+        Ok(sink)
+    }
+}
+
+/// When to flush: the first message at once, then every [`FLUSH_EVERY`], if there is anything to flush.
+#[derive(Debug, Default)]
+struct FlushTimer {
+    last: Option<Mono>,
+    pending: bool,
+}
+
+impl FlushTimer {
+    fn due(&mut self, now: Mono) -> bool {
+        let due = self.pending && self.last.is_none_or(|last| now.since(last) >= FLUSH_EVERY);
+        if due {
+            self.last = Some(now);
+            self.pending = false;
+        }
+        due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::messages::Text;
+    use std::io::Cursor;
+    use std::sync::{Arc, Mutex};
+
+    /// Memory that stays visible while the writer has it: what the operating system would hold after a crash.
+    #[derive(Clone, Default)]
+    struct Shared(Arc<Mutex<Cursor<Vec<u8>>>>);
+
+    impl Write for Shared {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            self.0.lock().unwrap().write(bytes)
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    impl Seek for Shared {
+        fn seek(&mut self, to: std::io::SeekFrom) -> std::io::Result<u64> {
+            self.0.lock().unwrap().seek(to)
+        }
+    }
+
+    fn readable(sink: &Shared) -> usize {
+        let bytes = sink.0.lock().unwrap().get_ref().clone();
+        mcap::MessageStream::new(&bytes).unwrap().take_while(Result::is_ok).count()
+    }
+
+    #[test]
+    fn the_first_message_is_on_disk_at_once_and_the_others_after_100_ms() {
+        let sink = Shared::default();
+        let mut log = LogWriter::create(sink.clone(), 0, &[], BTreeMap::new()).unwrap();
+        let say = |log: &mut LogWriter<Shared>| log.publish("/a", 1, &Text { data: "x".into() }).unwrap();
+        let at = |ms: u64| Mono(ms * 1_000_000);
+        assert!(!log.flush_if_due(at(5)).unwrap(), "nothing to flush yet");
+        say(&mut log);
+        assert!(log.flush_if_due(at(10)).unwrap());
+        assert_eq!(readable(&sink), 1);
+        say(&mut log);
+        assert!(!log.flush_if_due(at(109)).unwrap());
+        assert!(log.flush_if_due(at(110)).unwrap());
+        assert_eq!(readable(&sink), 2);
+        assert!(!log.flush_if_due(at(500)).unwrap(), "nothing new");
+    }
+
+    #[test]
+    fn a_finished_log_has_profile_statistics_metadata_and_attachment() {
+        let blueprint =
+            LogAttachment { name: "b.yaml".into(), media_type: "application/yaml".into(), data: b"name: x".to_vec() };
+        let metadata = BTreeMap::from([("run".to_owned(), "x".to_owned())]);
+        let mut log = LogWriter::create(Cursor::new(Vec::new()), 7, &[blueprint], metadata).unwrap();
+        log.publish("/a", 9, &Text { data: "x".into() }).unwrap();
+        log.announce::<Text>("/b").unwrap();
+        let bytes = log.finish().unwrap().into_inner();
+        let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+        let stats = summary.stats.as_ref().unwrap();
+        assert_eq!((stats.message_count, stats.channel_count, stats.schema_count), (1, 2, 1));
+        assert_eq!((stats.message_start_time, stats.message_end_time), (9, 9));
+        let found = mcap::read::attachment(&bytes, &summary.attachment_indexes[0]).unwrap();
+        assert_eq!((found.name.as_str(), &found.data[..]), ("b.yaml", &b"name: x"[..]));
+        let metadata = mcap::read::metadata(&bytes, &summary.metadata_indexes[0]).unwrap();
+        assert_eq!(metadata.metadata["run"], "x");
+        let mut records = mcap::read::LinearReader::new(&bytes).unwrap();
+        let Some(Ok(mcap::records::Record::Header(header))) = records.next() else { panic!("no header") };
+        assert_eq!(header.profile, "ros2");
+    }
+}

@@ -1,0 +1,238 @@
+//! The recorder thread: takes samples from the tick's ring and notes from everybody else, logs them, and hands
+//! events on in words. The only thread that waits for the disk; nobody waits for it.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::Receiver;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use thiserror::Error;
+
+use super::log_writer::LogAttachment;
+use super::worker::Worker;
+use crate::clock::{Clock, Mono, MonotonicClock, WallOffset};
+use crate::telemetry::describe::{Described, Names, Severity};
+use crate::telemetry::{Event, Sample};
+
+/// How often the ring is emptied.
+const DRAIN_EVERY: Duration = Duration::from_millis(10);
+/// Room for the write buffer: more than what a run logs between two flushes.
+const BUFFER: usize = 256 * 1024;
+
+/// What to record, and where.
+#[derive(Debug, Clone)]
+pub struct RecorderConfig {
+    /// The log file, which must not exist yet; its folder is made. `None` records nothing.
+    pub path: Option<PathBuf>,
+    /// Name of the run.
+    pub run: String,
+    /// Names of arms, joints and tasks, in the order of the tick's indices.
+    pub names: Names,
+    /// Frame of the joint states: the blueprint's `joint_state_frame_id`.
+    pub frame_id: String,
+    /// Files to put into the log, the blueprint first of all.
+    pub attachments: Vec<LogAttachment>,
+    /// More about the run, besides its name, arms, joints and tasks.
+    pub metadata: BTreeMap<String, String>,
+    /// Offset between monotonic and Unix time.
+    pub wall: WallOffset,
+}
+
+/// What other threads want in the log.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Note {
+    /// A request, sent before it is told to the tick.
+    Request {
+        /// The id that the tick answers with.
+        id: u64,
+        /// When it came.
+        stamp: Mono,
+        /// The request as it was told to the tick.
+        json: String,
+    },
+    /// A line of text.
+    Log {
+        /// How much it matters.
+        severity: Severity,
+        /// When.
+        stamp: Mono,
+        /// The line.
+        text: String,
+    },
+    /// What an arm says about its present error.
+    ArmText {
+        /// Index of the arm.
+        arm: u16,
+        /// The text.
+        text: String,
+    },
+}
+
+/// What the recorder tells while it runs, on its own thread: be quick.
+#[derive(Debug)]
+pub enum Notice<'a> {
+    /// Something happened in the tick with this index.
+    Event {
+        /// Index of the tick.
+        tick: u64,
+        /// What happened.
+        event: &'a Event,
+        /// The same in words.
+        described: &'a Described,
+    },
+    /// The recorder fell behind: so many samples are missing in the log.
+    Lost(u32),
+    /// The log could not be written and ends here. Said once; the run goes on.
+    Stopped(&'a RecordError),
+}
+
+/// Why there is no log, or no more of it.
+#[derive(Debug, Error)]
+pub enum RecordError {
+    /// The file or its folder cannot be made.
+    #[error("the log {path} cannot be made: {source}\nhint: {}", hint(source))]
+    Create {
+        /// The log file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A write failed.
+    #[error("the log {path} ends here: {reason}\nhint: see whether the disk is full; the run goes on without a log")]
+    Write {
+        /// The log file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// The thread cannot be started.
+    #[error("the recorder thread cannot be started: {0}\nhint: see whether a limit on threads or memory is reached")]
+    Thread(std::io::Error),
+}
+
+fn hint(source: &std::io::Error) -> &'static str {
+    match source.kind() {
+        std::io::ErrorKind::AlreadyExists => "a log is never overwritten: name another file, or remove it first",
+        _ => "name another file with --record FILE, or run with --no-record",
+    }
+}
+
+/// Figures of a running recorder.
+#[derive(Debug, Default)]
+pub struct RecorderStats {
+    /// Messages logged.
+    pub messages: AtomicU64,
+    /// Length of the log [bytes].
+    pub bytes: AtomicU64,
+    /// Samples lost, because the recorder fell behind.
+    pub dropped: AtomicU64,
+    /// A write failed: there is no more log.
+    pub failed: AtomicBool,
+}
+
+/// A running recorder. Dropping it closes the log.
+#[derive(Debug)]
+pub struct Recorder {
+    path: Option<PathBuf>,
+    stats: Arc<RecorderStats>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<Result<(), RecordError>>>,
+}
+
+impl Recorder {
+    /// Begins the log and starts the thread `recorder`. Without a path the ring is emptied and events are told all
+    /// the same.
+    pub fn start(
+        config: RecorderConfig,
+        ring: rtrb::Consumer<Sample>,
+        notes: Receiver<Note>,
+        on_notice: impl FnMut(Notice<'_>) + Send + 'static,
+    ) -> Result<Self, RecordError> {
+        let stats = Arc::new(RecorderStats::default());
+        let file = config.path.as_deref().map(create_file).transpose()?;
+        let disk = file.as_ref().and_then(|f| f.try_clone().ok());
+        let sink = file.map(|f| Counted { inner: BufWriter::with_capacity(BUFFER, f), stats: stats.clone() });
+        let mut worker = Worker::new(&config, sink, disk, ring, notes, on_notice, stats.clone())?;
+        let stop = Arc::new(AtomicBool::new(false));
+        let stopping = stop.clone();
+        let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
+            while !stopping.load(Ordering::Acquire) {
+                worker.step(MonotonicClock.now());
+                std::thread::park_timeout(DRAIN_EVERY);
+            }
+            worker.finish(MonotonicClock.now())
+        });
+        let thread = Some(thread.map_err(RecordError::Thread)?);
+        Ok(Self { path: config.path, stats, stop, thread })
+    }
+
+    /// Where the log is.
+    pub fn path(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// Its figures, up to date at any time.
+    pub fn stats(&self) -> Arc<RecorderStats> {
+        self.stats.clone()
+    }
+
+    /// Takes what is left in the ring and closes the log. Call it when the tick has ended. The error is the one that
+    /// ended the log, if one did.
+    pub fn finish(mut self) -> Result<(), RecordError> {
+        self.join()
+    }
+
+    fn join(&mut self) -> Result<(), RecordError> {
+        self.stop.store(true, Ordering::Release);
+        let Some(thread) = self.thread.take() else { return Ok(()) };
+        thread.thread().unpark();
+        let path = self.path.clone().unwrap_or_default();
+        let panicked = |_| RecordError::Write { path, reason: "the recorder thread panicked".into() };
+        thread.join().map_err(panicked).and_then(|result| result)
+    }
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        // Its error was told as `Notice::Stopped`, or there is nobody left to tell.
+        let _ = self.join();
+    }
+}
+
+fn create_file(path: &Path) -> Result<File, RecordError> {
+    let make = || {
+        if let Some(folder) = path.parent() {
+            std::fs::create_dir_all(folder)?;
+        }
+        File::create_new(path)
+    };
+    make().map_err(|source| RecordError::Create { path: path.to_owned(), source })
+}
+
+/// A sink that counts what goes through it.
+struct Counted<W> {
+    inner: W,
+    stats: Arc<RecorderStats>,
+}
+
+impl<W: Write> Write for Counted<W> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        let written = self.inner.write(bytes)?;
+        self.stats.bytes.fetch_add(written as u64, Ordering::Relaxed);
+        Ok(written)
+    }
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.inner.flush()
+    }
+}
+
+impl<W: Seek> Seek for Counted<W> {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        self.inner.seek(to)
+    }
+}

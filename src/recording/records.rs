@@ -1,0 +1,224 @@
+//! Reads the records of an MCAP file one after the other, within bounds: whatever the file says, no more than
+//! [`LIMIT`] bytes of it are in memory at a time, and a file that was cut is read up to the cut.
+
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use mcap::records::{ChunkHeader, Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{MAGIC, McapError, parse_record};
+use thiserror::Error;
+
+/// Longest record, and longest contents of a chunk, that are read [bytes]. Attachments may be longer.
+pub const LIMIT: usize = 16 * 1024 * 1024;
+/// Opcode and length, before each record.
+const PREFIX: usize = 9;
+/// Footer record and closing magic, at the end of every complete file.
+const TAIL: u64 = (PREFIX + 20 + MAGIC.len()) as u64;
+
+/// Why a log cannot be read, or not to its end.
+#[derive(Debug, Error)]
+pub enum ReplayError {
+    /// The file cannot be opened or read.
+    #[error("the log {path} cannot be read: {source}\nhint: `dimos replay --last` plays the newest log")]
+    Io {
+        /// The log file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not an MCAP file.
+    #[error("{path} is not an MCAP file\nhint: logs of a run end in .mcap")]
+    NotMcap {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file ends too early, or what follows is damaged. Everything before was read.
+    #[error(
+        "the log {path} ends at byte {at}: {reason}\nhint: everything before was read; a log ends like this when its run was killed, or is still going on"
+    )]
+    Cut {
+        /// The log file.
+        path: PathBuf,
+        /// Where the first record begins that cannot be read [bytes from the start].
+        at: u64,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// A record: its kind and contents. Of a kind that is of no use here the contents are empty.
+pub struct RawRecord {
+    /// Which kind of record: one of `mcap::records::op`.
+    pub opcode: u8,
+    /// Where it begins [bytes from the start of the file].
+    pub at: u64,
+    /// Its contents.
+    pub body: Vec<u8>,
+}
+
+/// Reads an MCAP file from one record to the next.
+pub struct RecordReader {
+    path: PathBuf,
+    file: BufReader<File>,
+    length: u64,
+    at: u64,
+    ended: bool,
+}
+
+impl RecordReader {
+    /// Opens a file and checks that it begins as MCAP does.
+    pub fn open(path: &Path) -> Result<Self, ReplayError> {
+        let io = |source| ReplayError::Io { path: path.to_owned(), source };
+        let file = File::open(path).map_err(io)?;
+        let length = file.metadata().map_err(io)?.len();
+        let mut file = BufReader::with_capacity(64 * 1024, file);
+        let mut magic = Vec::new();
+        file.by_ref().take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(io)?;
+        if magic != MAGIC {
+            return Err(ReplayError::NotMcap { path: path.to_owned() });
+        }
+        Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false })
+    }
+
+    /// Where the summary begins; `None` if the file was cut, or has none.
+    pub fn summary_start(&mut self) -> Result<Option<u64>, ReplayError> {
+        if self.length < TAIL + MAGIC.len() as u64 {
+            return Ok(None);
+        }
+        self.go_to(self.length - TAIL)?;
+        let tail: [u8; TAIL as usize] = self.read()?;
+        let start = tail.get(PREFIX..PREFIX + 8).and_then(|b| b.try_into().ok()).map_or(0, u64::from_le_bytes);
+        let complete = tail.first() == Some(&op::FOOTER) && tail.ends_with(MAGIC);
+        Ok((complete && start >= MAGIC.len() as u64 && start < self.length).then_some(start))
+    }
+
+    /// Goes to where a record begins.
+    pub fn go_to(&mut self, at: u64) -> Result<(), ReplayError> {
+        self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(e))?;
+        self.at = at;
+        self.ended = false;
+        Ok(())
+    }
+
+    /// Goes to the first record of the file.
+    pub fn rewind(&mut self) -> Result<(), ReplayError> {
+        self.go_to(MAGIC.len() as u64)
+    }
+
+    /// The next record; `None` after the footer of a complete file. After an error there is nothing more.
+    pub fn next_record(&mut self) -> Result<Option<RawRecord>, ReplayError> {
+        if self.ended {
+            return Ok(None);
+        }
+        let record = self.read_record();
+        self.ended = record.as_ref().map_or(true, |r| r.opcode == op::FOOTER);
+        record.map(Some)
+    }
+
+    fn read_record(&mut self) -> Result<RawRecord, ReplayError> {
+        let at = self.at;
+        if self.length - at < PREFIX as u64 {
+            return Err(self.cut(at, "it has no proper end"));
+        }
+        let prefix: [u8; PREFIX] = self.read()?;
+        let [opcode, length @ ..] = prefix;
+        let length = u64::from_le_bytes(length);
+        if opcode == 0 {
+            return Err(self.cut(at, "there is no record there"));
+        }
+        if length > self.length - at - PREFIX as u64 {
+            return Err(self.cut(at, "it ends in the middle of a record"));
+        }
+        self.at = at + PREFIX as u64 + length;
+        let body = match opcode {
+            op::ATTACHMENT | op::MESSAGE_INDEX | op::ATTACHMENT_INDEX | op::METADATA_INDEX | op::SUMMARY_OFFSET => {
+                self.file.seek_relative(length as i64).map_err(|e| self.io(e))?;
+                Vec::new()
+            }
+            _ if length > LIMIT as u64 => return Err(self.cut(at, "a record is longer than 16 MiB")),
+            _ => {
+                let mut body = vec![0; length as usize];
+                self.file.read_exact(&mut body).map_err(|e| self.io(e))?;
+                body
+            }
+        };
+        let closed = || self.length - self.at >= MAGIC.len() as u64;
+        if opcode == op::FOOTER && !(closed() && self.read::<{ MAGIC.len() }>()? == *MAGIC) {
+            return Err(self.cut(at, "it has no proper end"));
+        }
+        Ok(RawRecord { opcode, at, body })
+    }
+
+    fn read<const N: usize>(&mut self) -> Result<[u8; N], ReplayError> {
+        let mut bytes = [0; N];
+        self.file.read_exact(&mut bytes).map_err(|e| self.io(e))?;
+        Ok(bytes)
+    }
+
+    fn io(&self, source: std::io::Error) -> ReplayError {
+        ReplayError::Io { path: self.path.clone(), source }
+    }
+
+    /// The error for a record that cannot be read. Nothing is read after it.
+    pub fn cut(&mut self, at: u64, reason: impl ToString) -> ReplayError {
+        self.ended = true;
+        ReplayError::Cut { path: self.path.clone(), at, reason: reason.to_string() }
+    }
+}
+
+/// The header of a chunk record: time range, sizes, compression.
+pub fn chunk_header(body: &[u8]) -> Result<ChunkHeader, McapError> {
+    match parse_record(op::CHUNK, body)? {
+        Record::Chunk { header, .. } => Ok(header),
+        _ => Err(McapError::UnexpectedEoc),
+    }
+}
+
+/// Unpacks a chunk record and hands on the records inside, in order. Its checksum is verified before the first.
+pub fn unpack_chunk(body: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), McapError> {
+    let Record::Chunk { header, data } = parse_record(op::CHUNK, body)? else { return Err(McapError::UnexpectedEoc) };
+    if header.uncompressed_size > LIMIT as u64 {
+        return Err(McapError::ChunkTooLarge(header.uncompressed_size));
+    }
+    match header.compression.as_str() {
+        "" => walk(&data, each),
+        "zstd" => {
+            // The library's reader unpacks; it is given the chunk as a file of one record.
+            let mut reader = LinearReader::new_with_options(
+                LinearReaderOptions::default()
+                    .with_skip_start_magic(true)
+                    .with_skip_end_magic(true)
+                    .with_prevalidate_chunk_crcs(true)
+                    .with_record_length_limit(LIMIT),
+            );
+            let prefix = [&[op::CHUNK], &(body.len() as u64).to_le_bytes()[..]].concat();
+            let mut rest = prefix.chain(body);
+            while let Some(event) = reader.next_event() {
+                match event? {
+                    LinearReadEvent::ReadRequest(wanted) => {
+                        let wanted = wanted.min(PREFIX + body.len());
+                        let read = rest.read(reader.insert(wanted))?;
+                        reader.notify_read(read);
+                    }
+                    LinearReadEvent::Record { data, opcode } => each(opcode, data),
+                }
+            }
+            Ok(())
+        }
+        other => Err(McapError::UnsupportedCompression(other.to_owned())),
+    }
+}
+
+/// The records of a chunk that is not compressed.
+fn walk(mut rest: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), McapError> {
+    while let Some((&opcode, after)) = rest.split_first() {
+        let (length, after) = after.split_first_chunk().ok_or(McapError::UnexpectedEoc)?;
+        let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX);
+        let (body, after) = after.split_at_checked(length).ok_or(McapError::UnexpectedEoc)?;
+        each(opcode, body);
+        rest = after;
+    }
+    Ok(())
+}

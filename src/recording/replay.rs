@@ -1,0 +1,354 @@
+//! Reads a log back: its messages, decoded, in the order of their time, up to where the file was cut.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::path::Path;
+
+use mcap::parse_record;
+use mcap::records::{Channel, MessageHeader, Record, op};
+use serde::Serialize;
+
+use super::messages::{ArmInput, ArmOutput, ArmStatus, Event, JointState, Log, Text, Tick, WrenchStamped};
+use super::records::{RawRecord, RecordReader, chunk_header, unpack_chunk};
+use super::wire::Message;
+
+pub use super::records::ReplayError;
+
+/// Longest topic or schema name that is kept [bytes].
+const LONGEST_NAME: usize = 1024;
+
+/// Which messages to read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Selection {
+    /// Topics; all of them if empty.
+    pub topics: Vec<String>,
+    /// From this Unix time on [ns].
+    pub from: u64,
+    /// Up to this Unix time, inclusive [ns].
+    pub to: u64,
+}
+
+impl Default for Selection {
+    fn default() -> Self {
+        Self { topics: Vec::new(), from: 0, to: u64::MAX }
+    }
+}
+
+/// What a log says about itself.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct LogInfo {
+    /// Unix times of its first and last message [ns]; `None` without messages.
+    pub span: Option<(u64, u64)>,
+    /// Whether the log was closed properly.
+    pub complete: bool,
+    /// What the run said about itself: `run`, `version`, `arms`, `tasks`, `wall_offset_ns` and more.
+    pub metadata: BTreeMap<String, String>,
+    /// Topics and their schemas.
+    pub topics: BTreeMap<String, String>,
+}
+
+/// A message of a log.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Entry {
+    /// Its topic.
+    pub topic: String,
+    /// Its Unix time [ns].
+    pub log_time: u64,
+    /// What it says.
+    pub data: Payload,
+}
+
+macro_rules! payloads {
+    ($($name:ident)*) => {
+        /// What a message says, for the types that logs of a run contain.
+        #[derive(Debug, Clone, PartialEq, Serialize)]
+        #[serde(untagged)]
+        pub enum Payload {
+            $(
+                #[doc = concat!("A [`", stringify!($name), "`](super::messages::", stringify!($name), ").")]
+                $name($name),
+            )*
+            /// A type that is not known here.
+            Unknown {
+                /// Name of its schema.
+                schema: String,
+                /// Its length.
+                bytes: usize,
+            },
+            /// Not what its schema says.
+            Damaged {
+                /// Name of its schema.
+                schema: String,
+                /// What is wrong.
+                error: String,
+            },
+        }
+
+        fn decode(schema: &str, bytes: &[u8]) -> Payload {
+            let decoded = match schema {
+                $($name::SCHEMA => $name::decode(bytes).map(Payload::$name),)*
+                _ => return Payload::Unknown { schema: schema.into(), bytes: bytes.len() },
+            };
+            decoded.unwrap_or_else(|e| Payload::Damaged { schema: schema.into(), error: e.to_string() })
+        }
+    };
+}
+payloads! { JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput }
+
+/// A log, being read.
+pub struct LogReader {
+    records: RecordReader,
+    selection: Selection,
+    info: LogInfo,
+    channels: Channels,
+    ready: VecDeque<Entry>,
+    failed: Option<ReplayError>,
+    lost: u64,
+}
+
+impl LogReader {
+    /// Opens a log. A closed one is looked up in its summary; one that was cut is read through once, to know its end.
+    pub fn open(path: &Path) -> Result<Self, ReplayError> {
+        let mut records = RecordReader::open(path)?;
+        let mut channels = Channels::default();
+        let mut info = match records.summary_start()? {
+            Some(start) => summary(&mut records, start, &mut channels)?,
+            None => None,
+        }
+        .map_or_else(|| scan(&mut records, &mut channels), Ok)?;
+        info.topics = channels.topics();
+        info.metadata = metadata(&mut records)?;
+        records.rewind()?;
+        Ok(Self {
+            records,
+            selection: Selection::default(),
+            info,
+            channels,
+            ready: VecDeque::new(),
+            failed: None,
+            lost: 0,
+        })
+    }
+
+    /// What the log says about itself.
+    pub fn info(&self) -> &LogInfo {
+        &self.info
+    }
+
+    /// Starts over, with the messages of a selection.
+    pub fn select(&mut self, selection: Selection) -> Result<(), ReplayError> {
+        self.selection = selection;
+        self.ready.clear();
+        self.failed = None;
+        self.lost = 0;
+        self.records.rewind()
+    }
+
+    /// The next message; `None` at the end of a closed log. `ReplayError::Cut` comes once, in the place of the end,
+    /// when the log was cut or is damaged from there on.
+    pub fn next_entry(&mut self) -> Result<Option<Entry>, ReplayError> {
+        loop {
+            if let Some(entry) = self.ready.pop_front() {
+                return Ok(Some(entry));
+            }
+            if let Some(e) = self.failed.take() {
+                return Err(e);
+            }
+            let Some(record) = self.records.next_record()? else { return Ok(None) };
+            // Messages that stood before the damage come first.
+            self.failed = self.take(&record).err();
+        }
+    }
+
+    /// Samples that the recorder lost, in what was read so far, whether or not `/dimos/tick` was selected.
+    pub fn lost(&self) -> u64 {
+        self.lost
+    }
+
+    fn take(&mut self, record: &RawRecord) -> Result<(), ReplayError> {
+        match record.opcode {
+            op::CHUNK => {
+                let Self { channels, selection, ready, lost, .. } = self;
+                let mut take = || {
+                    let header = chunk_header(&record.body)?;
+                    if header.message_end_time >= selection.from && header.message_start_time <= selection.to {
+                        unpack_chunk(&record.body, |opcode, body| channels.take(opcode, body, selection, ready, lost))?;
+                    }
+                    Ok::<(), mcap::McapError>(())
+                };
+                take().map_err(|e| self.records.cut(record.at, e))?;
+                self.ready.make_contiguous().sort_by_key(|entry| entry.log_time);
+            }
+            opcode => self.channels.take(opcode, &record.body, &self.selection, &mut self.ready, &mut self.lost),
+        }
+        Ok(())
+    }
+}
+
+/// Time span and channels from the summary of a closed log; `None` if it does not say.
+fn summary(records: &mut RecordReader, start: u64, channels: &mut Channels) -> Result<Option<LogInfo>, ReplayError> {
+    records.go_to(start)?;
+    let mut info = None;
+    loop {
+        match records.next_record() {
+            Ok(Some(record)) => {
+                channels.learn(record.opcode, &record.body);
+                if record.opcode == op::STATISTICS
+                    && let Ok(Record::Statistics(s)) = parse_record(record.opcode, &record.body)
+                {
+                    let span = (s.message_count > 0).then_some((s.message_start_time, s.message_end_time));
+                    info = Some(LogInfo { span, complete: true, ..LogInfo::default() });
+                }
+            }
+            Ok(None) => return Ok(info),
+            // A summary that cannot be read is one that is not there.
+            Err(ReplayError::Cut { .. }) => return Ok(None),
+            Err(e) => return Err(e),
+        }
+    }
+}
+
+/// Time span and channels of a log without a summary: by reading all of it.
+fn scan(records: &mut RecordReader, channels: &mut Channels) -> Result<LogInfo, ReplayError> {
+    records.rewind()?;
+    let mut info = LogInfo::default();
+    let mut seen = |from: u64, to: u64| {
+        let (start, end) = info.span.unwrap_or((from, to));
+        info.span = Some((start.min(from), end.max(to)));
+    };
+    loop {
+        match records.next_record() {
+            Ok(Some(record)) if record.opcode == op::CHUNK => {
+                let mut any = false;
+                let each = |opcode, body: &[u8]| {
+                    any |= opcode == op::MESSAGE;
+                    channels.learn(opcode, body);
+                };
+                if unpack_chunk(&record.body, each).is_err() {
+                    return Ok(info);
+                }
+                if let (true, Ok(header)) = (any, chunk_header(&record.body)) {
+                    seen(header.message_start_time, header.message_end_time);
+                }
+            }
+            Ok(Some(record)) => {
+                channels.learn(record.opcode, &record.body);
+                if let Some((header, _)) = message(record.opcode, &record.body) {
+                    seen(header.log_time, header.log_time);
+                }
+            }
+            Ok(None) => {
+                info.complete = true;
+                return Ok(info);
+            }
+            Err(ReplayError::Cut { .. }) => return Ok(info),
+            Err(e) => return Err(e),
+        }
+    }
+}
+
+/// What the run said about itself: it stands before the first message.
+fn metadata(records: &mut RecordReader) -> Result<BTreeMap<String, String>, ReplayError> {
+    records.rewind()?;
+    loop {
+        let record = match records.next_record() {
+            Ok(Some(record)) => record,
+            Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(BTreeMap::new()),
+            Err(e) => return Err(e),
+        };
+        match parse_metadata(&record) {
+            Some(found) => return Ok(found),
+            None if matches!(record.opcode, op::CHUNK | op::MESSAGE) => return Ok(BTreeMap::new()),
+            None => {}
+        }
+    }
+}
+
+fn parse_metadata(record: &RawRecord) -> Option<BTreeMap<String, String>> {
+    if record.opcode != op::METADATA {
+        return None;
+    }
+    match parse_record(record.opcode, &record.body) {
+        Ok(Record::Metadata(m)) if m.name == "dimos" => Some(m.metadata),
+        _ => None,
+    }
+}
+
+fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])> {
+    if opcode != op::MESSAGE {
+        return None;
+    }
+    let Ok(Record::Message { header, .. }) = parse_record(opcode, body) else { return None };
+    Some((header, body.get(22..)?))
+}
+
+/// What is known about the channels of a log so far.
+#[derive(Default)]
+struct Channels {
+    /// Name and encoding of each schema.
+    schemas: HashMap<u16, (String, bool)>,
+    channels: HashMap<u16, KnownChannel>,
+}
+
+struct KnownChannel {
+    topic: String,
+    schema: String,
+    /// Whether its messages are CDR with a ROS 2 schema.
+    readable: bool,
+}
+
+impl Channels {
+    /// Takes schema and channel records. What cannot be one is passed over: its messages are passed over as well.
+    fn learn(&mut self, opcode: u8, body: &[u8]) {
+        match opcode {
+            op::SCHEMA => {
+                if let Ok(Record::Schema { header, .. }) = parse_record(opcode, body)
+                    && header.name.len() <= LONGEST_NAME
+                {
+                    self.schemas.insert(header.id, (header.name, header.encoding == "ros2msg"));
+                }
+            }
+            op::CHANNEL => {
+                if let Ok(Record::Channel(channel)) = parse_record(opcode, body)
+                    && channel.topic.len() <= LONGEST_NAME
+                {
+                    self.add(channel);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn add(&mut self, channel: Channel) {
+        let (schema, ros2) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+        let readable = ros2 && channel.message_encoding == "cdr";
+        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, readable });
+    }
+
+    fn take(&mut self, opcode: u8, body: &[u8], wanted: &Selection, ready: &mut VecDeque<Entry>, lost: &mut u64) {
+        self.learn(opcode, body);
+        let Some((header, bytes)) = message(opcode, body) else { return };
+        let Some(channel) = self.channels.get(&header.channel_id) else { return };
+        if header.log_time < wanted.from || header.log_time > wanted.to {
+            return;
+        }
+        let chosen = wanted.topics.is_empty() || wanted.topics.contains(&channel.topic);
+        if !chosen && channel.schema != Tick::SCHEMA {
+            return;
+        }
+        let data = if channel.readable {
+            decode(&channel.schema, bytes)
+        } else {
+            Payload::Unknown { schema: channel.schema.clone(), bytes: bytes.len() }
+        };
+        if let Payload::Tick(tick) = &data {
+            *lost += u64::from(tick.dropped);
+        }
+        if chosen {
+            ready.push_back(Entry { topic: channel.topic.clone(), log_time: header.log_time, data });
+        }
+    }
+
+    fn topics(&self) -> BTreeMap<String, String> {
+        self.channels.values().map(|c| (c.topic.clone(), c.schema.clone())).collect()
+    }
+}

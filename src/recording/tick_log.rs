@@ -1,0 +1,296 @@
+//! Turns a tick's samples into messages: collects them until the tick is closed, then logs all of them with the
+//! tick's time.
+
+use std::collections::BTreeMap;
+use std::io::{Seek, Write};
+use std::time::Duration;
+
+use mcap::McapResult;
+
+use super::arm_messages::{input, input_differs, output, output_differs, status};
+use super::log_writer::LogWriter;
+use super::messages::{
+    ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, Text, Tick, Time, Vector3, Wrench, WrenchStamped,
+};
+use crate::arm::{ArmCommand, ArmState, VelocitySource};
+use crate::clock::{Mono, WallOffset};
+use crate::joint::{ControlMode, Joints};
+use crate::telemetry::describe::{Described, Names, Severity};
+use crate::telemetry::{ArmSample, Cause, Phase, TickSample};
+
+/// Longest time between two messages on `/arm_status/<arm>`.
+const STATUS_EVERY: Duration = Duration::from_millis(100);
+
+/// The samples of the tick that is not closed yet, and what was logged of each arm last.
+pub struct TickLog {
+    run: String,
+    names: Names,
+    frame_id: String,
+    wall: WallOffset,
+    /// Names of all joints, arm by arm.
+    joints: Vec<String>,
+    arms: Vec<ArmLog>,
+    events: Vec<(u64, Described)>,
+    /// Samples given up since the last tick was closed, because the end of their own tick never came.
+    given_up: u32,
+}
+
+#[derive(Default)]
+struct ArmLog {
+    /// What came of this arm since the last tick was closed.
+    pending: Option<ArmSample>,
+    state: Option<ArmState>,
+    command: Option<ArmCommand>,
+    status: Option<StatusKey>,
+    status_at: Mono,
+    error_text: String,
+}
+
+/// What makes an arm's status worth telling at once.
+type StatusKey = (Phase, Cause, crate::arm::Link, ControlMode, bool, i32, VelocitySource, bool, String);
+
+impl TickLog {
+    /// Nothing logged yet.
+    pub fn new(run: String, names: Names, frame_id: String, wall: WallOffset) -> Self {
+        let joints = names.arms.iter().flat_map(|a| a.joints.clone()).collect();
+        let arms = names.arms.iter().map(|_| ArmLog::default()).collect();
+        Self { run, names, frame_id, wall, joints, arms, events: Vec::new(), given_up: 0 }
+    }
+
+    /// What readers need to understand the log, for its metadata: the joints of each arm, and the offset between
+    /// the monotonic times in it and Unix time.
+    pub fn metadata(&self) -> BTreeMap<String, String> {
+        let arms: serde_json::Map<_, _> =
+            self.names.arms.iter().map(|a| (a.hardware_id.clone(), a.joints.clone().into())).collect();
+        BTreeMap::from([
+            ("run".into(), self.run.clone()),
+            ("version".into(), env!("CARGO_PKG_VERSION").into()),
+            ("arms".into(), serde_json::Value::Object(arms).to_string()),
+            ("tasks".into(), serde_json::Value::from(self.names.tasks.clone()).to_string()),
+            ("wall_offset_ns".into(), self.wall.wall(Mono::ZERO).to_string()),
+        ])
+    }
+
+    /// Makes the topics known that every log has.
+    pub fn announce<W: Write + Seek>(&self, log: &mut LogWriter<W>) -> McapResult<()> {
+        log.announce::<JointState>("/joint_states")?;
+        log.announce::<JointState>("/joint_commands")?;
+        for arm in &self.names.arms {
+            let arm = &arm.hardware_id;
+            log.announce::<ArmStatus>(&format!("/arm_status/{arm}"))?;
+            log.announce::<ArmInput>(&format!("/dimos/inputs/{arm}"))?;
+            log.announce::<ArmOutput>(&format!("/dimos/outputs/{arm}"))?;
+        }
+        log.announce::<Tick>("/dimos/tick")?;
+        log.announce::<Event>("/dimos/events")?;
+        log.announce::<Text>("/dimos/requests")?;
+        log.announce::<Log>("/rosout")
+    }
+
+    /// Takes what a tick read of an arm.
+    pub fn arm(&mut self, sample: ArmSample) {
+        let older = self.arms.get_mut(usize::from(sample.arm)).and_then(|arm| arm.pending.replace(sample));
+        self.given_up += u32::from(older.is_some());
+    }
+
+    /// Takes something that happened in the tick with this index.
+    pub fn event(&mut self, tick: u64, described: Option<Described>) {
+        self.events.extend(described.map(|d| (tick, d)));
+    }
+
+    /// Forgets what came since the last tick was closed: there is no log to put it into.
+    pub fn clear(&mut self) {
+        self.arms.iter_mut().for_each(|arm| arm.pending = None);
+        self.events.clear();
+        self.given_up = 0;
+    }
+
+    /// Takes an arm's text for its present error.
+    pub fn arm_text(&mut self, arm: u16, text: String) {
+        if let Some(arm) = self.arms.get_mut(usize::from(arm)) {
+            arm.error_text = text;
+        }
+    }
+
+    /// Logs a request as it was told to the tick.
+    pub fn request<W: Write + Seek>(&self, log: &mut LogWriter<W>, id: u64, stamp: Mono, json: &str) -> McapResult<()> {
+        // A request that is not JSON is kept as text rather than lost.
+        let request = serde_json::from_str(json).unwrap_or_else(|_| serde_json::Value::from(json));
+        let data = serde_json::json!({ "id": id, "request": request }).to_string();
+        log.publish("/dimos/requests", self.wall.wall(stamp), &Text { data })
+    }
+
+    /// Logs a line of text.
+    pub fn line<W: Write + Seek>(
+        &self,
+        log: &mut LogWriter<W>,
+        severity: Severity,
+        stamp: Mono,
+        text: &str,
+    ) -> McapResult<()> {
+        let time = self.wall.wall(stamp);
+        let level = match severity {
+            Severity::Info => 20,
+            Severity::Warn => 30,
+            Severity::Error => 40,
+        };
+        let line =
+            Log { stamp: Time::of(time), level, name: self.run.clone(), msg: text.to_owned(), ..Default::default() };
+        log.publish("/rosout", time, &line)
+    }
+
+    /// Logs all that came since the last tick was closed. Says how many samples were lost since then.
+    pub fn close<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<u32> {
+        let mut tick = *tick;
+        if tick.dropped > 0 {
+            self.give_up_older(tick.deadline);
+        }
+        tick.dropped = tick.dropped.saturating_add(std::mem::take(&mut self.given_up));
+        self.joint_states(log, &tick)?;
+        self.joint_commands(log, &tick)?;
+        for index in 0..self.arms.len() {
+            self.one_arm(log, &tick, index)?;
+        }
+        self.tick(log, &tick)?;
+        if tick.dropped > 0 {
+            let text = format!("{} samples are missing here: the recorder fell behind", tick.dropped);
+            self.line(log, Severity::Warn, tick.deadline, &text)?;
+        }
+        for (index, d) in std::mem::take(&mut self.events) {
+            self.line(log, d.severity, tick.deadline, &d.text)?;
+            let time = self.wall.wall(tick.deadline);
+            log.publish("/dimos/events", time, &self.event_message(&tick, index, d))?;
+        }
+        Ok(tick.dropped)
+    }
+
+    /// Drops the samples of ticks before this one. A sample's own tick ended before its `next_tick`.
+    fn give_up_older(&mut self, deadline: Mono) {
+        for arm in &mut self.arms {
+            let older = arm.pending.take_if(|s| s.command.next_tick <= deadline);
+            self.given_up += u32::from(older.is_some());
+        }
+    }
+
+    fn header(&self, tick: &TickSample) -> Header {
+        Header { stamp: Time::of(self.wall.wall(tick.deadline)), frame_id: self.frame_id.clone() }
+    }
+
+    fn joint_states<W: Write + Seek>(&self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
+        let state = |arm: &ArmLog| arm.pending.map(|s| s.state).filter(|s| s.seq > 0);
+        if self.arms.iter().all(|arm| state(arm).is_none()) {
+            return Ok(());
+        }
+        let message = JointState {
+            header: self.header(tick),
+            name: self.joints.clone(),
+            position: self.column(|arm| state(arm).map(|s| s.position)),
+            velocity: self
+                .column(|arm| state(arm).filter(|s| s.velocity_source != VelocitySource::Absent).map(|s| s.velocity)),
+            effort: self.column(|arm| state(arm).and_then(|s| s.effort)),
+        };
+        log.publish("/joint_states", self.wall.wall(tick.deadline), &message)
+    }
+
+    fn joint_commands<W: Write + Seek>(&self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
+        let values = |wanted: fn(ControlMode) -> bool| {
+            self.column(|arm| arm.pending.filter(|s| s.command.mode.is_some_and(wanted)).map(|s| s.command.values))
+        };
+        let message = JointState {
+            header: self.header(tick),
+            name: self.joints.clone(),
+            position: values(ControlMode::is_position),
+            velocity: values(|mode| mode == ControlMode::Velocity),
+            effort: values(|mode| mode == ControlMode::Torque),
+        };
+        if message.position.is_empty() && message.velocity.is_empty() && message.effort.is_empty() {
+            return Ok(());
+        }
+        log.publish("/joint_commands", self.wall.wall(tick.deadline), &message)
+    }
+
+    /// One value per joint of all arms, NaN where an arm has none; empty if no arm has any.
+    fn column(&self, values: impl Fn(&ArmLog) -> Option<Joints>) -> Vec<f64> {
+        let mut any = false;
+        let mut column = Vec::with_capacity(self.joints.len());
+        for (arm, names) in self.arms.iter().zip(&self.names.arms) {
+            let values = values(arm);
+            any |= values.is_some();
+            let values = values.unwrap_or([f64::NAN; _]);
+            column.extend(values.into_iter().take(names.joints.len()));
+        }
+        if any { column } else { Vec::new() }
+    }
+
+    fn one_arm<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample, index: usize) -> McapResult<()> {
+        let (time, header) = (self.wall.wall(tick.deadline), self.header(tick));
+        let (Some(arm), Some(names)) = (self.arms.get_mut(index), self.names.arms.get(index)) else { return Ok(()) };
+        let Some(sample) = arm.pending.take() else { return Ok(()) };
+        let id = &names.hardware_id;
+        let state = &sample.state;
+        let is_new = arm.state.is_none_or(|last| last.seq != state.seq);
+        if arm.state.is_none_or(|last| input_differs(&last, state)) {
+            log.publish(&format!("/dimos/inputs/{id}"), time, &input(&header, tick.tick, state))?;
+        }
+        arm.state = Some(*state);
+        if arm.command.is_none_or(|last| output_differs(&last, &sample.command)) {
+            log.publish(&format!("/dimos/outputs/{id}"), time, &output(&header, tick.tick, &sample.command))?;
+        }
+        arm.command = Some(sample.command);
+        if let (true, Some(opening)) = (is_new, state.gripper) {
+            let message = JointState {
+                header: header.clone(),
+                name: vec![format!("{id}_gripper")],
+                position: vec![opening],
+                ..Default::default()
+            };
+            log.publish(&format!("/gripper/{id}"), time, &message)?;
+        }
+        if let (true, Some([x, y, z, tx, ty, tz])) = (is_new, state.wrench) {
+            let wrench = Wrench { force: Vector3 { x, y, z }, torque: Vector3 { x: tx, y: ty, z: tz } };
+            log.publish(&format!("/wrench/{id}"), time, &WrenchStamped { header: header.clone(), wrench })?;
+        }
+        let key = status_key(&sample, arm);
+        if arm.status.as_ref() != Some(&key) || tick.deadline.since(arm.status_at) >= STATUS_EVERY {
+            log.publish(&format!("/arm_status/{id}"), time, &status(header, tick, &sample, &arm.error_text))?;
+            arm.status = Some(key);
+            arm.status_at = tick.deadline;
+        }
+        Ok(())
+    }
+
+    fn tick<W: Write + Seek>(&self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
+        let message = Tick {
+            header: self.header(tick),
+            tick: tick.tick,
+            deadline_ns: tick.deadline.0,
+            late_ns: tick.late_ns,
+            compute_ns: tick.compute_ns,
+            skipped: tick.skipped,
+            dropped: tick.dropped,
+        };
+        log.publish("/dimos/tick", self.wall.wall(tick.deadline), &message)
+    }
+
+    fn event_message(&self, closing: &TickSample, tick: u64, d: Described) -> Event {
+        Event {
+            header: self.header(closing),
+            tick,
+            kind: d.kind.into(),
+            severity: d.severity.name().into(),
+            request: d.request.into_iter().collect(),
+            arm: d.arm.unwrap_or_default(),
+            task: d.task.unwrap_or_default(),
+            joint: d.joint.unwrap_or_default(),
+            status: d.status.into(),
+            values: d.values,
+            text: d.text,
+        }
+    }
+}
+
+fn status_key(sample: &ArmSample, arm: &ArmLog) -> StatusKey {
+    let s = &sample.state;
+    let text = arm.error_text.clone();
+    (sample.phase, sample.cause, s.link, s.mode, s.enabled, s.error, s.velocity_source, s.self_held, text)
+}

@@ -1,0 +1,159 @@
+//! How Rust types become fields of ROS 2 messages. [`message!`](crate::recording::wire::message) declares a message
+//! once: struct, schema text, encoder and decoder all come from that one list of fields, so they cannot disagree.
+
+use serde::Serialize;
+
+use super::cdr::{CdrError, Decoder, Encoder};
+
+/// The definitions a message depends on: name (`pkg/Type`) and text.
+pub type Definitions = Vec<(&'static str, String)>;
+
+/// A type that can be a field of a message.
+pub trait Field: Sized {
+    /// Its type in a message definition, e.g. `float64[]`.
+    const ROS: &'static str;
+    /// Fewest bytes it takes, to bound what a sequence of it may claim.
+    const MIN_SIZE: usize;
+    /// Appends it.
+    fn put(&self, out: &mut Encoder);
+    /// Reads it.
+    fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError>;
+    /// Adds the definitions it needs, its own included, each once.
+    fn define(_known: &mut Definitions) {}
+}
+
+/// A message type with a name of its own.
+pub trait Message: Field + Serialize {
+    /// Schema name, e.g. `sensor_msgs/msg/JointState`.
+    const SCHEMA: &'static str;
+    /// Its fields, one a line.
+    fn fields() -> String;
+
+    /// The whole schema text: its fields, then the definitions they need, the way the `ros2msg` encoding wants them.
+    fn schema_text() -> String {
+        let mut known = Definitions::new();
+        Self::define(&mut known);
+        let mut text = Self::fields();
+        for (name, fields) in known.iter().filter(|(name, _)| *name != Self::ROS) {
+            text.push_str(&format!("{}\nMSG: {name}\n{fields}", "=".repeat(80)));
+        }
+        text
+    }
+
+    /// The message in these bytes.
+    fn decode(bytes: &[u8]) -> Result<Self, CdrError> {
+        Self::get(&mut Decoder::new(bytes)?)
+    }
+}
+
+macro_rules! numbers {
+    ($($rust:ty => $ros:literal, $list:literal;)*) => {$(
+        impl Field for $rust {
+            const ROS: &'static str = $ros;
+            const MIN_SIZE: usize = size_of::<$rust>();
+            fn put(&self, out: &mut Encoder) {
+                out.number(self.to_le_bytes());
+            }
+            fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError> {
+                Ok(<$rust>::from_le_bytes(from.number()?))
+            }
+        }
+        sequences!($rust => $list;);
+    )*};
+}
+
+macro_rules! sequences {
+    ($($rust:ty => $list:literal;)*) => {$(
+        impl Field for Vec<$rust> {
+            const ROS: &'static str = $list;
+            const MIN_SIZE: usize = 4;
+            fn put(&self, out: &mut Encoder) {
+                out.length(self.len());
+                self.iter().for_each(|element| element.put(out));
+            }
+            fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError> {
+                let length = from.length(<$rust>::MIN_SIZE)?;
+                (0..length).map(|_| <$rust>::get(from)).collect()
+            }
+        }
+    )*};
+}
+
+numbers! {
+    u8 => "uint8", "uint8[]";
+    i32 => "int32", "int32[]";
+    u32 => "uint32", "uint32[]";
+    u64 => "uint64", "uint64[]";
+    f64 => "float64", "float64[]";
+}
+sequences! { String => "string[]"; }
+
+impl Field for bool {
+    const ROS: &'static str = "bool";
+    const MIN_SIZE: usize = 1;
+    fn put(&self, out: &mut Encoder) {
+        out.number([u8::from(*self)]);
+    }
+    fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError> {
+        Ok(from.number()? != [0])
+    }
+}
+
+impl Field for String {
+    const ROS: &'static str = "string";
+    const MIN_SIZE: usize = 4;
+    fn put(&self, out: &mut Encoder) {
+        out.text(self);
+    }
+    fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError> {
+        Ok(from.text()?.to_owned())
+    }
+}
+
+/// Declares a message: `"pkg/msg/Type" "pkg/Type" Name { field: type, … }`. Doc comments of fields become comments
+/// of the schema, so that a log explains itself.
+macro_rules! message {
+    ($(#[$meta:meta])* $schema:literal $ros:literal $name:ident {
+        $($(#[doc = $doc:literal])* $field:ident: $type:ty,)*
+    }) => {
+        $(#[$meta])*
+        #[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
+        pub struct $name {
+            $($(#[doc = $doc])* pub $field: $type,)*
+        }
+
+        impl $crate::recording::wire::Field for $name {
+            const ROS: &'static str = $ros;
+            const MIN_SIZE: usize = 0 $(+ <$type as $crate::recording::wire::Field>::MIN_SIZE)*;
+            fn put(&self, out: &mut $crate::recording::cdr::Encoder) {
+                $(self.$field.put(out);)*
+            }
+            fn get(
+                from: &mut $crate::recording::cdr::Decoder<'_>,
+            ) -> Result<Self, $crate::recording::cdr::CdrError> {
+                // Fields of a struct literal are evaluated in the order they are written: the wire's.
+                Ok(Self { $($field: $crate::recording::wire::Field::get(from)?,)* })
+            }
+            fn define(known: &mut $crate::recording::wire::Definitions) {
+                if known.iter().all(|(name, _)| *name != Self::ROS) {
+                    known.push((Self::ROS, <Self as $crate::recording::wire::Message>::fields()));
+                    $(<$type as $crate::recording::wire::Field>::define(known);)*
+                }
+            }
+        }
+
+        impl $crate::recording::wire::Message for $name {
+            const SCHEMA: &'static str = $schema;
+            fn fields() -> String {
+                let mut text = String::new();
+                $(
+                    $(text.push_str(concat!("#", $doc, "\n"));)*
+                    text.push_str(<$type as $crate::recording::wire::Field>::ROS);
+                    text.push_str(concat!(" ", stringify!($field), "\n"));
+                )*
+                text
+            }
+        }
+    };
+}
+pub(crate) use message;

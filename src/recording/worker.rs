@@ -1,0 +1,241 @@
+//! What the recorder thread does, one step at a time.
+
+use std::collections::VecDeque;
+use std::fs::File;
+use std::io::{Seek, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::Receiver;
+use std::time::Duration;
+
+use mcap::{McapError, McapResult};
+
+use super::log_writer::LogWriter;
+use super::recorder::{Note, Notice, RecordError, RecorderConfig, RecorderStats};
+use super::tick_log::TickLog;
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::telemetry::describe::{Described, Names, describe};
+use crate::telemetry::{Sample, TickSample};
+
+/// How often the disk is asked to keep what it was given, against a loss of power.
+const SYNC_EVERY: Duration = Duration::from_secs(1);
+
+/// Samples and notes in, log and notices out. A test steps it on a clock of its own.
+pub(super) struct Worker<W: Write + Seek, F> {
+    path: PathBuf,
+    log: Option<LogWriter<W>>,
+    /// The file once more, to be told to keep what it has.
+    disk: Option<File>,
+    synced: Mono,
+    ticks: TickLog,
+    names: Names,
+    ring: rtrb::Consumer<Sample>,
+    notes: Receiver<Note>,
+    on_notice: F,
+    stats: Arc<RecorderStats>,
+    ended: Option<RecordError>,
+}
+
+impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
+    pub(super) fn new(
+        config: &RecorderConfig,
+        sink: Option<W>,
+        disk: Option<File>,
+        ring: rtrb::Consumer<Sample>,
+        notes: Receiver<Note>,
+        on_notice: F,
+        stats: Arc<RecorderStats>,
+    ) -> Result<Self, RecordError> {
+        let names = config.names.clone();
+        let ticks = TickLog::new(config.run.clone(), names.clone(), config.frame_id.clone(), config.wall);
+        let begin = |sink| {
+            let mut metadata = config.metadata.clone();
+            metadata.extend(ticks.metadata());
+            let now = config.wall.wall(MonotonicClock.now());
+            let mut log = LogWriter::create(sink, now, &config.attachments, metadata)?;
+            ticks.announce(&mut log)?;
+            Ok(log)
+        };
+        let path = config.path.clone().unwrap_or_default();
+        let log = sink.map(begin).transpose().map_err(|e| write_error(&path, &e))?;
+        Ok(Self { path, log, disk, synced: Mono::ZERO, ticks, names, ring, notes, on_notice, stats, ended: None })
+    }
+
+    /// Takes everything there is and logs it.
+    pub(super) fn step(&mut self, now: Mono) {
+        // Counted before the notes are taken: a request is noted before it is told to the tick, so the note of every
+        // request that these samples answer is there, and stands before the answer in the log.
+        let waiting = self.ring.slots();
+        let notes: Vec<Note> = self.notes.try_iter().collect();
+        let samples: Vec<Sample> = self.ring.read_chunk(waiting).into_iter().flatten().collect();
+        // Events are told before anything waits for the disk.
+        let mut described = self.tell_events(&samples);
+        if let Err(e) = self.write(notes, &samples, &mut described, now) {
+            self.stop_log(&e);
+        }
+    }
+
+    fn tell_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
+        let mut all = VecDeque::new();
+        for sample in samples {
+            if let Sample::Event(tick, event) = sample {
+                let described = describe(event, &self.names);
+                (self.on_notice)(Notice::Event { tick: *tick, event, described: &described });
+                all.push_back(described);
+            }
+        }
+        all
+    }
+
+    fn write(
+        &mut self,
+        notes: Vec<Note>,
+        samples: &[Sample],
+        described: &mut VecDeque<Described>,
+        now: Mono,
+    ) -> McapResult<()> {
+        for note in notes {
+            self.note(note)?;
+        }
+        for sample in samples {
+            match sample {
+                Sample::Arm(arm) => self.ticks.arm(*arm),
+                Sample::Event(tick, _) => self.ticks.event(*tick, described.pop_front()),
+                Sample::Tick(tick) => self.close(tick)?,
+            }
+        }
+        let Some(log) = &mut self.log else { return Ok(()) };
+        if log.flush_if_due(now)? && now.since(self.synced) >= SYNC_EVERY {
+            self.disk.as_ref().map_or(Ok(()), File::sync_data)?;
+            self.synced = now;
+        }
+        self.stats.messages.store(log.written(), Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn note(&mut self, note: Note) -> McapResult<()> {
+        let Some(log) = &mut self.log else { return Ok(()) };
+        match note {
+            Note::Request { id, stamp, json } => self.ticks.request(log, id, stamp, &json),
+            Note::Log { severity, stamp, text } => self.ticks.line(log, severity, stamp, &text),
+            Note::ArmText { arm, text } => {
+                self.ticks.arm_text(arm, text);
+                Ok(())
+            }
+        }
+    }
+
+    fn close(&mut self, tick: &TickSample) -> McapResult<()> {
+        let (lost, result) = match self.log.as_mut().map(|log| self.ticks.close(log, tick)) {
+            Some(Ok(lost)) => (lost, Ok(())),
+            Some(Err(e)) => (tick.dropped, Err(e)),
+            None => {
+                self.ticks.clear();
+                (tick.dropped, Ok(()))
+            }
+        };
+        if lost > 0 {
+            self.stats.dropped.fetch_add(u64::from(lost), Ordering::Relaxed);
+            (self.on_notice)(Notice::Lost(lost));
+        }
+        result
+    }
+
+    fn stop_log(&mut self, e: &McapError) {
+        self.log = None;
+        self.stats.failed.store(true, Ordering::Relaxed);
+        let error = write_error(&self.path, e);
+        (self.on_notice)(Notice::Stopped(&error));
+        self.ended = Some(error);
+    }
+
+    /// Takes what is left and closes the log.
+    pub(super) fn finish(mut self, now: Mono) -> Result<(), RecordError> {
+        self.step(now);
+        let Some(log) = self.log.take() else { return self.ended.map_or(Ok(()), Err) };
+        let closed = log.finish().map(drop).and_then(|()| Ok(self.disk.as_ref().map_or(Ok(()), File::sync_data)?));
+        closed.map_err(|e| {
+            self.stop_log(&e);
+            write_error(&self.path, &e)
+        })
+    }
+}
+
+fn write_error(path: &Path, e: &McapError) -> RecordError {
+    let reason = if let McapError::Io(e) = e { e.to_string() } else { e.to_string() };
+    RecordError::Write { path: path.to_owned(), reason }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clock::WallOffset;
+    use crate::telemetry::Event;
+    use std::collections::BTreeMap;
+    use std::io::{Cursor, Error, ErrorKind, SeekFrom};
+    use std::sync::Mutex;
+    use std::sync::mpsc::channel;
+
+    /// A disk with little room left.
+    struct Full {
+        inner: Cursor<Vec<u8>>,
+        room: usize,
+    }
+
+    impl Write for Full {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            if self.inner.get_ref().len() + bytes.len() > self.room {
+                return Err(Error::new(ErrorKind::StorageFull, "No space left on device"));
+            }
+            self.inner.write(bytes)
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    impl Seek for Full {
+        fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+            self.inner.seek(to)
+        }
+    }
+
+    #[test]
+    fn a_full_disk_ends_the_log_and_is_said_once_while_the_ring_goes_on_being_emptied() {
+        let (mut producer, ring) = rtrb::RingBuffer::new(64);
+        let (_notes, receiver) = channel();
+        let config = RecorderConfig {
+            path: Some("run.mcap".into()),
+            run: "run".into(),
+            names: Names::default(),
+            frame_id: String::new(),
+            attachments: Vec::new(),
+            metadata: BTreeMap::new(),
+            wall: WallOffset::of(Mono::ZERO, 0),
+        };
+        let told = Arc::new(Mutex::new(Vec::new()));
+        let sink = told.clone();
+        let on_notice = move |n: Notice<'_>| match n {
+            Notice::Stopped(e) => sink.lock().unwrap().push(e.to_string()),
+            Notice::Event { described, .. } => sink.lock().unwrap().push(described.kind.to_owned()),
+            Notice::Lost(_) => {}
+        };
+        let stats = Arc::new(RecorderStats::default());
+        let disk = Full { inner: Cursor::new(Vec::new()), room: 4000 };
+        let mut worker = Worker::new(&config, Some(disk), None, ring, receiver, on_notice, stats.clone()).unwrap();
+        for tick in 0..40 {
+            let sample = TickSample { tick, ..TickSample::default() };
+            producer.push(Sample::Tick(sample)).unwrap();
+            worker.step(Mono(1_000_000_000 * (tick + 1)));
+        }
+        producer.push(Sample::Event(40, Event::Degraded)).unwrap();
+        worker.step(Mono(1_000_000_000 * 41));
+        assert_eq!(producer.slots(), 64);
+        assert!(stats.failed.load(Ordering::Relaxed));
+        let message = "the log run.mcap ends here: No space left on device\n\
+                       hint: see whether the disk is full; the run goes on without a log";
+        assert_eq!(*told.lock().unwrap(), [message, "degraded"]);
+        assert_eq!(worker.finish(Mono(1)).unwrap_err().to_string(), message);
+    }
+}

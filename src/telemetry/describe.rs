@@ -1,0 +1,316 @@
+//! Events in words: what the log, rpc and the terminal say about something that happened in a tick.
+//!
+//! The tick speaks in indices, because it may not allocate; here they become names again.
+
+use serde::Serialize;
+
+use super::{Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
+
+/// The names behind the tick's indices, in the blueprint's order.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Names {
+    /// The arms.
+    pub arms: Vec<ArmNames>,
+    /// The tasks.
+    pub tasks: Vec<String>,
+}
+
+/// Names of one arm and its joints.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ArmNames {
+    /// The arm's `hardware_id`.
+    pub hardware_id: String,
+    /// Its joints, in the arm's order; unique over all arms.
+    pub joints: Vec<String>,
+}
+
+impl Names {
+    /// An arm's `hardware_id`.
+    pub fn arm(&self, arm: u16) -> String {
+        self.arms.get(usize::from(arm)).map_or_else(|| format!("arm #{arm}"), |a| a.hardware_id.clone())
+    }
+
+    /// A task's name.
+    pub fn task(&self, task: u16) -> String {
+        self.tasks.get(usize::from(task)).cloned().unwrap_or_else(|| format!("task #{task}"))
+    }
+
+    /// The name of a joint, counted over all arms.
+    pub fn joint(&self, joint: u16) -> String {
+        let mut all = self.arms.iter().flat_map(|a| &a.joints);
+        all.nth(usize::from(joint)).cloned().unwrap_or_else(|| format!("joint #{joint}"))
+    }
+}
+
+/// How much an event matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    /// As it should be.
+    Info,
+    /// Not as somebody wanted it.
+    Warn,
+    /// An arm is held, or the tick fails to keep its time.
+    Error,
+}
+
+impl Severity {
+    /// The name used in rpc and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Info => "info",
+            Self::Warn => "warn",
+            Self::Error => "error",
+        }
+    }
+}
+
+/// An event with names and a sentence. What does not apply to an event is `None` or empty.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Described {
+    /// `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun` or `degraded`.
+    pub kind: &'static str,
+    /// How much it matters.
+    pub severity: Severity,
+    /// The request it answers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub request: Option<u64>,
+    /// The arm concerned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
+    /// The task concerned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
+    /// The joint concerned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub joint: Option<String>,
+    /// The status word: of the outcome, the task's state, the arm's phase, the limit.
+    pub status: &'static str,
+    /// The event's numbers: an error [rad], a step [rad], what was asked of a limited joint, skipped periods and
+    /// lateness [ns], an arm's error code.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub values: Vec<f64>,
+    /// One sentence, without a full stop.
+    pub text: String,
+}
+
+/// An event in words.
+pub fn describe(event: &Event, names: &Names) -> Described {
+    match *event {
+        Event::Request(id, outcome) => request(id, outcome, names),
+        Event::Task(task, state, reason) => task_changed(task, state, reason, names),
+        Event::Preempted(loser, winner, joint, equal) => {
+            let why = if equal { "has the same priority and comes first" } else { "has the higher priority" };
+            let (loser, winner, joint) = (names.task(loser), names.task(winner), names.joint(joint));
+            let text = format!("task {loser} lost {joint} to {winner}, which {why}");
+            Described { task: Some(loser), joint: Some(joint), ..plain("preempted", Severity::Warn, "preempted", text) }
+        }
+        Event::ModeConflict(loser, winner, arm) => {
+            let (loser, winner, arm) = (names.task(loser), names.task(winner), names.arm(arm));
+            let text = format!("task {loser} was refused: {winner} uses another control mode on {arm}");
+            let d = plain("mode_conflict", Severity::Warn, "refused", text);
+            Described { task: Some(loser), arm: Some(arm), ..d }
+        }
+        Event::Arm(arm, phase, cause) => arm_changed(arm, phase, cause, names),
+        Event::Limited(joint, kind, asked) => {
+            let joint = names.joint(joint);
+            let text = format!("{joint} is limited in {}: {asked:.4} {} was asked", kind.name(), unit(kind));
+            let d = plain("limited", Severity::Warn, kind.name(), text);
+            Described { joint: Some(joint), values: vec![asked], ..d }
+        }
+        Event::Overrun(skipped, late_ns) => {
+            let text = format!("overrun: {skipped} periods skipped, {:.3} ms late", late_ns as f64 * 1e-6);
+            let d = plain("overrun", Severity::Warn, "skipped", text);
+            Described { values: vec![f64::from(skipped), late_ns as f64], ..d }
+        }
+        Event::Degraded => {
+            let text = "ten ticks in a row were late by a period or more".into();
+            plain("degraded", Severity::Error, "late", text)
+        }
+    }
+}
+
+fn plain(kind: &'static str, severity: Severity, status: &'static str, text: String) -> Described {
+    Described { kind, severity, request: None, arm: None, task: None, joint: None, status, values: Vec::new(), text }
+}
+
+fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
+    let severity = match outcome {
+        Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped => Severity::Info,
+        _ => Severity::Warn,
+    };
+    let text = format!("request {id}: {}", outcome_text(&outcome, names));
+    let mut d = Described { request: Some(id), ..plain("request", severity, outcome.name(), text) };
+    match outcome {
+        Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped | Outcome::ShuttingDown => {}
+        Outcome::AlreadyExecuting(task) | Outcome::WrongTask(task) => d.task = Some(names.task(task)),
+        Outcome::NonFinite(joint) => d.joint = Some(names.joint(joint)),
+        Outcome::StartStateMismatch(joint, by) | Outcome::OutOfLimits(joint, by) => {
+            d.joint = Some(names.joint(joint));
+            d.values = vec![by];
+        }
+        Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) => d.arm = Some(names.arm(arm)),
+        Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
+            d.arm = Some(names.arm(arm));
+            d.values = code(cause);
+        }
+    }
+    d
+}
+
+/// What came of a request, in words.
+pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
+    match *outcome {
+        Outcome::Accepted => "accepted".into(),
+        Outcome::Cancelled => "the motion is being ended".into(),
+        Outcome::AlreadyStopped => "there was no motion to end".into(),
+        Outcome::AlreadyExecuting(task) => format!("task {} is executing already", names.task(task)),
+        Outcome::StartStateMismatch(joint, by) => {
+            format!("the trajectory starts {} from where {} is", angle(by), names.joint(joint))
+        }
+        Outcome::StartStateUnavailable(arm) => format!("there is no fresh state of {}", names.arm(arm)),
+        Outcome::ArmNotReady(arm, phase, cause) => {
+            format!("{} is not ready: {}{}", names.arm(arm), phase.name(), because(cause))
+        }
+        Outcome::ArmLatched(arm, cause) => format!("{} is held{}: reset it first", names.arm(arm), because(cause)),
+        Outcome::StillFaulted(arm, cause) => format!("{} cannot be reset yet{}", names.arm(arm), because(cause)),
+        Outcome::WrongTask(task) => format!("task {} cannot do that", names.task(task)),
+        Outcome::NonFinite(joint) => format!("the target of {} is not a finite number", names.joint(joint)),
+        Outcome::OutOfLimits(joint, by) => {
+            format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
+        }
+        Outcome::NoGripper(arm) => format!("{} has no gripper", names.arm(arm)),
+        Outcome::ShuttingDown => "the run is ending".into(),
+    }
+}
+
+fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> Described {
+    let severity = match state {
+        TaskState::Aborted | TaskState::Fault => Severity::Error,
+        _ if matches!(reason, Reason::None | Reason::Cancelled) => Severity::Info,
+        _ => Severity::Warn,
+    };
+    let name = names.task(task);
+    let why = reason_text(&reason, names);
+    let colon = if why.is_empty() { "" } else { ": " };
+    let text = format!("task {name} is {}{colon}{why}", state.name());
+    let mut d = Described { task: Some(name), ..plain("task", severity, state.name(), text) };
+    match reason {
+        Reason::None | Reason::Cancelled | Reason::Timeout => {}
+        Reason::PathTolerance(joint, value) | Reason::GoalTolerance(joint, value) | Reason::Jump(joint, value) => {
+            d.joint = Some(names.joint(joint));
+            d.values = vec![value];
+        }
+        Reason::Preempted(_, joint) | Reason::NonFinite(joint) => d.joint = Some(names.joint(joint)),
+        Reason::ArmHeld(arm, cause) => {
+            d.arm = Some(names.arm(arm));
+            d.values = code(cause);
+        }
+    }
+    d
+}
+
+/// Why a task is in its state, in words; empty where there is nothing to say.
+pub fn reason_text(reason: &Reason, names: &Names) -> String {
+    match *reason {
+        Reason::None => String::new(),
+        Reason::Cancelled => "cancelled".into(),
+        Reason::Timeout => "its targets stopped coming".into(),
+        Reason::PathTolerance(joint, by) => format!("{} was {} from the path", names.joint(joint), angle(by)),
+        Reason::GoalTolerance(joint, by) => format!("{} ended {} from the goal", names.joint(joint), angle(by)),
+        Reason::Preempted(task, joint) => format!("task {} took {}", names.task(task), names.joint(joint)),
+        Reason::ArmHeld(arm, cause) => format!("{} is held{}", names.arm(arm), because(cause)),
+        Reason::NonFinite(joint) => format!("the command of {} was not a finite number", names.joint(joint)),
+        Reason::Jump(joint, by) => format!("the command of {} jumped by {}", names.joint(joint), angle(by)),
+    }
+}
+
+fn arm_changed(arm: u16, phase: Phase, cause: Cause, names: &Names) -> Described {
+    let severity = match (phase, cause) {
+        (Phase::Held, Cause::Operator | Cause::Shutdown) => Severity::Warn,
+        (Phase::Held, _) => Severity::Error,
+        (_, Cause::None | Cause::Operator | Cause::Shutdown) => Severity::Info,
+        _ => Severity::Warn,
+    };
+    let name = names.arm(arm);
+    let text = format!("{name} is {}{}", phase.name(), because(cause));
+    Described { arm: Some(name), values: code(cause), ..plain("arm", severity, phase.name(), text) }
+}
+
+/// Why an arm is held, in words; empty for `Cause::None`.
+pub fn cause_text(cause: Cause) -> String {
+    match cause {
+        Cause::None => String::new(),
+        Cause::Operator => "an operator stopped it".into(),
+        Cause::Stale => "its states stopped coming".into(),
+        Cause::Fault(code) => format!("the arm reports error {code}"),
+        Cause::LinkLost => "the connection to it was lost".into(),
+        Cause::NonFinite => "a command was not a finite number".into(),
+        Cause::Jump => "a command jumped".into(),
+        Cause::Overrun => "the tick lost too much time".into(),
+        Cause::HeartbeatLost => "its device thread saw no heartbeat of the tick".into(),
+        Cause::PowerLost => "its motors went off without being asked".into(),
+        Cause::Shutdown => "the run is ending".into(),
+    }
+}
+
+fn because(cause: Cause) -> String {
+    if cause == Cause::None { String::new() } else { format!(" ({})", cause_text(cause)) }
+}
+
+fn code(cause: Cause) -> Vec<f64> {
+    if let Cause::Fault(code) = cause { vec![f64::from(code)] } else { Vec::new() }
+}
+
+fn angle(rad: f64) -> String {
+    format!("{rad:.4} rad ({:.2}°)", rad.to_degrees())
+}
+
+fn unit(kind: LimitKind) -> &'static str {
+    match kind {
+        LimitKind::Position => "rad",
+        LimitKind::Velocity => "rad/s",
+        LimitKind::Acceleration => "rad/s²",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names() -> Names {
+        let arm = |id: &str| ArmNames { hardware_id: id.into(), joints: crate::joint::make_joints(id, 2) };
+        Names { arms: vec![arm("left"), arm("right")], tasks: vec!["traj_left".into(), "servo".into()] }
+    }
+
+    #[test]
+    fn joints_are_counted_over_all_arms() {
+        assert_eq!(names().joint(0), "left_joint1");
+        assert_eq!(names().joint(3), "right_joint2");
+        assert_eq!(names().joint(4), "joint #4");
+    }
+
+    #[test]
+    fn an_aborted_task_names_its_joint_and_error() {
+        let d = describe(&Event::Task(0, TaskState::Aborted, Reason::GoalTolerance(1, 0.02)), &names());
+        assert_eq!(d.text, "task traj_left is ABORTED: left_joint2 ended 0.0200 rad (1.15°) from the goal");
+        assert_eq!((d.severity, d.status, d.joint.as_deref()), (Severity::Error, "ABORTED", Some("left_joint2")));
+        assert_eq!(d.values, [0.02]);
+    }
+
+    #[test]
+    fn a_held_arm_says_why() {
+        let d = describe(&Event::Arm(1, Phase::Held, Cause::Fault(31)), &names());
+        assert_eq!(d.text, "right is held (the arm reports error 31)");
+        assert_eq!(d.values, [31.0]);
+        let d = describe(&Event::Arm(1, Phase::Ready, Cause::None), &names());
+        assert_eq!((d.text.as_str(), d.severity), ("right is ready", Severity::Info));
+    }
+
+    #[test]
+    fn a_refused_request_carries_its_id_and_status() {
+        let d = describe(&Event::Request(7, Outcome::StartStateMismatch(0, 0.5)), &names());
+        assert_eq!((d.request, d.status), (Some(7), "START_STATE_MISMATCH"));
+        assert_eq!(d.text, "request 7: the trajectory starts 0.5000 rad (28.65°) from where left_joint1 is");
+    }
+}
