@@ -71,6 +71,11 @@ pub enum Code {
 }
 
 impl Code {
+    /// The word used in JSON and messages.
+    pub fn name(self) -> String {
+        serde_json::to_value(self).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
+    }
+
     /// The code of a refusal by the tick; `None` where the request was taken on.
     pub fn of(outcome: &Outcome) -> Option<Self> {
         match outcome {

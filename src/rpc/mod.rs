@@ -12,9 +12,11 @@
 //! sockets are and who lives, [`server`] and [`client`] are the two ends.
 
 pub mod api;
+mod arm_api;
 pub mod client;
 mod connection;
 pub mod error;
+mod motion_api;
 pub mod place;
 pub mod report;
 pub mod server;
