@@ -1,0 +1,70 @@
+//! Arguments that several verbs share, and how values are read.
+
+use std::time::Duration;
+
+use clap::Args;
+
+use super::exit::Result;
+use crate::rpc::client::{self, Client};
+use crate::rpc::place::{LiveRun, RunFolder};
+
+/// Which run to talk to, and how to print.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Args)]
+pub struct Target {
+    /// The run to talk to; needed only when several are live
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<String>,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+impl Target {
+    /// Connects to the run.
+    pub fn connect(&self) -> Result<Client> {
+        Ok(Client::find(&RunFolder::standard(), self.run.as_deref())?)
+    }
+
+    /// The run named, or all that live.
+    pub fn named_or_all(&self) -> Result<Vec<LiveRun>> {
+        let folder = RunFolder::standard();
+        Ok(match &self.run {
+            Some(name) => vec![client::find(&folder, Some(name))?],
+            None => folder.runs().map_err(client::ClientError::from)?,
+        })
+    }
+}
+
+/// A finite number.
+pub fn finite(text: &str) -> std::result::Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value.is_finite() => Ok(value),
+        Ok(_) => Err("must be finite".into()),
+        Err(_) => Err("not a number".into()),
+    }
+}
+
+/// A fraction of the arm's limits.
+pub fn speed(text: &str) -> std::result::Result<f64, String> {
+    let lowest = crate::rpc::api::MIN_SPEED;
+    let value = finite(text)?;
+    if (lowest..=1.0).contains(&value) { Ok(value) } else { Err(format!("must be within {lowest}–1")) }
+}
+
+/// A span of time with its unit: `10s`, `500ms`, `1m 30s`.
+pub fn duration(text: &str) -> std::result::Result<Duration, String> {
+    let hint = "give a unit: 10s, 500ms, 2m";
+    let span: jiff::SignedDuration = text.parse().map_err(|_| hint.to_owned())?;
+    match Duration::try_from(span) {
+        Ok(duration) if !duration.is_zero() => Ok(duration),
+        _ => Err("must be longer than nothing".into()),
+    }
+}
+
+/// `path=value`, as in `--set hardware.arm.address=192.168.1.100`.
+pub fn setting(text: &str) -> std::result::Result<(String, String), String> {
+    match text.split_once('=') {
+        Some((path, value)) if !path.trim().is_empty() => Ok((path.trim().to_owned(), value.to_owned())),
+        _ => Err("must be PATH=VALUE, such as coordinator.tick_rate=250".into()),
+    }
+}

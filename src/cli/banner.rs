@@ -1,0 +1,63 @@
+//! What a run says when it starts and when it has ended.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::output;
+use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
+
+/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout.
+pub fn print(report: &StatusReport, socket: &Path, json: bool) {
+    #[derive(Serialize)]
+    struct Started<'a> {
+        event: &'static str,
+        socket: &'a Path,
+        #[serde(flatten)]
+        report: &'a StatusReport,
+    }
+    if json {
+        return output::json(&Started { event: "started", socket, report });
+    }
+    text(report, socket).iter().for_each(output::note);
+}
+
+/// The banner's lines.
+pub fn text(report: &StatusReport, socket: &Path) -> Vec<String> {
+    let simulated = if report.simulated { "  SIMULATED" } else { "" };
+    let mut lines = vec![format!("run {}{simulated}  (pid {}, dimos {})", report.run, report.pid, report.version)];
+    let mut row = |what: &str, text: String| lines.push(format!("  {what:<10} {text}"));
+    row("blueprint", report.blueprint.clone());
+    for arm in &report.arms {
+        let standing = if arm.simulated { "SIMULATED, " } else { "" };
+        let address = if arm.address.is_empty() { String::new() } else { format!(" at {}", arm.address) };
+        row("arm", format!("{}: {standing}{}{address}, {}", arm.hardware_id, arm.adapter, arm.phase));
+        row("", format!("at exit: {}", at_exit(arm)));
+    }
+    row("tick", format!("{} Hz", report.tick_rate));
+    for (index, text) in report.realtime.iter().flat_map(realtime).enumerate() {
+        row(if index == 0 { "real time" } else { "" }, text);
+    }
+    row("log", report.log.clone().unwrap_or_else(|| "none is written".into()));
+    row("socket", socket.display().to_string());
+    lines.push("Ctrl-C ends it, controlled. In a second terminal: dimos status".into());
+    lines
+}
+
+/// What happens to the arm's motor power when the run ends.
+pub fn at_exit(arm: &ArmReport) -> &'static str {
+    match (arm.on_exit.as_str(), arm.holds_when_disabled) {
+        ("disable", true) => "motors off; it keeps its pose",
+        ("disable", false) => "motors off; it FALLS unless supported",
+        _ => "motors stay on and hold the pose",
+    }
+}
+
+/// One real-time measure; where it was not granted, a second line says how to get it.
+pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
+    if measure.granted {
+        return vec![format!("{}: granted", measure.what)];
+    }
+    let hint = measure.remedy.iter().map(|remedy| format!("hint: {remedy}"));
+    [format!("{}: NOT granted", measure.what)].into_iter().chain(hint).collect()
+}

@@ -1,0 +1,93 @@
+//! Waiting for a motion's end: a progress bar, Ctrl-C ends the motion, and at the end how far off each joint is.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::exit::{Exit, Failure, Result};
+use super::output::{self, Table, Tone, toned};
+use crate::rpc::api::{Cancel, Motion};
+use crate::rpc::client::Client;
+use crate::rpc::report::MotionReport;
+
+/// How often the run is asked.
+const INTERVAL: Duration = Duration::from_millis(50);
+/// How long a cancelled motion may take to come to rest, as far as this program waits.
+const REST: Duration = Duration::from_secs(10);
+/// Ended this close to its target, a joint is shown as on it [rad].
+const CLOSE: f64 = 0.01;
+
+/// Waits for the end of a motion of `task` and prints it. A signal cancels the motion first.
+pub fn follow(client: &mut Client, motion: u64, task: &str, json: bool) -> Result {
+    let signal = watch_signals();
+    let bar = ProgressBar::new(1000);
+    if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    bar.set_prefix(task.to_owned());
+    let mut cancelled: Option<Instant> = None;
+    let report = loop {
+        let report = client.call(Motion { motion })?;
+        bar.set_position((report.progress.clamp(0.0, 1.0) * 1000.0) as u64);
+        bar.set_message(format!("{:.1} s left", report.remaining.max(0.0)));
+        if report.done {
+            break report;
+        }
+        if cancelled.is_none() && signal.load(Ordering::Relaxed) != 0 {
+            bar.suspend(|| output::note(format_args!("cancelling motion {motion}: the arm decelerates")));
+            client.call(Cancel { task: Some(task.to_owned()), arm: None })?;
+            cancelled = Some(Instant::now());
+        }
+        if cancelled.is_some_and(|since| since.elapsed() > REST) {
+            bar.finish_and_clear();
+            let what = format!("motion {motion} was cancelled, but has not ended after {} s", REST.as_secs());
+            return Err(Failure::new(Exit::Failed, what).hint("dimos stop holds the arm at once"));
+        }
+        sleep(INTERVAL);
+    };
+    bar.finish_and_clear();
+    print(&report, json);
+    match signal.load(Ordering::Relaxed) {
+        signal if cancelled.is_some() => Ok(Exit::by_signal(signal as i32)),
+        _ if report.state == "COMPLETED" => Ok(Exit::Ok),
+        _ => {
+            let why = report.error.unwrap_or_else(|| "it ended before its goal".into());
+            let failure = Failure::new(Exit::Failed, format!("motion {motion}: {}: {why}", report.state));
+            Err(failure.hint("`dimos status` shows what the arm and the task wait for"))
+        }
+    }
+}
+
+/// Holds the number of the last signal received; 0 = none.
+fn watch_signals() -> Arc<AtomicUsize> {
+    let seen = Arc::new(AtomicUsize::new(0));
+    for signal in [libc::SIGINT, libc::SIGTERM] {
+        // Where this fails, the signal ends this program as usual, and the motion goes on.
+        let _ = signal_hook::flag::register_usize(signal, seen.clone(), signal as usize);
+    }
+    seen
+}
+
+fn print(report: &MotionReport, json: bool) {
+    if json {
+        return output::json(report);
+    }
+    output::line(format_args!("motion {}: {} after {:.2} s", report.motion, report.state, report.elapsed));
+    let Some(deviation) = &report.deviation else { return };
+    let mut table = Table::new(&["JOINT", ">TARGET rad", ">ENDED rad", ">OFF BY rad", ">OFF BY deg"]);
+    for joint in deviation {
+        let off = joint.error();
+        let tone = if off.abs() <= CLOSE { Tone::Good } else { Tone::Warning };
+        table.row([
+            joint.joint.as_str().into(),
+            format!("{:.4}", joint.target).into(),
+            format!("{:.4}", joint.actual).into(),
+            toned(format_args!("{off:+.4}"), tone),
+            toned(format_args!("{:+.3}", off.to_degrees()), tone),
+        ]);
+    }
+    table.print();
+}

@@ -1,0 +1,73 @@
+//! `dimos list-adapters`: the arms that this program can talk to.
+
+use serde_json::json;
+
+use super::exit::{Exit, Result};
+use super::output::{self, Table};
+use crate::hardware::registry::{AdapterSpec, Registry};
+
+/// Arguments of `list-adapters`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+LEVEL  how far it is proven: works (compiles, connects), conformant (passes the suite against a double),
+       emulated (passes it against an emulator of its real wire format; `address: sim` starts that)
+HOLDS  whether the arm keeps its pose when its motors are disabled")]
+pub struct Args {
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    if args.json {
+        output::json(&registry.rows().iter().map(to_json).collect::<Vec<_>>());
+        return Ok(Exit::Ok);
+    }
+    let mut table =
+        Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "MODES", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS", "ABOUT"]);
+    for row in registry.rows() {
+        table.row([
+            row.name.to_owned(),
+            row.level.name().to_owned(),
+            row.transport.to_owned(),
+            dof(row),
+            modes(row).join(" "),
+            row.wire_units.to_owned(),
+            format!("{:.0}", row.native_rate),
+            row.address.form.to_owned(),
+            if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
+            row.about.to_owned(),
+        ]);
+    }
+    table.print();
+    Ok(Exit::Ok)
+}
+
+fn dof(row: &AdapterSpec) -> String {
+    match row.dof {
+        (least, most) if least == most => least.to_string(),
+        (least, most) => format!("{least}–{most}"),
+    }
+}
+
+fn modes(row: &AdapterSpec) -> Vec<&'static str> {
+    row.modes.iter().map(|mode| mode.name()).collect()
+}
+
+fn to_json(row: &AdapterSpec) -> serde_json::Value {
+    json!({
+        "name": row.name,
+        "about": row.about,
+        "level": row.level.name(),
+        "transport": row.transport,
+        "dof": {"min": row.dof.0, "max": row.dof.1},
+        "modes": modes(row),
+        "wire_units": row.wire_units,
+        "native_rate_hz": row.native_rate,
+        "address": {"form": row.address.form, "required": row.address.required},
+        "holds_when_disabled": row.holds_when_disabled,
+        "gripper": row.gripper,
+        "emulator": row.emulate.is_some(),
+    })
+}

@@ -1,0 +1,194 @@
+//! `dimos status`: all runs in a line each, or one in full.
+
+use serde::Serialize;
+
+use super::arguments::Target;
+use super::exit::{Exit, Result};
+use super::output::{self, Table, Tone, number, span, toned};
+use crate::rpc::api::Status;
+use crate::rpc::client::{Client, ClientError};
+use crate::rpc::place::LiveRun;
+use crate::rpc::report::{ArmReport, Percentiles, StatusReport};
+
+/// Arguments of `status`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// A run in the overview: it may not answer.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Found {
+    Answered(Box<StatusReport>),
+    Silent { run: String, pid: u32, error: String },
+}
+
+/// Runs the verb: the run named, or the only one, in full; several as a list. `--json` without `--run` is a list always.
+pub fn run(args: &Args) -> Result {
+    let mut runs = args.target_run.named_or_all()?;
+    let only = (runs.len() == 1).then(|| runs.pop()).flatten();
+    match only {
+        Some(run) if args.target_run.run.is_some() || !args.target_run.json => {
+            let report = ask(&run)?;
+            if args.target_run.json { output::json(&report) } else { print(&report) }
+        }
+        only => overview(only.into_iter().chain(runs), args.target_run.json),
+    }
+    Ok(Exit::Ok)
+}
+
+fn ask(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
+    Client::connect(&run.name, &run.socket)?.call(Status {})
+}
+
+fn overview(runs: impl Iterator<Item = LiveRun>, json: bool) {
+    let found: Vec<Found> = runs
+        .map(|run| match ask(&run) {
+            Ok(report) => Found::Answered(Box::new(report)),
+            Err(error) => Found::Silent { run: run.name, pid: run.pid, error: error.to_string() },
+        })
+        .collect();
+    if json {
+        return output::json(&found);
+    }
+    if found.is_empty() {
+        return output::note("no run is live\nhint: start one: dimos run coordinator-yourarm");
+    }
+    let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "ARMS", "LOG"]);
+    for found in &found {
+        match found {
+            Found::Answered(r) => {
+                let arms: Vec<String> = r.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
+                let log = r.log.clone().unwrap_or_else(|| "-".into());
+                let simulated = if r.simulated { " SIMULATED" } else { "" };
+                let arms = arms.join(", ") + simulated;
+                table.row([r.run.clone(), r.pid.to_string(), span(r.uptime), r.blueprint.clone(), arms, log]);
+            }
+            Found::Silent { run, pid, error } => {
+                let [pid, error] = [pid.to_string(), error.clone()];
+                table.row([run.as_str(), &pid, "-", "-", &error, "-"]);
+            }
+        }
+    }
+    table.print();
+}
+
+fn print(r: &StatusReport) {
+    let simulated = if r.simulated { "  SIMULATED" } else { "" };
+    output::line(format_args!("run {}{simulated}", r.run));
+    let blueprint = &r.blueprint;
+    output::line(format_args!("  pid {}, up {}, blueprint {blueprint}, dimos {}", r.pid, span(r.uptime), r.version));
+    match (&r.log, &r.recorder) {
+        (Some(log), Some(recorder)) => {
+            let cut = recorder.error.as_ref().map(|e| format!("; ENDED: {e}")).unwrap_or_default();
+            let (messages, dropped) = (recorder.messages, recorder.dropped);
+            output::line(format_args!("  log {log}: {messages} messages, {dropped} dropped{cut}"));
+        }
+        _ => output::line("  no log is written"),
+    }
+    output::line("");
+    print_arms(&r.arms);
+    output::line("");
+    print_tasks(r);
+    output::line("");
+    print_timing(r);
+}
+
+fn print_arms(arms: &[ArmReport]) {
+    let mut table = Table::new(&[
+        "ARM", "PHASE", "LINK", "MOTORS", "MODE", ">AGE ms", ">RATE Hz", ">NATIVE", "ADAPTER", "ADDRESS", "ON EXIT",
+    ]);
+    for arm in arms {
+        let good = |well: bool| if well { Tone::Good } else { Tone::Bad };
+        let phase_tone = match arm.phase.as_str() {
+            "ready" => Tone::Good,
+            "held" => Tone::Bad,
+            _ => Tone::Warning,
+        };
+        let address = match arm.simulated {
+            true => format!("{} SIMULATED", arm.address),
+            false => arm.address.clone(),
+        };
+        table.row([
+            arm.hardware_id.as_str().into(),
+            toned(&arm.phase, phase_tone),
+            toned(&arm.link, good(arm.link == "up")),
+            if arm.enabled { "on" } else { "off" }.into(),
+            arm.mode.as_str().into(),
+            number(arm.state_age_ms, 1).into(),
+            number(arm.measured_rate_hz, 1).into(),
+            format!("{:.0}", arm.native_rate_hz).into(),
+            arm.adapter.as_str().into(),
+            address.trim().into(),
+            arm.on_exit.as_str().into(),
+        ]);
+    }
+    table.print();
+    for arm in arms {
+        let name = &arm.hardware_id;
+        if let Some(cause) = &arm.cause {
+            output::line(format_args!("  {name} is {}: {}", arm.phase, cause.text));
+        }
+        if let Some(error) = &arm.error {
+            output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));
+        }
+        for fault in &arm.faults {
+            let over = if fault.over { "over" } else { "still so" };
+            let (ago, count) = (span(fault.since), fault.count);
+            output::line(format_args!("  {name} {ago} ago, {count}×, {over}: {}", fault.text));
+        }
+        let counted: Vec<String> = arm.counters.iter().map(|(what, n)| format!("{what} {n}")).collect();
+        if !counted.is_empty() {
+            output::line(format_args!("  {name} counted {}", counted.join(", ")));
+        }
+    }
+}
+
+fn print_tasks(r: &StatusReport) {
+    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS", "REASON"]);
+    for task in &r.tasks {
+        let tone = match task.state.as_str() {
+            "ABORTED" | "FAULT" => Tone::Bad,
+            "CANCELLING" => Tone::Warning,
+            _ => Tone::Good,
+        };
+        table.row([
+            task.name.as_str().into(),
+            task.kind.as_str().into(),
+            task.priority.to_string().into(),
+            toned(&task.state, tone),
+            task.progress.map_or_else(|| "-".into(), |p| format!("{:.0} %", p * 100.0)).into(),
+            joints(&task.joints).into(),
+            task.reason.clone().unwrap_or_default().into(),
+        ]);
+    }
+    table.print();
+}
+
+/// The first and the last joint stand for all between.
+fn joints(names: &[String]) -> String {
+    match names {
+        [first, _, .., last] => format!("{first} … {last} ({})", names.len()),
+        few => few.join(" "),
+    }
+}
+
+fn print_timing(r: &StatusReport) {
+    let t = &r.ticks;
+    let heading = format!("TICK {:.0} Hz", r.tick_rate);
+    let mut table = Table::new(&[&heading, ">p50 µs", ">p99 µs", ">p99.9 µs", ">max µs"]);
+    let mut row = |what: &str, p: &Percentiles| {
+        let figures = [p.p50, p.p99, p.p99_9, p.max].map(|v| format!("{v:.1}"));
+        table.row([what.to_owned()].into_iter().chain(figures));
+    };
+    row("lateness", &t.lateness_us);
+    row("compute", &t.compute_us);
+    table.print();
+    output::line(format_args!("  {} ticks, {} overruns, {} periods skipped", t.count, t.overruns, t.skipped));
+    for text in r.realtime.iter().flat_map(super::banner::realtime) {
+        output::line(format_args!("  {text}"));
+    }
+}

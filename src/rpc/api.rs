@@ -1,0 +1,151 @@
+//! What a run can be asked: the table of methods, their parameters and replies, and [`Backend`], which answers.
+//!
+//! Everything is in SI units (rad, rad/s, Nm, m, N, s); a field in another unit says so in its name (`age_ms`).
+
+use std::future::Future;
+use std::pin::Pin;
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+pub use super::arm_api::*;
+use super::error::{Code, RpcError};
+pub use super::motion_api::*;
+use super::report::{MotionReport, StateReport, StatusReport};
+use super::streams::Streams;
+
+/// Longest request line, newline included [bytes].
+pub const MAX_LINE: usize = 256 * 1024;
+/// Most connections to one run.
+pub const MAX_CONNECTIONS: usize = 64;
+/// Most subscriptions of one connection.
+pub const MAX_SUBSCRIPTIONS: usize = 16;
+/// Lowest `speed` of a move, as a fraction of the arm's limits.
+pub const MIN_SPEED: f64 = 0.1;
+
+/// A boxed future, as trait objects need it.
+pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
+
+/// What stands behind the server: the run itself.
+pub trait Backend: Send + Sync + 'static {
+    /// Answers one request. Called from the server's thread, so it may wait but must not block; when it takes
+    /// longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is dropped.
+    fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
+    /// What the run publishes.
+    fn streams(&self) -> &Streams;
+}
+
+/// The parameters of a method, which know the method's name and reply.
+pub trait Method: Serialize + DeserializeOwned {
+    /// The method's name.
+    const NAME: &'static str;
+    /// What comes back.
+    type Reply: Serialize + DeserializeOwned;
+    /// Says what is wrong with the values, in a sentence without full stop.
+    fn check(&self) -> Result<(), String> {
+        Ok(())
+    }
+}
+
+/// One row per method: name, parameters, reply. Makes [`Request`], [`Reply`], [`METHODS`].
+macro_rules! methods {
+    ($($(#[$doc:meta])* $name:literal $variant:ident -> $reply:ty $(, check $check:path)?;)*) => {
+        /// A request that a run answers.
+        #[derive(Debug, Clone, PartialEq)]
+        pub enum Request { $($(#[$doc])* $variant($variant),)* }
+
+        /// What comes back: the variant of the same name.
+        #[derive(Debug, Clone, PartialEq, Serialize)]
+        #[serde(untagged)]
+        #[expect(clippy::large_enum_variant, reason = "a reply is moved a few times and never kept")]
+        pub enum Reply { $($(#[$doc])* $variant($reply),)* }
+
+        /// Names of all methods, those that the connection itself answers at the end.
+        pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe"];
+
+        $(impl Method for $variant {
+            const NAME: &'static str = $name;
+            type Reply = $reply;
+            $(fn check(&self) -> Result<(), String> { $check(self) })?
+        })*
+
+        impl Request {
+            /// Reads the parameters of a method; refuses unknown methods, unknown or ill-formed parameters.
+            pub fn read(method: &str, params: Value) -> Result<Self, RpcError> {
+                match method {
+                    $($name => read_params::<$variant>(params).map(Self::$variant),)*
+                    _ => Err(RpcError::unknown(Code::UnknownMethod, "method", method, METHODS)),
+                }
+            }
+        }
+    };
+}
+
+methods! {
+    /// Everything about the run: arms, tasks, timing, recorder.
+    "status" Status -> StatusReport;
+    /// The latest joint states and commands.
+    "state" State -> StateReport;
+    /// Moves an arm from where it is to a joint target, directly: not collision-checked. Answers when the motion
+    /// begins; `motion` tells how it goes.
+    "move" Move -> MoveReply, check Move::valid;
+    /// Follows a trajectory. Answers when the motion begins.
+    "execute" Execute -> ExecuteReply, check Execute::valid;
+    /// How a motion goes, or how it ended.
+    "motion" Motion -> MotionReport;
+    /// Ends motions by decelerating within limits: those of a task, of an arm, or all.
+    "cancel" Cancel -> CancelReply;
+    /// Latched hold at once, of one arm or of all: tasks cancelled, arms held until `arm_reset`. An operational stop.
+    "stop" Stop -> StopReply;
+    /// Clears a latched hold or a fault. Moves nothing, enables nothing.
+    "arm_reset" ArmReset -> ArmReply;
+    /// Enables the motors and makes the arm ready for motion, where it is.
+    "arm_enable" ArmEnable -> ArmReply;
+    /// Disables the motors. An arm without brakes falls.
+    "arm_disable" ArmDisable -> ArmReply;
+    /// Commands a gripper.
+    "gripper" Gripper -> Done, check Gripper::valid;
+    /// Next target of a servo task; repeat it within the task's timeout.
+    "servo" Servo -> Done, check Servo::valid;
+    /// Next target of a velocity task; repeat it within the task's timeout.
+    "velocity" Velocity -> Done, check Velocity::valid;
+    /// Ends the run exactly like SIGTERM: controlled. Answers before it begins.
+    "shutdown" Shutdown -> Done;
+}
+
+/// Reads and checks the parameters of one method; absent ones stand for `{}`.
+pub(super) fn read_params<M: Method>(params: Value) -> Result<M, RpcError> {
+    let params = if params.is_null() { Value::Object(Default::default()) } else { params };
+    let invalid = |what: String| RpcError::new(Code::InvalidParams, format!("params of {:?}: {what}", M::NAME));
+    let params: M = serde_json::from_value(params).map_err(|e| invalid(e.to_string()))?;
+    params.check().map_err(invalid)?;
+    Ok(params)
+}
+
+/// Parameters of `status`: none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Status {}
+
+/// Parameters of `state`: none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct State {}
+
+/// Parameters of `shutdown`: none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Shutdown {}
+
+/// Done; nothing to tell.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Done {}
+
+/// JSON has no infinities, but callers in this process do.
+pub(super) fn finite(field: &str, values: &[f64]) -> Result<(), String> {
+    match values.iter().find(|v| !v.is_finite()) {
+        Some(v) => Err(format!("{field} has the value {v}, which is not finite")),
+        None => Ok(()),
+    }
+}

@@ -1,0 +1,219 @@
+//! The other end of the socket: a blocking client, for the command line and for programs.
+
+use std::collections::VecDeque;
+use std::io::{self, BufRead, BufReader, Write};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+
+use super::api::Method;
+use super::error::{RpcError, nearest};
+use super::place::{LiveRun, PlaceError, RunFolder};
+use super::server::CALL_LIMIT;
+use super::wire::Incoming;
+
+/// How long to wait for a reply: a little longer than the run takes to give up.
+const PATIENCE: Duration = CALL_LIMIT.saturating_add(Duration::from_secs(2));
+/// Stream messages kept while a reply is awaited; older ones are lost and counted.
+const KEPT: usize = 1024;
+
+/// Why a client got no reply.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// No run lives.
+    #[error("no run is live")]
+    NoRun,
+    /// Several runs live, and none was named.
+    #[error("several runs are live: {}", names(.0))]
+    SeveralRuns(Vec<LiveRun>),
+    /// No live run has the name.
+    #[error("no live run is named {name:?}")]
+    UnknownRun {
+        /// The name asked for.
+        name: String,
+        /// The runs that live.
+        live: Vec<LiveRun>,
+    },
+    /// The folder of the sockets cannot be read.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// The connection failed or broke.
+    #[error("run {run:?}: {error}")]
+    Io {
+        /// The run's name.
+        run: String,
+        /// What the system said.
+        error: io::Error,
+    },
+    /// The run answered what it should not.
+    #[error("run {run:?} answered what cannot be read: {what}")]
+    Protocol {
+        /// The run's name.
+        run: String,
+        /// What was wrong.
+        what: String,
+    },
+    /// The run refused.
+    #[error(transparent)]
+    Refused(#[from] RpcError),
+}
+
+impl ClientError {
+    /// What to do about it.
+    pub fn hint(&self) -> Option<String> {
+        match self {
+            Self::NoRun => Some("start one: dimos run coordinator-yourarm".into()),
+            Self::SeveralRuns(_) => Some("say which with --run NAME".into()),
+            Self::UnknownRun { live, .. } if live.is_empty() => Self::NoRun.hint(),
+            Self::UnknownRun { name, live } => {
+                let known: Vec<&str> = live.iter().map(|r| r.name.as_str()).collect();
+                Some(match nearest(name, &known) {
+                    Some(best) => format!("did you mean {best:?}?"),
+                    None => format!("live: {}", names(live)),
+                })
+            }
+            Self::Place(error) => Some(error.hint().into()),
+            Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
+                Some("the process lives but does not answer; its log may say why".into())
+            }
+            Self::Io { .. } => Some("the run is starting or has just ended; see `dimos status`".into()),
+            Self::Protocol { .. } => Some("is it another version of dimos?".into()),
+            Self::Refused(error) => error.hint.clone(),
+        }
+    }
+}
+
+fn names(runs: &[LiveRun]) -> String {
+    runs.iter().map(|r| r.name.as_str()).collect::<Vec<_>>().join(", ")
+}
+
+/// A message of a subscription.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Message {
+    /// The stream's name.
+    pub stream: String,
+    /// The subscription's number.
+    pub subscription: u64,
+    /// How many messages this reader missed before this one.
+    pub lost: u64,
+    /// What was published.
+    pub data: Value,
+}
+
+/// A connection to a run.
+#[derive(Debug)]
+pub struct Client {
+    run: String,
+    from: BufReader<UnixStream>,
+    next: u64,
+    kept: VecDeque<Message>,
+}
+
+/// The live run of a name or, without one, the only live run.
+pub fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun, ClientError> {
+    let mut live = folder.runs()?;
+    match name {
+        Some(name) => match live.iter().position(|run| run.name == name) {
+            Some(at) => Ok(live.swap_remove(at)),
+            None => Err(ClientError::UnknownRun { name: name.to_owned(), live }),
+        },
+        None if live.len() > 1 => Err(ClientError::SeveralRuns(live)),
+        None => live.pop().ok_or(ClientError::NoRun),
+    }
+}
+
+impl Client {
+    /// Connects to the run of a name or, without one, to the only live run.
+    pub fn find(folder: &RunFolder, name: Option<&str>) -> Result<Self, ClientError> {
+        let run = find(folder, name)?;
+        Self::connect(&run.name, &run.socket)
+    }
+
+    /// Connects to a socket; `run` is for messages.
+    pub fn connect(run: &str, socket: &Path) -> Result<Self, ClientError> {
+        let connect = || {
+            let stream = UnixStream::connect(socket)?;
+            stream.set_read_timeout(Some(PATIENCE))?;
+            stream.set_write_timeout(Some(PATIENCE))?;
+            Ok(stream)
+        };
+        let stream = connect().map_err(|error| ClientError::Io { run: run.to_owned(), error })?;
+        Ok(Self { run: run.to_owned(), from: BufReader::new(stream), next: 1, kept: VecDeque::new() })
+    }
+
+    /// The run's name.
+    pub fn run(&self) -> &str {
+        &self.run
+    }
+
+    /// Asks, and waits for the answer. Stream messages that come meanwhile are kept for [`next_message`](Self::next_message).
+    pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
+        let id = self.next;
+        self.next += 1;
+        let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
+        if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
+            // A run that refuses the connection says so before it closes.
+            return Err(match self.read() {
+                Ok(Incoming { error: Some(refusal), .. }) => refusal.into(),
+                _ => self.io(error),
+            });
+        }
+        loop {
+            let incoming = self.read()?;
+            if incoming.stream.is_some() {
+                if self.kept.len() == KEPT
+                    && let Some(lost) = self.kept.pop_front()
+                    && let Some(next) = self.kept.front_mut()
+                {
+                    next.lost += lost.lost + 1;
+                }
+                self.kept.push_back(message(incoming));
+            } else if let Some(refusal) = incoming.error {
+                return Err(refusal.into());
+            } else if incoming.id == Some(id) {
+                return serde_json::from_value(incoming.result).map_err(|e| self.protocol(e.to_string()));
+            }
+        }
+    }
+
+    /// Waits for the next message of any subscription.
+    pub fn next_message(&mut self) -> Result<Message, ClientError> {
+        if let Some(message) = self.kept.pop_front() {
+            return Ok(message);
+        }
+        loop {
+            let incoming = self.read()?;
+            if incoming.stream.is_some() {
+                return Ok(message(incoming));
+            }
+        }
+    }
+
+    fn read(&mut self) -> Result<Incoming, ClientError> {
+        let mut line = String::new();
+        match self.from.read_line(&mut line) {
+            Ok(0) => Err(self.io(io::Error::new(io::ErrorKind::UnexpectedEof, "the run closed the connection"))),
+            Ok(_) => serde_json::from_str(&line).map_err(|e| self.protocol(e.to_string())),
+            Err(error) => Err(self.io(error)),
+        }
+    }
+
+    fn io(&self, error: io::Error) -> ClientError {
+        ClientError::Io { run: self.run.clone(), error }
+    }
+
+    fn protocol(&self, what: String) -> ClientError {
+        ClientError::Protocol { run: self.run.clone(), what }
+    }
+}
+
+fn message(incoming: Incoming) -> Message {
+    Message {
+        stream: incoming.stream.unwrap_or_default(),
+        subscription: incoming.subscription,
+        lost: incoming.lost,
+        data: incoming.data,
+    }
+}

@@ -1,0 +1,155 @@
+//! How a request is refused: a code for programs, a sentence and a hint for people.
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::telemetry::Outcome;
+
+/// What went wrong, for programs. In JSON: `START_STATE_MISMATCH`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Code {
+    /// The line is not a JSON object with `id`, `method`, `params`.
+    Malformed,
+    /// The line is longer than [`MAX_LINE`](super::api::MAX_LINE); the connection ends.
+    TooLarge,
+    /// The run has as many connections as it takes; the connection ends.
+    TooManyConnections,
+    /// The connection has as many subscriptions as it may.
+    TooManySubscriptions,
+    /// The socket belongs to another user; the connection ends.
+    Forbidden,
+    /// No such method.
+    UnknownMethod,
+    /// The parameters do not fit the method.
+    InvalidParams,
+    /// No such arm in the run.
+    UnknownArm,
+    /// No such task in the run.
+    UnknownTask,
+    /// No such motion, or one too long ago.
+    UnknownMotion,
+    /// No such subscription on this connection.
+    UnknownSubscription,
+    /// No trajectory task covers these joints.
+    NoTrajectoryTask,
+    /// The trajectory is not well-formed: empty, not increasing in time, wrong widths.
+    InvalidTrajectory,
+    /// The task is executing already.
+    AlreadyExecuting,
+    /// The trajectory does not start where the arm is.
+    StartStateMismatch,
+    /// No fresh state of the arm.
+    StartStateUnavailable,
+    /// The arm is not ready for motion.
+    ArmNotReady,
+    /// The arm is held and must be reset first.
+    ArmLatched,
+    /// What latched the arm still stands.
+    StillFaulted,
+    /// The task cannot do that.
+    WrongTask,
+    /// A number is not finite.
+    NonFinite,
+    /// A target is outside the joint's limits.
+    OutOfLimits,
+    /// The arm has no gripper.
+    NoGripper,
+    /// The arm or the run lacks this feature.
+    Unsupported,
+    /// The arm's device did not do it; the message has its words.
+    DeviceRefused,
+    /// The run is ending.
+    ShuttingDown,
+    /// The run did not answer in time; the request may still take effect.
+    NoAnswer,
+    /// A defect of the program.
+    Internal,
+    /// A code of a newer version.
+    #[serde(other)]
+    Other,
+}
+
+impl Code {
+    /// The word used in JSON and messages.
+    pub fn name(self) -> String {
+        serde_json::to_value(self).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
+    }
+
+    /// The code of a refusal by the tick; `None` where the request was taken on.
+    pub fn of(outcome: &Outcome) -> Option<Self> {
+        match outcome {
+            Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped => None,
+            Outcome::AlreadyExecuting(_) => Some(Self::AlreadyExecuting),
+            Outcome::StartStateMismatch(..) => Some(Self::StartStateMismatch),
+            Outcome::StartStateUnavailable(_) => Some(Self::StartStateUnavailable),
+            Outcome::ArmNotReady(..) => Some(Self::ArmNotReady),
+            Outcome::ArmLatched(..) => Some(Self::ArmLatched),
+            Outcome::StillFaulted(..) => Some(Self::StillFaulted),
+            Outcome::WrongTask(_) => Some(Self::WrongTask),
+            Outcome::NonFinite(_) => Some(Self::NonFinite),
+            Outcome::OutOfLimits(..) => Some(Self::OutOfLimits),
+            Outcome::NoGripper(_) => Some(Self::NoGripper),
+            Outcome::ShuttingDown => Some(Self::ShuttingDown),
+        }
+    }
+}
+
+/// A refused request.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, thiserror::Error)]
+#[error("{message}")]
+pub struct RpcError {
+    /// What went wrong, for programs.
+    pub code: Code,
+    /// What went wrong and where, in a sentence without full stop.
+    pub message: String,
+    /// What to do about it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hint: Option<String>,
+    /// Figures that belong to it: the joint, the amount.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub data: Option<Value>,
+}
+
+impl RpcError {
+    /// A refusal without hint or data.
+    pub fn new(code: Code, message: impl Into<String>) -> Self {
+        Self { code, message: message.into(), hint: None, data: None }
+    }
+
+    /// The same with a hint.
+    pub fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+
+    /// The same with figures for programs.
+    pub fn data(mut self, data: Value) -> Self {
+        self.data = Some(data);
+        self
+    }
+
+    /// `what` has no entry called `name`; the hint suggests the nearest of `known`, or lists them.
+    pub fn unknown<S: AsRef<str>>(code: Code, what: &str, name: &str, known: &[S]) -> Self {
+        let error = Self::new(code, format!("no {what} named {name:?}"));
+        match nearest(name, known) {
+            Some(best) => error.hint(format!("did you mean {best:?}?")),
+            None if known.is_empty() => error.hint(format!("there is no {what} here")),
+            None => {
+                let list: Vec<&str> = known.iter().map(AsRef::as_ref).collect();
+                error.hint(format!("there is {}", list.join(", ")))
+            }
+        }
+    }
+}
+
+/// The entry of `known` that `name` was probably meant to be.
+pub fn nearest<'a, S: AsRef<str>>(name: &str, known: &'a [S]) -> Option<&'a str> {
+    let name = name.to_lowercase();
+    known
+        .iter()
+        .map(|k| (strsim::jaro_winkler(&name, &k.as_ref().to_lowercase()), k.as_ref()))
+        .filter(|(likeness, _)| *likeness > 0.8)
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .map(|(_, k)| k)
+}

@@ -1,0 +1,195 @@
+//! Parameters and replies of the methods that move arms.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::api::{MIN_SPEED, finite};
+use crate::joint::MAX_DOF;
+
+/// Parameters of `move`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Move {
+    /// The arm's `hardware_id`.
+    pub arm: String,
+    /// Where its joints shall go [rad], one value per joint of the arm.
+    pub target: Vec<f64>,
+    /// Fraction of the velocity and acceleration limits to use, 0.1–1.
+    #[serde(default = "default_speed")]
+    pub speed: f64,
+}
+
+/// Fraction of the limits that a move uses when none is given.
+pub const DEFAULT_SPEED: f64 = 0.5;
+
+fn default_speed() -> f64 {
+    DEFAULT_SPEED
+}
+
+impl Move {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        values("target", &self.target)?;
+        if !(MIN_SPEED..=1.0).contains(&self.speed) {
+            return Err(format!("speed is {}, and must be within {MIN_SPEED}–1", self.speed));
+        }
+        Ok(())
+    }
+}
+
+/// A motion that began with `move`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MoveReply {
+    /// The motion's number, for `motion`.
+    pub motion: u64,
+    /// The task that carries it out.
+    pub task: String,
+    /// How long it is planned to take [s].
+    pub duration: f64,
+    /// Names of the joints, in the order of the values.
+    pub joints: Vec<String>,
+    /// Where it starts [rad].
+    pub start: Vec<f64>,
+    /// Where it goes [rad].
+    pub target: Vec<f64>,
+}
+
+/// Parameters of `execute`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Execute {
+    /// What to follow.
+    pub trajectory: Trajectory,
+    /// The trajectory task to use; without it the one whose joints cover the trajectory's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
+}
+
+/// A trajectory as it travels: ROS names and meaning.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Trajectory {
+    /// The joints, in the order of every point's values.
+    pub joint_names: Vec<String>,
+    /// The points, in order of time.
+    pub points: Vec<Point>,
+}
+
+/// A point of a trajectory.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Point {
+    /// Time since the trajectory's start [s].
+    pub time_from_start: f64,
+    /// Joint positions [rad].
+    pub positions: Vec<f64>,
+    /// Joint velocities [rad/s]; without them the path between points is the task's choice.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub velocities: Option<Vec<f64>>,
+    /// Joint accelerations [rad/s²].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub accelerations: Option<Vec<f64>>,
+}
+
+impl Execute {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        let joints = self.trajectory.joint_names.len();
+        if joints == 0 {
+            return Err("trajectory.joint_names is empty".into());
+        }
+        for (index, point) in self.trajectory.points.iter().enumerate() {
+            let at = |field| format!("trajectory.points[{index}].{field}");
+            finite(&at("time_from_start"), &[point.time_from_start])?;
+            let given = [
+                ("positions", Some(&point.positions)),
+                ("velocities", point.velocities.as_ref()),
+                ("accelerations", point.accelerations.as_ref()),
+            ];
+            for (field, values) in given.into_iter().filter_map(|(field, v)| v.map(|v| (field, v))) {
+                finite(&at(field), values)?;
+                if values.len() != joints {
+                    return Err(format!("{} has {} values for {joints} joints", at(field), values.len()));
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A motion that began with `execute`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ExecuteReply {
+    /// The motion's number, for `motion`.
+    pub motion: u64,
+    /// The task that carries it out.
+    pub task: String,
+    /// How long the trajectory takes [s].
+    pub duration: f64,
+}
+
+/// Parameters of `motion`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Motion {
+    /// The motion's number.
+    pub motion: u64,
+}
+
+/// Parameters of `cancel`: without any, every motion ends.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Cancel {
+    /// Ends the motions that move this arm.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
+    /// Ends the motion of this task.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
+}
+
+/// What `cancel` did, per task.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct CancelReply {
+    /// The status word of each task asked: `CANCELLED` or `ALREADY_STOPPED`.
+    pub tasks: BTreeMap<String, String>,
+}
+
+/// Parameters of `servo`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Servo {
+    /// The servo task's name.
+    pub task: String,
+    /// Joint positions [rad], in the order of the task's joints.
+    pub positions: Vec<f64>,
+}
+
+impl Servo {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        finite("positions", &self.positions)
+    }
+}
+
+/// Parameters of `velocity`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Velocity {
+    /// The velocity task's name.
+    pub task: String,
+    /// Joint velocities [rad/s], in the order of the task's joints.
+    pub velocities: Vec<f64>,
+}
+
+impl Velocity {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        finite("velocities", &self.velocities)
+    }
+}
+
+/// One value per joint of an arm, each finite.
+fn values(field: &str, values: &[f64]) -> Result<(), String> {
+    if values.is_empty() || values.len() > MAX_DOF {
+        return Err(format!("{field} has {} values, and must have 1 to {MAX_DOF}", values.len()));
+    }
+    finite(field, values)
+}

@@ -1,0 +1,181 @@
+//! What a run publishes while it runs, and how clients ask for it.
+//!
+//! Each message is encoded once, by the publisher, and kept in a ring of fixed length. Every subscriber reads the ring
+//! at its own pace: who is too slow loses its own oldest messages, is told how many, and holds up nobody.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use tokio::sync::broadcast;
+
+use super::api::Method;
+
+/// Joint states kept for slow readers.
+const STATES_KEPT: usize = 256;
+/// Events kept for slow readers.
+const EVENTS_KEPT: usize = 1024;
+
+/// The streams of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stream {
+    /// One [`JointState`] per tick.
+    CoordinatorJointState,
+    /// One [`EventReport`] per event.
+    Events,
+}
+
+impl Stream {
+    /// The name used in requests and messages.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::CoordinatorJointState => "coordinator_joint_state",
+            Self::Events => "events",
+        }
+    }
+}
+
+/// Parameters of `subscribe`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Subscribe {
+    /// Which stream.
+    pub stream: Stream,
+    /// At most so many messages per second [Hz]; without it, all of them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rate: Option<f64>,
+}
+
+/// Reply to `subscribe`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SubscribeReply {
+    /// The subscription's number on this connection.
+    pub subscription: u64,
+}
+
+/// Parameters of `unsubscribe`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Unsubscribe {
+    /// The subscription's number.
+    pub subscription: u64,
+}
+
+impl Method for Subscribe {
+    const NAME: &'static str = "subscribe";
+    type Reply = SubscribeReply;
+
+    fn check(&self) -> Result<(), String> {
+        match self.rate {
+            Some(rate) if !(rate.is_finite() && (0.01..=10_000.0).contains(&rate)) => {
+                Err(format!("rate is {rate}, and must be within 0.01–10000 Hz"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Method for Unsubscribe {
+    const NAME: &'static str = "unsubscribe";
+    type Reply = super::api::Done;
+}
+
+/// The joints of all arms after a tick: the guide's `coordinator_joint_state`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct JointState {
+    /// Index of the tick.
+    pub tick: u64,
+    /// When it was, by the wall clock [s since the Unix epoch].
+    pub stamp: f64,
+    /// The blueprint's `joint_state_frame_id`.
+    pub frame_id: String,
+    /// Names of the joints, in the order of the values.
+    pub name: Vec<String>,
+    /// Positions [rad]; null before an arm's first state.
+    pub position: Vec<Option<f64>>,
+    /// Velocities [rad/s]; null where unknown.
+    pub velocity: Vec<Option<f64>>,
+    /// Torques [Nm]; null where the arm reports none.
+    pub effort: Vec<Option<f64>>,
+}
+
+/// Something that happened.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct EventReport {
+    /// Index of the tick in which it happened.
+    pub tick: u64,
+    /// When it was, by the wall clock [s since the Unix epoch].
+    pub stamp: f64,
+    /// How much it matters.
+    pub level: Level,
+    /// What kind it is, for programs: `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`,
+    /// `degraded`.
+    pub kind: String,
+    /// The arm it is about.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
+    /// The task it is about.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
+    /// The joint it is about.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joint: Option<String>,
+    /// What happened, for people, in a sentence without full stop.
+    pub text: String,
+}
+
+/// How much an event matters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Level {
+    /// The ordinary course of things.
+    #[default]
+    Info,
+    /// Worth a look.
+    Warning,
+    /// Something ended that should not have.
+    Error,
+}
+
+/// The publishing end, owned by the run. Cheap to clone; never waits for a reader.
+#[derive(Debug, Clone)]
+pub struct Streams {
+    joint_state: broadcast::Sender<Arc<str>>,
+    events: broadcast::Sender<Arc<str>>,
+}
+
+impl Default for Streams {
+    fn default() -> Self {
+        Self { joint_state: broadcast::Sender::new(STATES_KEPT), events: broadcast::Sender::new(EVENTS_KEPT) }
+    }
+}
+
+impl Streams {
+    /// Publishes the state of a tick. `build` is only called when somebody listens. Allocates: not for the tick.
+    pub fn publish_joint_state(&self, build: impl FnOnce() -> JointState) {
+        publish(&self.joint_state, build);
+    }
+
+    /// Publishes an event. `build` is only called when somebody listens. Allocates: not for the tick.
+    pub fn publish_event(&self, build: impl FnOnce() -> EventReport) {
+        publish(&self.events, build);
+    }
+
+    /// A reader of a stream, from now on.
+    pub(super) fn reader(&self, stream: Stream) -> broadcast::Receiver<Arc<str>> {
+        match stream {
+            Stream::CoordinatorJointState => self.joint_state.subscribe(),
+            Stream::Events => self.events.subscribe(),
+        }
+    }
+}
+
+fn publish<T: Serialize>(to: &broadcast::Sender<Arc<str>>, build: impl FnOnce() -> T) {
+    if to.receiver_count() == 0 {
+        return;
+    }
+    // These types have string keys only, so encoding cannot fail; that the last reader just left is no error.
+    if let Ok(text) = serde_json::to_string(&build()) {
+        let _ = to.send(text.into());
+    }
+}

@@ -1,0 +1,90 @@
+//! The lines themselves: what a request line says, and how replies and stream messages are written.
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::error::{Code, RpcError};
+
+/// Longest `id` that is a string [bytes]: it is sent back as it came.
+const MAX_ID: usize = 128;
+
+/// A request line, its parameters not yet read.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Envelope {
+    /// Chosen by the client, sent back with the reply: a number, a string, or nothing.
+    #[serde(default)]
+    pub id: Value,
+    pub method: String,
+    #[serde(default)]
+    pub params: Value,
+}
+
+/// Reads a request line. A refusal comes with the id, where that much could be read.
+pub(super) fn read(line: &[u8]) -> Result<Envelope, (Value, RpcError)> {
+    let malformed = |id: Value, what: String| {
+        let hint = r#"one JSON object per line: {"id":1,"method":"state","params":{}}"#;
+        Err((id, RpcError::new(Code::Malformed, what).hint(hint)))
+    };
+    let value: Value = match serde_json::from_slice(line) {
+        Ok(value) => value,
+        Err(e) => return malformed(Value::Null, format!("not a line of JSON: {e}")),
+    };
+    let id = match value.get("id") {
+        Some(Value::Number(n)) => Value::Number(n.clone()),
+        Some(Value::String(s)) if s.len() <= MAX_ID => Value::String(s.clone()),
+        None | Some(Value::Null) => Value::Null,
+        Some(_) => return malformed(Value::Null, "id is neither a number nor a short string".into()),
+    };
+    match serde_json::from_value(value) {
+        Ok(envelope) => Ok(envelope),
+        Err(e) => malformed(id, format!("not a request: {e}")),
+    }
+}
+
+/// The reply to a request, as a line.
+pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> String {
+    #[derive(Serialize)]
+    #[serde(rename_all = "snake_case")]
+    enum Outcome<T> {
+        Result(T),
+        Error(RpcError),
+    }
+    #[derive(Serialize)]
+    struct Line<'a, T> {
+        id: &'a Value,
+        #[serde(flatten)]
+        outcome: Outcome<T>,
+    }
+    let outcome = match result {
+        Ok(value) => Outcome::Result(value),
+        Err(error) => Outcome::Error(error),
+    };
+    match serde_json::to_string(&Line { id, outcome }) {
+        Ok(line) => line + "\n",
+        Err(e) => reply::<()>(id, Err(RpcError::new(Code::Internal, format!("a reply that is no JSON: {e}")))),
+    }
+}
+
+/// A message of a subscription, as a line. `data` is JSON already; `lost` tells of messages that this reader missed
+/// before this one.
+pub(super) fn message(stream: &str, subscription: u64, lost: u64, data: &str) -> String {
+    let lost = if lost == 0 { String::new() } else { format!(r#","lost":{lost}"#) };
+    format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription}{lost},\"data\":{data}}}\n")
+}
+
+/// What a client reads: a reply or a message of a subscription.
+#[derive(Debug, Deserialize)]
+pub(super) struct Incoming {
+    pub id: Option<u64>,
+    #[serde(default)]
+    pub result: Value,
+    pub error: Option<RpcError>,
+    pub stream: Option<String>,
+    #[serde(default)]
+    pub subscription: u64,
+    #[serde(default)]
+    pub lost: u64,
+    #[serde(default)]
+    pub data: Value,
+}
