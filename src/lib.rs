@@ -13,14 +13,9 @@
 //!
 //! A module may use only those above it in this list; `tests/layering.rs` checks that.
 
-/// Version of this program, with the commit it was built from where that is known.
-pub const VERSION: &str = env!("DIMOS_VERSION");
-
 pub mod arm;
-pub mod cli;
 pub mod clock;
 pub mod joint;
-pub mod rpc;
 pub mod telemetry;
 pub mod trajectory;
 pub mod yaml;
@@ -31,8 +26,10 @@ pub mod hardware;
 
 pub mod control;
 
+pub mod rpc;
 
 pub mod recording;
 
 
 
+pub mod cli;
