@@ -2,4 +2,6 @@
 
 pub mod arms;
 pub mod registry;
+pub mod sim;
 pub mod spec;
+pub mod transport;
