@@ -2,5 +2,7 @@
 
 use crate::hardware::registry::AdapterSpec;
 
+pub mod mock;
+
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[];
+pub const TABLE: &[AdapterSpec] = &[mock::SPEC];
