@@ -6,3 +6,4 @@ pub mod mock;
 
 /// The compile-time adapter table.
 pub const TABLE: &[AdapterSpec] = &[mock::SPEC];
+pub mod yourarm;
