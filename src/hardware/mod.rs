@@ -3,4 +3,6 @@
 pub mod arms;
 pub mod device;
 pub mod registry;
+pub mod sim;
 pub mod spec;
+pub mod transport;

@@ -2,5 +2,8 @@
 
 use crate::hardware::registry::AdapterSpec;
 
+pub mod mock;
+
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[];
+pub const TABLE: &[AdapterSpec] = &[mock::SPEC];
+pub mod yourarm;

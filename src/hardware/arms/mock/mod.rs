@@ -1,0 +1,47 @@
+//! An ideal arm in memory, for trying things out and for tests: no wire, but a real plant and scripted faults.
+
+mod adapter;
+mod options;
+#[cfg(test)]
+mod tests;
+
+pub use adapter::MockArm;
+pub use options::Options;
+
+use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::joint::{ControlMode, JointLimits, MAX_DOF};
+use std::f64::consts::PI;
+
+/// The modes of the mock arm.
+const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+
+/// How often the mock arm can deliver its state [Hz].
+const NATIVE_RATE: f64 = 1000.0;
+
+/// The mock arm's row in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "mock",
+    about: "an ideal arm in memory, 1 to 16 joints",
+    level: Level::Emulated,
+    transport: "memory",
+    dof: (1, MAX_DOF),
+    modes: MODES,
+    wire_units: "rad, m",
+    native_rate: NATIVE_RATE,
+    address: AddressForm { form: "none", required: false, check: |_| Ok(()) },
+    holds_when_disabled: true,
+    gripper: true,
+    options: OptionsSpec::of::<Options>(),
+    limits,
+    create: |config| Ok(Box::new(MockArm::new(config)?)),
+    emulate: None,
+};
+
+/// ±2π rad, π rad/s, 10 rad/s², 100 rad/s³ for every joint.
+fn limits(dof: usize) -> JointLimits {
+    JointLimits {
+        acceleration_max: vec![10.0; dof],
+        jerk_max: vec![100.0; dof],
+        ..JointLimits::uniform(dof, 2.0 * PI, PI)
+    }
+}

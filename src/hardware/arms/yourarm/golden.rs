@@ -1,0 +1,50 @@
+//! Frames computed by hand from `docs/yourarm-protocol.md`, with a CRC that is not ours. Adapter and emulator are
+//! both tested against them, so that a mistake which both sides share still shows.
+
+/// Bytes written as hexadecimal digits.
+pub fn bytes(hex: &str) -> Vec<u8> {
+    (0..hex.len()).step_by(2).map(|i| u8::from_str_radix(&hex[i..i + 2], 16).unwrap()).collect()
+}
+
+/// Joints of the samples [deg].
+pub const JOINTS: [f64; 6] = [10.0, -20.0, 30.0, -40.0, 50.0, -60.0];
+/// Pose of the samples [mm, deg].
+pub const POSE: [f64; 6] = [300.0, -100.0, 250.5, 180.0, 0.0, -90.0];
+
+/// HELLO, sequence 1.
+pub const HELLO: &str = "59410101010000009b5f";
+/// GET_STATE, sequence 2.
+pub const GET_STATE: &str = "5941010202000000952a";
+/// SET_MODE servo, sequence 3.
+pub const SET_MODE: &str = "594101030300010001c8d8";
+/// ENABLE on, sequence 4.
+pub const ENABLE: &str = "5941010404000100015d77";
+/// CLEAR_ERROR, sequence 5.
+pub const CLEAR_ERROR: &str = "59410105050000006c1c";
+/// STOP, sequence 0xFFFE.
+pub const STOP: &str = "59410106feff00008fbc";
+/// MOVE_JOINTS at 25 % to [`JOINTS`], sequence 7.
+pub const MOVE_JOINTS: &str = "5941011007001c000000c841000020410000a0c10000f041000020c200004842000070c25769";
+/// SERVO_JOINTS to [`JOINTS`], sequence 8.
+pub const SERVO_JOINTS: &str = "5941011108001800000020410000a0c10000f041000020c200004842000070c20419";
+/// VELOCITY_JOINTS 1.5, 0, 0, 0, 0, −90 deg/s, sequence 9.
+pub const VELOCITY_JOINTS: &str = "59410112090018000000c03f000000000000000000000000000000000000b4c2b5f7";
+/// MOVE_CARTESIAN at 50 % to [`POSE`], sequence 10.
+pub const MOVE_CARTESIAN: &str = "594101130a001c0000004842000096430000c8c200807a4300003443000000000000b4c22398";
+/// GRIPPER to 42.5 mm, sequence 11.
+pub const GRIPPER: &str = "594101200b00040000002a42b473";
+
+/// Reply to [`HELLO`]: YOURARM-6, 6 joints, firmware 2.1.3, serial number YA6-00042.
+pub const HELLO_REPLY: &str = "594101810100250000594f555241524d2d3600000000000000060201035941362d303030343200000000\
+    000000b08a";
+/// Reply to [`GET_STATE`]: 123.456789 s, moving, servo mode, enabled, gripper fitted, no error, [`JOINTS`],
+/// 1 −2 3 −4 5 −6 deg/s, 0.5 −0.5 1 −1 2 −2 Nm, 42.5 mm, [`POSE`].
+pub const STATE_REPLY: &str = "59410182020073000015cd5b0700000000020103060000000020410000a0c10000f041000020c2000048\
+    42000070c20000803f000000c000004040000080c00000a0400000c0c00000003f000000bf0000803f000080bf00000040000000c000002a\
+    42000096430000c8c200807a4300003443000000000000b4c20f85";
+/// Refusal of [`SET_MODE`]: the arm is moving; no error.
+pub const MOVING_REPLY: &str = "594101830300030006000058f8";
+/// Refusal of [`SERVO_JOINTS`]: in error 2.
+pub const IN_ERROR_REPLY: &str = "5941019108000300080200067c";
+/// Good reply to [`STOP`].
+pub const STOP_REPLY: &str = "59410186feff010000470a";

@@ -1,0 +1,392 @@
+//! The wire format of the YourArm controller: pure encoding and decoding, no I/O, no units but the wire's own
+//! (deg, deg/s, mm, Nm, µs). The sheet is `docs/yourarm-protocol.md`; this file follows its order.
+//!
+//! Encoders write into the caller's buffer. Decoders answer `None` or skip for whatever bytes come; none panics.
+
+use crate::hardware::transport::tcp::Scan;
+
+// --- Frame: "YA" | version | opcode | sequence u16 | length u16 | payload | CRC-16; all little-endian ---
+
+/// The two bytes that every frame begins with.
+const MAGIC: [u8; 2] = *b"YA";
+/// The protocol version that follows them.
+const VERSION: u8 = 1;
+/// Bytes before the payload.
+const HEADER: usize = 8;
+/// Bytes after the payload.
+const CRC: usize = 2;
+/// Longest payload.
+const MAX_PAYLOAD: usize = 256;
+/// Longest frame; the size of a frame buffer.
+pub const MAX_FRAME: usize = HEADER + MAX_PAYLOAD + CRC;
+/// Set in the opcode of a reply.
+const REPLY: u8 = 0x80;
+
+/// Number of joints.
+pub const DOF: usize = 6;
+/// The model name that the controller gives.
+pub const MODEL: &str = "YOURARM-6";
+/// The controller's TCP port.
+pub const PORT: u16 = 9760;
+
+/// One value per joint, in wire units.
+pub type WireJoints = [f64; DOF];
+
+/// What the controller can be asked.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Command {
+    /// Who are you?
+    Hello,
+    /// Everything that is measured, in one packet.
+    GetState,
+    /// Changes the mode; refused while the arm moves.
+    SetMode(Mode),
+    /// Motors on (holding where the arm is) or off.
+    Enable(bool),
+    /// Clears the error.
+    ClearError,
+    /// Decelerates to standstill; motors stay on.
+    Stop,
+    /// Plans and makes a move.
+    MoveJoints {
+        /// Speed [% of the top speed].
+        speed: f64,
+        /// Target [deg].
+        joints: WireJoints,
+    },
+    /// Next set point [deg].
+    ServoJoints(WireJoints),
+    /// Joint velocities [deg/s]; the arm stops when no other follows within 200 ms.
+    VelocityJoints(WireJoints),
+    /// Plans and makes a move to a pose.
+    MoveCartesian {
+        /// Speed [% of the top speed].
+        speed: f64,
+        /// Target x, y, z [mm], roll, pitch, yaw [deg].
+        pose: [f64; 6],
+    },
+    /// Gripper opening [mm].
+    Gripper(f64),
+}
+
+impl Command {
+    /// The command's number on the wire.
+    pub fn opcode(&self) -> u8 {
+        match self {
+            Self::Hello => 0x01,
+            Self::GetState => 0x02,
+            Self::SetMode(_) => 0x03,
+            Self::Enable(_) => 0x04,
+            Self::ClearError => 0x05,
+            Self::Stop => 0x06,
+            Self::MoveJoints { .. } => 0x10,
+            Self::ServoJoints(_) => 0x11,
+            Self::VelocityJoints(_) => 0x12,
+            Self::MoveCartesian { .. } => 0x13,
+            Self::Gripper(_) => 0x20,
+        }
+    }
+
+    /// The command's name on the sheet.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Hello => "HELLO",
+            Self::GetState => "GET_STATE",
+            Self::SetMode(_) => "SET_MODE",
+            Self::Enable(_) => "ENABLE",
+            Self::ClearError => "CLEAR_ERROR",
+            Self::Stop => "STOP",
+            Self::MoveJoints { .. } => "MOVE_JOINTS",
+            Self::ServoJoints(_) => "SERVO_JOINTS",
+            Self::VelocityJoints(_) => "VELOCITY_JOINTS",
+            Self::MoveCartesian { .. } => "MOVE_CARTESIAN",
+            Self::Gripper(_) => "GRIPPER",
+        }
+    }
+}
+
+/// The controller's modes, with their numbers on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[repr(u8)]
+pub enum Mode {
+    /// The controller plans the way.
+    #[default]
+    Position = 0,
+    /// Follows set points.
+    Servo = 1,
+    /// Keeps velocities.
+    Velocity = 2,
+}
+
+impl Mode {
+    fn from_wire(byte: u8) -> Option<Self> {
+        match byte {
+            0 => Some(Self::Position),
+            1 => Some(Self::Servo),
+            2 => Some(Self::Velocity),
+            _ => None,
+        }
+    }
+}
+
+/// Writes the frame of a command into `frame`; the answer is the part that was written.
+pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAME]) -> &'a [u8] {
+    let mut out = Writer { frame, at: HEADER };
+    match command {
+        Command::Hello | Command::GetState | Command::ClearError | Command::Stop => {}
+        Command::SetMode(mode) => out.put(&[*mode as u8]),
+        Command::Enable(on) => out.put(&[u8::from(*on)]),
+        Command::MoveJoints { speed, joints } => {
+            out.floats(&[*speed]);
+            out.floats(joints);
+        }
+        Command::ServoJoints(joints) | Command::VelocityJoints(joints) => out.floats(joints),
+        Command::MoveCartesian { speed, pose } => {
+            out.floats(&[*speed]);
+            out.floats(pose);
+        }
+        Command::Gripper(opening) => out.floats(&[*opening]),
+    }
+    let end = out.at;
+    let length = (end - HEADER) as u16;
+    out.at = 0;
+    out.put(&MAGIC);
+    out.put(&[VERSION, command.opcode()]);
+    out.put(&sequence.to_le_bytes());
+    out.put(&length.to_le_bytes());
+    let checksum = crc16(frame.get(..end).unwrap_or_default());
+    Writer { frame, at: end }.put(&checksum.to_le_bytes());
+    frame.get(..end + CRC).unwrap_or_default()
+}
+
+/// CRC-16/CCITT-FALSE: polynomial 0x1021, start value 0xFFFF, not reflected. Of "123456789" it is 0x29B1.
+fn crc16(bytes: &[u8]) -> u16 {
+    bytes.iter().fold(0xFFFF, |crc, byte| {
+        (0..8).fold(
+            crc ^ (u16::from(*byte) << 8),
+            |crc, _| {
+                if crc & 0x8000 != 0 { (crc << 1) ^ 0x1021 } else { crc << 1 }
+            },
+        )
+    })
+}
+
+// --- Replies: status u8, then data; a refusal carries the controller's error code (u16) ---
+
+/// A whole reply with a good checksum.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reply<'a> {
+    /// What the controller made of the command.
+    pub status: Status,
+    /// What follows the status.
+    pub data: &'a [u8],
+}
+
+/// What the controller made of a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// Done, or begun.
+    Ok,
+    /// Refused, with the number of the reason; [`status_text`] explains it.
+    Refused(u8),
+}
+
+/// Refused because the controller is in error; the data tell which.
+pub const IN_ERROR: u8 = 8;
+
+/// Finds the reply to the command with this opcode and sequence number at the front of `bytes`. Noise, damaged
+/// frames and replies to other commands are skipped.
+pub fn scan<'a>(bytes: &'a [u8], opcode: u8, sequence: u16) -> Scan<Reply<'a>> {
+    // A frame can only begin where the magic is; a lone first byte of it may still become one.
+    let begins = |at: &[u8]| at.starts_with(&MAGIC) || at == &MAGIC[..1];
+    let noise = (0..bytes.len()).take_while(|i| !bytes.get(*i..).is_some_and(begins)).count();
+    if noise > 0 {
+        return Scan::Skip(noise);
+    }
+    let Some([_, _, version, code, s0, s1, l0, l1]) = bytes.first_chunk::<HEADER>() else { return Scan::More };
+    let length = usize::from(u16::from_le_bytes([*l0, *l1]));
+    if *version != VERSION || length > MAX_PAYLOAD {
+        return Scan::Skip(1);
+    }
+    let Some(frame) = bytes.get(..HEADER + length + CRC) else { return Scan::More };
+    let Some((body, checksum)) = frame.split_last_chunk::<CRC>() else { return Scan::More };
+    if crc16(body) != u16::from_le_bytes(*checksum) {
+        return Scan::Skip(1);
+    }
+    let answers = *code == opcode | REPLY && u16::from_le_bytes([*s0, *s1]) == sequence;
+    match body.get(HEADER..).and_then(<[u8]>::split_first) {
+        Some((status, data)) if answers => {
+            let status = if *status == 0 { Status::Ok } else { Status::Refused(*status) };
+            Scan::Take(frame.len(), Reply { status, data })
+        }
+        _ => Scan::Skip(frame.len()),
+    }
+}
+
+/// Why the controller refused, in words.
+pub fn status_text(status: u8) -> &'static str {
+    match status {
+        1 => "it does not know the command",
+        2 => "a value is malformed",
+        3 => "another client is connected to it",
+        4 => "the motors are disabled",
+        5 => "it is in another mode",
+        6 => "the arm is moving",
+        7 => "the target is outside the arm's limits or out of reach",
+        IN_ERROR => "it is in error",
+        9 => "there is no gripper",
+        _ => "it gives a reason that the sheet does not list",
+    }
+}
+
+/// What an error code of the controller means.
+pub fn error_text(code: u16) -> &'static str {
+    match code {
+        0 => "",
+        1 => "E-stop line open",
+        2 => "collision detected",
+        3 => "joint over-temperature",
+        4 => "joint over-current",
+        5 => "following error too large",
+        6 => "joint beyond its position limit",
+        7 => "servo drive does not answer",
+        8 => "supply voltage out of range",
+        _ => "an error that the sheet does not list",
+    }
+}
+
+/// The reply to [`Command::Hello`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Hello {
+    /// Model name.
+    pub model: String,
+    /// Number of joints.
+    pub dof: usize,
+    /// Firmware version.
+    pub firmware: [u8; 3],
+    /// Serial number.
+    pub serial: String,
+}
+
+impl Hello {
+    /// Decodes the data of a good reply.
+    pub fn decode(data: &[u8]) -> Option<Self> {
+        let mut data = Reader(data);
+        let model = data.text()?;
+        let [dof, major, minor, patch] = data.take()?;
+        let serial = data.text()?;
+        data.0.is_empty().then_some(Self { model, dof: dof.into(), firmware: [major, minor, patch], serial })
+    }
+}
+
+/// The reply to [`Command::GetState`]. All numbers are finite.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct State {
+    /// Time of the measurement since power-up [µs].
+    pub time_us: u64,
+    /// 0 disabled, 1 standing, 2 moving, 3 in error.
+    pub state: u8,
+    /// The mode.
+    pub mode: Mode,
+    /// Whether the motors are on.
+    pub enabled: bool,
+    /// Whether a gripper is fitted.
+    pub gripper_fitted: bool,
+    /// The error; 0 = none.
+    pub error: u16,
+    /// Joint positions [deg].
+    pub positions: WireJoints,
+    /// Joint velocities [deg/s].
+    pub velocities: WireJoints,
+    /// Joint torques [Nm].
+    pub torques: WireJoints,
+    /// Gripper opening [mm].
+    pub gripper: f64,
+    /// Flange x, y, z [mm], roll, pitch, yaw [deg].
+    pub pose: [f64; 6],
+}
+
+impl State {
+    /// Decodes the data of a good reply. `None` also when a number is not finite: such a packet is not to be trusted.
+    pub fn decode(data: &[u8]) -> Option<Self> {
+        let mut data = Reader(data);
+        let time_us = u64::from_le_bytes(data.take()?);
+        let [state, mode, flags, dof] = data.take()?;
+        if usize::from(dof) != DOF {
+            return None;
+        }
+        let decoded = Self {
+            time_us,
+            state,
+            mode: Mode::from_wire(mode)?,
+            enabled: flags & 1 != 0,
+            gripper_fitted: flags & 2 != 0,
+            error: u16::from_le_bytes(data.take()?),
+            positions: data.floats()?,
+            velocities: data.floats()?,
+            torques: data.floats()?,
+            gripper: data.float()?,
+            pose: data.floats()?,
+        };
+        data.0.is_empty().then_some(decoded)
+    }
+}
+
+/// The controller's error code in the data of a refusal.
+pub fn decode_refusal(data: &[u8]) -> Option<u16> {
+    Reader(data).take().map(u16::from_le_bytes)
+}
+
+/// Puts bytes one after the other into a frame; what does not fit is left out.
+struct Writer<'a> {
+    frame: &'a mut [u8; MAX_FRAME],
+    at: usize,
+}
+
+impl Writer<'_> {
+    fn put(&mut self, bytes: &[u8]) {
+        if let Some(to) = self.frame.get_mut(self.at..self.at + bytes.len()) {
+            to.copy_from_slice(bytes);
+            self.at += bytes.len();
+        }
+    }
+
+    fn floats(&mut self, values: &[f64]) {
+        values.iter().for_each(|value| self.put(&(*value as f32).to_le_bytes()));
+    }
+}
+
+/// Takes bytes one after the other from a payload; `None` when there are not enough.
+struct Reader<'a>(&'a [u8]);
+
+impl Reader<'_> {
+    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let (taken, rest) = self.0.split_first_chunk::<N>()?;
+        self.0 = rest;
+        Some(*taken)
+    }
+
+    fn float(&mut self) -> Option<f64> {
+        let value = f32::from_le_bytes(self.take()?);
+        value.is_finite().then_some(f64::from(value))
+    }
+
+    fn floats<const N: usize>(&mut self) -> Option<[f64; N]> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.float()?;
+        }
+        Some(values)
+    }
+
+    /// 16 bytes of ASCII, padded with NUL.
+    fn text(&mut self) -> Option<String> {
+        let bytes: [u8; 16] = self.take()?;
+        let text: Vec<u8> = bytes.into_iter().take_while(|byte| *byte != 0).collect();
+        String::from_utf8(text).ok().filter(|text| text.is_ascii())
+    }
+}
+
+#[cfg(test)]
+#[path = "protocol_tests.rs"]
+mod tests;

@@ -1,0 +1,95 @@
+use super::*;
+use crate::hardware::arms::yourarm::golden::{self, JOINTS, POSE, bytes};
+use proptest::prelude::*;
+
+#[test]
+fn commands_are_the_golden_bytes() {
+    let mut frame = [0; MAX_FRAME];
+    for (command, sequence, golden) in [
+        (Command::Hello, 1, golden::HELLO),
+        (Command::GetState, 2, golden::GET_STATE),
+        (Command::SetMode(Mode::Servo), 3, golden::SET_MODE),
+        (Command::Enable(true), 4, golden::ENABLE),
+        (Command::ClearError, 5, golden::CLEAR_ERROR),
+        (Command::Stop, 0xFFFE, golden::STOP),
+        (Command::MoveJoints { speed: 25.0, joints: JOINTS }, 7, golden::MOVE_JOINTS),
+        (Command::ServoJoints(JOINTS), 8, golden::SERVO_JOINTS),
+        (Command::VelocityJoints([1.5, 0.0, 0.0, 0.0, 0.0, -90.0]), 9, golden::VELOCITY_JOINTS),
+        (Command::MoveCartesian { speed: 50.0, pose: POSE }, 10, golden::MOVE_CARTESIAN),
+        (Command::Gripper(42.5), 11, golden::GRIPPER),
+    ] {
+        assert_eq!(encode(&command, sequence, &mut frame), bytes(golden), "{}", command.name());
+    }
+}
+
+#[test]
+fn replies_are_read_from_the_golden_bytes() {
+    let reply = bytes(golden::HELLO_REPLY);
+    let Scan::Take(length, reply_to_hello) = scan(&reply, 0x01, 1) else { panic!("no reply") };
+    let serial = "YA6-00042".to_owned();
+    let hello = Hello { model: MODEL.into(), dof: 6, firmware: [2, 1, 3], serial };
+    assert_eq!((length, Hello::decode(reply_to_hello.data)), (reply.len(), Some(hello)));
+
+    let reply = bytes(golden::STATE_REPLY);
+    let Scan::Take(_, state) = scan(&reply, 0x02, 2) else { panic!("no reply") };
+    let expected = State {
+        time_us: 123_456_789,
+        state: 2,
+        mode: Mode::Servo,
+        enabled: true,
+        gripper_fitted: true,
+        error: 0,
+        positions: JOINTS,
+        velocities: [1.0, -2.0, 3.0, -4.0, 5.0, -6.0],
+        torques: [0.5, -0.5, 1.0, -1.0, 2.0, -2.0],
+        gripper: 42.5,
+        pose: POSE,
+    };
+    assert_eq!(State::decode(state.data), Some(expected));
+
+    let reply = bytes(golden::IN_ERROR_REPLY);
+    let Scan::Take(_, refusal) = scan(&reply, 0x11, 8) else { panic!("no reply") };
+    assert_eq!((refusal.status, decode_refusal(refusal.data)), (Status::Refused(IN_ERROR), Some(2)));
+    let reply = bytes(golden::STOP_REPLY);
+    assert_eq!(scan(&reply, 0x06, 0xFFFE), Scan::Take(11, Reply { status: Status::Ok, data: &[] }));
+}
+
+#[test]
+fn noise_damage_and_foreign_replies_are_skipped() {
+    let good = bytes(golden::STOP_REPLY);
+    assert_eq!(scan(&good, 0x06, 1), Scan::Skip(good.len()), "another sequence number");
+    assert_eq!(scan(&good, 0x05, 0xFFFE), Scan::Skip(good.len()), "another command");
+    assert_eq!(scan(b"noiseYA", 0x06, 0xFFFE), Scan::Skip(5));
+    assert_eq!(scan(b"Y", 0x06, 0xFFFE), Scan::More);
+    for i in 0..good.len() {
+        assert_eq!(scan(&good[..i], 0x06, 0xFFFE), Scan::More, "{i} bytes of a frame");
+        let mut damaged = good.clone();
+        damaged[i] ^= 0x10;
+        assert!(!matches!(scan(&damaged, 0x06, 0xFFFE), Scan::Take(..)), "byte {i} damaged");
+    }
+}
+
+#[test]
+fn a_state_that_is_not_finite_or_has_other_joints_is_refused() {
+    let mut data = bytes(golden::STATE_REPLY)[9..123].to_vec();
+    assert!(State::decode(&data).is_some());
+    assert!(State::decode(&data[..113]).is_none());
+    data[11] = 7;
+    assert!(State::decode(&data).is_none(), "7 joints");
+    data[11] = 6;
+    data[14..18].copy_from_slice(&f32::NAN.to_le_bytes());
+    assert!(State::decode(&data).is_none(), "NaN");
+}
+
+proptest! {
+    #[test]
+    fn no_bytes_make_a_decoder_panic(noise in proptest::collection::vec(any::<u8>(), 0..300), magic: bool) {
+        let mut data = if magic { vec![b'Y', b'A', 1, 0x86] } else { vec![] };
+        data.extend(noise);
+        match scan(&data, 0x06, 1) {
+            Scan::More => prop_assert!(data.is_empty() || data[0] == b'Y'),
+            Scan::Skip(n) | Scan::Take(n, _) => prop_assert!(n >= 1 && n <= data.len()),
+        }
+        let _ = (Hello::decode(&data), State::decode(&data), decode_refusal(&data));
+    }
+}

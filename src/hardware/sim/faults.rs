@@ -1,0 +1,239 @@
+//! Scripted faults of simulated arms: what goes wrong, when, and for how long.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// What goes wrong. Not every simulated arm can play every kind; each names those it can.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FaultKind {
+    /// Reads fail.
+    ReadError,
+    /// Writes fail.
+    WriteError,
+    /// The arm does not answer until `duration` is over (1 s when none is given), then answers as if nothing was.
+    Stall,
+    /// Requests are never answered.
+    Silent,
+    /// The connection breaks.
+    Disconnect,
+    /// The arm goes into error `code`: it stops and refuses motion until the error is cleared.
+    ErrorCode,
+    /// The E-stop line opens: the arm stops and its motors lose power. It closes after `duration`, if one is given.
+    Estop,
+    /// The arm loses power: its connection breaks, its motors are off, it is unreachable for `duration`.
+    PowerLoss,
+    /// The adapter panics.
+    Panic,
+    /// Joint positions are reported as NaN.
+    Nan,
+    /// Joint positions and velocities are reported as zero.
+    ZeroState,
+    /// Noise stands before an answer.
+    Garbage,
+    /// One byte of an answer is wrong.
+    Corrupt,
+    /// Only the first half of an answer arrives.
+    Truncated,
+    /// The arm says that it has one joint more than it has.
+    WrongDof,
+    /// The arm sinks by `amount` [rad] at its second joint when its motors are enabled.
+    Sag,
+    /// Joint number `joint` does not move for `duration`.
+    Blocked,
+}
+
+/// One fault of a script.
+///
+/// It begins `at` seconds after the first connection. From then on it is active for `duration` seconds, and strikes
+/// at most `count` times. Without either it strikes once.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Fault {
+    /// When it begins: time since the first connection [s].
+    #[serde(default, deserialize_with = "seconds")]
+    #[schemars(range(min = 0))]
+    pub at: f64,
+    /// What goes wrong.
+    pub kind: FaultKind,
+    /// How long it stays active [s]; 0 = until it has struck `count` times.
+    #[serde(default, deserialize_with = "seconds")]
+    #[schemars(range(min = 0))]
+    pub duration: f64,
+    /// How often it strikes; 0 = without limit during `duration`.
+    #[serde(default)]
+    pub count: u32,
+    /// The arm's error code, for `error_code`.
+    #[serde(default = "default_code")]
+    #[schemars(range(min = 1))]
+    pub code: u16,
+    /// How far the arm sinks, for `sag` [rad].
+    #[serde(default = "default_amount", deserialize_with = "seconds")]
+    pub amount: f64,
+    /// Which joint, counted from 1, for `blocked`.
+    #[serde(default = "default_joint")]
+    #[schemars(range(min = 1))]
+    pub joint: usize,
+}
+
+fn default_code() -> u16 {
+    2
+}
+
+fn default_amount() -> f64 {
+    0.05
+}
+
+fn default_joint() -> usize {
+    1
+}
+
+/// A finite number that is not negative.
+fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    let value = f64::deserialize(deserializer)?;
+    if value.is_finite() && value >= 0.0 {
+        Ok(value)
+    } else {
+        Err(serde::de::Error::custom(format!("{value} is not a finite number of at least 0")))
+    }
+}
+
+impl Fault {
+    /// A fault that strikes once, at once.
+    pub fn new(kind: FaultKind) -> Self {
+        Self {
+            at: 0.0,
+            kind,
+            duration: 0.0,
+            count: 0,
+            code: default_code(),
+            amount: default_amount(),
+            joint: default_joint(),
+        }
+    }
+
+    /// The same, beginning `at` seconds after the first connection (injected: from now).
+    pub fn at(mut self, at: f64) -> Self {
+        self.at = at;
+        self
+    }
+
+    /// The same, active for `duration` seconds.
+    pub fn lasting(mut self, duration: f64) -> Self {
+        self.duration = duration;
+        self
+    }
+
+    /// The same, striking `count` times.
+    pub fn times(mut self, count: u32) -> Self {
+        self.count = count;
+        self
+    }
+
+    /// The same, with the arm's error code.
+    pub fn code(mut self, code: u16) -> Self {
+        self.code = code;
+        self
+    }
+
+    /// When the fault is over [s since the first connection], where it has a duration.
+    pub fn end(&self) -> Option<f64> {
+        (self.duration > 0.0).then_some(self.at + self.duration)
+    }
+}
+
+/// A script and how much of it has been played.
+#[derive(Debug, Clone, Default)]
+pub struct FaultScript {
+    entries: Vec<(Fault, u32)>,
+}
+
+impl FaultScript {
+    /// A script that has not begun.
+    pub fn new(faults: &[Fault]) -> Self {
+        Self { entries: faults.iter().map(|fault| (*fault, 0)).collect() }
+    }
+
+    /// Adds a fault that begins `fault.at` seconds after `now` [s since the first connection].
+    pub fn inject(&mut self, mut fault: Fault, now: f64) {
+        fault.at += now;
+        self.entries.retain(|entry| !Self::over(entry, now));
+        self.entries.push((fault, 0));
+    }
+
+    /// The fault of this kind that strikes at `now` [s since the first connection], counted as one strike.
+    pub fn take(&mut self, kind: FaultKind, now: f64) -> Option<Fault> {
+        let entry = self
+            .entries
+            .iter_mut()
+            .find(|entry| entry.0.kind == kind && now >= entry.0.at && !Self::over(entry, now))?;
+        entry.1 += 1;
+        Some(entry.0)
+    }
+
+    fn over((fault, struck): &(Fault, u32), now: f64) -> bool {
+        let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
+        (limit > 0 && *struck >= limit) || fault.end().is_some_and(|end| now >= end)
+    }
+}
+
+/// Refuses a script with kinds that the simulated arm `name` cannot play.
+pub fn check_kinds(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), String> {
+    match faults.iter().find(|fault| !playable.contains(&fault.kind)) {
+        None => Ok(()),
+        Some(fault) => {
+            let word = |kind: &FaultKind| serde_json::to_value(kind).map_or(String::new(), |v| v.to_string());
+            let known: Vec<String> = playable.iter().map(word).collect();
+            Err(format!("{name} cannot play the fault {}; it can play {}", word(&fault.kind), known.join(", ")))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_without_count_or_duration_strikes_once() {
+        let mut script = FaultScript::new(&[Fault::new(FaultKind::ReadError).at(1.0)]);
+        assert_eq!(script.take(FaultKind::ReadError, 0.9), None);
+        assert_eq!(script.take(FaultKind::WriteError, 1.0), None);
+        assert!(script.take(FaultKind::ReadError, 1.0).is_some());
+        assert_eq!(script.take(FaultKind::ReadError, 1.1), None);
+    }
+
+    #[test]
+    fn duration_and_count_bound_a_fault() {
+        let fault = Fault::new(FaultKind::Nan).at(1.0).lasting(2.0).times(2);
+        let mut script = FaultScript::new(&[fault, Fault::new(FaultKind::Silent).lasting(0.5)]);
+        assert!(script.take(FaultKind::Nan, 1.0).is_some());
+        assert!(script.take(FaultKind::Nan, 2.0).is_some());
+        assert!(script.take(FaultKind::Nan, 2.5).is_none(), "struck twice already");
+        assert!((0..100).all(|_| script.take(FaultKind::Silent, 0.4).is_some()), "no count: any number of times");
+        assert!(script.take(FaultKind::Silent, 0.5).is_none(), "its duration is over");
+    }
+
+    #[test]
+    fn injected_faults_count_from_now() {
+        let mut script = FaultScript::default();
+        script.inject(Fault::new(FaultKind::Stall).at(0.5), 10.0);
+        assert!(script.take(FaultKind::Stall, 10.4).is_none());
+        assert!(script.take(FaultKind::Stall, 10.5).is_some());
+    }
+
+    #[test]
+    fn the_written_form_is_strict() {
+        let read = serde_json::from_str::<Fault>;
+        let fault = read(r#"{"at": 2.0, "kind": "error_code", "code": 3}"#).unwrap();
+        assert_eq!((fault.at, fault.kind, fault.code), (2.0, FaultKind::ErrorCode, 3));
+        assert!(read(r#"{"kind": "error_code", "cod": 3}"#).is_err());
+        assert!(read(r#"{"kind": "explode"}"#).is_err());
+        assert!(read(r#"{"kind": "stall", "at": -1}"#).is_err());
+    }
+
+    #[test]
+    fn kinds_that_cannot_be_played_are_named() {
+        let wrong = check_kinds("mock", &[Fault::new(FaultKind::Garbage)], &[FaultKind::Stall]).unwrap_err();
+        assert_eq!(wrong, r#"mock cannot play the fault "garbage"; it can play "stall""#);
+    }
+}

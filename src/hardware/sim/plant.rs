@@ -1,0 +1,369 @@
+//! The joints of a simulated arm: position, velocity, limits, and how they follow what they are told.
+//!
+//! Time is passed in ([`Plant::advance`]), so the same inputs give the same motion on any machine. Nothing here
+//! allocates after construction.
+
+use crate::joint::{JointLimits, Joints, MAX_DOF};
+
+/// The longest step of integration [s].
+const STEP: f64 = 0.002;
+/// The most waiting time that an ideal joint may make up for in one jump [s].
+const CREDIT: f64 = 0.1;
+/// Speed at which a sagging joint sinks [rad/s].
+const SAG_SPEED: f64 = 0.25;
+/// Viscous friction [Nm·s/rad].
+const FRICTION: f64 = 0.5;
+/// Below these a joint that follows a target has arrived [rad, rad/s].
+const ARRIVED: (f64, f64) = (1e-7, 1e-4);
+
+/// How joints follow servo set points and velocities.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Tracking {
+    /// At once, as far as the velocity limit allows.
+    Ideal,
+    /// First-order with this time constant [s], within the acceleration limit.
+    Lag(f64),
+}
+
+/// What drives the joints.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Drive {
+    /// Motors off: brakes hold, or the arm falls.
+    Disabled,
+    /// Motors on: decelerates to standstill and holds.
+    Stop,
+    /// On its own trapezoid to the target.
+    Position,
+    /// Follows set points.
+    Servo,
+    /// Keeps a velocity.
+    Velocity,
+}
+
+#[derive(Debug, Clone, Copy, Default)]
+struct Joint {
+    position: f64,
+    velocity: f64,
+    /// Target position [rad] or velocity [rad/s].
+    target: f64,
+    lower: f64,
+    upper: f64,
+    velocity_max: f64,
+    acceleration: f64,
+    /// Time in which an ideal joint has not moved although it might have [s].
+    credit: f64,
+    blocked: bool,
+}
+
+/// Up to [`MAX_DOF`] joints with their motors.
+#[derive(Debug, Clone)]
+pub struct Plant {
+    joints: [Joint; MAX_DOF],
+    dof: usize,
+    drive: Drive,
+    tracking: Tracking,
+    /// Fraction of the top speed in drive `Position` (0–1].
+    speed: f64,
+    /// Speed at which joints fall to their lower limits when disabled [rad/s]; 0 = brakes hold.
+    fall: f64,
+    /// How far the second joint still has to sink [rad].
+    sag: f64,
+    /// Time since the last servo set point, and between the two before [s].
+    since_set_point: f64,
+    interval: f64,
+}
+
+impl Plant {
+    /// Joints within `limits` (defaults where they state no acceleration), at rest at `initial` [rad], disabled.
+    /// `fall` [rad/s] is the speed at which they sink when disabled, 0 for an arm with brakes.
+    pub fn new(limits: &JointLimits, initial: &[f64], tracking: Tracking, fall: f64) -> Self {
+        let limits = limits.clone().with_defaults();
+        let mut joints = [Joint::default(); MAX_DOF];
+        let dof = limits.position_lower.len().min(MAX_DOF);
+        for (i, joint) in joints.iter_mut().take(dof).enumerate() {
+            let of = |values: &[f64]| values.get(i).copied().unwrap_or_default();
+            joint.lower = of(&limits.position_lower);
+            joint.upper = of(&limits.position_upper).max(joint.lower);
+            joint.velocity_max = of(&limits.velocity_max);
+            joint.acceleration = of(&limits.acceleration_max);
+            joint.position = of(initial).clamp(joint.lower, joint.upper);
+        }
+        let (speed, sag, since_set_point, interval) = (1.0, 0.0, 0.0, 0.0);
+        Self { joints, dof, drive: Drive::Disabled, tracking, speed, fall, sag, since_set_point, interval }
+    }
+
+    /// Joint positions [rad].
+    pub fn positions(&self) -> Joints {
+        self.joints.map(|joint| joint.position)
+    }
+
+    /// Joint velocities [rad/s].
+    pub fn velocities(&self) -> Joints {
+        self.joints.map(|joint| joint.velocity)
+    }
+
+    /// Joint torques [Nm]: friction only.
+    pub fn efforts(&self) -> Joints {
+        self.joints.map(|joint| joint.velocity * FRICTION)
+    }
+
+    /// What drives the joints now.
+    pub fn drive(&self) -> Drive {
+        self.drive
+    }
+
+    /// Whether the motors are on.
+    pub fn enabled(&self) -> bool {
+        self.drive != Drive::Disabled
+    }
+
+    /// Whether any joint is faster than 1 mrad/s, or has still to move to a target of its own.
+    pub fn moving(&self) -> bool {
+        self.active().iter().any(|joint| {
+            joint.velocity.abs() > 1e-3
+                || (self.drive == Drive::Position && joint.position != joint.target && !joint.blocked)
+        })
+    }
+
+    /// Switches the motors on, holding where the arm is, or off.
+    pub fn enable(&mut self, on: bool) {
+        if on != self.enabled() {
+            self.drive = if on { Drive::Stop } else { Drive::Disabled };
+        }
+    }
+
+    /// Decelerates to standstill and holds. Nothing when disabled.
+    pub fn stop(&mut self) {
+        if self.enabled() {
+            self.drive = Drive::Stop;
+        }
+    }
+
+    /// Moves to `target` [rad] at a fraction of the top speed (0–1].
+    pub fn move_to(&mut self, target: &[f64], speed: f64) {
+        self.speed = if speed.is_finite() { speed.clamp(0.01, 1.0) } else { 0.01 };
+        self.drive_to(Drive::Position, target);
+    }
+
+    /// Follows a set point [rad].
+    pub fn servo(&mut self, target: &[f64]) {
+        if !self.drive_to(Drive::Servo, target) {
+            return;
+        }
+        self.interval = self.since_set_point.clamp(1e-3, CREDIT);
+        self.since_set_point = 0.0;
+        if self.tracking == Tracking::Ideal {
+            let interval = self.interval;
+            for joint in self.active_mut().iter_mut().filter(|joint| !joint.blocked) {
+                let reach = joint.velocity_max * joint.credit;
+                let step = (joint.target - joint.position).clamp(-reach, reach);
+                joint.position += step;
+                joint.velocity = (step / interval).clamp(-joint.velocity_max, joint.velocity_max);
+                joint.credit = 0.0;
+            }
+        }
+    }
+
+    /// Keeps a velocity [rad/s].
+    pub fn velocity(&mut self, target: &[f64]) {
+        self.drive_to(Drive::Velocity, target);
+    }
+
+    /// Lets the second joint sink by `amount` [rad].
+    pub fn sag(&mut self, amount: f64) {
+        self.sag = amount.max(0.0);
+    }
+
+    /// Blocks a joint (index from 0) where it is, or frees it.
+    pub fn block(&mut self, joint: usize, blocked: bool) {
+        if let Some(joint) = self.active_mut().get_mut(joint) {
+            joint.blocked = blocked;
+        }
+    }
+
+    /// Lets `dt` [s] pass.
+    pub fn advance(&mut self, dt: f64) {
+        let mut left = if dt.is_finite() { dt.max(0.0) } else { 0.0 };
+        while left > 0.0 {
+            if self.at_rest() {
+                self.since_set_point += left;
+                self.active_mut().iter_mut().for_each(|joint| joint.credit = (joint.credit + left).min(CREDIT));
+                return;
+            }
+            // Steps of equal length up to the end, so that a remainder of rounding is not a step of its own.
+            let h = if left < STEP * 1.5 { left } else { STEP };
+            self.step(h);
+            left -= h;
+        }
+    }
+
+    fn active(&self) -> &[Joint] {
+        self.joints.get(..self.dof).unwrap_or_default()
+    }
+
+    fn active_mut(&mut self) -> &mut [Joint] {
+        self.joints.get_mut(..self.dof).unwrap_or_default()
+    }
+
+    /// Takes over new targets; a joint whose value is missing or not finite stays where it is. `false` when disabled.
+    fn drive_to(&mut self, drive: Drive, target: &[f64]) -> bool {
+        if !self.enabled() {
+            return false;
+        }
+        self.drive = drive;
+        for (i, joint) in self.active_mut().iter_mut().enumerate() {
+            let value = target.get(i).copied().unwrap_or(f64::NAN);
+            let (low, high, stay) = match drive {
+                Drive::Velocity => (-joint.velocity_max, joint.velocity_max, 0.0),
+                _ => (joint.lower, joint.upper, joint.position),
+            };
+            joint.target = if value.is_finite() { value.clamp(low, high) } else { stay };
+        }
+        true
+    }
+
+    fn at_rest(&self) -> bool {
+        let still = |joint: &Joint| joint.velocity == 0.0;
+        self.sag <= 0.0
+            && match self.drive {
+                Drive::Disabled => {
+                    self.active().iter().all(|j| still(j) && (self.fall == 0.0 || j.position <= j.lower))
+                }
+                Drive::Stop => self.active().iter().all(still),
+                Drive::Position | Drive::Servo => self.active().iter().all(|j| still(j) && j.position == j.target),
+                Drive::Velocity => self.active().iter().all(|j| still(j) && j.target == 0.0),
+            }
+    }
+
+    fn step(&mut self, h: f64) {
+        self.since_set_point += h;
+        let pause = self.since_set_point > 1.5 * self.interval;
+        let (drive, tracking, speed, fall) = (self.drive, self.tracking, self.speed, self.fall);
+        for joint in self.active_mut() {
+            if joint.blocked {
+                joint.velocity = 0.0;
+                continue;
+            }
+            match (drive, tracking) {
+                (Drive::Disabled, _) => joint.fall(fall, h),
+                (Drive::Stop, _) => joint.accelerate(0.0, h),
+                (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, h),
+                (Drive::Servo, Tracking::Lag(lag)) => joint.approach(joint.velocity_max, lag, h),
+                (Drive::Servo, Tracking::Ideal) => joint.follow(pause, h),
+                (Drive::Velocity, Tracking::Lag(_)) => {
+                    let room = if joint.target > 0.0 { joint.upper } else { joint.lower } - joint.position;
+                    let brake = braking_speed(room.abs(), joint.acceleration, h);
+                    joint.accelerate(joint.target.clamp(-brake, brake), h);
+                }
+                (Drive::Velocity, Tracking::Ideal) => {
+                    joint.velocity = joint.target;
+                    joint.travel(h);
+                }
+            }
+        }
+        if self.sag > 0.0 {
+            let sink = self.sag.min(SAG_SPEED * h);
+            self.sag = if self.sag > sink { self.sag - sink } else { 0.0 };
+            if let Some(joint) = self.active_mut().get_mut(1) {
+                joint.position = (joint.position - sink).max(joint.lower);
+            }
+        }
+    }
+}
+
+/// The speed from which a joint can still stop within `distance` [rad], braking at `acceleration` [rad/s²] in
+/// steps of `h` [s].
+fn braking_speed(distance: f64, acceleration: f64, h: f64) -> f64 {
+    let dv = acceleration * h;
+    let speed = 0.5 * ((dv * dv + 8.0 * acceleration * distance).sqrt() - dv);
+    speed.min(distance / h)
+}
+
+impl Joint {
+    fn travel(&mut self, h: f64) {
+        self.position += self.velocity * h;
+        if self.position < self.lower || self.position > self.upper {
+            self.position = self.position.clamp(self.lower, self.upper);
+            self.velocity = 0.0;
+        }
+    }
+
+    fn accelerate(&mut self, velocity: f64, h: f64) {
+        let dv = self.acceleration * h;
+        self.velocity += (velocity - self.velocity).clamp(-dv, dv);
+        self.travel(h);
+    }
+
+    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time.
+    fn approach(&mut self, top: f64, lag: f64, h: f64) {
+        let error = self.target - self.position;
+        if error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(self.acceleration * h) {
+            (self.position, self.velocity) = (self.target, 0.0);
+            return;
+        }
+        let wanted = error.abs() / lag.max(h);
+        let brake = braking_speed(error.abs(), self.acceleration, h);
+        self.accelerate(wanted.min(brake).min(top).copysign(error), h);
+    }
+
+    /// An ideal joint between set points: makes the rest of its way at top speed, then stands.
+    fn follow(&mut self, pause: bool, h: f64) {
+        let error = self.target - self.position;
+        if error != 0.0 {
+            let step = error.clamp(-self.velocity_max * h, self.velocity_max * h);
+            self.position = if step == error { self.target } else { self.position + step };
+            self.velocity = step / h;
+            self.credit = 0.0;
+        } else {
+            self.credit = (self.credit + h).min(CREDIT);
+            if pause {
+                self.velocity = 0.0;
+            }
+        }
+    }
+
+    fn fall(&mut self, speed: f64, h: f64) {
+        self.velocity = if self.position > self.lower { -speed } else { 0.0 };
+        self.travel(h);
+    }
+}
+
+/// A gripper with finite speed.
+#[derive(Debug, Clone, Copy)]
+pub struct Gripper {
+    /// Opening [m].
+    pub position: f64,
+    target: f64,
+    max: f64,
+    speed: f64,
+}
+
+impl Gripper {
+    /// A gripper that opens to `max` [m] at `speed` [m/s]; half open.
+    pub fn new(max: f64, speed: f64) -> Self {
+        Self { position: max / 2.0, target: max / 2.0, max, speed }
+    }
+
+    /// Moves to an opening [m].
+    pub fn move_to(&mut self, target: f64) {
+        if target.is_finite() {
+            self.target = target.clamp(0.0, self.max);
+        }
+    }
+
+    /// Stays where it is.
+    pub fn stop(&mut self) {
+        self.target = self.position;
+    }
+
+    /// Lets `dt` [s] pass.
+    pub fn advance(&mut self, dt: f64) {
+        let reach = self.speed * dt.max(0.0);
+        let error = self.target - self.position;
+        self.position = if error.abs() <= reach { self.target } else { self.position + reach.copysign(error) };
+    }
+}
+
+#[cfg(test)]
+#[path = "plant_tests.rs"]
+mod tests;

@@ -1,0 +1,132 @@
+use super::*;
+
+fn plant(tracking: Tracking) -> Plant {
+    let limits = JointLimits { acceleration_max: vec![10.0; 2], ..JointLimits::uniform(2, 2.0, 1.0) };
+    let mut plant = Plant::new(&limits, &[0.5, -0.5], tracking, 0.0);
+    plant.enable(true);
+    plant
+}
+
+/// Advances in steps of 1 ms and checks velocity, acceleration and position limits at every one.
+fn run(plant: &mut Plant, seconds: f64, mut each: impl FnMut(&Plant)) {
+    for _ in 0..(seconds * 1000.0).round() as usize {
+        let before = plant.velocities();
+        plant.advance(1e-3);
+        for ((v, v0), p) in plant.velocities().iter().zip(before).zip(plant.positions()) {
+            assert!(v.abs() <= 1.0 + 1e-9, "velocity {v}");
+            assert!((v - v0).abs() <= 10.0 * 1e-3 + 1e-9, "acceleration {}", (v - v0) / 1e-3);
+            assert!(p.abs() <= 2.0, "position {p}");
+        }
+        each(plant);
+    }
+}
+
+#[test]
+fn position_moves_on_a_trapezoid_and_lands_exactly() {
+    let mut plant = plant(Tracking::Lag(0.02));
+    plant.move_to(&[1.5, -0.49], 0.5);
+    let mut top: f64 = 0.0;
+    run(&mut plant, 2.5, |p| top = top.max(p.velocities()[0]));
+    assert!((top - 0.5).abs() < 1e-9, "half speed: {top}");
+    assert_eq!(plant.positions()[..2], [1.5, -0.49]);
+    assert_eq!(plant.velocities()[..2], [0.0, 0.0]);
+    assert!(!plant.moving());
+}
+
+#[test]
+fn a_lagging_servo_follows_a_ramp_one_time_constant_behind() {
+    let mut plant = plant(Tracking::Lag(0.02));
+    let mut target = 0.5;
+    for _ in 0..100 {
+        target += 0.5 * 0.01;
+        plant.servo(&[target, -0.5]);
+        run(&mut plant, 0.01, |_| ());
+    }
+    let behind = target - plant.positions()[0];
+    assert!((0.002..0.02).contains(&behind), "behind by {behind}");
+    run(&mut plant, 1.0, |_| ());
+    assert_eq!(plant.positions()[..2], [target, -0.5]);
+}
+
+#[test]
+fn an_ideal_servo_is_there_at_once_within_its_speed() {
+    let mut plant = plant(Tracking::Ideal);
+    plant.advance(0.01);
+    plant.servo(&[0.505, -0.5]);
+    assert_eq!(plant.positions()[0], 0.505);
+    assert!((plant.velocities()[0] - 0.5).abs() < 1e-9);
+    plant.advance(0.01);
+    plant.servo(&[0.605, -0.5]);
+    assert!((plant.positions()[0] - 0.515).abs() < 1e-9, "10 ms at 1 rad/s, not further");
+    plant.advance(0.05);
+    assert!((plant.positions()[0] - 0.565).abs() < 1e-9, "goes on at top speed");
+    plant.servo(&[0.605, -0.5]);
+    assert!((plant.positions()[0] - 0.565).abs() < 1e-9, "time on the way counts only once");
+    plant.advance(1.0);
+    assert_eq!((plant.positions()[0], plant.velocities()[0]), (0.605, 0.0));
+}
+
+#[test]
+fn velocity_integrates_stops_at_limits_and_stop_decelerates() {
+    let mut ideal = plant(Tracking::Ideal);
+    ideal.velocity(&[0.25, -9.0]);
+    ideal.advance(1.0);
+    assert!((ideal.positions()[0] - 0.75).abs() < 1e-9 && (ideal.positions()[1] + 1.5).abs() < 1e-9);
+    let mut lagging = plant(Tracking::Lag(0.02));
+    lagging.velocity(&[1.0, -1.0]);
+    run(&mut lagging, 3.0, |_| ());
+    assert!((lagging.positions()[0] - 2.0).abs() < 1e-3, "brakes before its limit");
+    lagging.velocity(&[-1.0, 0.0]);
+    run(&mut lagging, 0.5, |_| ());
+    lagging.stop();
+    run(&mut lagging, 0.11, |_| ());
+    assert_eq!(lagging.velocities()[..2], [0.0, 0.0], "1 rad/s at 10 rad/s² takes 0.1 s");
+}
+
+#[test]
+fn disabled_holds_with_brakes_and_falls_without() {
+    let mut braked = plant(Tracking::Ideal);
+    braked.enable(false);
+    braked.servo(&[0.0, 0.0]);
+    braked.advance(1.0);
+    assert_eq!(braked.positions()[..2], [0.5, -0.5]);
+    let mut falling = Plant::new(&JointLimits::uniform(2, 2.0, 1.0), &[0.5, -0.5], Tracking::Ideal, 0.2);
+    falling.advance(1.0);
+    assert!((falling.positions()[0] - 0.3).abs() < 1e-9);
+    falling.advance(100.0);
+    assert_eq!(falling.positions()[..2], [-2.0, -2.0]);
+}
+
+#[test]
+fn sag_and_block_disturb_one_joint() {
+    let mut plant = plant(Tracking::Lag(0.02));
+    plant.sag(0.05);
+    plant.block(0, true);
+    plant.advance(1.0);
+    assert!((plant.positions()[1] + 0.55).abs() < 1e-9);
+    plant.move_to(&[0.0, 0.0], 1.0);
+    plant.advance(3.0);
+    assert_eq!(plant.positions()[..2], [0.5, 0.0]);
+}
+
+#[test]
+fn nonsense_moves_nothing() {
+    let mut plant = plant(Tracking::Ideal);
+    plant.servo(&[f64::NAN, f64::INFINITY]);
+    plant.advance(f64::NAN);
+    plant.advance(-1.0);
+    plant.advance(0.1);
+    plant.velocity(&[f64::NAN]);
+    plant.advance(0.1);
+    assert_eq!(plant.positions()[..2], [0.5, -0.5]);
+}
+
+#[test]
+fn gripper_has_a_finite_speed() {
+    let mut gripper = Gripper::new(0.08, 0.1);
+    gripper.move_to(1.0);
+    gripper.advance(0.1);
+    assert!((gripper.position - 0.05).abs() < 1e-12);
+    gripper.advance(10.0);
+    assert_eq!(gripper.position, 0.08);
+}

@@ -1,0 +1,3 @@
+//! Ways to reach a device, shared by the arms.
+
+pub mod tcp;

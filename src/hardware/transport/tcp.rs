@@ -1,0 +1,287 @@
+//! A TCP connection to a controller: bounded connecting, bounded waiting, frames out of a byte stream.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::{IpAddr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use crate::hardware::spec::{AdapterError, AdapterResult};
+
+/// Most bytes that may wait for the rest of their frame.
+const BUFFER: usize = 4096;
+/// A peer that acknowledges nothing for this long is gone [ms].
+const USER_TIMEOUT_MS: u32 = 1000;
+
+/// Where a controller listens.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Endpoint {
+    /// IPv4 or IPv6 address, or a name.
+    pub host: String,
+    /// TCP port.
+    pub port: u16,
+}
+
+impl Endpoint {
+    /// Reads `HOST[:PORT]`; an IPv6 address with a port stands in brackets. Asks nobody.
+    pub fn parse(address: &str, default_port: u16) -> Result<Self, String> {
+        let (host, port) = if let Some(rest) = address.strip_prefix('[') {
+            let (host, port) = rest.split_once(']').ok_or_else(|| format!("{address:?} lacks the closing bracket"))?;
+            host.parse::<Ipv6Addr>().map_err(|_| format!("{host:?} is not an IPv6 address"))?;
+            match port {
+                "" => (host, None),
+                _ => (host, Some(port.strip_prefix(':').ok_or_else(|| format!("{port:?} is not a port"))?)),
+            }
+        } else if address.parse::<Ipv6Addr>().is_ok() {
+            (address, None)
+        } else {
+            match address.split_once(':') {
+                Some((host, port)) => (host, Some(port)),
+                None => (address, None),
+            }
+        };
+        if host.is_empty() {
+            return Err("the host is missing".into());
+        }
+        let is_name = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '.' | '_');
+        let numeric = host.chars().all(|c| c.is_ascii_digit() || c == '.');
+        if host.parse::<IpAddr>().is_err() && (numeric || !host.chars().all(is_name)) {
+            return Err(format!("{host:?} is neither an IP address nor a host name"));
+        }
+        let port = match port {
+            None => default_port,
+            Some(text) => match text.parse() {
+                Ok(port) if port != 0 => port,
+                _ => return Err(format!("{text:?} is not a port (1 to 65535)")),
+            },
+        };
+        Ok(Self { host: host.to_owned(), port })
+    }
+
+    /// Looks the name up, within `timeout`.
+    fn resolve(&self, timeout: Duration) -> Result<SocketAddr, String> {
+        if let Ok(ip) = self.host.parse::<IpAddr>() {
+            return Ok(SocketAddr::new(ip, self.port));
+        }
+        // The system's resolver knows no deadline, so it gets a thread of its own, left behind when it is late.
+        let (sender, receiver) = mpsc::channel();
+        let target = (self.host.clone(), self.port);
+        std::thread::Builder::new()
+            .name("resolve".into())
+            .spawn(move || drop(sender.send(target.to_socket_addrs().map(|mut found| found.next()))))
+            .map_err(|e| e.to_string())?;
+        match receiver.recv_timeout(timeout) {
+            Ok(Ok(Some(address))) => Ok(address),
+            Ok(_) => Err("the host name is not known".into()),
+            Err(_) => Err("looking up the host name took too long".into()),
+        }
+    }
+}
+
+impl std::fmt::Display for Endpoint {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { host, port } = self;
+        if host.contains(':') { write!(f, "[{host}]:{port}") } else { write!(f, "{host}:{port}") }
+    }
+}
+
+/// What stands at the front of the received bytes, as a protocol sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Scan<T> {
+    /// The beginning of a frame; more bytes are needed.
+    More,
+    /// So many bytes (at least 1) are not the awaited frame.
+    Skip(usize),
+    /// The awaited frame, and how many bytes it takes.
+    Take(usize, T),
+}
+
+/// A connection over which frames go both ways.
+#[derive(Debug)]
+pub struct TcpLink {
+    stream: TcpStream,
+    peer: String,
+    buffer: Vec<u8>,
+    /// The received bytes that are not used up yet.
+    filled: std::ops::Range<usize>,
+    timeout: Duration,
+}
+
+impl TcpLink {
+    /// Connects within `timeout`, the look-up of a name included. `device` names the arm in messages.
+    pub fn connect(device: &str, endpoint: &Endpoint, timeout: Duration) -> AdapterResult<Self> {
+        let failed = |why: String| AdapterError::Io(format!("cannot connect to {device} at {endpoint}: {why}"));
+        let deadline = Instant::now() + timeout;
+        let address = endpoint.resolve(timeout).map_err(failed)?;
+        let left = deadline.saturating_duration_since(Instant::now()).max(Duration::from_millis(1));
+        let stream = TcpStream::connect_timeout(&address, left).map_err(|e| match e.kind() {
+            ErrorKind::TimedOut => {
+                AdapterError::Timeout(format!("cannot connect to {device} at {endpoint}: no answer within {timeout:?}"))
+            }
+            _ => failed(reason(&e)),
+        })?;
+        let prepare = || -> std::io::Result<()> {
+            stream.set_nodelay(true)?;
+            stream.set_read_timeout(Some(timeout))?;
+            stream.set_write_timeout(Some(timeout))?;
+            rustix::net::sockopt::set_socket_keepalive(&stream, true)?;
+            rustix::net::sockopt::set_tcp_keepidle(&stream, Duration::from_secs(1))?;
+            rustix::net::sockopt::set_tcp_keepintvl(&stream, Duration::from_secs(1))?;
+            rustix::net::sockopt::set_tcp_user_timeout(&stream, USER_TIMEOUT_MS)?;
+            Ok(())
+        };
+        prepare().map_err(|e| failed(reason(&e)))?;
+        let peer = format!("{device} at {endpoint}");
+        Ok(Self { stream, peer, buffer: vec![0; BUFFER], filled: 0..0, timeout })
+    }
+
+    /// The device and its address, for messages.
+    pub fn peer(&self) -> &str {
+        &self.peer
+    }
+
+    /// Sends all of `bytes`.
+    pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
+        self.stream.write_all(bytes).map_err(|e| self.broken(&e))
+    }
+
+    /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
+    /// a frame; it must skip what is not for it. `Timeout` leaves the connection usable; `Io` does not.
+    pub fn receive<T>(&mut self, timeout: Duration, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
+        let deadline = Instant::now() + timeout;
+        let mut left = timeout;
+        loop {
+            while !self.filled.is_empty() {
+                let bytes = self.buffer.get(self.filled.clone()).unwrap_or_default();
+                match scan(bytes) {
+                    Scan::More => break,
+                    Scan::Skip(n) => self.used(n.max(1)),
+                    Scan::Take(n, frame) => {
+                        self.used(n.max(1));
+                        return Ok(frame);
+                    }
+                }
+            }
+            if left.is_zero() {
+                return Err(AdapterError::Timeout(format!("{} did not answer within {timeout:?}", self.peer)));
+            }
+            self.fill(left)?;
+            left = deadline.saturating_duration_since(Instant::now());
+        }
+    }
+
+    fn used(&mut self, n: usize) {
+        self.filled.start = self.filled.start.saturating_add(n).min(self.filled.end);
+    }
+
+    /// Reads what has arrived, waiting up to `timeout`; nothing when nothing arrives.
+    fn fill(&mut self, timeout: Duration) -> AdapterResult<()> {
+        if self.timeout != timeout {
+            self.stream.set_read_timeout(Some(timeout)).map_err(|e| self.broken(&e))?;
+            self.timeout = timeout;
+        }
+        self.buffer.copy_within(self.filled.clone(), 0);
+        self.filled = 0..self.filled.len();
+        let room = self.buffer.get_mut(self.filled.end..).unwrap_or_default();
+        if room.is_empty() {
+            return Err(AdapterError::Protocol(format!("{} sent a frame that is too long", self.peer)));
+        }
+        match self.stream.read(room) {
+            Ok(0) => Err(AdapterError::Io(format!("{} closed the connection", self.peer))),
+            Ok(n) => {
+                self.filled.end += n;
+                Ok(())
+            }
+            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
+                Ok(())
+            }
+            Err(e) => Err(self.broken(&e)),
+        }
+    }
+
+    fn broken(&self, error: &std::io::Error) -> AdapterError {
+        AdapterError::Io(format!("the connection to {} broke: {}", self.peer, reason(error)))
+    }
+}
+
+/// An I/O error in plain words, without the system's number.
+fn reason(error: &std::io::Error) -> String {
+    match error.kind() {
+        ErrorKind::ConnectionRefused => "connection refused".into(),
+        ErrorKind::ConnectionReset => "connection reset".into(),
+        ErrorKind::BrokenPipe | ErrorKind::ConnectionAborted => "connection closed".into(),
+        ErrorKind::HostUnreachable => "host unreachable".into(),
+        ErrorKind::NetworkUnreachable => "network unreachable".into(),
+        ErrorKind::TimedOut | ErrorKind::WouldBlock => "no answer".into(),
+        _ => error.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::net::TcpListener;
+
+    #[test]
+    fn addresses() {
+        let ok = |text| Endpoint::parse(text, 9760).map(|e| e.to_string());
+        assert_eq!(ok("192.168.1.100"), Ok("192.168.1.100:9760".into()));
+        assert_eq!(ok("arm-1.local:77"), Ok("arm-1.local:77".into()));
+        assert_eq!(ok("::1"), Ok("[::1]:9760".into()));
+        assert_eq!(ok("[fe80::2]:80"), Ok("[fe80::2]:80".into()));
+        for bad in ["", ":80", "300.1.1.1", "1.2.3", "a b", "host:0", "host:99999", "host:", "[::1", "[::1]80", "a/b"] {
+            assert!(Endpoint::parse(bad, 9760).is_err(), "{bad:?}");
+        }
+    }
+
+    /// A peer that sends `pieces` one by one and then keeps the connection open until the client closes it.
+    fn peer(pieces: Vec<Vec<u8>>) -> Endpoint {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            for piece in pieces {
+                stream.write_all(&piece).unwrap();
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            let _ = stream.read(&mut [0; 1]);
+        });
+        Endpoint { host: "127.0.0.1".into(), port }
+    }
+
+    /// Frames of three bytes that begin with `#`.
+    fn scan(bytes: &[u8]) -> Scan<Vec<u8>> {
+        match bytes {
+            [b'#', _, _, ..] => Scan::Take(3, bytes[..3].to_vec()),
+            [b'#', ..] => Scan::More,
+            _ => Scan::Skip(1),
+        }
+    }
+
+    #[test]
+    fn frames_arrive_in_pieces_and_among_noise() {
+        let pieces = [&b"xx#"[..], b"a", b"b#cd!!!", b"#e"].map(<[u8]>::to_vec).to_vec();
+        let mut link = TcpLink::connect("test", &peer(pieces), Duration::from_secs(2)).unwrap();
+        let wait = Duration::from_secs(5);
+        assert_eq!(link.receive(wait, scan), Ok(b"#ab".to_vec()));
+        assert_eq!(link.receive(wait, scan), Ok(b"#cd".to_vec()));
+        let late = link.receive(Duration::from_millis(20), scan);
+        assert!(matches!(late, Err(AdapterError::Timeout(_))), "{late:?}");
+    }
+
+    #[test]
+    fn a_frame_without_end_is_an_error_not_a_hang() {
+        let endless = vec![b'#'; BUFFER];
+        let mut link = TcpLink::connect("test", &peer(vec![endless]), Duration::from_secs(2)).unwrap();
+        let result = link.receive::<()>(Duration::from_secs(5), |_| Scan::More);
+        assert!(matches!(result, Err(AdapterError::Protocol(_))), "{result:?}");
+    }
+
+    #[test]
+    fn failures_say_who_and_why() {
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let nobody = Endpoint { host: "127.0.0.1".into(), port };
+        let error = TcpLink::connect("yourarm", &nobody, Duration::from_secs(1)).unwrap_err();
+        let expected = format!("cannot connect to yourarm at 127.0.0.1:{port}: connection refused");
+        assert_eq!(error.to_string(), expected);
+    }
+}
