@@ -24,12 +24,16 @@ pub struct Pulse {
     pub beat: Arc<Beat>,
     /// Ticks made.
     pub ticks: AtomicU64,
+    /// Ticks that began a period or more too late.
+    pub overruns: AtomicU64,
     /// Whole periods skipped.
     pub skipped: AtomicU64,
     /// Whether the thread runs under FIFO.
     pub fifo: AtomicBool,
     /// Whether no arm is being moved by commands.
     pub at_rest: AtomicBool,
+    /// Somebody listens to the joint state: wake whoever publishes it after every tick.
+    pub streaming: AtomicBool,
     /// Set to end the thread after its present tick.
     pub stop: AtomicBool,
     /// Samples that found the ring full.
@@ -136,7 +140,7 @@ pub fn run(
                 replied |= ports.replies.push((*id, *outcome)).is_ok();
             }
         }
-        if replied {
+        if replied || pulse.streaming.load(Ordering::Relaxed) {
             ports.reply_wake.raise();
         }
         for motion in output.retired.drain(..) {
@@ -169,6 +173,7 @@ pub fn run(
         pulse.lateness.record(late_ns);
         pulse.compute.record(compute_ns);
         pulse.overwritten.fetch_add(overwritten, Ordering::Relaxed);
+        pulse.overruns.fetch_add(u64::from(skipped > 0), Ordering::Relaxed);
         pulse.skipped.fetch_add(skipped as u64, Ordering::Relaxed);
         pulse.ticks.store(tick + 1, Ordering::Release);
         pulse.cpu_ns.store(host::thread_cpu_time().as_nanos() as u64, Ordering::Relaxed);

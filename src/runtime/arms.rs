@@ -1,0 +1,234 @@
+//! All arms of a run: their locks, emulators and device threads, brought up and released together.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::device_lock::{self, DeviceLock};
+use super::{Options, StartError};
+use crate::arm::{ArmCommand, ArmState};
+use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
+use crate::hardware::registry::{AdapterConfig, Emulator, SIM};
+use crate::joint::JointLimits;
+use crate::rt::beat::Beat;
+use crate::rt::slot::{SlotReader, SlotWriter, slot};
+
+/// An adapter must know within this time whether its device answers; a little is added for the machine.
+const CONNECT_LIMIT: Duration = Duration::from_millis(3_500);
+/// How long an arm gets to enable.
+const ENABLE_LIMIT: Duration = Duration::from_secs(4);
+/// How long all arms together get to be released.
+const RELEASE_LIMIT: Duration = Duration::from_secs(2);
+
+/// The arms of a run.
+pub struct Arms {
+    /// Their device threads, in the blueprint's order.
+    pub devices: Vec<Arc<Device>>,
+    disable: Vec<bool>,
+    // Emulators end after the threads that talk to them, locks last.
+    _emulators: Vec<Box<dyn Emulator>>,
+    _locks: Vec<DeviceLock>,
+}
+
+/// The tick's ends of the slots.
+#[derive(Default)]
+pub struct Slots {
+    /// States in.
+    pub states: Vec<SlotReader<ArmState>>,
+    /// Commands out.
+    pub commands: Vec<SlotWriter<ArmCommand>>,
+}
+
+/// What came of connecting.
+pub struct BroughtUp {
+    /// The arms.
+    pub arms: Arms,
+    /// The tick's ends of the slots.
+    pub slots: Slots,
+    /// What each arm said of itself, and its effective limits.
+    pub connected: Vec<(Connected, JointLimits)>,
+    /// From when on a state is stale, per arm.
+    pub state_timeouts: Vec<Duration>,
+}
+
+/// Connects all arms at once, or none: on the first that fails, all others are let go again.
+pub fn bring_up(
+    blueprint: &Blueprint,
+    options: &Options,
+    beat: &Arc<Beat>,
+    note: impl Fn(usize, Note) + Clone + Send + 'static,
+) -> Result<BroughtUp, StartError> {
+    let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
+    let mut arms = Arms { devices: Vec::new(), disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
+    let mut slots = Slots::default();
+    let mut state_timeouts = Vec::new();
+    for (index, arm) in blueprint.arms.iter().enumerate() {
+        let config = configure(arm, &mut arms, options)?;
+        let adapter = (arm.adapter.create)(&config).map_err(|e| hardware(arm, &e))?;
+        let (state_writer, state_reader) = slot(ArmState::default());
+        let (command_writer, command_reader) = slot(ArmCommand::default());
+        let note = note.clone();
+        let device = DeviceConfig {
+            hardware_id: arm.hardware_id.clone(),
+            dof: arm.joints.len(),
+            tick_period: period,
+            native_rate: arm.adapter.native_rate,
+            velocity_max: (arm.adapter.limits)(arm.joints.len()).velocity_max.iter().copied().fold(0.1, f64::max),
+            beat: beat.clone(),
+            clock: Arc::new(MonotonicClock),
+            notes: Box::new(move |what| note(index, what)),
+        };
+        state_timeouts.push(device.state_timeout());
+        let thread = |e| StartError::other(format!("no device thread for {}: {e}", arm.hardware_id), "see ulimit -u");
+        arms.devices.push(Arc::new(Device::spawn(device, adapter, state_writer, command_reader).map_err(thread)?));
+        arms.disable.push(arm.on_exit == OnExit::Disable);
+        slots.states.push(state_reader);
+        slots.commands.push(command_writer);
+    }
+    let answers: Vec<_> = arms.devices.iter().map(|d| d.connect()).collect();
+    let limit = Instant::now() + CONNECT_LIMIT;
+    let results: Vec<_> = answers.into_iter().map(|a| a.wait(limit.saturating_duration_since(Instant::now()))).collect();
+    let mut connected = Vec::new();
+    for (arm, result) in blueprint.arms.iter().zip(results) {
+        let brought = result.map_err(|e| hardware(arm, &e)).and_then(|c| {
+            let limits = effective_limits(arm, &c.limits)?;
+            Ok((c, limits))
+        });
+        match brought {
+            Ok(pair) => connected.push(pair),
+            Err(error) => {
+                arms.release();
+                return Err(error);
+            }
+        }
+    }
+    Ok(BroughtUp { arms, slots, connected, state_timeouts })
+}
+
+/// Locks the device or starts its emulator; answers what the adapter is made from.
+fn configure(arm: &Arm, arms: &mut Arms, options: &Options) -> Result<AdapterConfig, StartError> {
+    let mut config = AdapterConfig {
+        hardware_id: arm.hardware_id.clone(),
+        address: arm.address.clone(),
+        dof: arm.joints.len(),
+        options: arm.options.clone(),
+    };
+    match arm.adapter.emulate {
+        Some(emulate) if arm.address == SIM => {
+            let emulator = emulate(&config).map_err(|e| hardware(arm, &e))?;
+            config.address = emulator.address();
+            arms._emulators.push(emulator);
+        }
+        _ if arm.address.is_empty() || arm.address == SIM => {}
+        _ => {
+            let lock = device_lock::take(options.folder.path(), &arm.adapter_type, &arm.address).map_err(|e| {
+                StartError::Hardware {
+                    arm: arm.hardware_id.clone(),
+                    what: e.to_string(),
+                    hint: "end the other run first: `dimos status` shows it, `dimos down` ends it".to_owned(),
+                }
+            })?;
+            arms._locks.push(lock);
+        }
+    }
+    Ok(config)
+}
+
+fn hardware(arm: &Arm, error: &dyn std::fmt::Display) -> StartError {
+    let text = error.to_string();
+    // An adapter that knows what to do says so in a line of its own.
+    let (what, hint) = match text.split_once("\nhint: ") {
+        Some((what, hint)) => (what.to_owned(), hint.to_owned()),
+        None if arm.adapter.emulate.is_some() => {
+            let id = &arm.hardware_id;
+            let hint = format!(
+                "is it powered, and is `hardware.{id}.address` right ({})? To try without it: --sim",
+                arm.adapter.address.form
+            );
+            (text, hint)
+        }
+        None => (text, format!("see `hardware.{}` in the blueprint", arm.hardware_id)),
+    };
+    StartError::Hardware { arm: arm.hardware_id.clone(), what, hint }
+}
+
+/// The arm's own limits, narrowed by the blueprint, with defaults where neither says anything.
+fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartError> {
+    let mut limits = own.clone().with_defaults();
+    let narrow = |list: &mut Vec<f64>, j: usize, value: Option<f64>, higher: bool| {
+        if let (Some(old), Some(new)) = (list.get_mut(j), value) {
+            *old = if higher { old.max(new) } else { old.min(new) };
+        }
+    };
+    for (j, JointOverride { position_lower, position_upper, velocity, acceleration, jerk }) in
+        arm.limits.iter().enumerate()
+    {
+        narrow(&mut limits.position_lower, j, *position_lower, true);
+        narrow(&mut limits.position_upper, j, *position_upper, false);
+        narrow(&mut limits.velocity_max, j, *velocity, false);
+        // Where the arm states no acceleration or jerk, the blueprint's replaces the default.
+        for (list, stated, value) in [
+            (&mut limits.acceleration_max, own.acceleration_max.is_empty(), *acceleration),
+            (&mut limits.jerk_max, own.jerk_max.is_empty(), *jerk),
+        ] {
+            match (list.get_mut(j), value) {
+                (Some(old), Some(new)) if stated => *old = new,
+                (Some(old), Some(new)) => *old = old.min(new),
+                _ => {}
+            }
+        }
+    }
+    let usable = (0..arm.joints.len()).all(|j| {
+        let at = |list: &[f64]| list.get(j).copied().filter(|v| v.is_finite());
+        let range = at(&limits.position_lower).zip(at(&limits.position_upper)).is_some_and(|(l, u)| l < u);
+        range && [&limits.velocity_max, &limits.acceleration_max, &limits.jerk_max].iter().all(|l| at(l).is_some_and(|v| v > 0.0))
+    });
+    if usable {
+        return Ok(limits);
+    }
+    Err(StartError::Hardware {
+        arm: arm.hardware_id.clone(),
+        what: "the joint limits it reports leave no room to move".to_owned(),
+        hint: format!("`dimos check` shows them; see `hardware.{}.limits`", arm.hardware_id),
+    })
+}
+
+impl Arms {
+    /// The time that the device threads use.
+    pub fn now(&self) -> Mono {
+        MonotonicClock.now()
+    }
+
+    /// Enables the given arms, all at once; answers the first that could not be.
+    pub fn enable(&self, blueprint: &Blueprint, which: impl Iterator<Item = usize>) -> Result<(), StartError> {
+        let answers: Vec<_> = which.filter_map(|i| Some((i, self.devices.get(i)?.activate()))).collect();
+        for (i, answer) in answers {
+            if let (Err(e), Some(arm)) = (answer.wait(ENABLE_LIMIT), blueprint.arms.get(i)) {
+                return Err(StartError::Hardware {
+                    arm: arm.hardware_id.clone(),
+                    what: format!("cannot be enabled: {e}"),
+                    hint: format!(
+                        "clear the arm's own error, or start without motors: --set hardware.{}.auto_enable=false",
+                        arm.hardware_id
+                    ),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends commanded motion, disables what is to be disabled at exit, disconnects. Answers what went wrong.
+    pub fn release(&mut self) -> Vec<String> {
+        let answers: Vec<_> = self.devices.iter().zip(&self.disable).map(|(d, disable)| d.finish(*disable)).collect();
+        let limit = Instant::now() + RELEASE_LIMIT;
+        let mut troubles = Vec::new();
+        for (device, answer) in self.devices.iter().zip(answers) {
+            if let Err(e) = answer.wait(limit.saturating_duration_since(Instant::now())) {
+                troubles.push(format!("{}: could not be released as planned: {e}", device.hardware_id()));
+            }
+        }
+        self.devices.clear();
+        troubles
+    }
+}

@@ -1,0 +1,375 @@
+//! How a run comes up.
+
+use std::collections::BTreeMap;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Sender, channel};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use super::arms::{self, BroughtUp};
+use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
+use super::service::{Service, ServiceParts};
+use super::watchdog::Watchdog;
+use super::{Ending, Options, Record, Run, StartError};
+use crate::arm::ArmState;
+use crate::blueprint::{Blueprint, TaskKind as Typed};
+use crate::clock::{Clock, MonotonicClock, WallOffset};
+use crate::control::config::{
+    ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
+};
+use crate::control::coordinator::Coordinator;
+use crate::control::request::Request;
+use crate::control::tick_loop::{self, Pulse, TickPorts};
+use crate::hardware::device;
+use crate::joint::MAX_DOF;
+use crate::recording::files;
+use crate::recording::log_writer::LogAttachment;
+use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
+use crate::rpc::server::Server;
+use crate::rpc::streams::Streams;
+use crate::rt::host;
+use crate::rt::slot::slot;
+use crate::rt::wake::Wake;
+use crate::telemetry::describe::{ArmNames, Names, Severity};
+use crate::telemetry::{ArmSample, Cause, Phase, Sample, TaskView, TickSample};
+
+/// So many seconds of samples fit into the recorder's ring.
+const RING_SECONDS: f64 = 5.0;
+/// How long enabled arms get until they are ready.
+const READY_LIMIT: Duration = Duration::from_secs(2);
+
+impl Run {
+    /// Starts a run. When this fails, everything that had been started is stopped again and nothing has moved.
+    pub fn start(blueprint: &Blueprint, mut options: Options) -> Result<Self, StartError> {
+        let name = options.name.clone().unwrap_or_else(|| blueprint.name.clone());
+        let claim = options.folder.claim(&name).map_err(|e| StartError::other(&e, e.hint()))?;
+        let (grants, latency) = host::prepare_process(options.hold_latency);
+        let wall = WallOffset::take(&MonotonicClock);
+        let log = log_path(blueprint, &options, &name, wall)?;
+        let names = names_of(blueprint);
+        let pulse = Arc::new(Pulse::default());
+        let (notes, noted) = channel();
+
+        let device_notes = {
+            let (notes, names) = (notes.clone(), names.clone());
+            move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
+        };
+        let BroughtUp { mut arms, slots, connected, state_timeouts } =
+            arms::bring_up(blueprint, &options, &pulse.beat, device_notes)?;
+        let config = coordinator_config(blueprint, &connected, &state_timeouts);
+
+        let samples = ring_size(&config);
+        let (mut sample_producer, mut sample_consumer) = rtrb::RingBuffer::new(samples);
+        touch(&mut sample_producer, &mut sample_consumer);
+        let (request_producer, request_consumer) = rtrb::RingBuffer::new(REQUEST_RING);
+        let (reply_producer, reply_consumer) = rtrb::RingBuffer::new(2 * REQUEST_RING);
+        let (retired_producer, retired_consumer) = rtrb::RingBuffer::new(REQUEST_RING + 2 * config.tasks.len());
+        let empty = ArmSample {
+            arm: 0,
+            state: ArmState::default(),
+            command: crate::arm::ArmCommand::default(),
+            phase: Phase::Unknown,
+            cause: Cause::None,
+        };
+        let (arm_writers, arm_readers) = config.arms.iter().map(|_| slot(empty)).unzip();
+        let (task_writers, task_readers) = config.tasks.iter().map(|_| slot(TaskView::default())).unzip();
+        let reply_wake = wake()?;
+
+        let streams = Streams::default();
+        let dispatcher = Arc::new(Dispatcher::new(request_producer, notes.clone()));
+        let (endings, ended) = channel();
+        let fail = |arms: &mut arms::Arms, error: StartError| {
+            arms.release();
+            error
+        };
+        let record = RecorderConfig {
+            path: log.clone(),
+            run: name.clone(),
+            names: names.clone(),
+            frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
+            attachments: attachments(blueprint),
+            metadata: metadata(blueprint),
+            wall,
+        };
+        let service = Arc::new(Service::new(ServiceParts {
+            run: name.clone(),
+            blueprint: blueprint.clone(),
+            config: config.clone(),
+            names: names.clone(),
+            connected: connected.iter().map(|(c, _)| c.clone()).collect(),
+            devices: arms.devices.clone(),
+            dispatcher: dispatcher.clone(),
+            pulse: pulse.clone(),
+            streams: streams.clone(),
+            arm_views: Mutex::new(arm_readers),
+            task_views: Mutex::new(task_readers),
+            grants,
+            wall,
+            log: log.clone(),
+            endings: endings.clone(),
+        }));
+        let notice = {
+            let (service, wall) = (service.clone(), wall);
+            move |notice: Notice<'_>| service.notice(notice, wall)
+        };
+        let recorder = Recorder::start(record, sample_consumer, noted, notice)
+            .map_err(|e| fail(&mut arms, split_hint(&e.to_string())))?;
+        service.set_recorder(recorder.stats());
+        retain(blueprint, &log);
+
+        let ports = TickPorts {
+            states: slots.states,
+            commands: slots.commands,
+            wakes: arms.devices.iter().map(|d| d.wake()).collect(),
+            requests: request_consumer,
+            replies: reply_producer,
+            reply_wake: reply_wake.clone(),
+            retired: retired_producer,
+            samples: sample_producer,
+            arm_views: arm_writers,
+            task_views: task_writers,
+            pulse: pulse.clone(),
+        };
+        let publish = {
+            let service = service.clone();
+            move || service.publish()
+        };
+        let io = |what: &str, e: std::io::Error| StartError::other(format!("no {what} thread: {e}"), "see ulimit -u");
+        let courier = Courier::start(dispatcher.clone(), reply_wake, reply_consumer, retired_consumer, publish)
+            .map_err(|e| fail(&mut arms, io("courier", e)))?;
+        let tick = spawn_tick(&config, ports, options.probe.take(), endings.clone())
+            .map_err(|e| fail(&mut arms, io("tick", e)))?;
+        let watchdog = Watchdog::start(pulse.beat.clone(), config.period(), endings.clone())
+            .map_err(|e| fail(&mut arms, io("watchdog", e)))?;
+        let mut run = Self {
+            name,
+            arms,
+            pulse,
+            tick: Some(tick),
+            watchdog,
+            dispatcher,
+            courier,
+            recorder,
+            server: None,
+            service,
+            endings: (endings, ended),
+            _latency: latency,
+        };
+        if let Err(error) = run.enable(blueprint) {
+            run.stop();
+            return Err(error);
+        }
+        if blueprint.rpc.enabled {
+            match Server::start(claim, run.service.clone()) {
+                Ok(server) => run.server = Some(server),
+                Err(e) => {
+                    let what = format!("the socket cannot be opened: {e}");
+                    run.stop();
+                    return Err(StartError::other(what, "see the folder's rights, or set rpc.enabled: false"));
+                }
+            }
+        } else {
+            run.service.keep(claim);
+        }
+        Ok(run)
+    }
+
+    fn enable(&self, blueprint: &Blueprint) -> Result<(), StartError> {
+        let which = || blueprint.arms.iter().enumerate().filter(|(_, a)| a.auto_enable).map(|(i, _)| i);
+        self.arms.enable(blueprint, which())?;
+        for arm in which() {
+            let request = Request::Ready { arm: arm as u16 };
+            let log = log_of(&request);
+            // Whether it was taken shows in the arm's phase.
+            let _ = self.dispatcher.send(request, log);
+        }
+        let limit = std::time::Instant::now() + READY_LIMIT;
+        while !which().all(|arm| self.service.phase(arm) == Phase::Ready) {
+            if std::time::Instant::now() >= limit {
+                break; // The banner and `status` say how far it came.
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        Ok(())
+    }
+}
+
+fn wake() -> Result<Wake, StartError> {
+    Wake::new().map_err(|e| StartError::other(format!("no eventfd: {e}"), "see ulimit -n"))
+}
+
+fn spawn_tick(
+    config: &CoordinatorConfig,
+    ports: TickPorts,
+    probe: Option<tick_loop::Probe>,
+    endings: Sender<Ending>,
+) -> std::io::Result<std::thread::JoinHandle<()>> {
+    let (coordinator, period) = (Coordinator::new(config), config.period());
+    std::thread::Builder::new().name("tick".into()).stack_size(host::STACK).spawn(move || {
+        let ran = catch_unwind(AssertUnwindSafe(|| {
+            tick_loop::run(coordinator, ports, period, &MonotonicClock, probe);
+        }));
+        if let Err(panic) = ran {
+            let text = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
+            let text = text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
+            let _ = endings.send(Ending::Fault(format!("the tick thread panicked: {text}")));
+        }
+    })
+}
+
+/// Touches every page of the ring, so that no page fault comes while it is filled for the first time.
+fn touch(producer: &mut rtrb::Producer<Sample>, consumer: &mut rtrb::Consumer<Sample>) {
+    while producer.push(Sample::Tick(TickSample::default())).is_ok() {}
+    if let Ok(chunk) = consumer.read_chunk(consumer.slots()) {
+        let (first, second) = chunk.as_slices();
+        host::lock_pages(first);
+        host::lock_pages(second);
+        chunk.commit_all();
+    }
+}
+
+fn ring_size(config: &CoordinatorConfig) -> usize {
+    let per_tick = config.arms.len() + 1;
+    512 + (per_tick as f64 * config.rate * RING_SECONDS) as usize
+}
+
+fn names_of(blueprint: &Blueprint) -> Names {
+    Names {
+        arms: blueprint
+            .arms
+            .iter()
+            .map(|a| ArmNames { hardware_id: a.hardware_id.clone(), joints: a.joints.clone() })
+            .collect(),
+        tasks: blueprint.tasks.iter().map(|t| t.name.clone()).collect(),
+    }
+}
+
+fn coordinator_config(
+    blueprint: &Blueprint,
+    connected: &[(device::Connected, crate::joint::JointLimits)],
+    state_timeouts: &[Duration],
+) -> CoordinatorConfig {
+    let arms = blueprint.arms.iter().zip(connected).zip(state_timeouts);
+    CoordinatorConfig {
+        rate: blueprint.coordinator.tick_rate,
+        arms: arms
+            .map(|((arm, (said, limits)), timeout)| ArmConfig {
+                name: arm.hardware_id.clone(),
+                dof: arm.joints.len().min(MAX_DOF),
+                limits: limits.clone(),
+                modes: said.info.modes.to_vec(),
+                gripper: arm.adapter.gripper,
+                state_timeout: *timeout,
+            })
+            .collect(),
+        tasks: blueprint
+            .tasks
+            .iter()
+            .map(|task| TaskConfig {
+                name: task.name.clone(),
+                kind: kind_of(&task.kind),
+                joints: task.joints.iter().map(|&j| j as u16).collect(),
+                priority: task.priority,
+                auto_start: task.auto_start,
+            })
+            .collect(),
+    }
+}
+
+fn kind_of(typed: &Typed) -> TaskKind {
+    match typed {
+        Typed::Trajectory(p) => TaskKind::Trajectory(TrajectoryParams {
+            start_position_tolerance: p.start_position_tolerance,
+            path_tolerance: p.path_tolerance,
+            goal_tolerance: p.goal_tolerance,
+            goal_time: p.goal_time,
+        }),
+        Typed::Servo(p) => {
+            TaskKind::Servo(ServoParams { timeout: p.timeout, default_positions: p.default_positions.clone() })
+        }
+        Typed::Velocity(p) => {
+            TaskKind::Velocity(VelocityParams { timeout: p.timeout, zero_on_timeout: p.zero_on_timeout })
+        }
+    }
+}
+
+fn log_path(
+    blueprint: &Blueprint,
+    options: &Options,
+    run: &str,
+    wall: WallOffset,
+) -> Result<Option<PathBuf>, StartError> {
+    match &options.record {
+        Record::Off => Ok(None),
+        Record::To(path) => Ok(Some(path.clone())),
+        Record::AsBlueprint if !blueprint.recording.enabled => Ok(None),
+        Record::AsBlueprint => {
+            let folder = log_folder(blueprint).ok_or_else(|| {
+                StartError::other("no folder for the log: neither XDG_STATE_HOME nor HOME is set", "use --record FILE")
+            })?;
+            Ok(Some(files::new_log_path(&folder, run, wall.wall(MonotonicClock.now()))))
+        }
+    }
+}
+
+fn log_folder(blueprint: &Blueprint) -> Option<PathBuf> {
+    blueprint.recording.directory.as_ref().map(PathBuf::from).or_else(files::log_folder)
+}
+
+/// Removes the oldest logs beyond what the blueprint keeps.
+fn retain(blueprint: &Blueprint, log: &Option<PathBuf>) {
+    let folder = log_folder(blueprint).filter(|f| log.as_deref().and_then(|l| l.parent()) == Some(f));
+    if let (Some(folder), 1..) = (folder, blueprint.recording.keep)
+        && let Err(e) = files::retain(&folder, blueprint.recording.keep as usize)
+    {
+        tracing::warn!("old logs were not removed: {e}");
+    }
+}
+
+fn attachments(blueprint: &Blueprint) -> Vec<LogAttachment> {
+    let yaml = |name: String, text: &str| LogAttachment {
+        name,
+        media_type: "application/yaml".to_owned(),
+        data: text.as_bytes().to_vec(),
+    };
+    let mut all = vec![yaml("blueprint.yaml".to_owned(), &blueprint.source_yaml)];
+    all.extend(blueprint.sources.iter().map(|(name, text)| yaml(format!("source/{name}"), text)));
+    all
+}
+
+fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
+    BTreeMap::from([
+        ("blueprint".to_owned(), blueprint.name.clone()),
+        ("tick_rate".to_owned(), blueprint.coordinator.tick_rate.to_string()),
+        ("dimos_version".to_owned(), crate::VERSION.to_owned()),
+        ("simulated".to_owned(), blueprint.arms.iter().any(|a| a.simulated).to_string()),
+    ])
+}
+
+fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: device::Note) {
+    let id = names.arm(arm as u16);
+    let (severity, text) = match note {
+        device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),
+        device::Note::Over(text) => (Severity::Info, format!("{id}: over: {text}")),
+    };
+    match severity {
+        Severity::Info => tracing::info!("{text}"),
+        _ => tracing::warn!("{text}"),
+    }
+    let stamp = MonotonicClock.now();
+    // Only a run that is ending has no recorder any more.
+    let _ = notes.send(Note::ArmText { arm: arm as u16, text: text.clone() });
+    let _ = notes.send(Note::Log { severity, stamp, text });
+}
+
+fn split_hint(text: &str) -> StartError {
+    let (what, hint) = text.split_once("\nhint: ").unwrap_or((text, "run with --no-record"));
+    StartError::other(what, hint)
+}
+
+/// Marks a run as ended when it is: other threads look at it.
+pub(super) fn is_ending(pulse: &Pulse) -> bool {
+    pulse.stop.load(Ordering::Acquire)
+}

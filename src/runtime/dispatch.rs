@@ -1,0 +1,159 @@
+//! The way into the tick and out of it, for everyone else: requests go into its ring and are logged, outcomes come
+//! back, finished motions are freed, the joint state is published.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tokio::sync::oneshot;
+
+use crate::clock::{Clock, MonotonicClock};
+use crate::control::request::{Envelope, Motion, Request};
+use crate::recording::recorder::Note;
+use crate::rt::wake::Wake;
+use crate::telemetry::Outcome;
+
+/// Room for requests on their way to the tick.
+pub const REQUEST_RING: usize = 256;
+/// How often finished motions are looked for when nothing else happens.
+const SWEEP: Duration = Duration::from_millis(100);
+
+/// Sends requests to the tick. Never used by a real-time thread.
+pub struct Dispatcher {
+    requests: Mutex<rtrb::Producer<Envelope>>,
+    waiting: Mutex<HashMap<u64, oneshot::Sender<Outcome>>>,
+    next_id: AtomicU64,
+    notes: Sender<Note>,
+}
+
+/// Why a request got no outcome.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum NotTold {
+    /// Too many requests are waiting.
+    #[error("too many requests at once")]
+    Full,
+    /// The tick did not answer.
+    #[error("the coordinator did not answer")]
+    NoAnswer,
+}
+
+impl Dispatcher {
+    /// A dispatcher in front of a ring.
+    pub fn new(requests: rtrb::Producer<Envelope>, notes: Sender<Note>) -> Self {
+        Self {
+            requests: Mutex::new(requests),
+            waiting: Mutex::default(),
+            next_id: AtomicU64::new(1),
+            notes,
+        }
+    }
+
+    /// A number for a motion or a request, given once.
+    pub fn number(&self) -> u64 {
+        self.next_id.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Sends a request; the answer comes with the tick that handles it. `log` is how the log tells it.
+    pub fn send(&self, request: Request, log: Value) -> Result<oneshot::Receiver<Outcome>, NotTold> {
+        let id = self.number();
+        let (sender, receiver) = oneshot::channel();
+        let mut ring = lock(&self.requests);
+        if ring.slots() == 0 {
+            return Err(NotTold::Full);
+        }
+        lock(&self.waiting).insert(id, sender);
+        let note = Note::Request { id, stamp: MonotonicClock.now(), json: log.to_string() };
+        // Only a run that is ending has no recorder any more.
+        let _ = self.notes.send(note);
+        if ring.push(Envelope { id, request }).is_err() {
+            lock(&self.waiting).remove(&id);
+            return Err(NotTold::Full);
+        }
+        Ok(receiver)
+    }
+
+    /// Sends a request and waits for its outcome.
+    pub async fn ask(&self, request: Request, log: Value) -> Result<Outcome, NotTold> {
+        let answer = self.send(request, log)?;
+        match tokio::time::timeout(Duration::from_secs(3), answer).await {
+            Ok(Ok(outcome)) => Ok(outcome),
+            _ => Err(NotTold::NoAnswer),
+        }
+    }
+
+    fn answered(&self, id: u64, outcome: Outcome) {
+        if let Some(sender) = lock(&self.waiting).remove(&id) {
+            // Whoever asked may have gone.
+            let _ = sender.send(outcome);
+        }
+    }
+}
+
+/// How the log tells a request that carries no trajectory.
+pub fn log_of(request: &Request) -> Value {
+    match request {
+        Request::Execute { task, motion } => json!({"execute": {"task": task, "motion": motion.id}}),
+        Request::Cancel { task } => json!({"cancel": {"task": task}}),
+        Request::Servo { task, target } => json!({"servo": {"task": task, "target": target}}),
+        Request::Velocity { task, target } => json!({"velocity": {"task": task, "target": target}}),
+        Request::Stop { arm } => json!({"stop": {"arm": arm}}),
+        Request::Reset { arm } => json!({"reset": {"arm": arm}}),
+        Request::Ready { arm } => json!({"ready": {"arm": arm}}),
+        Request::Park { arm } => json!({"park": {"arm": arm}}),
+        Request::Gripper { arm, opening } => json!({"gripper": {"arm": arm, "opening": opening}}),
+        Request::Shutdown => json!({"shutdown": {}}),
+    }
+}
+
+/// The thread behind the dispatcher. Ends when it is dropped.
+pub struct Courier {
+    stop: Arc<AtomicBool>,
+    wake: Wake,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Courier {
+    /// Starts the thread `courier`. `publish` is called after every tick that woke it.
+    pub fn start(
+        dispatcher: Arc<Dispatcher>,
+        wake: Wake,
+        mut replies: rtrb::Consumer<(u64, Outcome)>,
+        mut retired: rtrb::Consumer<Box<Motion>>,
+        mut publish: impl FnMut() + Send + 'static,
+    ) -> std::io::Result<Self> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let (stopping, waiting) = (stop.clone(), wake.clone());
+        let thread = std::thread::Builder::new().name("courier".into()).spawn(move || {
+            while !stopping.load(Ordering::Acquire) {
+                let woken = waiting.wait(SWEEP);
+                while let Ok((id, outcome)) = replies.pop() {
+                    dispatcher.answered(id, outcome);
+                }
+                while retired.pop().is_ok() {}
+                if woken {
+                    publish();
+                }
+            }
+        })?;
+        Ok(Self { stop, wake, thread: Some(thread) })
+    }
+}
+
+impl Drop for Courier {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        self.wake.raise();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Locks; a panic of another holder leaves plain data behind, which is as good as before.
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

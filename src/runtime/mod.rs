@@ -1,0 +1,243 @@
+//! The composition root: a resolved blueprint becomes threads, and they are stopped in order. The only place that
+//! knows every module.
+//!
+//! ```text
+//! start: claim the name ─▶ lock the devices ─▶ emulators ─▶ connect all ─▶ tick, recorder ─▶ enable ─▶ rpc
+//! stop:  come to rest ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
+//! ```
+
+mod arms;
+mod build;
+mod device_lock;
+mod dispatch;
+mod motions;
+mod reports;
+mod service;
+mod watchdog;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+pub use device_lock::DeviceTaken;
+
+use crate::control::request::Request;
+use crate::control::tick_loop::{Probe, Pulse};
+use crate::recording::recorder::Recorder;
+use crate::rpc::place::RunFolder;
+use crate::rpc::report::StatusReport;
+use crate::rpc::server::Server;
+use crate::rt::host::LatencyHold;
+use arms::Arms;
+use dispatch::{Courier, Dispatcher};
+use service::Service;
+use watchdog::Watchdog;
+
+/// How long moving arms get to come to rest.
+const REST_LIMIT: Duration = Duration::from_secs(2);
+/// How long the tick gets to end.
+const TICK_END_LIMIT: Duration = Duration::from_millis(300);
+
+/// Where a run is logged.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Record {
+    /// As the blueprint says.
+    #[default]
+    AsBlueprint,
+    /// To this file.
+    To(PathBuf),
+    /// Not at all.
+    Off,
+}
+
+/// What a blueprint leaves open.
+pub struct Options {
+    /// Name of the run; without it the blueprint's.
+    pub name: Option<String>,
+    /// Where it is logged.
+    pub record: Record,
+    /// Where the socket and the locks are.
+    pub folder: RunFolder,
+    /// Called at each tick; for tests and benchmarks.
+    pub probe: Option<Probe>,
+    /// Whether idle states of the processor are held off.
+    pub hold_latency: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            name: None,
+            record: Record::AsBlueprint,
+            folder: RunFolder::standard(),
+            probe: None,
+            hold_latency: true,
+        }
+    }
+}
+
+/// Why a run did not start. Everything that had been started is stopped again.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// An arm cannot be reached, or is not what it should be.
+    #[error("{arm}: {what}")]
+    Hardware {
+        /// The arm.
+        arm: String,
+        /// What is wrong.
+        what: String,
+        /// What to do.
+        hint: String,
+    },
+    /// Something else is in the way.
+    #[error("{what}")]
+    Other {
+        /// What is wrong.
+        what: String,
+        /// What to do.
+        hint: String,
+    },
+}
+
+impl StartError {
+    /// What to do about it.
+    pub fn hint(&self) -> &str {
+        match self {
+            Self::Hardware { hint, .. } | Self::Other { hint, .. } => hint,
+        }
+    }
+
+    fn other(what: impl ToString, hint: impl ToString) -> Self {
+        Self::Other { what: what.to_string(), hint: hint.to_string() }
+    }
+}
+
+/// Why a run ends.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Ending {
+    /// A signal came: its number.
+    Signal(i32),
+    /// Its time is over.
+    Duration,
+    /// It was asked to, over rpc.
+    Asked,
+    /// Something broke.
+    Fault(String),
+}
+
+/// What is to be said of a run that has ended.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Ended {
+    /// What did not go as it should while stopping.
+    pub troubles: Vec<String>,
+    /// The log, if one was written.
+    pub log: Option<PathBuf>,
+}
+
+/// A run that is up.
+pub struct Run {
+    name: String,
+    arms: Arms,
+    pulse: Arc<Pulse>,
+    tick: Option<JoinHandle<()>>,
+    watchdog: Watchdog,
+    dispatcher: Arc<Dispatcher>,
+    courier: Courier,
+    recorder: Recorder,
+    server: Option<Server>,
+    service: Arc<Service>,
+    endings: (Sender<Ending>, Receiver<Ending>),
+    _latency: Option<LatencyHold>,
+}
+
+impl Run {
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Its socket, if it has one.
+    pub fn socket(&self) -> Option<&std::path::Path> {
+        self.server.as_ref().map(Server::socket)
+    }
+
+    /// What it tells of itself.
+    pub fn status(&self) -> StatusReport {
+        self.service.status()
+    }
+
+    /// Lets other threads end it.
+    pub fn endings(&self) -> Sender<Ending> {
+        self.endings.0.clone()
+    }
+
+    /// Waits for its end, so long at most.
+    pub fn wait(&self, limit: Option<Duration>) -> Ending {
+        let received = match limit {
+            Some(limit) => self.endings.1.recv_timeout(limit),
+            None => self.endings.1.recv().map_err(|_| RecvTimeoutError::Disconnected),
+        };
+        received.unwrap_or(Ending::Duration)
+    }
+
+    /// Stops it, in order: nothing is skipped, whatever breaks on the way.
+    pub fn stop(mut self) -> Ended {
+        let mut ended = Ended { log: self.recorder.path().map(PathBuf::from), ..Ended::default() };
+        self.service.close();
+        self.come_to_rest(&mut ended);
+        self.watchdog.stand_down();
+        self.end_tick(&mut ended);
+        ended.troubles.extend(self.arms.release());
+        drop(self.server.take());
+        drop(self.courier);
+        if let Err(e) = self.recorder.finish() {
+            ended.troubles.push(e.to_string());
+        }
+        ended
+    }
+
+    fn tick_lives(&self) -> bool {
+        self.tick.as_ref().is_some_and(|t| !t.is_finished())
+            && self.pulse.beat.silence(self.arms.now()).is_none_or(|s| s < Duration::from_millis(300))
+    }
+
+    fn come_to_rest(&self, ended: &mut Ended) {
+        let limit = Instant::now() + REST_LIMIT;
+        let told = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
+        let Ok(answer) = told else { return ended.troubles.push("the coordinator takes no requests".to_owned()) };
+        let mut answer = Some(answer);
+        while self.tick_lives() && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(2));
+            if let Some(waiting) = &mut answer {
+                if waiting.try_recv().is_err() {
+                    continue;
+                }
+                answer = None;
+            }
+            if self.pulse.at_rest.load(Ordering::Acquire) {
+                return;
+            }
+        }
+        if self.tick_lives() {
+            ended.troubles.push(format!("the arms were not at rest after {} s", REST_LIMIT.as_secs()));
+        }
+    }
+
+    fn end_tick(&mut self, ended: &mut Ended) {
+        self.pulse.stop.store(true, Ordering::Release);
+        let Some(tick) = self.tick.take() else { return };
+        let limit = Instant::now() + TICK_END_LIMIT.max(2 * self.service.period());
+        while !tick.is_finished() && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if tick.is_finished() {
+            // A panic was told when it happened.
+            let _ = tick.join();
+        } else {
+            ended.troubles.push("the tick thread does not end; it is left behind".to_owned());
+        }
+    }
+}

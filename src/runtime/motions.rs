@@ -1,0 +1,86 @@
+//! Remembers the motions of a run: what was planned, and how it ended.
+
+use std::collections::BTreeMap;
+
+use crate::telemetry::{Reason, TaskState};
+
+/// So many motions are remembered.
+const REMEMBERED: usize = 256;
+
+/// A motion as it was handed over.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Planned {
+    /// The task that carries it out.
+    pub task: u16,
+    /// Its joints, over all arms.
+    pub joints: Vec<u16>,
+    /// Where they should end [rad].
+    pub goal: Vec<f64>,
+    /// How long it should take [s].
+    pub duration: f64,
+}
+
+/// How a motion ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct End {
+    /// The task's state.
+    pub state: TaskState,
+    /// Why.
+    pub reason: Reason,
+    /// Where its joints were [rad].
+    pub actual: Vec<f64>,
+}
+
+/// The motions of a run, by number.
+#[derive(Debug, Default)]
+pub struct Motions(BTreeMap<u64, (Planned, Option<End>)>);
+
+impl Motions {
+    /// A motion is about to be handed over.
+    pub fn plan(&mut self, number: u64, planned: Planned) {
+        while self.0.len() >= REMEMBERED {
+            self.0.pop_first();
+        }
+        self.0.insert(number, (planned, None));
+    }
+
+    /// It was refused.
+    pub fn forget(&mut self, number: u64) {
+        self.0.remove(&number);
+    }
+
+    /// A task changed its state. `positions`: of all joints, now [rad]. Motions of a task end in their order.
+    pub fn task_changed(&mut self, task: u16, state: TaskState, reason: Reason, positions: &[f64]) {
+        if !matches!(state, TaskState::Completed | TaskState::Aborted | TaskState::Fault) {
+            return;
+        }
+        let running = self.0.values_mut().find(|(planned, end)| planned.task == task && end.is_none());
+        if let Some((planned, end)) = running {
+            let at = |j: &u16| positions.get(*j as usize).copied().unwrap_or(f64::NAN);
+            *end = Some(End { state, reason, actual: planned.joints.iter().map(at).collect() });
+        }
+    }
+
+    /// A motion, and how it ended if it did.
+    pub fn get(&self, number: u64) -> Option<&(Planned, Option<End>)> {
+        self.0.get(&number)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn motions_of_a_task_end_in_their_order_and_old_ones_are_forgotten() {
+        let planned = |task| Planned { task, joints: vec![1], goal: vec![0.5], duration: 1.0 };
+        let mut m = Motions::default();
+        (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));
+        m.task_changed(1, TaskState::Executing, Reason::None, &[]);
+        m.task_changed(1, TaskState::Completed, Reason::None, &[0.0, 0.499]);
+        assert_eq!(m.get(1).unwrap().1.as_ref().unwrap().actual, vec![0.499]);
+        assert!(m.get(2).unwrap().1.is_none() && m.get(3).unwrap().1.is_none());
+        (4..500).for_each(|n| m.plan(n, planned(0)));
+        assert!(m.get(1).is_none() && m.get(499).is_some());
+    }
+}

@@ -1,0 +1,284 @@
+//! What a run tells of itself: status, state, motions, streams.
+
+use std::sync::atomic::Ordering::Relaxed;
+
+use super::dispatch::lock;
+use super::service::Service;
+use crate::arm::{ArmState, VelocitySource};
+use crate::blueprint::OnExit;
+use crate::clock::WallOffset;
+use crate::rpc::report::*;
+use crate::rpc::streams::{EventReport, JointState, Level};
+use crate::rpc::{Code, RpcError};
+use crate::rt::histogram::Figures;
+use crate::telemetry::describe::{Described, Severity, cause_text, outcome_text, reason_text};
+use crate::telemetry::{Cause, Outcome, Reason, TaskState};
+
+impl Service {
+    /// Reply to `status`.
+    pub fn status(&self) -> StatusReport {
+        let (parts, pulse) = (&self.parts, &self.parts.pulse);
+        let started = parts.wall.wall(self.now()) as i64 - self.started.elapsed().as_nanos() as i64;
+        StatusReport {
+            run: parts.run.clone(),
+            pid: std::process::id(),
+            version: crate::VERSION.to_owned(),
+            blueprint: parts.blueprint.name.clone(),
+            started: rfc3339(started),
+            uptime: self.started.elapsed().as_secs_f64(),
+            tick_rate: parts.config.rate,
+            simulated: parts.blueprint.arms.iter().any(|a| a.simulated),
+            log: parts.log.as_ref().map(|p| p.display().to_string()),
+            realtime: parts
+                .grants
+                .iter()
+                .map(|g| RealtimeReport {
+                    what: format!("{}: {}", g.what, g.detail),
+                    granted: g.granted,
+                    remedy: (!g.remedy.is_empty()).then(|| g.remedy.to_owned()),
+                })
+                .collect(),
+            ticks: TickReport {
+                count: pulse.ticks.load(Relaxed),
+                overruns: pulse.overruns.load(Relaxed),
+                skipped: pulse.skipped.load(Relaxed),
+                lateness_us: percentiles(pulse.lateness.figures()),
+                compute_us: percentiles(pulse.compute.figures()),
+            },
+            recorder: self.recorder.get().filter(|_| parts.log.is_some()).map(|stats| RecorderReport {
+                messages: stats.messages.load(Relaxed),
+                dropped: stats.dropped.load(Relaxed) + pulse.dropped.load(Relaxed),
+                error: stats.failed.load(Relaxed).then(|| "a write failed: the log has ended".to_owned()),
+            }),
+            arms: (0..parts.config.arms.len()).filter_map(|i| self.arm_report(i)).collect(),
+            tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
+        }
+    }
+
+    fn arm_report(&self, index: usize) -> Option<ArmReport> {
+        let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
+        let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
+        let info = &self.parts.connected.get(index)?.info;
+        let faults = health.episodes().into_iter().map(|e| FaultReport {
+            since: now.seconds_since(e.since),
+            over: e.until.is_some(),
+            count: e.count,
+            text: e.text,
+        });
+        let counters = [
+            ("reads", &health.reads),
+            ("read_errors", &health.read_errors),
+            ("writes", &health.writes),
+            ("write_errors", &health.write_errors),
+            ("reconnects", &health.reconnects),
+        ];
+        Some(ArmReport {
+            hardware_id: arm.hardware_id.clone(),
+            adapter: arm.adapter_type.clone(),
+            address: arm.address.clone(),
+            simulated: arm.simulated,
+            link: view.state.link.name().to_owned(),
+            phase: view.phase.name().to_owned(),
+            cause: (view.cause != Cause::None)
+                .then(|| CauseReport { name: view.cause.name().to_owned(), text: cause_text(view.cause) }),
+            enabled: view.state.enabled,
+            mode: view.state.mode.name().to_owned(),
+            error: (view.state.error != 0)
+                .then(|| DeviceError { code: view.state.error, text: health.error_text() }),
+            state_age_ms: self.age_ms(&view.state),
+            measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),
+            native_rate_hz: info.native_rate,
+            faults: faults.collect(),
+            on_exit: match arm.on_exit {
+                OnExit::Hold => "hold".to_owned(),
+                OnExit::Disable => "disable".to_owned(),
+            },
+            holds_when_disabled: info.holds_when_disabled,
+            counters: counters.into_iter().map(|(name, n)| (name.to_owned(), n.load(Relaxed))).collect(),
+        })
+    }
+
+    fn task_report(&self, index: usize) -> Option<TaskReport> {
+        let (config, view) = (self.parts.config.tasks.get(index)?, self.task_view(index));
+        Some(TaskReport {
+            name: config.name.clone(),
+            kind: config.kind.name().to_owned(),
+            joints: config.joints.iter().map(|&j| self.parts.names.joint(j)).collect(),
+            priority: config.priority,
+            state: view.state.name().to_owned(),
+            progress: (view.motion > 0).then_some(view.progress),
+            reason: self.reason(&view.reason),
+            motion: (view.motion > 0).then_some(view.motion),
+        })
+    }
+
+    fn reason(&self, reason: &Reason) -> Option<String> {
+        (*reason != Reason::None).then(|| reason_text(reason, &self.parts.names))
+    }
+
+    /// Age of a state [ms].
+    fn age_ms(&self, state: &ArmState) -> Option<f64> {
+        (state.seq > 0).then(|| self.now().seconds_since(state.stamp) * 1e3)
+    }
+
+    /// Reply to `state`.
+    pub fn state(&self) -> StateReport {
+        let arms = self.parts.blueprint.arms.iter().enumerate().filter_map(|(i, arm)| {
+            let view = self.arm_view(i)?;
+            let (s, known) = (&view.state, view.state.seq > 0);
+            let joints = arm.joints.iter().enumerate().map(|(j, name)| JointReport {
+                name: name.clone(),
+                position: s.position.get(j).copied().filter(|_| known),
+                velocity: s.velocity.get(j).copied().filter(|_| s.velocity_source != VelocitySource::Absent),
+                velocity_source: s.velocity_source.name().to_owned(),
+                effort: s.effort.and_then(|e| e.get(j).copied()),
+                command: view.command.mode.and_then(|_| view.command.values.get(j).copied()),
+            });
+            Some(ArmStateReport {
+                hardware_id: arm.hardware_id.clone(),
+                simulated: arm.simulated,
+                age_ms: self.age_ms(s),
+                joints: joints.collect(),
+                gripper: s.gripper,
+                pose: s.pose.map(|p| PoseReport { xyz: p.xyz, rpy: p.rpy }),
+                wrench: s.wrench,
+            })
+        });
+        StateReport { tick: self.last_tick(), stamp: self.wall_seconds(), arms: arms.collect() }
+    }
+
+    fn last_tick(&self) -> u64 {
+        self.parts.pulse.ticks.load(Relaxed).saturating_sub(1)
+    }
+
+    fn wall_seconds(&self) -> f64 {
+        self.parts.wall.wall(self.now()) as f64 * 1e-9
+    }
+
+    /// Reply to `motion`.
+    pub fn motion(&self, number: u64) -> Result<MotionReport, RpcError> {
+        let motions = lock(&self.motions);
+        let Some((planned, end)) = motions.get(number) else {
+            return Err(RpcError::new(Code::UnknownMotion, format!("no motion {number}, or too long ago")));
+        };
+        let mut report = MotionReport { motion: number, task: self.parts.names.task(planned.task), ..Default::default() };
+        let view = self.task_view(planned.task as usize);
+        if view.motion == number {
+            (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);
+        }
+        match end {
+            None => {
+                report.state = if view.motion == number { view.state } else { TaskState::Executing }.name().to_owned();
+                // The task may be done a moment before it is known where the arm ended.
+                if !matches!(view.state, TaskState::Executing | TaskState::Cancelling) {
+                    report.state = TaskState::Executing.name().to_owned();
+                }
+            }
+            Some(end) => {
+                report.state = end.state.name().to_owned();
+                report.done = true;
+                report.error = self.reason(&end.reason);
+                if end.state == TaskState::Completed {
+                    (report.progress, report.remaining) = (1.0, 0.0);
+                }
+                let all = planned.joints.iter().zip(&planned.goal).zip(&end.actual);
+                let deviation = all.map(|((joint, target), actual)| Deviation {
+                    joint: self.parts.names.joint(*joint),
+                    target: *target,
+                    actual: *actual,
+                });
+                report.deviation = Some(deviation.collect());
+            }
+        }
+        Ok(report)
+    }
+
+    /// A refusal by the tick in words; `None`: it was taken on.
+    pub(super) fn refusal(&self, outcome: &Outcome) -> Option<RpcError> {
+        let code = Code::of(outcome)?;
+        let names = &self.parts.names;
+        let error = RpcError::new(code, outcome_text(outcome, names));
+        let arm = |i: &u16| names.arm(*i);
+        Some(match outcome {
+            Outcome::AlreadyExecuting(_) => error.hint("wait for it, or end it with `dimos cancel`"),
+            Outcome::StartStateMismatch(joint, distance) => error
+                .hint("move to its first point first: `dimos move`")
+                .data(serde_json::json!({"joint": names.joint(*joint), "distance": distance})),
+            Outcome::StartStateUnavailable(_) => error.hint("`dimos status` shows its link and the age of its state"),
+            Outcome::ArmNotReady(a, ..) => error.hint(format!("make it ready: `dimos arm enable {}`", arm(a))),
+            Outcome::ArmLatched(a, _) => {
+                let a = arm(a);
+                error.hint(format!("when it may move again: `dimos arm reset {a}`, then `dimos arm enable {a}`"))
+            }
+            Outcome::StillFaulted(a, _) => {
+                error.hint(format!("remove the cause, then again: `dimos arm reset {}`", arm(a)))
+            }
+            Outcome::OutOfLimits(joint, by) => error
+                .hint("limits are the arm's own, narrowed by `limits` in the blueprint")
+                .data(serde_json::json!({"joint": names.joint(*joint), "by": by})),
+            Outcome::WrongTask(_) => error.hint("`dimos status` lists the tasks and their types"),
+            _ => error,
+        })
+    }
+
+    /// Publishes the joint state of the last tick to those who listen.
+    pub fn publish(&self) {
+        if !self.parts.blueprint.coordinator.publish_joint_state {
+            return;
+        }
+        self.parts.streams.publish_joint_state(|| {
+            let mut out = JointState {
+                tick: self.last_tick(),
+                stamp: self.wall_seconds(),
+                frame_id: self.parts.blueprint.coordinator.joint_state_frame_id.clone(),
+                ..JointState::default()
+            };
+            for (i, arm) in self.parts.blueprint.arms.iter().enumerate() {
+                let Some(view) = self.arm_view(i) else { continue };
+                let s = &view.state;
+                let velocities = s.velocity_source != VelocitySource::Absent;
+                for (j, name) in arm.joints.iter().enumerate() {
+                    out.name.push(name.clone());
+                    out.position.push(s.position.get(j).copied().filter(|_| s.seq > 0));
+                    out.velocity.push(s.velocity.get(j).copied().filter(|_| velocities));
+                    out.effort.push(s.effort.and_then(|e| e.get(j).copied()));
+                }
+            }
+            out
+        });
+    }
+
+    /// Tells an event to the text log and to those who listen.
+    pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
+        match described.severity {
+            Severity::Info => tracing::debug!("{}", described.text),
+            Severity::Warn => tracing::warn!("{}", described.text),
+            Severity::Error => tracing::error!("{}", described.text),
+        }
+        self.parts.streams.publish_event(|| EventReport {
+            tick,
+            stamp: wall.wall(self.now()) as f64 * 1e-9,
+            level: match described.severity {
+                Severity::Info => Level::Info,
+                Severity::Warn => Level::Warning,
+                Severity::Error => Level::Error,
+            },
+            kind: described.kind.to_owned(),
+            arm: described.arm.clone(),
+            task: described.task.clone(),
+            joint: described.joint.clone(),
+            text: described.text.clone(),
+        });
+    }
+}
+
+fn percentiles(f: Figures) -> Percentiles {
+    Percentiles { p50: f.p50, p99: f.p99, p99_9: f.p99_9, max: f.max }
+}
+
+fn rfc3339(wall_ns: i64) -> String {
+    let time = jiff::Timestamp::from_nanosecond(i128::from(wall_ns)).unwrap_or_default();
+    // Whole seconds are enough for people.
+    jiff::Timestamp::from_second(time.as_second()).unwrap_or_default().to_string()
+}
+

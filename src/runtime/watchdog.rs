@@ -1,0 +1,64 @@
+//! Sees that the tick is alive: the checker is not the checked. The device threads hold their arms by themselves
+//! when the tick falls silent; the watchdog ends the run.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Sender;
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use super::Ending;
+use crate::clock::{Clock, MonotonicClock};
+use crate::rt::beat::Beat;
+use crate::rt::host;
+
+/// How often it looks.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// A tick silent for this long is taken to hang: long enough for a machine that stalls, short enough to end a run
+/// within a second.
+pub fn silence_limit(period: Duration) -> Duration {
+    (5 * period).max(Duration::from_millis(400))
+}
+
+/// The running watchdog. Ends when it is dropped.
+pub struct Watchdog {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Watchdog {
+    /// Starts the thread `watchdog`.
+    pub fn start(beat: Arc<Beat>, period: Duration, endings: Sender<Ending>) -> std::io::Result<Self> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let stopping = stop.clone();
+        let thread = std::thread::Builder::new().name("watchdog".into()).stack_size(host::STACK).spawn(move || {
+            host::enter_realtime(host::WATCHDOG_PRIORITY);
+            let limit = silence_limit(period);
+            while !stopping.load(Ordering::Acquire) {
+                std::thread::sleep(LOOK_EVERY);
+                let silence = beat.silence(MonotonicClock.now()).unwrap_or_default();
+                if silence > limit && !stopping.load(Ordering::Acquire) {
+                    let what = format!("the tick has been silent for {} ms", silence.as_millis());
+                    let _ = endings.send(Ending::Fault(what));
+                    return;
+                }
+            }
+        })?;
+        Ok(Self { stop, thread: Some(thread) })
+    }
+
+    /// From here on silence is meant.
+    pub fn stand_down(&self) {
+        self.stop.store(true, Ordering::Release);
+    }
+}
+
+impl Drop for Watchdog {
+    fn drop(&mut self) {
+        self.stand_down();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
