@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use dimos::rpc::api::*;
 use dimos::rpc::place::RunFolder;
@@ -115,15 +115,16 @@ pub fn start(folder: &Path, run: &str, backend: FakeBackend) -> (Server, Arc<Fak
     (Server::start(claim, backend.clone()).expect("the socket opens"), backend)
 }
 
-/// Waits until `what` holds, for 5 s at most.
+/// Waits until `what` holds, for 30 s at most.
 pub fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
-    for _ in 0..500 {
+    let began = Instant::now();
+    while began.elapsed() < Duration::from_secs(30) {
         if holds() {
             return;
         }
         std::thread::sleep(Duration::from_millis(10));
     }
-    panic!("not within 5 s: {what}");
+    panic!("not within 30 s: {what}");
 }
 
 pub fn status() -> StatusReport {
