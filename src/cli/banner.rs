@@ -61,3 +61,48 @@ pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
     let hint = measure.remedy.iter().map(|remedy| format!("hint: {remedy}"));
     [format!("{}: NOT granted", measure.what)].into_iter().chain(hint).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_banner_tells_what_a_user_must_know() {
+        let arm = |on_exit: &str, holds_when_disabled| ArmReport {
+            hardware_id: "arm".into(),
+            adapter: "yourarm".into(),
+            address: "sim".into(),
+            simulated: true,
+            phase: "ready".into(),
+            on_exit: on_exit.into(),
+            holds_when_disabled,
+            ..Default::default()
+        };
+        let missing = RealtimeReport { what: "SCHED_FIFO".into(), granted: false, remedy: Some("ulimit -r 80".into()) };
+        let report = StatusReport {
+            run: "coordinator-yourarm".into(),
+            pid: 42,
+            version: "0.1.0".into(),
+            blueprint: "coordinator-yourarm".into(),
+            tick_rate: 100.0,
+            simulated: true,
+            realtime: vec![missing],
+            arms: vec![arm("hold", false), arm("disable", false)],
+            ..Default::default()
+        };
+        let expected = "\
+run coordinator-yourarm  SIMULATED  (pid 42, dimos 0.1.0)
+  blueprint  coordinator-yourarm
+  arm        arm: SIMULATED, yourarm at sim, ready
+             at exit: motors stay on and hold the pose
+  arm        arm: SIMULATED, yourarm at sim, ready
+             at exit: motors off; it FALLS unless supported
+  tick       100 Hz
+  real time  SCHED_FIFO: NOT granted
+             hint: ulimit -r 80
+  log        none is written
+  socket     /run/dimos.sock
+Ctrl-C ends it, controlled. In a second terminal: dimos status";
+        assert_eq!(text(&report, Path::new("/run/dimos.sock")).join("\n"), expected);
+    }
+}

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use super::arguments::Target;
 use super::exit::{Exit, Result};
-use super::{follow, output, trajectory_file};
+use super::follow::{Signals, follow};
+use super::{output, trajectory_file};
 use crate::rpc::api::Execute;
 
 /// Arguments of `execute`.
@@ -32,16 +33,19 @@ pub fn run(args: &Args) -> Result {
     let trajectory = trajectory_file::read(&args.file)?;
     let mut client = args.target_run.connect()?;
     let points = trajectory.points.len();
+    let signals = (!args.no_wait).then(Signals::watch);
     let begun = client.call(Execute { trajectory, task: args.task.clone() })?;
     output::note(format_args!(
         "motion {} on {}: {points} points, {:.2} s, not collision-checked",
         begun.motion, begun.task, begun.duration
     ));
-    if args.no_wait {
-        if args.target_run.json {
-            output::json(&begun);
+    match signals {
+        Some(signals) => follow(&mut client, begun.motion, &begun.task, &signals, args.target_run.json),
+        None => {
+            if args.target_run.json {
+                output::json(&begun);
+            }
+            Ok(Exit::Ok)
         }
-        return Ok(Exit::Ok);
     }
-    follow::follow(&mut client, begun.motion, &begun.task, args.target_run.json)
 }

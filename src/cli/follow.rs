@@ -20,9 +20,11 @@ const REST: Duration = Duration::from_secs(10);
 /// Ended this close to its target, a joint is shown as on it [rad].
 const CLOSE: f64 = 0.01;
 
+/// The last signal received, while a verb watches for them; 0 = none.
+pub struct Signals(Arc<AtomicUsize>);
+
 /// Waits for the end of a motion of `task` and prints it. A signal cancels the motion first.
-pub fn follow(client: &mut Client, motion: u64, task: &str, json: bool) -> Result {
-    let signal = watch_signals();
+pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, json: bool) -> Result {
     let bar = ProgressBar::new(1000);
     if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
         bar.set_style(style.progress_chars("=> "));
@@ -36,7 +38,7 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, json: bool) -> Resul
         if report.done {
             break report;
         }
-        if cancelled.is_none() && signal.load(Ordering::Relaxed) != 0 {
+        if cancelled.is_none() && signals.last().is_some() {
             bar.suspend(|| output::note(format_args!("cancelling motion {motion}: the arm decelerates")));
             client.call(Cancel { task: Some(task.to_owned()), arm: None })?;
             cancelled = Some(Instant::now());
@@ -50,8 +52,8 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, json: bool) -> Resul
     };
     bar.finish_and_clear();
     print(&report, json);
-    match signal.load(Ordering::Relaxed) {
-        signal if cancelled.is_some() => Ok(Exit::by_signal(signal as i32)),
+    match signals.last() {
+        Some(signal) if cancelled.is_some() => Ok(Exit::by_signal(signal)),
         _ if report.state == "COMPLETED" => Ok(Exit::Ok),
         _ => {
             let why = report.error.unwrap_or_else(|| "it ended before its goal".into());
@@ -61,14 +63,21 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, json: bool) -> Resul
     }
 }
 
-/// Holds the number of the last signal received; 0 = none.
-fn watch_signals() -> Arc<AtomicUsize> {
-    let seen = Arc::new(AtomicUsize::new(0));
-    for signal in [libc::SIGINT, libc::SIGTERM] {
-        // Where this fails, the signal ends this program as usual, and the motion goes on.
-        let _ = signal_hook::flag::register_usize(signal, seen.clone(), signal as usize);
+impl Signals {
+    /// From now on SIGINT and SIGTERM do not end this program. Watched from before a motion begins, so that none
+    /// begins that a Ctrl-C meant to prevent.
+    pub fn watch() -> Self {
+        let seen = Arc::new(AtomicUsize::new(0));
+        for signal in [libc::SIGINT, libc::SIGTERM] {
+            // Where this fails, the signal ends this program as usual, and the motion goes on.
+            let _ = signal_hook::flag::register_usize(signal, seen.clone(), signal as usize);
+        }
+        Self(seen)
     }
-    seen
+
+    fn last(&self) -> Option<i32> {
+        Some(self.0.load(Ordering::Relaxed) as i32).filter(|signal| *signal != 0)
+    }
 }
 
 fn print(report: &MotionReport, json: bool) {

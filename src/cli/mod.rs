@@ -17,6 +17,7 @@ pub mod status;
 pub mod stop;
 mod trajectory_file;
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
@@ -34,7 +35,7 @@ Exit codes: 0 done, 1 failed or refused, 2 usage or blueprint wrong, 3 hardware 
 
 #[derive(Debug, Parser)]
 #[command(name = "dimos", version = crate::VERSION, about = "Runs robot arms from a blueprint", after_help = AFTER_HELP)]
-#[command(propagate_version = true, arg_required_else_help = true)]
+#[command(arg_required_else_help = true)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -65,7 +66,7 @@ enum Command {
 /// Runs the command line, with more adapters than those in the box. What `main` of an embedding program calls.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
     // Usage errors, `--help` and `--version` end here, with 2 or 0.
-    let cli = Cli::parse();
+    let cli = Cli::parse_from(std::env::args_os().map(spelled_out));
     let registry = Registry::with(adapters);
     let result = match &cli.command {
         Command::Status(args) => status::run(args),
@@ -83,4 +84,65 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         failure.exit
     });
     ExitCode::from(exit as u8)
+}
+
+/// Negative numbers in plain decimals: of `-0.5`, `-.5` and `-5e-1` the parser takes only the first for a number.
+fn spelled_out(argument: OsString) -> OsString {
+    match argument.to_str().filter(|text| text.starts_with('-')).and_then(|text| text.parse::<f64>().ok()) {
+        Some(number) if number.is_finite() => number.to_string().into(),
+        _ => argument,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    /// Stands in for the program, to read the arguments of one verb.
+    #[derive(Debug, Parser)]
+    struct Only<A: clap::Args> {
+        #[command(flatten)]
+        args: A,
+    }
+
+    fn read<A: clap::Args>(line: &str) -> Result<A, clap::Error> {
+        Only::try_parse_from(["dimos"].into_iter().chain(line.split_whitespace())).map(|only| only.args)
+    }
+
+    #[test]
+    fn the_command_line_is_sound() {
+        Cli::command().debug_assert();
+        Only::<run::Args>::command().debug_assert();
+    }
+
+    #[test]
+    fn arguments_of_run_are_read() {
+        let args: run::Args = read("a --set x.y=1 --set z= --duration 1m30s --record f.mcap --name n --sim").unwrap();
+        assert_eq!(args.set, [("x.y".into(), "1".into()), ("z".into(), String::new())]);
+        assert_eq!(args.duration, Some(std::time::Duration::from_secs(90)));
+        assert_eq!((args.blueprint.as_str(), args.name.as_deref(), args.sim), ("a", Some("n"), true));
+        for wrong in [
+            "",
+            "a --set x",
+            "a --set =1",
+            "a --duration 10",
+            "a --duration -1s",
+            "a --duration 0s",
+            "a --record f --no-record",
+        ] {
+            assert_eq!(read::<run::Args>(wrong).unwrap_err().exit_code(), 2, "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn negative_numbers_are_spelled_out() {
+        for (typed, meant) in [("-.5", "-0.5"), ("-1e-3", "-0.001"), ("-0.30000000000000004", "-0.30000000000000004")] {
+            assert_eq!(spelled_out(typed.into()), meant);
+        }
+        for same in ["-0.5", "-0", "-x", "-.", "--", ".5", "1e-3", "-inf", "-nan"] {
+            assert_eq!(spelled_out(same.into()), same);
+        }
+    }
 }

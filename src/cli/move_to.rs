@@ -2,7 +2,8 @@
 
 use super::arguments::{Target, finite, speed};
 use super::exit::{Exit, Result};
-use super::{follow, output};
+use super::follow::{Signals, follow};
+use super::output;
 use crate::rpc::api::{DEFAULT_SPEED, Move};
 
 /// Arguments of `move`.
@@ -27,16 +28,19 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
+    let signals = (!args.no_wait).then(Signals::watch);
     let begun = client.call(Move { arm: args.arm.clone(), target: args.target.clone(), speed: args.speed })?;
     output::note(format_args!(
         "motion {} on {}: {:.2} s, direct, not collision-checked",
         begun.motion, begun.task, begun.duration
     ));
-    if args.no_wait {
-        if args.target_run.json {
-            output::json(&begun);
+    match signals {
+        Some(signals) => follow(&mut client, begun.motion, &begun.task, &signals, args.target_run.json),
+        None => {
+            if args.target_run.json {
+                output::json(&begun);
+            }
+            Ok(Exit::Ok)
         }
-        return Ok(Exit::Ok);
     }
-    follow::follow(&mut client, begun.motion, &begun.task, args.target_run.json)
 }

@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use super::api::Method;
-use super::error::{RpcError, nearest};
+use super::api::{MAX_LINE, Method};
+use super::error::{Code, RpcError, nearest};
 use super::place::{LiveRun, PlaceError, RunFolder};
 use super::server::CALL_LIMIT;
 use super::wire::Incoming;
@@ -153,6 +153,10 @@ impl Client {
         let id = self.next;
         self.next += 1;
         let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
+        if line.len() > MAX_LINE {
+            let text = format!("the request is {} bytes long, and may be {MAX_LINE}", line.len());
+            return Err(RpcError::new(Code::TooLarge, text).hint("send less at once: fewer points").into());
+        }
         if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
             // A run that refuses the connection says so before it closes.
             return Err(match self.read() {

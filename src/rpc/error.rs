@@ -137,7 +137,7 @@ impl RpcError {
             None if known.is_empty() => error.hint(format!("there is no {what} here")),
             None => {
                 let list: Vec<&str> = known.iter().map(AsRef::as_ref).collect();
-                error.hint(format!("there is {}", list.join(", ")))
+                error.hint(format!("known: {}", list.join(", ")))
             }
         }
     }

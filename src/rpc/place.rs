@@ -15,6 +15,8 @@ const MAX_NAME: usize = 64;
 const MAX_SOCKET_PATH: usize = 107;
 /// How often a name that looks taken is tried again: someone listing the runs holds each lock for a moment.
 const ATTEMPTS: u32 = 20;
+/// The same while the lock's file does not say who has it: its holder will write it in a moment, or only lists.
+const ATTEMPTS_UNNAMED: u32 = 400;
 /// Pause between attempts.
 const PAUSE: Duration = Duration::from_millis(5);
 
@@ -119,7 +121,9 @@ impl RunFolder {
         let lock_path = self.0.join(format!("{run}.lock"));
         let in_lock = |error| PlaceError::Io { path: lock_path.clone(), error };
         let mut pid = 0;
-        for _ in 0..ATTEMPTS {
+        let mut attempts = 0;
+        while attempts < if pid == 0 { ATTEMPTS_UNNAMED } else { ATTEMPTS } {
+            attempts += 1;
             let mut file = OpenOptions::new()
                 .read(true)
                 .write(true)

@@ -196,3 +196,64 @@ pub fn cause_text(cause: Cause) -> String {
 pub fn cause(cause: Cause) -> Option<CauseReport> {
     (cause != Cause::None).then(|| CauseReport { name: cause.name().into(), text: cause_text(cause) })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names() -> Names {
+        let of = |list: &[&str]| list.iter().map(|s| s.to_string()).collect();
+        Names { arms: of(&["left", "right"]), tasks: of(&["traj", "servo"]), joints: of(&["l1", "r1"]) }
+    }
+
+    #[test]
+    fn refusals_name_what_they_are_about() {
+        let names = names();
+        for (outcome, message, hint) in [
+            (Outcome::AlreadyExecuting(1), "task servo is executing already", "dimos cancel"),
+            (Outcome::StartStateMismatch(1, 0.25), "0.250 rad away from where r1 is", "first point"),
+            (Outcome::ArmLatched(1, Cause::Operator), "right is held: stopped by an operator", "dimos arm reset right"),
+            (
+                Outcome::ArmNotReady(0, Phase::Standby, Cause::None),
+                "left is not ready for motion, it is standby",
+                "enable left",
+            ),
+            (Outcome::OutOfLimits(0, 0.5), "l1 is 0.5000 beyond", "limits"),
+        ] {
+            let error = names.outcome(&outcome).unwrap_err();
+            assert!(error.message.contains(message), "{error:?}");
+            assert!(error.hint.as_deref().unwrap_or_default().contains(hint), "{error:?}");
+            assert_eq!(error.code.name(), outcome.name());
+        }
+        assert_eq!(names.outcome(&Outcome::AlreadyStopped), Ok("ALREADY_STOPPED"));
+    }
+
+    #[test]
+    fn every_refusal_has_the_code_of_its_status_word() {
+        let (phase, cause) = (Phase::Held, Cause::Stale);
+        for outcome in [
+            Outcome::StartStateUnavailable(0),
+            Outcome::ArmNotReady(0, phase, cause),
+            Outcome::StillFaulted(0, cause),
+            Outcome::WrongTask(0),
+            Outcome::NonFinite(0),
+            Outcome::NoGripper(0),
+            Outcome::ShuttingDown,
+        ] {
+            assert_eq!(names().outcome(&outcome).unwrap_err().code.name(), outcome.name());
+        }
+    }
+
+    #[test]
+    fn events_name_what_they_are_about_and_how_much_they_matter() {
+        let lost = names().event(5, 1.0, &Event::Preempted(1, 0, 1, true));
+        assert_eq!(lost.text, "task servo lost r1 to task traj, of the same priority but named first in the blueprint");
+        assert_eq!((lost.task.as_deref(), lost.joint.as_deref(), lost.tick), (Some("servo"), Some("r1"), 5));
+        let level = |event| names().event(0, 0.0, &event).level;
+        assert_eq!(level(Event::Arm(0, Phase::Held, Cause::Operator)), Level::Info);
+        assert_eq!(level(Event::Arm(0, Phase::Held, Cause::LinkLost)), Level::Error);
+        assert_eq!(level(Event::Task(0, TaskState::Aborted, Reason::Cancelled)), Level::Info);
+        assert_eq!(level(Event::Task(0, TaskState::Aborted, Reason::GoalTolerance(0, 0.1))), Level::Error);
+        assert!(names().event(0, 0.0, &Event::Limited(9, LimitKind::Velocity, 2.0)).text.starts_with("?:"));
+    }
+}
