@@ -13,6 +13,9 @@
 //!
 //! A module may use only those above it in this list; `tests/layering.rs` checks that.
 
+/// Version of this program, with the commit it was built from where that is known.
+pub const VERSION: &str = env!("DIMOS_VERSION");
+
 pub mod arm;
 pub mod clock;
 pub mod joint;
@@ -30,6 +33,9 @@ pub mod rpc;
 
 pub mod recording;
 
+pub mod blueprint;
 
+pub mod runtime;
 
 pub mod cli;
+pub mod testing;
