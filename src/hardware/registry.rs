@@ -3,6 +3,7 @@
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
+use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
 use crate::yaml;
@@ -83,6 +84,8 @@ impl AdapterConfig {
 pub trait Emulator: Send {
     /// The address at which the adapter reaches it.
     fn address(&self) -> String;
+    /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that it can play.
+    fn inject(&self, fault: Fault) -> Result<(), String>;
 }
 
 /// One row of the table.
