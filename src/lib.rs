@@ -5,4 +5,5 @@ pub mod clock;
 pub mod hardware;
 pub mod joint;
 pub mod telemetry;
+pub mod testing;
 pub mod yaml;

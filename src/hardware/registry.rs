@@ -4,7 +4,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
 use crate::hardware::sim::faults::Fault;
-use crate::hardware::spec::{AdapterError, ManipulatorAdapter};
+use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
 use crate::yaml;
 
@@ -120,7 +120,7 @@ pub struct AdapterSpec {
     /// Makes an adapter. Does not connect.
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
-    pub emulate: Option<fn(&AdapterConfig) -> Result<Box<dyn Emulator>, AdapterError>>,
+    pub emulate: Option<fn(&AdapterConfig) -> AdapterResult<Box<dyn Emulator>>>,
 }
 
 /// The address that asks for the emulator.

@@ -171,10 +171,10 @@ impl Controller {
         self.suffer(t, now);
         let outcome = frame.request.and_then(|request| self.execute(&request, now, t));
         let status = outcome.err().unwrap_or(status::OK);
-        if let (Some(trace), Ok(request)) = (&mut self.trace, frame.request) {
-            if trace.len() < TRACE {
-                trace.push(Received { at: now, request, status });
-            }
+        if let (Some(trace), Ok(request)) = (&mut self.trace, frame.request)
+            && trace.len() < TRACE
+        {
+            trace.push(Received { at: now, request, status });
         }
         match (outcome, frame.request) {
             (Ok(()), Ok(Request::Hello)) => {
@@ -245,10 +245,9 @@ impl Controller {
             }
             Request::Enable(true) if self.error != 0 => return Err(status::IN_ERROR),
             Request::Enable(on) => {
-                if on && !self.plant.enabled() {
-                    if let Some(fault) = self.script.take(FaultKind::Sag, t) {
-                        self.plant.sag(fault.amount);
-                    }
+                let wakes = on && !self.plant.enabled();
+                if wakes && let Some(fault) = self.script.take(FaultKind::Sag, t) {
+                    self.plant.sag(fault.amount);
                 }
                 self.plant.enable(on);
             }
