@@ -88,6 +88,9 @@ pub trait Emulator: Send {
     fn inject(&self, fault: Fault) -> Result<(), String>;
 }
 
+/// Starts an emulator for an arm's configuration.
+pub type Emulate = fn(&AdapterConfig) -> AdapterResult<Box<dyn Emulator>>;
+
 /// One row of the table.
 #[derive(Debug, Clone, Copy)]
 pub struct AdapterSpec {
@@ -120,7 +123,7 @@ pub struct AdapterSpec {
     /// Makes an adapter. Does not connect.
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
-    pub emulate: Option<fn(&AdapterConfig) -> AdapterResult<Box<dyn Emulator>>>,
+    pub emulate: Option<Emulate>,
 }
 
 /// The address that asks for the emulator.
