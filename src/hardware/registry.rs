@@ -3,7 +3,8 @@
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
-use crate::hardware::spec::{AdapterError, ManipulatorAdapter};
+use crate::hardware::sim::faults::Fault;
+use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
 use crate::yaml;
 
@@ -83,7 +84,12 @@ impl AdapterConfig {
 pub trait Emulator: Send {
     /// The address at which the adapter reaches it.
     fn address(&self) -> String;
+    /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that it can play.
+    fn inject(&self, fault: Fault) -> Result<(), String>;
 }
+
+/// Starts an emulator for an arm's configuration.
+pub type Emulate = fn(&AdapterConfig) -> AdapterResult<Box<dyn Emulator>>;
 
 /// One row of the table.
 #[derive(Debug, Clone, Copy)]
@@ -117,7 +123,7 @@ pub struct AdapterSpec {
     /// Makes an adapter. Does not connect.
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
-    pub emulate: Option<fn(&AdapterConfig) -> Result<Box<dyn Emulator>, AdapterError>>,
+    pub emulate: Option<Emulate>,
 }
 
 /// The address that asks for the emulator.

@@ -3,7 +3,7 @@
 use crate::hardware::registry::AdapterSpec;
 
 pub mod mock;
+pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[mock::SPEC];
-pub mod yourarm;
+pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC];

@@ -88,13 +88,16 @@ fn default_joint() -> usize {
     1
 }
 
-/// A finite number that is not negative.
+/// Longest time in a script [s]: eleven days.
+const LONGEST: f64 = 1e6;
+
+/// A number that is neither negative nor absurd.
 fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     let value = f64::deserialize(deserializer)?;
-    if value.is_finite() && value >= 0.0 {
+    if (0.0..=LONGEST).contains(&value) {
         Ok(value)
     } else {
-        Err(serde::de::Error::custom(format!("{value} is not a finite number of at least 0")))
+        Err(serde::de::Error::custom(format!("{value} is not between 0 and {LONGEST}")))
     }
 }
 

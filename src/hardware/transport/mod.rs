@@ -1,3 +1,4 @@
 //! Ways to reach a device, shared by the arms.
 
+pub mod device_time;
 pub mod tcp;

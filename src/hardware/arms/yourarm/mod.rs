@@ -1,3 +1,107 @@
+//! YourArm, a made-up 6-joint arm: the template for an arm of your own. Copy this folder, then change, in this
+//! order: `protocol.rs` (the bytes), `adapter.rs` (the units and the lifecycle), `emulator/` (the other side of the
+//! wire), the numbers below, and add the row to the table in `arms/mod.rs`.
+
+pub mod adapter;
+pub mod emulator;
 #[cfg(test)]
 mod golden;
 pub mod protocol;
+#[cfg(test)]
+mod tests;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+
+use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::transport::tcp::Endpoint;
+use crate::joint::{ControlMode, JointLimits};
+
+/// The modes of the arm, in the order of their numbers on the wire.
+const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+
+/// How often the controller measures [Hz]: asking more often brings nothing new.
+const NATIVE_RATE: f64 = 500.0;
+
+/// Whether the arm keeps its pose when its motors are off: it has brakes.
+const HOLDS_WHEN_DISABLED: bool = true;
+
+/// Widest opening of the gripper [m].
+const GRIPPER_MAX: f64 = 0.08;
+
+/// YourArm's row in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "yourarm",
+    about: "YourArm YA6, the annotated template",
+    level: Level::Emulated,
+    transport: "tcp",
+    dof: (protocol::DOF, protocol::DOF),
+    modes: MODES,
+    wire_units: "deg, mm",
+    native_rate: NATIVE_RATE,
+    address: AddressForm {
+        form: "HOST[:PORT]",
+        required: true,
+        check: |address| Endpoint::parse(address, protocol::PORT).map(|_| ()),
+    },
+    holds_when_disabled: HOLDS_WHEN_DISABLED,
+    gripper: true,
+    options: OptionsSpec::of::<Options>(),
+    limits,
+    create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
+    emulate: Some(|config| Ok(Box::new(emulator::YourArmEmulator::start(config)?))),
+};
+
+/// The data sheet's joint limits, here in the sheet's units: lowest and highest position [deg], top speed [deg/s].
+const DATA_SHEET: [(f64, f64, f64); protocol::DOF] = [
+    (-170.0, 170.0, 180.0),
+    (-100.0, 130.0, 180.0),
+    (-70.0, 150.0, 180.0),
+    (-175.0, 175.0, 360.0),
+    (-100.0, 120.0, 360.0),
+    (-270.0, 270.0, 360.0),
+];
+/// Highest acceleration [rad/s²] and jerk [rad/s³] of every joint.
+const ACCELERATION: f64 = 10.0;
+const JERK: f64 = 100.0;
+
+/// The joint limits in SI units. They do not depend on `dof`: the arm has 6 joints.
+fn limits(_dof: usize) -> JointLimits {
+    JointLimits {
+        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
+        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
+        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
+        acceleration_max: vec![ACCELERATION; protocol::DOF],
+        jerk_max: vec![JERK; protocol::DOF],
+    }
+}
+
+/// What a blueprint may set of a YourArm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Scales the speed of moves that the controller plans (0–1].
+    #[serde(deserialize_with = "fraction")]
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
+    pub speed_scale: f64,
+    /// Whether to use the gripper.
+    pub gripper: bool,
+    /// What the emulator does, when one stands in for the arm.
+    pub sim: emulator::SimOptions,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { speed_scale: 1.0, gripper: true, sim: emulator::SimOptions::default() }
+    }
+}
+
+/// A number above 0, up to 1.
+fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    let value = f64::deserialize(deserializer)?;
+    if value > 0.0 && value <= 1.0 {
+        Ok(value)
+    } else {
+        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most 1")))
+    }
+}

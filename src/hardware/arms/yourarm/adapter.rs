@@ -1,0 +1,374 @@
+//! The YourArm adapter: the adapter protocol on one side, the controller's wire format on the other.
+//!
+//! Wire: degrees, deg/s, millimetres, Nm, one TCP connection, one reply to each command.
+//! Here: rad, rad/s, m, Nm. Every conversion between the two is in this file.
+//!
+//! One packet of the controller holds all that is measured. [`ManipulatorAdapter::read_joints`] fetches it; what is
+//! read right after (error, gripper, pose …) is answered from the same packet, so that a cycle costs one round trip.
+
+use std::time::Duration;
+
+use super::protocol::{self, Command, DOF, Hello, Mode, Status, WireJoints};
+use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use crate::arm::Pose;
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::registry::AdapterConfig;
+use crate::hardware::spec::{
+    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
+use crate::hardware::transport::device_time::DeviceTime;
+use crate::hardware::transport::tcp::{Endpoint, Scan, TcpLink};
+use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
+
+/// Longest wait for the connection and for the controller's introduction: together below 3 s.
+const CONNECT_TIMEOUT: Duration = Duration::from_millis(1500);
+const HELLO_TIMEOUT: Duration = Duration::from_millis(1000);
+/// Longest wait for any other reply. The controller answers within 1 ms; the rest is for a busy host.
+const REPLY_TIMEOUT: Duration = Duration::from_millis(100);
+/// So many replies in a row that do not come end the connection. One lost reply is not a lost arm.
+const LOST_AFTER: u32 = 3;
+/// A packet answers further questions for one period of the controller.
+const PACKET_AGE: Duration = Duration::from_millis(2);
+
+const MM_PER_M: f64 = 1000.0;
+
+/// A YourArm behind its controller.
+pub struct YourArmAdapter {
+    endpoint: Endpoint,
+    options: Options,
+    /// The connection, and who is at its other end.
+    link: Option<TcpLink>,
+    hello: Option<Hello>,
+    /// Number of the last command; its reply carries the same.
+    sequence: u16,
+    /// Replies in a row that did not come.
+    lost: u32,
+    /// The last packet, and when it arrived; `Mono::ZERO` when it must not answer anything any more.
+    state: protocol::State,
+    state_at: Mono,
+    device_time: DeviceTime,
+}
+
+impl YourArmAdapter {
+    /// An adapter for the controller at `config.address`. Does not connect.
+    pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
+        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
+        if config.dof != DOF {
+            return Err(rejected(format!("yourarm has {DOF} joints, not {}", config.dof)));
+        }
+        Ok(Self {
+            endpoint: Endpoint::parse(&config.address, protocol::PORT)
+                .map_err(|e| rejected(format!("address: {e}")))?,
+            options: config.options()?,
+            link: None,
+            hello: None,
+            sequence: 0,
+            lost: 0,
+            state: protocol::State::default(),
+            state_at: Mono::ZERO,
+            device_time: DeviceTime::default(),
+        })
+    }
+
+    /// Sends a command and waits for its reply; `decode` makes something of the reply's data.
+    fn request<T>(
+        &mut self,
+        command: &Command,
+        timeout: Duration,
+        decode: impl Fn(&[u8]) -> Option<T>,
+    ) -> AdapterResult<T> {
+        let link = self.link.as_mut().ok_or(AdapterError::NotConnected)?;
+        self.sequence = self.sequence.wrapping_add(1);
+        let (sequence, opcode) = (self.sequence, command.opcode());
+        let mut frame = [0; protocol::MAX_FRAME];
+        let result = link.send(protocol::encode(command, sequence, &mut frame)).and_then(|()| {
+            link.receive(timeout, |bytes| match protocol::scan(bytes, opcode, sequence) {
+                Scan::More => Scan::More,
+                Scan::Skip(n) => Scan::Skip(n),
+                Scan::Take(n, reply) => Scan::Take(n, read_reply(command, &reply, &decode)),
+            })
+        });
+        match result {
+            Ok(reply) => {
+                self.lost = 0;
+                reply
+            }
+            Err(error) => {
+                self.lost += 1;
+                if !matches!(error, AdapterError::Timeout(_)) || self.lost >= LOST_AFTER {
+                    self.disconnect();
+                }
+                Err(error)
+            }
+        }
+    }
+
+    /// A command whose reply has no data. What was measured before it answers nothing after it.
+    fn command(&mut self, command: &Command) -> AdapterResult<()> {
+        self.state_at = Mono::ZERO;
+        self.request(command, REPLY_TIMEOUT, |_| Some(()))
+    }
+
+    /// Asks for a packet of measurements.
+    fn fetch(&mut self) -> AdapterResult<()> {
+        self.state_at = Mono::ZERO;
+        self.state = self.request(&Command::GetState, REPLY_TIMEOUT, protocol::State::decode)?;
+        self.state_at = MonotonicClock.now();
+        Ok(())
+    }
+
+    /// The last packet, or a new one when that is too old.
+    fn recent(&mut self) -> AdapterResult<&protocol::State> {
+        if self.link.is_none() {
+            return Err(AdapterError::NotConnected);
+        }
+        if MonotonicClock.now().since(self.state_at) > PACKET_AGE {
+            self.fetch()?;
+        }
+        Ok(&self.state)
+    }
+
+    /// Says whether the other end is the arm that this adapter is for.
+    fn verify(&self, hello: &Hello) -> AdapterResult<()> {
+        let wrong = |what: String| Err(AdapterError::Rejected(format!("yourarm at {}: {what}", self.endpoint)));
+        if hello.dof != DOF {
+            wrong(format!("expected {DOF} joints, the controller says {}", hello.dof))
+        } else if hello.model != protocol::MODEL {
+            wrong(format!("expected model {}, the controller says {:?}", protocol::MODEL, hello.model))
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Speed of a planned move [%] from a fraction of the top speed.
+    fn percent(&self, velocity: f64) -> f64 {
+        (velocity * self.options.speed_scale * 100.0).clamp(1.0, 100.0)
+    }
+}
+
+/// Turns refusals into errors and data into what they mean.
+fn read_reply<T>(
+    command: &Command,
+    reply: &protocol::Reply<'_>,
+    decode: impl Fn(&[u8]) -> Option<T>,
+) -> AdapterResult<T> {
+    let name = command.name();
+    match reply.status {
+        Status::Ok => decode(reply.data)
+            .ok_or_else(|| AdapterError::Protocol(format!("yourarm: the reply to {name} is malformed"))),
+        Status::Refused(protocol::IN_ERROR) => {
+            let code = protocol::decode_refusal(reply.data).unwrap_or_default();
+            Err(AdapterError::Fault { code: code.into(), text: protocol::error_text(code).into() })
+        }
+        Status::Refused(status) => {
+            Err(AdapterError::Rejected(format!("yourarm refuses {name}: {}", protocol::status_text(status))))
+        }
+    }
+}
+
+// --- Units ---
+
+/// Joint values of the wire [deg or deg/s] as ours [rad or rad/s].
+fn from_degrees(values: &WireJoints) -> Joints {
+    joints_of(&values.map(f64::to_radians))
+}
+
+/// Our joint values [rad or rad/s] as those of the wire [deg or deg/s].
+fn to_degrees(values: &[f64]) -> AdapterResult<WireJoints> {
+    match <[f64; DOF]>::try_from(values) {
+        Ok(values) if values.iter().all(|value| value.is_finite()) => Ok(values.map(f64::to_degrees)),
+        _ => Err(AdapterError::Rejected(format!("{DOF} finite values are needed, one per joint"))),
+    }
+}
+
+/// Copies the first values; `out` has length dof.
+fn fill(out: &mut [f64], values: &[f64]) {
+    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+}
+
+impl ManipulatorAdapter for YourArmAdapter {
+    // --- Lifecycle ---
+
+    fn connect(&mut self) -> AdapterResult<()> {
+        self.disconnect();
+        self.link = Some(TcpLink::connect("yourarm", &self.endpoint, CONNECT_TIMEOUT)?);
+        let introduced = self.request(&Command::Hello, HELLO_TIMEOUT, Hello::decode).and_then(|hello| {
+            self.verify(&hello)?;
+            self.hello = Some(hello);
+            self.fetch() // so that the mode is known, and that measurements do come
+        });
+        if introduced.is_err() {
+            self.disconnect();
+        }
+        introduced
+    }
+
+    fn disconnect(&mut self) {
+        self.link = None;
+        self.lost = 0;
+        self.state_at = Mono::ZERO;
+        self.device_time = DeviceTime::default();
+    }
+
+    fn is_connected(&self) -> bool {
+        self.link.is_some()
+    }
+
+    // `activate` and `deactivate`: the default bodies do what is right here. ENABLE holds the arm where it is; STOP
+    // leaves the motors on.
+
+    // --- What it is ---
+
+    fn get_info(&self) -> ManipulatorInfo {
+        let hello = self.hello.as_ref();
+        ManipulatorInfo {
+            vendor: "YourVendor".into(),
+            model: hello.map_or(protocol::MODEL.into(), |hello| hello.model.clone()),
+            dof: DOF,
+            firmware_version: hello.map(|hello| hello.firmware.map(|n| n.to_string()).join(".")),
+            serial_number: hello.map(|hello| hello.serial.clone()),
+            native_rate: NATIVE_RATE,
+            modes: MODES,
+            holds_when_disabled: HOLDS_WHEN_DISABLED,
+        }
+    }
+
+    fn get_dof(&self) -> usize {
+        DOF
+    }
+
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        Ok(limits(DOF)) // the controller cannot be asked for them
+    }
+
+    // --- Mode ---
+
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        let wire = match mode {
+            ControlMode::Position => Mode::Position,
+            ControlMode::ServoPosition => Mode::Servo,
+            ControlMode::Velocity => Mode::Velocity,
+            _ => return Err(AdapterError::Unsupported),
+        };
+        self.command(&Command::SetMode(wire))?; // refused while the arm moves
+        self.fetch()?;
+        if self.state.mode == wire {
+            Ok(())
+        } else {
+            Err(AdapterError::Protocol(format!("yourarm confirmed the mode {wire:?} but is in {:?}", self.state.mode)))
+        }
+    }
+
+    fn get_control_mode(&self) -> ControlMode {
+        match self.state.mode {
+            Mode::Position => ControlMode::Position,
+            Mode::Servo => ControlMode::ServoPosition,
+            Mode::Velocity => ControlMode::Velocity,
+        }
+    }
+
+    // --- State ---
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        self.fetch()?;
+        fill(positions, &from_degrees(&self.state.positions));
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        fill(velocities, &from_degrees(&self.recent()?.velocities));
+        Ok(true) // `false` if your arm does not measure them: never fill in zeros
+    }
+
+    fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
+        fill(efforts, &self.recent()?.torques);
+        Ok(true)
+    }
+
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        self.fetch()?;
+        *reading = JointReading {
+            stamp: Some(self.device_time.translate(self.state.time_us.saturating_mul(1000), self.state_at)),
+            position: from_degrees(&self.state.positions),
+            velocity: Some(from_degrees(&self.state.velocities)),
+            effort: Some(joints_of(&self.state.torques)),
+        };
+        Ok(())
+    }
+
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        let state = self.recent()?;
+        Ok(RobotState { state: state.state.into(), mode: state.mode as i32 })
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        let code = self.recent()?.error;
+        Ok((code.into(), protocol::error_text(code).into())) // an empty text allocates nothing
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        Ok(self.recent()?.enabled)
+    }
+
+    // --- Motion ---
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        let joints = to_degrees(positions)?;
+        match self.get_control_mode() {
+            ControlMode::Position => self.command(&Command::MoveJoints { speed: self.percent(velocity), joints }),
+            ControlMode::ServoPosition => self.command(&Command::ServoJoints(joints)),
+            mode => Err(AdapterError::Rejected(format!("joint positions in {} mode", mode.name()))),
+        }
+    }
+
+    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
+        let joints = to_degrees(velocities)?;
+        self.command(&Command::VelocityJoints(joints)) // the controller checks the mode
+    }
+
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        self.command(&Command::Stop)?;
+        Ok(Stop::Confirmed) // the controller replied; where an arm cannot, answer `Sent`
+    }
+
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        self.command(&Command::Enable(enable))
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.command(&Command::ClearError)
+    }
+
+    // --- Optional parts: leave out what your arm does not have ---
+
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+        let [x, y, z, roll, pitch, yaw] = self.recent()?.pose;
+        Ok(Some(Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw].map(f64::to_radians) }))
+    }
+
+    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
+        let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz.map(|v| v * MM_PER_M), pose.rpy.map(f64::to_degrees));
+        let pose = [x, y, z, roll, pitch, yaw];
+        if !pose.iter().all(|value| value.is_finite()) {
+            return Err(AdapterError::Rejected("the pose is not finite".into()));
+        }
+        self.command(&Command::MoveCartesian { speed: self.percent(velocity), pose })
+    }
+
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        let used = self.options.gripper;
+        let state = self.recent()?;
+        Ok((used && state.gripper_fitted).then_some(state.gripper / MM_PER_M))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        if !self.options.gripper {
+            return Err(AdapterError::Unsupported);
+        }
+        if !(0.0..=super::GRIPPER_MAX).contains(&position) {
+            let max = super::GRIPPER_MAX;
+            return Err(AdapterError::Rejected(format!("gripper opening {position} m is not within 0 to {max} m")));
+        }
+        self.command(&Command::Gripper(position * MM_PER_M))
+    }
+}

@@ -1,0 +1,136 @@
+//! The emulator: plays a YourArm controller on a loopback address, for `address: sim` and for tests.
+//!
+//! A thread waits for clients, another serves the one that is connected; both sleep in the kernel while nothing
+//! comes, and the joints are brought up to date when somebody asks. Like the real controller it serves one client at
+//! a time and turns a second one away.
+
+mod controller;
+mod kinematics;
+mod server;
+pub mod wire;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::{limits, protocol::DOF};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::registry::{AdapterConfig, Emulator};
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::joint::Joints;
+use controller::Controller;
+pub use controller::Received;
+use server::Server;
+
+/// The faults that the emulator can play.
+const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::Nan,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Corrupt,
+    FaultKind::Truncated,
+    FaultKind::WrongDof,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+];
+
+/// What the emulator does.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at power-up [rad], one per joint; `[0, -0.3, 0.6, 0, 0.8, 0]` when empty.
+    pub initial_positions: Vec<f64>,
+    /// What goes wrong, and when (seconds after the first connection).
+    pub faults: Vec<Fault>,
+}
+
+/// A running emulator. Ends when it is dropped.
+pub struct YourArmEmulator {
+    server: Server,
+}
+
+impl YourArmEmulator {
+    /// Starts an emulator on a free loopback port, with the `sim` part of an adapter's options.
+    pub fn start(config: &AdapterConfig) -> AdapterResult<Self> {
+        Self::with(&config.options::<super::Options>()?.sim)
+    }
+
+    /// Starts an emulator on a free loopback port.
+    pub fn with(options: &SimOptions) -> AdapterResult<Self> {
+        let rejected = |text| AdapterError::Rejected(format!("yourarm emulator: {text}"));
+        check_kinds("the yourarm emulator", &options.faults, PLAYABLE).map_err(AdapterError::Rejected)?;
+        let initial = &options.initial_positions;
+        if !initial.is_empty() {
+            let limits = limits(DOF);
+            let inside = initial
+                .iter()
+                .zip(limits.position_lower.iter().zip(&limits.position_upper))
+                .all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
+            if initial.len() != DOF || !inside {
+                return Err(rejected(format!("initial_positions must be {DOF} angles [rad] within the joint limits")));
+            }
+        }
+        let controller = Controller::new(initial, &options.faults, MonotonicClock.now());
+        let server = Server::start(controller).map_err(|e| rejected(format!("cannot start: {e}")))?;
+        Ok(Self { server })
+    }
+
+    /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
+    pub fn press_estop(&self) {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            controller.press_estop();
+        });
+    }
+
+    /// Releases the E-stop button. Nothing else changes.
+    pub fn release_estop(&self) {
+        self.server.with(|controller, _| controller.release_estop());
+    }
+
+    /// True joint positions [rad] and velocities [rad/s] now.
+    pub fn joints(&self) -> (Joints, Joints) {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            controller.joints()
+        })
+    }
+
+    /// Whether the motors are on.
+    pub fn enabled(&self) -> bool {
+        self.server.with(|controller, _| controller.enabled())
+    }
+
+    /// Starts to record what comes over the wire, up to 200 000 requests; forgets what was recorded before.
+    pub fn record(&self) {
+        self.server.with(|controller, _| controller.record());
+    }
+
+    /// What came over the wire since [`YourArmEmulator::record`].
+    pub fn trace(&self) -> Vec<Received> {
+        self.server.with(|controller, _| controller.trace())
+    }
+
+    /// How many clients were turned away because another one was connected.
+    pub fn refused_clients(&self) -> u64 {
+        self.server.refused()
+    }
+}
+
+impl Emulator for YourArmEmulator {
+    fn address(&self) -> String {
+        self.server.address().to_string()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        check_kinds("the yourarm emulator", &[fault], PLAYABLE)?;
+        self.server.with(|controller, now| controller.inject(fault, now));
+        Ok(())
+    }
+}

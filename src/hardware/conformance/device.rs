@@ -1,0 +1,149 @@
+//! Reading the arm, its modes and its optional parts.
+
+use super::Check;
+use super::context::{Context, farthest, require};
+use crate::hardware::spec::{AdapterError, JointReading};
+use crate::joint::ControlMode;
+
+/// The checks of this file.
+pub const CHECKS: &[Check] = &[
+    Check { name: "reads_agree", about: "read_joints says the same as the single reads", run: reads_agree },
+    Check { name: "positions_are_plausible", about: "positions are in rad, inside the limits", run: plausible },
+    Check { name: "stamps_are_of_the_past", about: "stamps grow and are never of the future", run: stamps },
+    Check { name: "reads_do_not_allocate", about: "a cycle's reads and writes allocate nothing", run: no_allocation },
+    Check { name: "modes_are_what_it_says", about: "its modes work, others are Unsupported", run: modes },
+    Check { name: "optional_parts_never_fail", about: "what it has not is None or Unsupported", run: optional_parts },
+    Check { name: "gripper_is_in_metres", about: "the gripper goes where it is sent", run: gripper },
+];
+
+fn reads_agree(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let dof = context.config.dof;
+    let reading = context.joints()?;
+    let mut buffer = vec![f64::NAN; dof];
+    context.adapter.read_joint_positions(&mut buffer).map_err(|e| e.to_string())?;
+    let (position, rest) = reading.position.split_at(dof);
+    require(farthest(position, &buffer) < 1e-6 && buffer.iter().all(|v| v.is_finite()), || {
+        format!("read_joint_positions {buffer:?}, read_joints {position:?}")
+    })?;
+    require(rest.iter().all(|v| *v == 0.0), || "entries past dof are not zero".into())?;
+    let velocities = context.adapter.read_joint_velocities(&mut buffer).map_err(|e| e.to_string())?;
+    require(velocities == reading.velocity.is_some(), || "the two disagree on having velocities".into())?;
+    require(!velocities || buffer.iter().all(|v| v.abs() < 1e-3), || format!("velocities at rest: {buffer:?}"))?;
+    let efforts = context.adapter.read_joint_efforts(&mut buffer).map_err(|e| e.to_string())?;
+    require(efforts == reading.effort.is_some(), || "the two disagree on having torques".into())?;
+    context.adapter.read_state().map(|_| ()).map_err(|e| format!("read_state: {e}"))
+}
+
+fn plausible(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let (positions, limits) = (context.positions()?, context.limits()?);
+    let range = limits.position_lower.iter().zip(&limits.position_upper);
+    for (i, (position, (lower, upper))) in positions.iter().zip(range).enumerate() {
+        let inside = (lower - 0.01..=upper + 0.01).contains(position);
+        require(inside, || format!("joint {}: {position} rad is outside {lower} to {upper}", i + 1))?;
+    }
+    Ok(())
+}
+
+fn stamps(context: &mut Context) -> Result<(), String> {
+    use crate::clock::{Clock, Mono, MonotonicClock};
+    context.connect()?;
+    let mut last = Mono::ZERO;
+    for _ in 0..20 {
+        let reading = context.joints()?;
+        let Some(stamp) = reading.stamp else { return context.skip("it gives no time") };
+        require(stamp >= last, || format!("{stamp:?} after {last:?}"))?;
+        require(stamp <= MonotonicClock.now(), || format!("{stamp:?} is in the future"))?;
+        last = stamp;
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    Ok(())
+}
+
+fn no_allocation(context: &mut Context) -> Result<(), String> {
+    let Some(allocations) = context.allocations else { return context.skip("no counting allocator") };
+    let servo = context.row.modes.contains(&ControlMode::ServoPosition);
+    context.ready(if servo { ControlMode::ServoPosition } else { ControlMode::Position })?;
+    let hold = context.positions()?;
+    let mut reading = JointReading::default();
+    // The first cycles may fill caches.
+    for cycle in 0..50 {
+        let before = allocations();
+        let adapter = &mut context.adapter;
+        let read = adapter.read_joints(&mut reading).is_ok()
+            && adapter.read_error().is_ok()
+            && adapter.read_enabled().is_ok()
+            && adapter.read_state().is_ok()
+            && adapter.read_gripper_position().is_ok()
+            && adapter.read_cartesian_position().is_ok()
+            && adapter.read_force_torque().is_ok();
+        let written = adapter.write_joint_positions(&hold, 0.1).is_ok();
+        let made = allocations() - before;
+        require(made == 0 || cycle < 5 || !(read && written), || format!("{made} allocations in cycle {cycle}"))?;
+    }
+    Ok(())
+}
+
+fn modes(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    context.adapter.activate().map_err(|e| format!("activate: {e}"))?;
+    let start = context.positions()?;
+    let all = [
+        ControlMode::Position,
+        ControlMode::ServoPosition,
+        ControlMode::Velocity,
+        ControlMode::Torque,
+        ControlMode::Cartesian,
+        ControlMode::CartesianVelocity,
+        ControlMode::Impedance,
+    ];
+    for mode in all {
+        let result = context.adapter.set_control_mode(mode);
+        if context.row.modes.contains(&mode) {
+            require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
+            let now = context.adapter.get_control_mode();
+            require(now == mode, || format!("set to {}, says {}", mode.name(), now.name()))?;
+        } else {
+            require(result == Err(AdapterError::Unsupported), || format!("{}: {result:?}", mode.name()))?;
+        }
+    }
+    context.stays(&start, 1e-3)
+}
+
+fn optional_parts(context: &mut Context) -> Result<(), String> {
+    context.ready(context.row.modes.first().copied().unwrap_or_default())?;
+    let dof = context.config.dof;
+    let adapter = &mut context.adapter;
+    let pose = adapter.read_cartesian_position().map_err(|e| format!("read_cartesian_position: {e}"))?;
+    let gripper = adapter.read_gripper_position().map_err(|e| format!("read_gripper_position: {e}"))?;
+    adapter.read_force_torque().map_err(|e| format!("read_force_torque: {e}"))?;
+    if gripper.is_none() {
+        let result = adapter.write_gripper_position(0.01);
+        require(result == Err(AdapterError::Unsupported), || format!("no gripper, but writing gives {result:?}"))?;
+    }
+    if let Some(pose) = pose {
+        // 20 m away and 7 rad round: such an arm counts in millimetres or degrees.
+        require(pose.xyz.iter().all(|v| v.abs() < 20.0), || format!("{:?} is not in metres", pose.xyz))?;
+        require(pose.rpy.iter().all(|v| v.abs() < 7.0), || format!("{:?} is not in rad", pose.rpy))?;
+    }
+    if !context.row.modes.contains(&ControlMode::Velocity) {
+        let result = adapter.write_joint_velocities(&vec![0.0; dof]);
+        require(result == Err(AdapterError::Unsupported), || {
+            format!("no velocity mode, but writing gives {result:?}")
+        })?;
+    }
+    Ok(())
+}
+
+fn gripper(context: &mut Context) -> Result<(), String> {
+    context.ready(context.row.modes.first().copied().unwrap_or_default())?;
+    let opening = |context: &mut Context| context.adapter.read_gripper_position().map_err(|e| e.to_string());
+    let Some(start) = opening(context)? else {
+        return context.skip("it has no gripper");
+    };
+    require((-0.01..0.5).contains(&start), || format!("an opening of {start} m"))?;
+    let target = if start > 0.02 { start / 2.0 } else { start + 0.01 };
+    context.adapter.write_gripper_position(target).map_err(|e| format!("write_gripper_position: {e}"))?;
+    context.until("the gripper", |context| Ok(opening(context)?.is_some_and(|now| (now - target).abs() < 0.001)))
+}

@@ -1,0 +1,91 @@
+//! What an adapter says of itself.
+
+use super::Check;
+use super::context::{Context, require};
+use crate::hardware::registry::AdapterConfig;
+
+/// The checks of this file.
+pub const CHECKS: &[Check] = &[
+    Check { name: "row_is_complete", about: "the table row is filled in and consistent", run: row_is_complete },
+    Check { name: "describes_itself", about: "get_info and get_dof agree with the row", run: describes_itself },
+    Check { name: "limits_are_usable", about: "limits are finite, ordered, one per joint", run: limits_are_usable },
+    Check { name: "addresses_are_checked", about: "ill-formed addresses are refused", run: addresses_are_checked },
+    Check { name: "options_are_strict", about: "unknown options are refused by name", run: options_are_strict },
+    Check { name: "dof_is_checked", about: "a number of joints it cannot have is refused", run: dof_is_checked },
+];
+
+fn row_is_complete(context: &mut Context) -> Result<(), String> {
+    let row = &context.row;
+    let name_ok =
+        !row.name.is_empty() && row.name.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_');
+    require(name_ok, || format!("name {:?} is not lower-case letters, digits and _", row.name))?;
+    require(!row.about.is_empty() && !row.transport.is_empty() && !row.wire_units.is_empty(), || {
+        "about, transport or wire_units is empty".into()
+    })?;
+    require(1 <= row.dof.0 && row.dof.0 <= row.dof.1, || format!("dof {:?} is not a range", row.dof))?;
+    require(!row.modes.is_empty(), || "it has no modes".into())?;
+    require(row.native_rate > 0.0, || format!("native_rate is {}", row.native_rate))
+}
+
+fn describes_itself(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let (info, row, dof) = (context.adapter.get_info(), &context.row, context.config.dof);
+    require(!info.vendor.is_empty() && !info.model.is_empty(), || "vendor or model is empty".into())?;
+    require(info.dof == dof && context.adapter.get_dof() == dof, || format!("it says {} joints, not {dof}", info.dof))?;
+    require(info.modes == row.modes, || format!("modes {:?}, in the table {:?}", info.modes, row.modes))?;
+    require(info.native_rate > 0.0, || format!("native_rate is {}", info.native_rate))?;
+    require(info.holds_when_disabled == row.holds_when_disabled, || "holds_when_disabled is not the table's".into())
+}
+
+fn limits_are_usable(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let dof = context.config.dof;
+    for (source, limits) in [("table", (context.row.limits)(dof)), ("get_limits", context.limits()?)] {
+        let required = [&limits.position_lower, &limits.position_upper, &limits.velocity_max];
+        require(required.iter().all(|values| values.len() == dof), || format!("{source}: not {dof} values"))?;
+        for optional in [&limits.acceleration_max, &limits.jerk_max] {
+            require(optional.is_empty() || optional.len() == dof, || format!("{source}: neither 0 nor {dof} values"))?;
+            require(optional.iter().all(|v| v.is_finite() && *v > 0.0), || {
+                format!("{source}: a limit is not above 0")
+            })?;
+        }
+        let finite = required.iter().all(|values| values.iter().all(|v| v.is_finite()));
+        require(finite, || format!("{source}: a limit is not finite"))?;
+        let ordered = limits.position_lower.iter().zip(&limits.position_upper).all(|(lower, upper)| lower < upper);
+        require(ordered, || format!("{source}: a lower limit is not below its upper limit"))?;
+        // 100 rad or 100 rad/s is no arm: these are degrees.
+        let radians = limits.position_lower.iter().chain(&limits.position_upper).chain(&limits.velocity_max);
+        require(radians.into_iter().all(|v| v.abs() < 100.0), || format!("{source}: these limits are not in rad"))?;
+        require(limits.velocity_max.iter().all(|v| *v > 0.0), || format!("{source}: a velocity limit is not above 0"))?;
+    }
+    Ok(())
+}
+
+fn addresses_are_checked(context: &mut Context) -> Result<(), String> {
+    let address = context.row.address;
+    require(!address.form.is_empty(), || "the form of the address is not stated".into())?;
+    if !address.required {
+        return context.skip("it needs no address");
+    }
+    require((address.check)("").is_err(), || "an empty address is accepted".into())?;
+    (address.check)(&context.config.address).map_err(|e| format!("the emulator's own address is refused: {e}"))
+}
+
+fn options_are_strict(context: &mut Context) -> Result<(), String> {
+    let options = serde_json::json!({ "no_such_option": 1 });
+    match (context.row.create)(&AdapterConfig { options, ..context.config.clone() }) {
+        Ok(_) => Err("an unknown option is accepted".into()),
+        Err(error) => require(error.to_string().contains("no_such_option"), || {
+            format!("the error does not name the option: {error}")
+        }),
+    }
+}
+
+fn dof_is_checked(context: &mut Context) -> Result<(), String> {
+    let (fewest, most) = context.row.dof;
+    for dof in [fewest.wrapping_sub(1), most + 1] {
+        let made = (context.row.create)(&AdapterConfig { dof, ..context.config.clone() });
+        require(made.is_err(), || format!("{dof} joints are accepted"))?;
+    }
+    Ok(())
+}

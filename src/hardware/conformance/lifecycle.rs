@@ -1,0 +1,145 @@
+//! Connecting, activating, leaving: nothing may move by it.
+
+use std::time::{Duration, Instant};
+
+use super::Check;
+use super::context::{Context, farthest, require};
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::spec::{AdapterError, JointReading};
+
+/// The longest that `connect` may take on an address that does not answer.
+const UNREACHABLE: Duration = Duration::from_secs(3);
+
+/// The checks of this file.
+pub const CHECKS: &[Check] = &[
+    Check {
+        name: "not_connected_is_said",
+        about: "calls before connect answer NotConnected",
+        run: not_connected_is_said,
+    },
+    Check {
+        name: "connecting_changes_nothing",
+        about: "connect enables and moves nothing",
+        run: connecting_changes_nothing,
+    },
+    Check { name: "activation_holds", about: "activate enables and holds within 0.005 rad", run: activation_holds },
+    Check {
+        name: "leaving_moves_nothing",
+        about: "deactivate and disconnect move nothing",
+        run: leaving_moves_nothing,
+    },
+    Check { name: "connects_twice", about: "connecting again, or after leaving, works", run: connects_twice },
+    Check { name: "unreachable_is_clear", about: "an address without arm fails within 3 s", run: unreachable_is_clear },
+    Check {
+        name: "silence_is_clear",
+        about: "an arm that accepts but is silent fails within 3 s",
+        run: silence_is_clear,
+    },
+    Check { name: "wrong_arm_is_refused", about: "another number of joints is refused", run: wrong_arm_is_refused },
+];
+
+fn not_connected_is_said(context: &mut Context) -> Result<(), String> {
+    context.adapter.disconnect();
+    let mut buffer = vec![0.0; context.config.dof];
+    let adapter = &mut context.adapter;
+    require(!adapter.is_connected(), || "is_connected is true".into())?;
+    let answers = [
+        ("read_joint_positions", adapter.read_joint_positions(&mut buffer).err()),
+        ("read_joints", adapter.read_joints(&mut JointReading::default()).err()),
+        ("read_state", adapter.read_state().err()),
+        ("read_error", adapter.read_error().err()),
+        ("read_enabled", adapter.read_enabled().err()),
+        ("write_joint_positions", adapter.write_joint_positions(&buffer, 0.1).err()),
+        ("write_stop", adapter.write_stop().err()),
+        ("write_enable", adapter.write_enable(true).err()),
+        ("write_clear_errors", adapter.write_clear_errors().err()),
+    ];
+    for (name, answer) in answers {
+        require(answer == Some(AdapterError::NotConnected), || format!("{name} answers {answer:?}"))?;
+    }
+    Ok(())
+}
+
+fn connecting_changes_nothing(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    require(context.adapter.is_connected(), || "is_connected is false".into())?;
+    require(!context.enabled()?, || "the motors are on".into())?;
+    let start = context.positions()?;
+    context.stays(&start, 1e-6)
+}
+
+fn activation_holds(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let start = context.positions()?;
+    context.adapter.activate().map_err(|e| format!("activate: {e}"))?;
+    require(context.enabled()?, || "the motors are off".into())?;
+    context.stays(&start, 0.005)
+}
+
+fn leaving_moves_nothing(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    context.adapter.activate().map_err(|e| format!("activate: {e}"))?;
+    let start = context.positions()?;
+    context.adapter.deactivate().map_err(|e| format!("deactivate: {e}"))?;
+    require(context.enabled()?, || "deactivate switched the motors off".into())?;
+    context.adapter.disconnect();
+    context.adapter.disconnect();
+    require(!context.adapter.is_connected(), || "is_connected is true".into())?;
+    context.connect()?;
+    context.stays(&start, 0.005)
+}
+
+fn connects_twice(context: &mut Context) -> Result<(), String> {
+    for _ in 0..3 {
+        context.connect()?;
+        context.connect()?;
+        let first = context.positions()?;
+        context.adapter.disconnect();
+        context.connect()?;
+        let moved = farthest(&context.positions()?, &first);
+        require(moved < 1e-6, || format!("the arm moved by {moved} rad"))?;
+        context.adapter.disconnect();
+    }
+    Ok(())
+}
+
+fn unreachable_is_clear(context: &mut Context) -> Result<(), String> {
+    if context.emulator.take().is_none() {
+        return context.skip("it is its own plant");
+    }
+    let start = Instant::now();
+    fails_clearly(context, start)?;
+    let (error, address) = (context.adapter.connect().err(), &context.config.address);
+    let text = error.map_or(String::new(), |e| e.to_string());
+    require(text.contains(address.as_str()), || format!("the error does not name {address}: {text}"))
+}
+
+fn silence_is_clear(context: &mut Context) -> Result<(), String> {
+    if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::Silent).lasting(60.0)) {
+        return context.skip("its double cannot be silent");
+    }
+    context.strike()?;
+    fails_clearly(context, Instant::now())
+}
+
+fn fails_clearly(context: &mut Context, start: Instant) -> Result<(), String> {
+    let result = context.adapter.connect();
+    let took = start.elapsed();
+    let expected = matches!(result, Err(AdapterError::Io(_) | AdapterError::Timeout(_)));
+    require(expected, || format!("connect answers {result:?}"))?;
+    require(took < UNREACHABLE, || format!("connect took {took:?}"))?;
+    require(!context.adapter.is_connected(), || "is_connected is true".into())
+}
+
+fn wrong_arm_is_refused(context: &mut Context) -> Result<(), String> {
+    if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::WrongDof)) {
+        return context.skip("its double cannot be another arm");
+    }
+    context.strike()?;
+    let result = context.adapter.connect();
+    let text = result.as_ref().err().map_or(String::new(), |e| e.to_string());
+    let numbers = [context.config.dof, context.config.dof + 1].map(|n| n.to_string());
+    require(matches!(result, Err(AdapterError::Rejected(_))), || format!("connect answers {result:?}"))?;
+    require(numbers.iter().all(|n| text.contains(n)), || format!("expected and found are not both in: {text}"))?;
+    require(!context.adapter.is_connected(), || "is_connected is true".into())
+}

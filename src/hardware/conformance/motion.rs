@@ -1,0 +1,160 @@
+//! Moving: units, signs, joint order, stopping, refusing.
+
+use std::time::{Duration, Instant};
+
+use super::Check;
+use super::context::{Context, farthest, require};
+use crate::joint::ControlMode;
+
+/// The checks of this file.
+pub const CHECKS: &[Check] = &[
+    Check { name: "planned_moves_arrive", about: "each joint goes its own way, in rad", run: planned_moves_arrive },
+    Check { name: "set_points_are_followed", about: "streamed positions are followed", run: set_points_are_followed },
+    Check { name: "velocities_are_kept", about: "rad/s written is rad/s moved and read", run: velocities_are_kept },
+    Check { name: "stop_ends_motion", about: "write_stop in motion brings standstill", run: stop_ends_motion },
+    Check { name: "stop_at_rest_is_harmless", about: "write_stop at rest changes nothing", run: stop_at_rest },
+    Check { name: "disabled_arms_do_not_move", about: "commands without power are refused", run: disabled_arms },
+    Check { name: "nonsense_is_refused", about: "NaN and wrong lengths are refused, nothing moves", run: nonsense },
+];
+
+fn planned_moves_arrive(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::Position) {
+        return context.skip("it has no position mode");
+    }
+    context.ready(ControlMode::Position)?;
+    let start = context.positions()?;
+    let target = context.nearby(&start)?;
+    for goal in [&target, &start] {
+        context.adapter.write_joint_positions(goal, 0.5).map_err(|e| format!("write_joint_positions: {e}"))?;
+        context.until("arrival", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))?;
+    }
+    Ok(())
+}
+
+fn set_points_are_followed(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::ServoPosition) {
+        return context.skip("it has no servo mode");
+    }
+    context.ready(ControlMode::ServoPosition)?;
+    let start = context.positions()?;
+    let target = context.nearby(&start)?;
+    for i in 1..=50 {
+        let part = f64::from(i) / 50.0;
+        let point: Vec<f64> = start.iter().zip(&target).map(|(a, b)| a + (b - a) * part).collect();
+        context.adapter.write_joint_positions(&point, 1.0).map_err(|e| format!("write_joint_positions: {e}"))?;
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    context.until("the last set point", |context| Ok(farthest(&context.positions()?, &target) < 1e-3))
+}
+
+fn velocities_are_kept(context: &mut Context) -> Result<(), String> {
+    const SPEED: f64 = 0.1;
+    if !context.row.modes.contains(&ControlMode::Velocity) {
+        return context.skip("it has no velocity mode");
+    }
+    context.ready(ControlMode::Velocity)?;
+    let start = context.positions()?;
+    let away = context.nearby(&start)?;
+    let wanted: Vec<f64> = start.iter().zip(&away).map(|(a, b)| SPEED.copysign(b - a)).collect();
+    let mut measured = None;
+    // The speed between the two halves of the way: independent of how long the arm takes to get going.
+    let mut half = None;
+    let mut end = (start, Instant::now());
+    for i in 0..40 {
+        context.adapter.write_joint_velocities(&wanted).map_err(|e| format!("write_joint_velocities: {e}"))?;
+        std::thread::sleep(Duration::from_millis(10));
+        let reading = context.joints()?;
+        let positions = reading.position.get(..wanted.len()).unwrap_or_default().to_vec();
+        end = (positions, Instant::now());
+        if i == 15 {
+            half = Some(end.clone());
+        }
+        measured = reading.velocity;
+    }
+    context.adapter.write_stop().map_err(|e| format!("write_stop: {e}"))?;
+    let (from, then) = half.ok_or("the arm could not be watched")?;
+    let seconds = (end.1 - then).as_secs_f64();
+    for (i, ((a, b), wanted)) in from.iter().zip(&end.0).zip(&wanted).enumerate() {
+        let found = (b - a) / seconds;
+        let close = (found - wanted).abs() < 0.5 * SPEED;
+        require(close, || format!("joint {}: {wanted} rad/s written, {found:.4} rad/s moved", i + 1))?;
+    }
+    if let Some(measured) = measured {
+        let off = farthest(&measured, &wanted);
+        require(off < 0.5 * SPEED, || format!("velocities written {wanted:?}, read {measured:?}"))?;
+    }
+    Ok(())
+}
+
+fn stop_ends_motion(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::Position) {
+        return context.skip("it has no position mode");
+    }
+    context.ready(ControlMode::Position)?;
+    let start = context.positions()?;
+    let limits = context.limits()?;
+    let far: Vec<f64> = limits
+        .position_lower
+        .iter()
+        .zip(&limits.position_upper)
+        .map(|(lower, upper)| lower + 0.9 * (upper - lower))
+        .collect();
+    context.adapter.write_joint_positions(&far, 0.1).map_err(|e| format!("write_joint_positions: {e}"))?;
+    context.until("motion", |context| Ok(farthest(&context.positions()?, &start) > 0.01))?;
+    context.adapter.write_stop().map_err(|e| format!("write_stop: {e}"))?;
+    let stopped = context.standstill()?;
+    require(farthest(&stopped, &far) > 0.01, || "it went to its target all the same".into())?;
+    require(context.enabled()?, || "the motors are off".into())?;
+    context.stays(&stopped, 1e-3)
+}
+
+fn stop_at_rest(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let start = context.positions()?;
+    context.adapter.write_stop().map_err(|e| format!("write_stop when disabled: {e}"))?;
+    require(!context.enabled()?, || "write_stop switched the motors on".into())?;
+    context.adapter.activate().map_err(|e| format!("activate: {e}"))?;
+    for _ in 0..3 {
+        context.adapter.write_stop().map_err(|e| format!("write_stop: {e}"))?;
+    }
+    require(context.enabled()?, || "write_stop switched the motors off".into())?;
+    context.stays(&start, 0.005)
+}
+
+fn disabled_arms(context: &mut Context) -> Result<(), String> {
+    let mode = context.row.modes.first().copied().unwrap_or_default();
+    context.ready(mode)?;
+    context.adapter.write_enable(false).map_err(|e| format!("write_enable: {e}"))?;
+    require(!context.enabled()?, || "the motors are still on".into())?;
+    if !context.row.holds_when_disabled {
+        return Ok(());
+    }
+    let start = context.positions()?;
+    let target = context.nearby(&start)?;
+    let result = context.adapter.write_joint_positions(&target, 0.1);
+    require(result.is_err(), || "a command without power is accepted".into())?;
+    context.stays(&start, 1e-3)?;
+    context.adapter.write_enable(true).map_err(|e| format!("write_enable: {e}"))?;
+    context.stays(&start, 0.005)
+}
+
+fn nonsense(context: &mut Context) -> Result<(), String> {
+    for mode in context.row.modes.iter().filter(|mode| mode.is_position() || **mode == ControlMode::Velocity) {
+        context.ready(*mode)?;
+        let start = context.positions()?;
+        let mut not_finite = start.clone();
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            not_finite.iter_mut().take(1).for_each(|value| *value = bad);
+            for values in [&not_finite[..], start.get(1..).unwrap_or_default(), &[]] {
+                let result = if *mode == ControlMode::Velocity {
+                    context.adapter.write_joint_velocities(values)
+                } else {
+                    context.adapter.write_joint_positions(values, 0.1)
+                };
+                require(result.is_err(), || format!("{}: {values:?} is accepted", mode.name()))?;
+            }
+        }
+        context.stays(&start, 1e-3)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,370 @@
+//! For the unit tests of programs that use this crate: an adapter that answers what it is told to and remembers
+//! what it was asked.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use crate::arm::Pose;
+use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
+use crate::joint::{ControlMode, JointLimits};
+
+/// A call that an adapter got, with its arguments in SI units.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Call {
+    /// A method without arguments that matter: every read, `connect`, `activate`, `write_stop` …
+    Method(&'static str),
+    /// `set_control_mode`
+    SetControlMode(ControlMode),
+    /// `write_joint_positions`: positions [rad], fraction of the top speed.
+    WriteJointPositions(Vec<f64>, f64),
+    /// `write_joint_velocities` [rad/s]
+    WriteJointVelocities(Vec<f64>),
+    /// `write_enable`
+    WriteEnable(bool),
+    /// `write_cartesian_position`: pose, fraction of the top speed.
+    WriteCartesianPosition(Pose, f64),
+    /// `write_gripper_position` [m]
+    WriteGripperPosition(f64),
+}
+
+impl Call {
+    /// The name of the method.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Method(name) => name,
+            Self::SetControlMode(_) => "set_control_mode",
+            Self::WriteJointPositions(..) => "write_joint_positions",
+            Self::WriteJointVelocities(_) => "write_joint_velocities",
+            Self::WriteEnable(_) => "write_enable",
+            Self::WriteCartesianPosition(..) => "write_cartesian_position",
+            Self::WriteGripperPosition(_) => "write_gripper_position",
+        }
+    }
+}
+
+/// The methods that can be made to fail.
+const METHODS: &[&str] = &[
+    "connect",
+    "activate",
+    "deactivate",
+    "get_limits",
+    "set_control_mode",
+    "read_joint_positions",
+    "read_joint_velocities",
+    "read_joint_efforts",
+    "read_state",
+    "read_error",
+    "read_enabled",
+    "write_joint_positions",
+    "write_joint_velocities",
+    "write_stop",
+    "write_enable",
+    "write_clear_errors",
+    "read_cartesian_position",
+    "write_cartesian_position",
+    "read_gripper_position",
+    "write_gripper_position",
+    "read_force_torque",
+];
+
+/// All control modes: a mock adapter accepts each.
+const MODES: &[ControlMode] = &[
+    ControlMode::Position,
+    ControlMode::ServoPosition,
+    ControlMode::Velocity,
+    ControlMode::Torque,
+    ControlMode::Cartesian,
+    ControlMode::CartesianVelocity,
+    ControlMode::Impedance,
+];
+
+struct Shared {
+    dof: usize,
+    connected: bool,
+    enabled: bool,
+    mode: ControlMode,
+    positions: Vec<f64>,
+    velocities: Option<Vec<f64>>,
+    efforts: Option<Vec<f64>>,
+    error: (i32, String),
+    pose: Option<Pose>,
+    gripper: Option<f64>,
+    wrench: Option<[f64; 6]>,
+    failures: VecDeque<(&'static str, AdapterError)>,
+    calls: Vec<Call>,
+}
+
+/// A test double for [`ManipulatorAdapter`]: canned answers, and a record of the calls.
+///
+/// Nothing moves: positions stay what they were set to, whatever is written. (For an arm that moves use the adapter
+/// `mock`.) Clones share everything, so a test keeps one and hands the other over.
+///
+/// ```
+/// use dimos::hardware::spec::{AdapterError, ManipulatorAdapter};
+/// use dimos::testing::{Call, MockAdapter};
+///
+/// let mock = MockAdapter::new(6).positions(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
+/// let mut adapter: Box<dyn ManipulatorAdapter> = Box::new(mock.clone());
+///
+/// let mut positions = [0.0; 6];
+/// adapter.read_joint_positions(&mut positions).unwrap();
+/// assert_eq!(positions, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);
+///
+/// adapter.write_joint_positions(&[0.0; 6], 0.5).unwrap();
+/// assert_eq!(mock.calls().last(), Some(&Call::WriteJointPositions(vec![0.0; 6], 0.5)));
+///
+/// mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
+/// assert!(adapter.write_stop().is_err());
+/// assert!(adapter.write_stop().is_ok(), "it fails once");
+/// ```
+#[derive(Clone)]
+pub struct MockAdapter(Arc<Mutex<Shared>>);
+
+impl MockAdapter {
+    /// An adapter of `dof` joints: connected, enabled, all joints at zero and at rest, no error; no efforts, pose,
+    /// gripper or force/torque sensor.
+    pub fn new(dof: usize) -> Self {
+        Self(Arc::new(Mutex::new(Shared {
+            dof,
+            connected: true,
+            enabled: true,
+            mode: ControlMode::Position,
+            positions: vec![0.0; dof],
+            velocities: Some(vec![0.0; dof]),
+            efforts: None,
+            error: (0, String::new()),
+            pose: None,
+            gripper: None,
+            wrench: None,
+            failures: VecDeque::new(),
+            calls: Vec::new(),
+        })))
+    }
+
+    /// Answers of `read_joint_positions` [rad].
+    pub fn positions(self, positions: &[f64]) -> Self {
+        self.lock().positions = positions.to_vec();
+        self
+    }
+
+    /// Answers of `read_joint_velocities` [rad/s]; `None`: it has no velocities.
+    pub fn velocities(self, velocities: Option<&[f64]>) -> Self {
+        self.lock().velocities = velocities.map(<[f64]>::to_vec);
+        self
+    }
+
+    /// Answers of `read_joint_efforts` [Nm]; `None`: it has no torques.
+    pub fn efforts(self, efforts: Option<&[f64]>) -> Self {
+        self.lock().efforts = efforts.map(<[f64]>::to_vec);
+        self
+    }
+
+    /// Whether it is connected before `connect` is called.
+    pub fn connected(self, connected: bool) -> Self {
+        self.lock().connected = connected;
+        self
+    }
+
+    /// Whether its motors are enabled before `write_enable` is called.
+    pub fn enabled(self, enabled: bool) -> Self {
+        self.lock().enabled = enabled;
+        self
+    }
+
+    /// Answers of `read_error`, until errors are cleared.
+    pub fn error(self, code: i32, text: &str) -> Self {
+        self.lock().error = (code, text.to_owned());
+        self
+    }
+
+    /// Answers of `read_cartesian_position`.
+    pub fn pose(self, pose: Pose) -> Self {
+        self.lock().pose = Some(pose);
+        self
+    }
+
+    /// Gives it a gripper at this opening [m].
+    pub fn gripper(self, opening: f64) -> Self {
+        self.lock().gripper = Some(opening);
+        self
+    }
+
+    /// Answers of `read_force_torque` [N, N, N, Nm, Nm, Nm].
+    pub fn force_torque(self, wrench: [f64; 6]) -> Self {
+        self.lock().wrench = Some(wrench);
+        self
+    }
+
+    /// Makes the next call of a method fail; several failures of one method happen in order.
+    ///
+    /// # Panics
+    /// When the trait has no fallible method of that name.
+    pub fn fail(&self, method: &str, error: AdapterError) {
+        let known = METHODS.iter().find(|known| **known == method);
+        assert!(known.is_some(), "no method {method:?} of ManipulatorAdapter can fail");
+        self.lock().failures.extend(known.map(|name| (*name, error)));
+    }
+
+    /// All calls so far, in order. Those of `is_connected` and the `get_…` that cannot fail are not among them.
+    pub fn calls(&self) -> Vec<Call> {
+        self.lock().calls.clone()
+    }
+
+    /// Forgets the calls so far.
+    pub fn clear_calls(&self) {
+        self.lock().calls.clear();
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Shared> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Records a call and fails if it was told to.
+    fn called(&self, call: Call) -> AdapterResult<MutexGuard<'_, Shared>> {
+        let mut shared = self.lock();
+        let name = call.name();
+        shared.calls.push(call);
+        match shared.failures.iter().position(|failure| failure.0 == name) {
+            Some(i) => Err(shared.failures.remove(i).map_or(AdapterError::NotConnected, |failure| failure.1)),
+            None => Ok(shared),
+        }
+    }
+
+    fn asked(&self, name: &'static str) -> AdapterResult<MutexGuard<'_, Shared>> {
+        self.called(Call::Method(name))
+    }
+}
+
+fn fill(out: &mut [f64], values: &[f64]) {
+    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+}
+
+impl ManipulatorAdapter for MockAdapter {
+    fn connect(&mut self) -> AdapterResult<()> {
+        self.asked("connect")?.connected = true;
+        Ok(())
+    }
+
+    fn disconnect(&mut self) {
+        let mut shared = self.lock();
+        shared.calls.push(Call::Method("disconnect"));
+        shared.connected = false;
+    }
+
+    fn is_connected(&self) -> bool {
+        self.lock().connected
+    }
+
+    fn activate(&mut self) -> AdapterResult<()> {
+        self.asked("activate")?.enabled = true;
+        Ok(())
+    }
+
+    fn deactivate(&mut self) -> AdapterResult<()> {
+        self.asked("deactivate").map(|_| ())
+    }
+
+    fn get_info(&self) -> ManipulatorInfo {
+        ManipulatorInfo {
+            vendor: "dimos".into(),
+            model: "test double".into(),
+            dof: self.get_dof(),
+            firmware_version: None,
+            serial_number: None,
+            native_rate: 1000.0,
+            modes: MODES,
+            holds_when_disabled: true,
+        }
+    }
+
+    fn get_dof(&self) -> usize {
+        self.lock().dof
+    }
+
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        let dof = self.asked("get_limits")?.dof;
+        Ok(JointLimits::uniform(dof, std::f64::consts::PI, std::f64::consts::PI))
+    }
+
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        self.called(Call::SetControlMode(mode))?.mode = mode;
+        Ok(())
+    }
+
+    fn get_control_mode(&self) -> ControlMode {
+        self.lock().mode
+    }
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        fill(positions, &self.asked("read_joint_positions")?.positions);
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        let shared = self.asked("read_joint_velocities")?;
+        fill(velocities, shared.velocities.as_deref().unwrap_or_default());
+        Ok(shared.velocities.is_some())
+    }
+
+    fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
+        let shared = self.asked("read_joint_efforts")?;
+        fill(efforts, shared.efforts.as_deref().unwrap_or_default());
+        Ok(shared.efforts.is_some())
+    }
+
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        self.asked("read_state").map(|_| RobotState::default())
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        Ok(self.asked("read_error")?.error.clone())
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        Ok(self.asked("read_enabled")?.enabled)
+    }
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        self.called(Call::WriteJointPositions(positions.to_vec(), velocity)).map(|_| ())
+    }
+
+    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
+        self.called(Call::WriteJointVelocities(velocities.to_vec())).map(|_| ())
+    }
+
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        self.asked("write_stop").map(|_| Stop::Confirmed)
+    }
+
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        self.called(Call::WriteEnable(enable))?.enabled = enable;
+        Ok(())
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.asked("write_clear_errors")?.error = (0, String::new());
+        Ok(())
+    }
+
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+        Ok(self.asked("read_cartesian_position")?.pose)
+    }
+
+    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
+        let shared = self.called(Call::WriteCartesianPosition(*pose, velocity))?;
+        if shared.pose.is_some() { Ok(()) } else { Err(AdapterError::Unsupported) }
+    }
+
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(self.asked("read_gripper_position")?.gripper)
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        let shared = self.called(Call::WriteGripperPosition(position))?;
+        if shared.gripper.is_some() { Ok(()) } else { Err(AdapterError::Unsupported) }
+    }
+
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        Ok(self.asked("read_force_torque")?.wrench)
+    }
+}
