@@ -1,3 +1,4 @@
+<<<<<<< HEAD
 //! The command line: one file per verb. stdout is data, stderr is diagnostics; exit codes are a contract ([`exit`]).
 
 pub mod arguments;
@@ -146,3 +147,8 @@ mod tests {
         }
     }
 }
+=======
+//! The command line: one file per verb.
+
+pub mod replay;
+>>>>>>> 2621c0636747fa33917181abc09c19dcc7bbd3e3

@@ -1,5 +1,6 @@
 //! From samples to a file and back.
 
+mod golden;
 mod hostile;
 
 use std::collections::BTreeMap;
@@ -350,4 +351,15 @@ fn without_a_log_events_are_told_all_the_same() {
     recorder.finish().unwrap();
     assert_eq!(producer.slots(), 64, "the ring is empty");
     assert_eq!(*told.lock().unwrap(), ["degraded"]);
+}
+
+#[test]
+fn the_page_on_the_format_names_every_topic_and_schema() {
+    let page = include_str!("../../../docs/log-format.md");
+    let (_folder, path) = folder();
+    record(&path, (0..11).flat_map(tick));
+    for (topic, schema) in &LogReader::open(&path).unwrap().info().topics {
+        let topic = topic.replace("/left", "/<arm>").replace("/right", "/<arm>");
+        assert!(page.contains(&format!("| `{topic}` | {schema} |")), "{topic} with {schema} is not in the page");
+    }
 }

@@ -1,0 +1,56 @@
+# run install check test · test-tools test-rerun · bench jitter
+
+PYTHON ?= python3
+READERS := tests/readers
+
+.PHONY: run install check test test-tools test-rerun bench jitter
+
+# Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
+run:
+	cargo run --release -- run coordinator-yourarm
+
+# Installs `dimos` for this user.
+install:
+	cargo install --path . --locked --profile dist
+
+check:
+	cargo fmt --check
+	cargo clippy --all-targets --locked -- -D warnings
+
+# Installs nothing: tests whose tools are missing are skipped.
+test:
+	@[ -e .venv/readers-installed ] || echo "note: some tests will be skipped; make test-tools installs what they need"
+	cargo test --locked --doc
+	@if cargo nextest --version >/dev/null 2>&1; \
+	then cargo nextest run --locked; \
+	else cargo test --locked --lib --bins --tests; \
+	fi
+
+# The tools that tests compare with: cyclictest (as root), and other people's readers of logs.
+test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json
+	@if [ "$$(id -u)" = 0 ] && ! command -v cyclictest >/dev/null; \
+	then apt-get update -q && apt-get install -qy --no-install-recommends rt-tests; \
+	fi
+
+.venv/readers-installed: $(READERS)/requirements.txt
+	$(PYTHON) -m venv .venv
+	.venv/bin/pip install -q -r $<
+	touch $@
+
+$(READERS)/node_modules/.package-lock.json: $(READERS)/package-lock.json
+	cd $(READERS) && npm ci --no-audit --no-fund
+	touch $@
+
+# rerun is large (0.8 GB installed), so it is not part of test-tools.
+test-rerun: .venv/readers-installed
+	.venv/bin/pip install -q rerun-sdk==0.41.0
+	.venv/bin/rerun analytics disable
+	DIMOS_RERUN=1 cargo test --locked --test readers rerun
+
+# Compute time of a tick, cost per arm, memory, start-up.
+bench:
+	cargo bench --locked --bench control
+
+# Lateness of the tick beside cyclictest.
+jitter:
+	cargo bench --locked --bench jitter

@@ -1,0 +1,180 @@
+//! `dimos replay`: plays a log back to the terminal, in the time it took.
+
+mod player;
+mod view;
+
+use std::io::{self, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::Args;
+use thiserror::Error;
+
+use crate::recording::files;
+use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use player::{Part, RealTime, play};
+use view::{JsonLines, Live, Plain, View};
+
+/// Exit code: the log is not there, not a log, or does not have what was asked for.
+const USAGE: u8 = 2;
+/// Exit code: data was lost while recording, or the log was cut.
+const DATA_LOST: u8 = 3;
+
+/// Play a log back to the terminal
+///
+/// In the time it took: a joint table and a progress bar on a terminal, a line a second elsewhere, a JSON object per
+/// message with --json. Exits with 3 if the log was cut, or if the recorder lost data.
+#[derive(Debug, Clone, Args)]
+pub struct ReplayArgs {
+    /// Log file (.mcap)
+    #[arg(value_name = "LOG", required_unless_present = "last", conflicts_with = "last")]
+    pub log: Option<PathBuf>,
+    /// Play the newest log
+    #[arg(long)]
+    pub last: bool,
+    /// Play faster or slower: 2 is twice as fast
+    #[arg(short, long, value_name = "FACTOR", default_value = "1", value_parser = rate)]
+    pub rate: f64,
+    /// Begin again at the end
+    #[arg(short, long = "loop")]
+    pub looping: bool,
+    /// Begin this long after the first message, e.g. 1.5, 10s or 2m
+    #[arg(long, value_name = "TIME", default_value = "0", value_parser = duration)]
+    pub start_offset: Duration,
+    /// Play this much of it, e.g. 1.5, 10s or 2m
+    #[arg(long, value_name = "TIME", value_parser = duration)]
+    pub duration: Option<Duration>,
+    /// Play these topics only, separated by commas
+    #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
+    pub topics: Vec<String>,
+    /// Print a JSON object per message
+    #[arg(long)]
+    pub json: bool,
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    let rate: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if (1e-3..=1e6).contains(&rate) { Ok(rate) } else { Err("must be between 0.001 and 1000000".into()) }
+}
+
+/// A time in seconds, or with a unit.
+fn duration(text: &str) -> Result<Duration, String> {
+    let wrong = || "not a time: say 1.5, 500ms, 10s or 2m".to_owned();
+    match text.parse::<f64>() {
+        Ok(seconds) => Duration::try_from_secs_f64(seconds).map_err(|_| wrong()),
+        Err(_) => text.parse::<jiff::SignedDuration>().ok().and_then(|d| d.try_into().ok()).ok_or_else(wrong),
+    }
+}
+
+/// What is asked of a log that does not have it.
+#[derive(Debug, Error)]
+enum NotThere {
+    #[error("there is no log yet{}\nhint: `dimos run` makes one unless told not to", folder_text(.0))]
+    NoLogs(Option<PathBuf>),
+    #[error("the log {path} has no topic {topic}\nhint: it has {topics}")]
+    NoTopic { path: PathBuf, topic: String, topics: String },
+    #[error("the log {path} has no messages\nhint: its run ended before the first tick")]
+    Empty { path: PathBuf },
+    #[error("the log {path} is only {length:.3} s long\nhint: choose a shorter --start-offset")]
+    TooShort { path: PathBuf, length: f64 },
+}
+
+fn folder_text(folder: &Option<PathBuf>) -> String {
+    folder.as_ref().map_or_else(String::new, |f| format!(" in {}", f.display()))
+}
+
+/// Plays a log as the arguments say. Gives the exit code.
+pub fn run(args: &ReplayArgs) -> anyhow::Result<u8> {
+    match try_run(args) {
+        Ok(code) => Ok(code),
+        Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(0),
+        Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() => {
+            eprintln!("error: {e}");
+            Ok(USAGE)
+        }
+        Err(e) => Err(e),
+    }
+}
+
+fn try_run(args: &ReplayArgs) -> anyhow::Result<u8> {
+    let path = log_path(args)?;
+    let mut log = LogReader::open(&path)?;
+    let part = choose(args, log.info(), &path)?;
+    let out = io::stdout();
+    let tty = out.is_terminal();
+    let mut view: Box<dyn View> = if args.json {
+        Box::new(JsonLines::new(out.lock()))
+    } else {
+        eprintln!("{}", headline(&path, log.info()));
+        if tty { Box::new(Live::new(out.lock(), &part)) } else { Box::new(Plain::new(out.lock(), part.from)) }
+    };
+    let end = play(&mut log, &part, view.as_mut(), &mut RealTime)?;
+    drop(view);
+    if let Some(cut) = &end.cut {
+        eprintln!("warning: {cut}");
+    }
+    if end.lost > 0 {
+        eprintln!("warning: {} samples are missing in this log: the recorder fell behind", end.lost);
+    }
+    if end.damaged > 0 {
+        eprintln!("warning: {} messages are not what their schema says", end.damaged);
+    }
+    Ok(if end.cut.is_some() || end.lost > 0 || end.damaged > 0 { DATA_LOST } else { 0 })
+}
+
+fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
+    if let Some(path) = &args.log {
+        return Ok(path.clone());
+    }
+    let folder = files::log_folder();
+    let newest = folder.as_deref().map(files::newest).transpose()?.flatten();
+    Ok(newest.ok_or(NotThere::NoLogs(folder))?)
+}
+
+fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> Result<Part, NotThere> {
+    let path = path.to_owned();
+    if let Some(topic) = args.topics.iter().find(|t| !info.topics.contains_key(*t)) {
+        let topics = info.topics.keys().cloned().collect::<Vec<_>>().join(", ");
+        return Err(NotThere::NoTopic { path, topic: topic.clone(), topics });
+    }
+    let Some((start, end)) = info.span else { return Err(NotThere::Empty { path }) };
+    let nanoseconds = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
+    let from = start.saturating_add(nanoseconds(args.start_offset));
+    if from > end {
+        return Err(NotThere::TooShort { path, length: (end - start) as f64 * 1e-9 });
+    }
+    let to = args.duration.map_or(end, |d| from.saturating_add(nanoseconds(d)).min(end));
+    Ok(Part { topics: args.topics.clone(), from, to, rate: args.rate, looping: args.looping })
+}
+
+/// One line about the log, before it plays.
+fn headline(path: &Path, info: &LogInfo) -> String {
+    let run = info.metadata.get("run").map_or_else(String::new, |run| format!(", run {run}"));
+    let length = info.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9);
+    let cut = if info.complete { "" } else { ", cut" };
+    format!("{}: {length:.3} s{run}{cut}", path.display())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_seconds_or_have_a_unit() {
+        assert_eq!(duration("1.5"), Ok(Duration::from_millis(1500)));
+        assert_eq!(duration("10s"), Ok(Duration::from_secs(10)));
+        assert_eq!(duration("500ms"), Ok(Duration::from_millis(500)));
+        assert_eq!(duration("2m"), Ok(Duration::from_secs(120)));
+        for wrong in ["", "-1", "nan", "inf", "-2s", "soon"] {
+            assert!(duration(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn rates_are_positive_numbers() {
+        assert_eq!(rate("0.5"), Ok(0.5));
+        for wrong in ["0", "-1", "nan", "inf", "fast"] {
+            assert!(rate(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,173 @@
+//! Hands the messages of a log to a view, each at its time.
+
+use std::time::Duration;
+
+use super::view::View;
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
+
+/// Which part of a log to play, and how.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    /// Topics; all of them if empty.
+    pub topics: Vec<String>,
+    /// From this Unix time on [ns].
+    pub from: u64,
+    /// Up to this Unix time, inclusive [ns].
+    pub to: u64,
+    /// How much faster than it happened.
+    pub rate: f64,
+    /// Begin again at the end.
+    pub looping: bool,
+}
+
+/// How it ended.
+#[derive(Debug, Default)]
+pub struct End {
+    /// The log was cut here.
+    pub cut: Option<ReplayError>,
+    /// Samples that the recorder had lost.
+    pub lost: u64,
+    /// Messages that are not what their schema says.
+    pub damaged: u64,
+}
+
+/// Time that can be waited for.
+pub trait Waiting: Clock {
+    /// Returns when it is that time; at once if it is past.
+    fn wait_until(&mut self, time: Mono);
+}
+
+/// Time as it goes by.
+#[derive(Debug, Clone, Copy)]
+pub struct RealTime;
+
+impl Clock for RealTime {
+    fn now(&self) -> Mono {
+        MonotonicClock.now()
+    }
+}
+
+impl Waiting for RealTime {
+    fn wait_until(&mut self, time: Mono) {
+        std::thread::sleep(time.since(self.now()));
+    }
+}
+
+/// Plays a part of a log.
+pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dyn Waiting) -> anyhow::Result<End> {
+    loop {
+        let mut end = End::default();
+        log.select(Selection { topics: part.topics.clone(), from: part.from, to: part.to })?;
+        let begun = time.now();
+        let due = |log_time: u64| {
+            begun.after(Duration::from_secs_f64(log_time.saturating_sub(part.from) as f64 * 1e-9 / part.rate))
+        };
+        let mut any = false;
+        loop {
+            match log.next_entry() {
+                Ok(Some(entry)) => {
+                    time.wait_until(due(entry.log_time));
+                    end.damaged += u64::from(matches!(entry.data, Payload::Damaged { .. }));
+                    view.show(&entry, time.now())?;
+                    any = true;
+                }
+                Ok(None) => break,
+                Err(cut @ ReplayError::Cut { .. }) => {
+                    end.cut = Some(cut);
+                    break;
+                }
+                Err(e) => return Err(e.into()),
+            }
+        }
+        end.lost = log.lost();
+        view.end()?;
+        if !(part.looping && any) {
+            return Ok(end);
+        }
+        // A pass never takes less time than its part of the log, or a short one would loop as fast as it can.
+        time.wait_until(due(part.to));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clock::VirtualClock;
+    use crate::recording::log_writer::LogWriter;
+    use crate::recording::messages::Text;
+    use crate::recording::replay::Entry;
+    use std::collections::BTreeMap;
+    use std::io;
+
+    impl Waiting for VirtualClock {
+        fn wait_until(&mut self, time: Mono) {
+            self.advance(time.since(self.now()));
+        }
+    }
+
+    /// Notes what is shown and when [ms], and gives up after a number of messages.
+    struct Notes {
+        seen: Vec<(String, u64)>,
+        room: usize,
+    }
+
+    impl View for Notes {
+        fn show(&mut self, entry: &Entry, now: Mono) -> io::Result<()> {
+            let Payload::Text(text) = &entry.data else { panic!("{entry:?}") };
+            self.seen.push((text.data.clone(), now.0 / 1_000_000));
+            if self.seen.len() < self.room { Ok(()) } else { Err(io::ErrorKind::BrokenPipe.into()) }
+        }
+        fn end(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    /// A log with a message every 100 ms: 0, 1, … 9.
+    fn log(folder: &tempfile::TempDir) -> LogReader {
+        let path = folder.path().join("a.mcap");
+        let mut log = LogWriter::create(std::fs::File::create(&path).unwrap(), 0, &[], BTreeMap::new()).unwrap();
+        for i in 0..10 {
+            log.publish("/a", 5_000_000_000 + i * 100_000_000, &Text { data: i.to_string() }).unwrap();
+        }
+        log.finish().unwrap();
+        LogReader::open(&path).unwrap()
+    }
+
+    fn played(part: Part, room: usize) -> Vec<(String, u64)> {
+        let folder = tempfile::tempdir().unwrap();
+        let mut notes = Notes { seen: Vec::new(), room };
+        let mut clock = VirtualClock::default();
+        let end = play(&mut log(&folder), &part, &mut notes, &mut clock);
+        assert_eq!(end.is_ok(), notes.seen.len() < room);
+        notes.seen
+    }
+
+    fn part(from_ms: u64, to_ms: u64) -> Part {
+        let ns = |ms| 5_000_000_000 + ms * 1_000_000;
+        Part { topics: Vec::new(), from: ns(from_ms), to: ns(to_ms), rate: 1.0, looping: false }
+    }
+
+    #[test]
+    fn messages_come_at_their_time() {
+        let seen = played(part(0, 900), 99);
+        assert_eq!(seen.len(), 10);
+        assert_eq!(seen[9], ("9".into(), 900));
+    }
+
+    #[test]
+    fn an_offset_begins_at_once_and_a_duration_ends_early() {
+        assert_eq!(played(part(250, 450), 99), [("3".into(), 50), ("4".into(), 150)]);
+    }
+
+    #[test]
+    fn a_rate_scales_time() {
+        assert_eq!(played(Part { rate: 2.0, ..part(0, 200) }, 99).last(), Some(&("2".into(), 100)));
+    }
+
+    #[test]
+    fn a_loop_begins_again() {
+        let seen = played(Part { looping: true, ..part(800, 900) }, 5);
+        assert_eq!(seen, [("8", 0), ("9", 100), ("8", 100), ("9", 200), ("8", 200)].map(|(t, at)| (t.into(), at)));
+    }
+}

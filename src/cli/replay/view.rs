@@ -1,0 +1,287 @@
+//! What a replay looks like: JSON lines, plain lines, or a table that is drawn anew again and again.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{self, Write};
+use std::time::Duration;
+
+use comfy_table::{Cell, CellAlignment, Table, presets};
+
+use super::player::Part;
+use crate::clock::Mono;
+use crate::recording::messages::JointState;
+use crate::recording::replay::{Entry, Payload};
+
+/// Time between two drawings of the table.
+const REDRAW_EVERY: Duration = Duration::from_millis(50);
+/// Log time between two plain lines of joint positions [ns].
+const LINE_EVERY: u64 = 1_000_000_000;
+/// Lines of the text log below the table.
+const TEXT_LINES: usize = 5;
+/// Width of the progress bar.
+const BAR: usize = 40;
+
+/// Something that messages are shown on.
+pub trait View {
+    /// Takes a message; `now` is the time by which it draws.
+    fn show(&mut self, entry: &Entry, now: Mono) -> io::Result<()>;
+    /// The end of the log, or of one pass of a loop.
+    fn end(&mut self) -> io::Result<()>;
+}
+
+/// One JSON object per message: `topic`, `log_time` [ns since the Unix epoch], `data`.
+pub struct JsonLines<W>(W);
+
+impl<W: Write> JsonLines<W> {
+    /// Writes to `out`.
+    pub fn new(out: W) -> Self {
+        Self(out)
+    }
+}
+
+impl<W: Write> View for JsonLines<W> {
+    fn show(&mut self, entry: &Entry, _now: Mono) -> io::Result<()> {
+        let mut line = serde_json::to_vec(entry)?;
+        line.push(b'\n');
+        self.0.write_all(&line)
+    }
+    fn end(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+/// A line of joint positions a second, and each line of the text log.
+pub struct Plain<W> {
+    out: W,
+    from: u64,
+    next: u64,
+    others: BTreeMap<String, u64>,
+}
+
+impl<W: Write> Plain<W> {
+    /// Writes to `out`, with times counted from a Unix time [ns].
+    pub fn new(out: W, from: u64) -> Self {
+        Self { out, from, next: 0, others: BTreeMap::new() }
+    }
+}
+
+impl<W: Write> View for Plain<W> {
+    fn show(&mut self, entry: &Entry, _now: Mono) -> io::Result<()> {
+        let at = entry.log_time.saturating_sub(self.from) as f64 * 1e-9;
+        match &entry.data {
+            Payload::JointState(joints) if entry.topic == "/joint_states" => {
+                if entry.log_time >= self.next {
+                    self.next = entry.log_time + LINE_EVERY;
+                    let mut line = format!("{at:10.3} s");
+                    for (i, name) in joints.name.iter().enumerate() {
+                        line.push_str(&format!("  {name} {} rad", number(&joints.position, i, 4)));
+                    }
+                    writeln!(self.out, "{line}")?;
+                }
+            }
+            Payload::Log(log) => writeln!(self.out, "{at:10.3} s  {}: {}", level(log.level), log.msg)?,
+            // Already said, by its line of the text log.
+            Payload::Event(_) => {}
+            _ => *self.others.entry(entry.topic.clone()).or_default() += 1,
+        }
+        Ok(())
+    }
+
+    fn end(&mut self) -> io::Result<()> {
+        self.next = 0;
+        for (topic, count) in std::mem::take(&mut self.others) {
+            writeln!(self.out, "{:10}    {topic}: {count} messages", "")?;
+        }
+        self.out.flush()
+    }
+}
+
+/// A table of all joints, with arms above it and a progress bar and the latest text below. Redraws itself in place.
+pub struct Live<W> {
+    out: W,
+    from: u64,
+    to: u64,
+    rate: f64,
+    at: u64,
+    drawn_at: Option<Mono>,
+    drawn_lines: usize,
+    states: Option<JointState>,
+    commands: BTreeMap<String, f64>,
+    arms: BTreeMap<String, String>,
+    texts: VecDeque<String>,
+}
+
+impl<W: Write> Live<W> {
+    /// Draws on `out`, a terminal.
+    pub fn new(out: W, part: &Part) -> Self {
+        Self {
+            out,
+            from: part.from,
+            to: part.to,
+            rate: part.rate,
+            at: part.from,
+            drawn_at: None,
+            drawn_lines: 0,
+            states: None,
+            commands: BTreeMap::new(),
+            arms: BTreeMap::new(),
+            texts: VecDeque::new(),
+        }
+    }
+
+    fn take(&mut self, entry: &Entry) {
+        match &entry.data {
+            Payload::JointState(joints) if entry.topic == "/joint_states" => self.states = Some(joints.clone()),
+            Payload::JointState(joints) if entry.topic == "/joint_commands" => {
+                self.commands = joints.name.iter().cloned().zip(joints.position.iter().copied()).collect();
+            }
+            Payload::ArmStatus(arm) => {
+                let name = entry.topic.trim_start_matches("/arm_status/").to_owned();
+                let why = if arm.cause_text.is_empty() { String::new() } else { format!(" ({})", arm.cause_text) };
+                let error = if arm.error == 0 { String::new() } else { format!(", error {}", arm.error) };
+                self.arms.insert(name, format!("{}{why}, link {}{error}", arm.phase, arm.link));
+            }
+            Payload::Log(log) => {
+                let at = entry.log_time.saturating_sub(self.from) as f64 * 1e-9;
+                self.texts.push_back(format!("{at:10.3} s  {}: {}", level(log.level), log.msg));
+                if self.texts.len() > TEXT_LINES {
+                    self.texts.pop_front();
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn picture(&self) -> String {
+        let mut lines: Vec<String> = self.arms.iter().map(|(name, text)| format!("{name}: {text}")).collect();
+        if let Some(states) = &self.states {
+            let mut table = Table::new();
+            table.load_style(presets::NOTHING);
+            table.set_header(["joint", "rad", "deg", "rad/s", "command rad"].map(right));
+            for (i, name) in states.name.iter().enumerate() {
+                let degrees: Vec<f64> = states.position.iter().map(|p| p.to_degrees()).collect();
+                let command: Vec<f64> = self.commands.get(name).copied().into_iter().collect();
+                let cells = [
+                    number(&states.position, i, 4),
+                    number(&degrees, i, 2),
+                    number(&states.velocity, i, 4),
+                    number(&command, 0, 4),
+                ];
+                table.add_row(std::iter::once(Cell::new(name)).chain(cells.map(right)).collect::<Vec<_>>());
+            }
+            lines.extend(table.lines());
+        }
+        lines.push(self.bar());
+        lines.extend(self.texts.iter().cloned());
+        lines.join("\n")
+    }
+
+    fn bar(&self) -> String {
+        let (at, whole) = (self.at.saturating_sub(self.from), self.to.saturating_sub(self.from));
+        let full = (at as f64 / whole.max(1) as f64 * BAR as f64) as usize;
+        let full = full.min(BAR);
+        let (at, whole) = (at as f64 * 1e-9, whole as f64 * 1e-9);
+        format!("[{}{}] {at:.1} / {whole:.1} s  ×{}", "=".repeat(full), " ".repeat(BAR - full), self.rate)
+    }
+
+    fn draw(&mut self) -> io::Result<()> {
+        let picture = self.picture();
+        // Up to where the last picture began, and clear from there on.
+        let up = if self.drawn_lines > 0 { format!("\x1b[{}A\x1b[J", self.drawn_lines) } else { String::new() };
+        self.drawn_lines = picture.lines().count();
+        writeln!(self.out, "{up}{picture}")?;
+        self.out.flush()
+    }
+}
+
+impl<W: Write> View for Live<W> {
+    fn show(&mut self, entry: &Entry, now: Mono) -> io::Result<()> {
+        self.take(entry);
+        self.at = entry.log_time;
+        if self.drawn_at.is_none_or(|last| now.since(last) >= REDRAW_EVERY) {
+            self.drawn_at = Some(now);
+            self.draw()?;
+        }
+        Ok(())
+    }
+
+    fn end(&mut self) -> io::Result<()> {
+        self.draw()
+    }
+}
+
+fn right(text: impl ToString) -> Cell {
+    Cell::new(text).set_alignment(CellAlignment::Right)
+}
+
+/// A value with its digits, or a dash where there is none.
+fn number(values: &[f64], i: usize, digits: usize) -> String {
+    match values.get(i) {
+        Some(value) if !value.is_nan() => format!("{value:.digits$}"),
+        _ => "-".into(),
+    }
+}
+
+fn level(level: u8) -> &'static str {
+    match level {
+        0..=10 => "debug",
+        11..=20 => "info",
+        21..=30 => "warn",
+        _ => "error",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recording::messages::Log;
+
+    fn joints(log_time: u64, position: &[f64]) -> Entry {
+        let name = (1..=position.len()).map(|i| format!("joint{i}")).collect();
+        let data = JointState { name, position: position.to_vec(), ..JointState::default() };
+        Entry { topic: "/joint_states".into(), log_time, data: Payload::JointState(data) }
+    }
+
+    fn text(log_time: u64) -> Entry {
+        let log = Log { level: 30, msg: "arm is held".into(), ..Log::default() };
+        Entry { topic: "/rosout".into(), log_time, data: Payload::Log(log) }
+    }
+
+    #[test]
+    fn json_has_topic_time_and_fields_with_null_for_nan() {
+        let mut out = Vec::new();
+        JsonLines::new(&mut out).show(&joints(7, &[0.25, f64::NAN]), Mono::ZERO).unwrap();
+        let line: serde_json::Value = serde_json::from_slice(&out).unwrap();
+        assert_eq!((line["topic"].as_str(), line["log_time"].as_u64()), (Some("/joint_states"), Some(7)));
+        assert_eq!(line["data"]["position"], serde_json::json!([0.25, null]));
+        assert_eq!(line["data"]["header"]["stamp"]["sec"], 0);
+        assert!(out.ends_with(b"}\n"));
+    }
+
+    #[test]
+    fn plain_lines_come_once_a_second_and_for_each_text() {
+        let mut out = Vec::new();
+        let mut view = Plain::new(&mut out, 1_000_000_000);
+        for i in 0..=15 {
+            view.show(&joints(1_000_000_000 + i * 100_000_000, &[i as f64, f64::NAN]), Mono::ZERO).unwrap();
+        }
+        view.show(&text(2_600_000_000), Mono::ZERO).unwrap();
+        view.end().unwrap();
+        let expected = "     0.000 s  joint1 0.0000 rad  joint2 - rad\n     1.000 s  joint1 10.0000 rad  joint2 - rad\n     1.600 s  warn: arm is held\n";
+        assert_eq!(String::from_utf8(out).unwrap(), expected);
+    }
+
+    #[test]
+    fn the_live_table_redraws_in_place() {
+        let part = Part { topics: vec![], from: 0, to: 2_000_000_000, rate: 1.0, looping: false };
+        let mut out = Vec::new();
+        let mut view = Live::new(&mut out, &part);
+        view.show(&joints(0, &[std::f64::consts::PI, f64::NAN]), Mono(0)).unwrap();
+        view.show(&joints(10_000_000, &[1.0, 1.0]), Mono(10_000_000)).unwrap();
+        view.show(&text(1_000_000_000), Mono(1_000_000_000)).unwrap();
+        let out = String::from_utf8(out).unwrap();
+        let (first, second) = out.split_once("\x1b[4A\x1b[J").expect("one redraw, four lines up");
+        assert!(first.contains("3.1416") && first.contains("180.00") && first.contains("0.0 / 2.0 s"), "{first}");
+        assert!(second.contains("[====================                    ] 1.0 / 2.0 s"), "{second}");
+        assert!(second.contains("1.000 s  warn: arm is held"), "{second}");
+    }
+}

@@ -1,0 +1,157 @@
+//! Logs are read by other people's code: every message must mean the same to them.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::mpsc::channel;
+
+use dimos::arm::{ArmCommand, ArmState, Link, Pose, VelocitySource};
+use dimos::clock::{Mono, WallOffset};
+use dimos::joint::{ControlMode, joints_of, make_joints};
+use dimos::recording::log_writer::LogAttachment;
+use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
+use dimos::recording::replay::LogReader;
+use dimos::telemetry::describe::{ArmNames, Names, Severity};
+use dimos::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, Sample, TaskState, TickSample};
+
+const WALL: u64 = 1_795_270_590_123_456_789;
+
+/// A log with every topic, every optional value present and absent, and texts that are not ASCII.
+fn record(path: &Path) {
+    let arm = |id: &str, dof| ArmNames { hardware_id: id.into(), joints: make_joints(id, dof) };
+    let config = RecorderConfig {
+        path: Some(path.to_owned()),
+        run: "readers".into(),
+        names: Names { arms: vec![arm("left", 7), arm("right", 6)], tasks: vec!["traj_left".into()] },
+        frame_id: "coordinator".into(),
+        attachments: vec![LogAttachment {
+            name: "blueprint.yaml".into(),
+            media_type: "application/yaml".into(),
+            data: b"name: readers\n".to_vec(),
+        }],
+        metadata: BTreeMap::new(),
+        wall: WallOffset::of(Mono(5_000_000_000), WALL),
+    };
+    let (mut ring, consumer) = rtrb::RingBuffer::new(4096);
+    let (notes, receiver) = channel();
+    let stamp = Mono(5_000_000_000);
+    notes.send(Note::Request { id: 1, stamp, json: r#"{"method":"move","arm":"left"}"#.into() }).unwrap();
+    notes.send(Note::Log { severity: Severity::Warn, stamp, text: "Größe: 1 µm".into() }).unwrap();
+    notes.send(Note::ArmText { arm: 1, text: "joint 2: überhitzt".into() }).unwrap();
+    for tick in 0..200 {
+        sample(tick).into_iter().for_each(|s| ring.push(s).unwrap());
+    }
+    Recorder::start(config, consumer, receiver, |_| {}).unwrap().finish().unwrap();
+}
+
+fn sample(tick: u64) -> Vec<Sample> {
+    let deadline = Mono(5_000_000_000 + tick * 10_000_000);
+    let x = tick as f64 * 0.013;
+    let mut samples = Vec::new();
+    for arm in 0..2u16 {
+        let state = ArmState {
+            seq: if arm == 1 && tick < 20 { 0 } else { tick + 1 },
+            stamp: Mono(deadline.0 - 777_777),
+            dof: 7 - usize::from(arm),
+            position: joints_of(&[x.sin(), -0.0, 1e-310, x, 2.0, 3.0, 4.0]),
+            velocity: joints_of(&[x.cos(), 0.1 + 0.2]),
+            velocity_source: if tick < 40 { VelocitySource::Absent } else { VelocitySource::Estimated },
+            effort: (arm == 0 && tick % 50 > 25).then(|| joints_of(&[x; 7])),
+            gripper: (arm == 0).then_some(x * 1e-3),
+            pose: (tick % 2 == 0).then_some(Pose { xyz: [x, 0.2, 0.3], rpy: [0.0, -1.0, x] }),
+            wrench: (arm == 1).then_some([1.0, 2.0, x, 4.0, 5.0, 6.0]),
+            mode: ControlMode::ServoPosition,
+            enabled: tick > 2,
+            error: if arm == 1 && tick > 100 { -31 } else { 0 },
+            link: if arm == 1 && tick > 100 { Link::Faulted } else { Link::Up },
+            self_held: false,
+            written: tick,
+        };
+        let mode = [None, Some(ControlMode::ServoPosition), Some(ControlMode::Velocity), Some(ControlMode::Torque)];
+        let mode = mode[(tick / 10 % 4) as usize];
+        let command = ArmCommand { seq: tick, mode, values: joints_of(&[x; 7]), ..ArmCommand::default() };
+        samples.push(Sample::Arm(ArmSample { arm, state, command, phase: Phase::Ready, cause: Cause::None }));
+    }
+    match tick {
+        5 => samples.push(Sample::Event(tick, Event::Request(1, Outcome::Accepted))),
+        90 => samples.push(Sample::Event(tick, Event::Task(0, TaskState::Aborted, Reason::GoalTolerance(2, 0.03)))),
+        101 => samples.push(Sample::Event(tick, Event::Arm(1, Phase::Held, Cause::Fault(-31)))),
+        _ => {}
+    }
+    samples.push(Sample::Tick(TickSample { tick, deadline, late_ns: 20_000 + tick, ..TickSample::default() }));
+    samples
+}
+
+/// Writes the log and what dimos reads from it, one JSON object a line.
+fn log_and_expected(folder: &Path) -> (PathBuf, PathBuf) {
+    let (log, expected) = (folder.join("log.mcap"), folder.join("expected.ndjson"));
+    record(&log);
+    let mut reader = LogReader::open(&log).unwrap();
+    let mut lines = String::new();
+    while let Some(entry) = reader.next_entry().unwrap() {
+        lines.push_str(&serde_json::to_string(&entry).unwrap());
+        lines.push('\n');
+    }
+    std::fs::write(&expected, lines).unwrap();
+    (log, expected)
+}
+
+/// Says that a tool is missing; fails where nothing may be skipped.
+fn skip(tool: &str) {
+    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{tool} is missing (make test-tools)");
+    println!("SKIPPED: {tool} (make test-tools)");
+}
+
+fn succeed(command: &mut Command) -> String {
+    let output = command.output().unwrap();
+    let out = String::from_utf8_lossy(&output.stdout).into_owned();
+    let err = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{command:?}\n{out}{err}");
+    out
+}
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+#[test]
+fn python_readers_find_the_same_messages() {
+    let python = root().join(".venv/bin/python");
+    if !python.exists() {
+        return skip("the Python readers in .venv");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (log, expected) = log_and_expected(folder.path());
+    let said = succeed(Command::new(python).arg(root().join("tests/readers/read_log.py")).args([log, expected]));
+    assert_eq!(said.lines().filter(|line| line.ends_with("are the same")).count(), 3, "{said}");
+}
+
+#[test]
+fn foxgloves_readers_find_the_same_messages() {
+    if !root().join("tests/readers/node_modules/@mcap/core").exists() {
+        return skip("Foxglove's readers in tests/readers/node_modules");
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (log, expected) = log_and_expected(folder.path());
+    let said = succeed(Command::new("node").arg(root().join("tests/readers/read_log.mjs")).args([log, expected]));
+    assert!(said.contains("are the same"), "{said}");
+}
+
+/// `make test-rerun` installs rerun and asks for this one; it is too large for `make test-tools`.
+#[test]
+fn rerun_finds_nothing_wrong() {
+    if std::env::var("DIMOS_RERUN").as_deref() != Ok("1") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = log_and_expected(folder.path());
+    let rerun = root().join(".venv/bin/rerun");
+    succeed(Command::new(&rerun).args(["mcap", "check", "--full"]).arg(&log));
+    let rrd = folder.path().join("log.rrd");
+    succeed(Command::new(&rerun).args(["mcap", "convert"]).arg(&log).arg("-o").arg(&rrd));
+    let printed = succeed(Command::new(&rerun).args(["rrd", "print", "-vv"]).arg(&rrd));
+    for entity in ["/joint_states", "/rosout", "/dimos/tick"] {
+        assert!(printed.contains(entity), "{entity} is not in the recording");
+    }
+    assert!(printed.contains("Scalars"), "joint states have become curves");
+}
