@@ -1,6 +1,7 @@
 //! dimos runs robot arms.
 
 pub mod arm;
+pub mod blueprint;
 pub mod clock;
 pub mod hardware;
 pub mod joint;

