@@ -56,9 +56,11 @@ pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEnt
         let adapter = adapter(checker, entry);
         if let Some(row) = &adapter {
             dof(checker, entry, row, joints.len(), joints_known);
-            let node = entry.options.as_ref().map(|o| o.at);
-            let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
-            (row.options.check)(checker.tree, node);
+            if checker.has(entry.at, "options") {
+                let node = entry.options.as_ref().map(|o| o.at);
+                let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
+                (row.options.check)(checker.tree, node);
+            }
         }
         let address = address(checker, entry, adapter.as_ref());
         let own = adapter.as_ref().filter(|_| joints_known && !joints.is_empty()).map(|row| (row.limits)(joints.len()));

@@ -1,6 +1,9 @@
 //! The JSON Schema of blueprints, for editors: the types of `schema.rs`, joined with the adapters' options and the
 //! task types' parameters.
 
+use std::collections::BTreeMap;
+use std::sync::OnceLock;
+
 use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
 use serde_json::{Value, json};
 
@@ -34,6 +37,41 @@ pub fn json_schema(adapters: &Registry) -> Value {
     }
     schema
 }
+
+/// The group in which a key belongs: `coordinator` for `tick_rate`, an empty name for the top of the file. For keys of
+/// one group only.
+pub(super) fn home_of(key: &str) -> Option<String> {
+    static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
+    let homes = HOMES.get_or_init(|| {
+        let mut homes: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();
+        let schema = json_schema(&Registry::default());
+        for (pointer, name) in GROUPS {
+            let keys = schema.pointer(&format!("{pointer}/properties")).and_then(Value::as_object);
+            for key in keys.into_iter().flat_map(|keys| keys.keys()) {
+                homes.entry(key.clone()).or_default().push(name);
+            }
+        }
+        homes
+    });
+    match homes.get(key).map(Vec::as_slice) {
+        Some([home]) => Some((*home).to_owned()),
+        _ => None,
+    }
+}
+
+/// Groups of the schema, and how they are called.
+const GROUPS: [(&str, &str); 10] = [
+    ("", ""),
+    ("/$defs/CoordinatorConfig", "coordinator"),
+    ("/$defs/HardwareEntry", "hardware"),
+    ("/$defs/LimitsEntry", "limits"),
+    ("/$defs/TaskEntry", "tasks"),
+    ("/$defs/TrajectoryParams", "params"),
+    ("/$defs/PlannerConfig", "planner"),
+    ("/$defs/RobotConfig", "planner.robots"),
+    ("/$defs/RecordingConfig", "recording"),
+    ("/$defs/ViewConfig", "view"),
+];
 
 fn subschema<T: JsonSchema>(generator: &mut SchemaGenerator) -> Value {
     generator.subschema_for::<T>().to_value()

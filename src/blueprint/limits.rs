@@ -66,7 +66,10 @@ impl<'de> Visitor<'de> for PositionsVisitor {
         }
         match numbers[..] {
             [lower, upper] => Ok(Positions::All(lower, upper)),
-            _ => Err(A::Error::custom(format!("expected two numbers, lowest and highest, found {}", numbers.len()))),
+            _ => Err(A::Error::custom(format!(
+                "expected two numbers, found {}\nhint: write [lowest, highest], in radians",
+                numbers.len()
+            ))),
         }
     }
 
@@ -183,7 +186,7 @@ pub(super) fn resolve(
                 && (lower < low || upper > high)
             {
                 let name = joints.get(joint).map_or("", String::as_str);
-                let diag = Diag::error(format!("`{name}` may only be limited to less than the arm's own range"));
+                let diag = Diag::error(format!("`{name}`: [{lower}, {upper}] is wider than the arm's own range"));
                 let diag = diag.note(format!("the arm's own range is {low} to {high} rad"));
                 checker.error(at, diag.hint("limits narrow the arm's own; leave them out to use the full range"));
             }

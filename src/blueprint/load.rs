@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::blueprint::include::{Includer, RULES};
+use crate::blueprint::json_schema::home_of;
 use crate::blueprint::registry::{Found, SearchPath};
 use crate::blueprint::resolve::{Blueprint, Checker, resolve};
 use crate::blueprint::schema::BlueprintFile;
@@ -122,6 +123,7 @@ fn read_blueprint(
     overrides: &Overrides,
     adapters: &Registry,
 ) -> Option<Blueprint> {
+    tree.know_homes(home_of);
     let mut includer = Includer::new(tree, search);
     let root = includer.read(found);
     let incomplete = includer.incomplete;

@@ -9,14 +9,14 @@ pub const TICK_RATE: (f64, f64) = (1.0, 2000.0);
 fn number<'de, D: Deserializer<'de>>(d: D, wanted: &str, good: fn(f64) -> bool) -> Result<f64, D::Error> {
     let value = f64::deserialize(d)?;
     if !value.is_finite() || !good(value) {
-        return Err(D::Error::custom(format!("{value} is out of range: {wanted}")));
+        return Err(D::Error::custom(format!("{value} is out of range\nhint: give {wanted}")));
     }
     Ok(value)
 }
 
 /// A control rate.
 pub fn tick_rate<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
-    number(d, "1 to 2000 Hz", |v| (TICK_RATE.0..=TICK_RATE.1).contains(&v))
+    number(d, "a rate from 1 to 2000 Hz", |v| (TICK_RATE.0..=TICK_RATE.1).contains(&v))
 }
 
 /// Zero or more.
@@ -26,5 +26,5 @@ pub fn non_negative<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
 
 /// More than zero.
 pub fn positive<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
-    number(d, "more than 0", |v| v > 0.0)
+    number(d, "a number above 0", |v| v > 0.0)
 }

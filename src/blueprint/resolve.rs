@@ -150,23 +150,20 @@ impl Checker<'_> {
     pub(super) fn check_name(&mut self, name: &Located<String>, what: &str) -> bool {
         let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
         let problem = match name.value.chars().find(|c| !good(*c)) {
-            _ if name.is_empty() => "is empty".to_owned(),
-            Some(c) => {
-                format!("{} contains {}", quote(name), if c == ' ' { "a space".into() } else { quote(&c.to_string()) })
-            }
-            None if name.starts_with('-') => format!("{} starts with a dash", quote(name)),
-            None if name.len() > 64 => format!("{} is longer than 64 characters", quote(name)),
+            _ if name.is_empty() => format!("the {what} is empty"),
+            Some(' ') => format!("the {what} {} contains a space", quote(name)),
+            Some(c) => format!("the {what} {} contains {}", quote(name), quote(&c.to_string())),
+            None if name.starts_with('-') => format!("the {what} {} starts with a dash", quote(name)),
+            None if name.len() > 64 => format!("the {what} {} is longer than 64 characters", quote(name)),
             None => return true,
         };
-        let separator = if problem.starts_with("is") { " " } else { ": " };
-        let diag = Diag::error(format!("a {what}{separator}{problem}"));
-        let suggestion: String = name.value.chars().map(|c| if good(c) { c } else { '_' }).take(64).collect();
-        let suggestion = suggestion.trim_start_matches('-');
-        let hint = match suggestion.chars().any(|c| c.is_ascii_alphanumeric()) {
-            true => format!("use letters, digits, `_` and `-`: {suggestion}"),
-            false => "use letters, digits, `_` and `-`".to_owned(),
+        let instead: String = name.value.chars().map(|c| if good(c) { c } else { '_' }).take(64).collect();
+        let instead = instead.trim_start_matches('-');
+        let hint = match name.value.is_ascii() && instead.chars().any(|c| c.is_ascii_alphanumeric()) {
+            true => format!("use letters, digits, `_` and `-`: {instead}"),
+            false => "use the letters a to z and A to Z, digits, `_` and `-`".to_owned(),
         };
-        self.error(name.at, diag.hint(hint));
+        self.error(name.at, Diag::error(problem).hint(hint));
         false
     }
 }

@@ -209,9 +209,7 @@ impl<'a> Deserializer<'a> for De<'a> {
             Kind::Seq(items) => self.seq(items, visitor),
             // `tasks:` with nothing below it is an empty list: everything was commented out.
             _ if self.is_null() => self.seq(&[], visitor),
-            Kind::Scalar { text, .. } if !text.is_empty() => {
-                Err(self.wrong("a list", Some(format!("write it in brackets: [{text}]"))))
-            }
+            Kind::Scalar { .. } => Err(self.wrong("a list", None)),
             _ => Err(self.wrong("a list", Some("start each entry with `- `".to_owned()))),
         }
     }
@@ -220,7 +218,8 @@ impl<'a> Deserializer<'a> for De<'a> {
         match self.kind()? {
             Kind::Seq(items) if items.len() == len => self.seq(items, visitor),
             Kind::Seq(items) => {
-                Err(ReadError::value(format!("expected a list of {len} values, found {}", items.len()), None))
+                let hint = format!("write {len} values in brackets");
+                Err(ReadError::value(format!("expected a list of {len} values, found {}", items.len()), Some(hint)))
             }
             _ => Err(self.wrong(&format!("a list of {len} values"), None)),
         }
@@ -239,8 +238,11 @@ impl<'a> Deserializer<'a> for De<'a> {
         match self.kind()? {
             Kind::Map(entries) => self.map(entries, visitor),
             _ if self.is_null() => self.map(&[], visitor),
-            Kind::Seq(_) => Err(self.wrong("a group of keys", Some("write `key: value`, without the dash".to_owned()))),
-            Kind::Scalar { .. } => Err(self.wrong("a group of keys", Some("write `key: value`".to_owned()))),
+            Kind::Seq(_) => {
+                Err(self
+                    .wrong("a group of keys", Some("write its keys below it, without dashes or brackets".to_owned())))
+            }
+            Kind::Scalar { .. } => Err(self.wrong("a group of keys", None)),
         }
     }
 

@@ -62,8 +62,13 @@ impl fmt::Display for ReadError {
 impl std::error::Error for ReadError {}
 
 impl serde::de::Error for ReadError {
+    /// A message may end with a line `hint: …`.
     fn custom<T: fmt::Display>(message: T) -> Self {
-        Self::value(message.to_string(), None)
+        let message = message.to_string();
+        match message.split_once("\nhint: ") {
+            Some((message, hint)) => Self::value(message, Some(hint.to_owned())),
+            None => Self::value(message, None),
+        }
     }
 
     fn invalid_type(found: Unexpected<'_>, expected: &dyn Expected) -> Self {

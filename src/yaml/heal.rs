@@ -14,6 +14,7 @@ use serde::de::DeserializeOwned;
 use crate::yaml::de::{De, Detour};
 use crate::yaml::diag::Diag;
 use crate::yaml::error::{ReadError, What};
+use crate::yaml::scalar::number_hint;
 use crate::yaml::suggest::{closest, did_you_mean, quote};
 use crate::yaml::tree::{Kind, NodeId, Tree};
 
@@ -106,10 +107,7 @@ impl Healer {
         match what {
             What::UnknownKey { given, known } => {
                 let meant = closest(&given, known.iter().copied());
-                let hint = match known.is_empty() {
-                    true => Some("this group takes no keys".to_owned()),
-                    false => did_you_mean(&given, known.iter().copied(), "known keys"),
-                };
+                let hint = unknown_key_hint(tree, &given, known);
                 let diag = Diag::error(format!("unknown key {}", quote(&given))).at(tree.label(at));
                 tree.report(diag.maybe_hint(hint));
                 if let (Some(&map), Some(meant)) = (trail.get(2), meant) {
@@ -140,7 +138,8 @@ impl Healer {
             What::Variant { given, known } => {
                 let hint = did_you_mean(&given, known.iter().copied(), "known words");
                 let message = format!("{} is not one of {}", quote(&given), known.join(", "));
-                self.report_value(tree, &trail, message, hint.filter(|h| h.starts_with("did")));
+                let hint = hint.filter(|h| h.starts_with("did"));
+                self.report_value(tree, &trail, message, hint.or_else(|| Some("write one of these words".to_owned())));
                 self.drop_innermost(tree, &trail)
             }
         }
@@ -153,6 +152,7 @@ impl Healer {
             return;
         }
         let name = name_of(tree, trail);
+        let hint = hint.or_else(|| value_hint(tree, at, &message));
         let message = if name.is_empty() { message } else { format!("`{name}`: {message}") };
         tree.report(Diag::error(message).at(tree.label(at)).maybe_hint(hint));
     }
@@ -182,6 +182,52 @@ impl Healer {
         self.lost.dropped.insert(value);
         self.detour.dropped.insert(value)
     }
+}
+
+/// What to do about an unknown key.
+fn unknown_key_hint(tree: &Tree, given: &str, known: &[&'static str]) -> Option<String> {
+    if given == "<<" {
+        return Some("YAML 1.2 has no merge keys; repeat the keys, or use `include`".to_owned());
+    }
+    if !given.is_empty() && given.chars().all(|c| c.is_ascii_digit()) {
+        return Some(format!("if this is part of a number, write a point: 0.{given}"));
+    }
+    if closest(given, known.iter().copied()).is_none()
+        && let Some(home) = tree.home_of(given)
+    {
+        return Some(match home.is_empty() {
+            true => format!("`{given}` belongs at the top of the file, without indentation"),
+            false => format!("`{given}` belongs under `{home}`"),
+        });
+    }
+    match known.is_empty() {
+        true => Some("remove it; this group takes no keys".to_owned()),
+        false => did_you_mean(given, known.iter().copied(), "known keys"),
+    }
+}
+
+/// What to do about a value of the wrong kind, where the Deserializer did not know better.
+fn value_hint(tree: &Tree, at: NodeId, message: &str) -> Option<String> {
+    let wanted = message.strip_prefix("expected ")?.split(", found").next()?;
+    let general = match () {
+        _ if wanted.contains("whole number") => "write a whole number, such as 6",
+        _ if wanted.contains("number") => "write a number, such as 1.5",
+        _ if wanted.contains("group") => "write its keys below it: `key: value`",
+        _ if wanted.contains("list") => "write the values in brackets: [A, B]",
+        _ if wanted.contains("text") => "write a word, or a text in quotes",
+        _ => "see docs/blueprint-reference.md for what may stand here",
+    };
+    let specific = match tree.node(at).map(|n| &n.kind) {
+        Some(Kind::Scalar { text, plain }) if wanted.contains("number") => number_hint(text, *plain),
+        Some(Kind::Scalar { text, .. }) if wanted.contains("list") && !text.is_empty() => {
+            Some(format!("write it in brackets: [{text}]"))
+        }
+        Some(Kind::Seq(_)) if wanted.contains("number") && !wanted.contains("list") => {
+            Some("write one number, without brackets".to_owned())
+        }
+        _ => None,
+    };
+    specific.or_else(|| Some(general.to_owned()))
 }
 
 /// How the innermost node of a trail is called: its key, or `key[2]` for an element of a list.

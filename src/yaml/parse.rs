@@ -84,7 +84,8 @@ impl<'t> Builder<'t> {
             && !tag.is_yaml_core_schema()
         {
             let diag = Diag::error(format!("the tag {} has no meaning here", quote(&tag.original())));
-            self.fail(self.range(span), diag.hint("remove it; values are written plainly"));
+            let at = span.tag_span().unwrap_or(*span);
+            self.fail(self.range(&at), diag.hint("remove it; values are written plainly"));
         }
         match event {
             Event::Scalar(text, style, anchor, _) => {
@@ -175,7 +176,8 @@ impl<'t> Builder<'t> {
                 Some(key) => {
                     let Some(name) = self.tree.text(key) else {
                         let diag = Diag::error("a key must be a word, not a list or group");
-                        self.tree.report(diag.at(self.tree.label(key)));
+                        let diag = diag.at(self.tree.label(key));
+                        self.tree.report(diag.hint("write one word before the colon"));
                         return Ok(());
                     };
                     if let Some(&(first, value)) = seen.get(name).and_then(|&at| entries.get(at)) {
@@ -243,12 +245,19 @@ impl<'t> Builder<'t> {
             "indent with spaces; YAML does not allow tabs"
         } else if before.matches('"').count() % 2 == 1 && info.contains("quoted") {
             "a quotation mark is never closed"
-        } else if info.contains("flow") || info.contains("expected ',' or") {
-            "a bracket is never closed, or a comma is missing"
+        } else if info.contains("flow") || info.contains("expected ',' or") || info.contains("bracket") {
+            "close each bracket, and put commas between the values"
         } else {
             "check the indentation, and that each key is followed by a colon and a space"
         };
-        self.fail(at..at, Diag::error(format!("YAML syntax: {info}")).hint(hint));
+        let mut diag = Diag::error(format!("YAML syntax: {info}")).hint(hint);
+        if let Some(open) = self.open.iter().rfind(|open| open.flow)
+            && let Some(start) = self.tree.node(open.node).map(|n| n.range.start)
+        {
+            let range = start..(start + 1).min(self.text.len());
+            diag = diag.also(Label { source: self.source, range, text: "this bracket is open".to_owned() });
+        }
+        self.fail(at..at, diag);
     }
 
     fn fail(&mut self, mut range: Range<usize>, diag: Diag) {

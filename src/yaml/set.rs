@@ -76,8 +76,7 @@ impl Walk<'_> {
                 }
             },
             _ => {
-                let diag = Diag::error(format!("{} is a single value, nothing is below it", quote(&self.path)));
-                self.fail(at, diag.hint("end the path here"));
+                self.fail_below_value(at);
                 return false;
             }
         };
@@ -111,10 +110,7 @@ impl Walk<'_> {
                 }
                 self.tree.set_kind(self.node, Kind::Map(entries));
             }
-            _ => {
-                let diag = Diag::error(format!("{} is a single value, nothing is below it", quote(&self.path)));
-                self.fail(at, diag.hint("end the path here"));
-            }
+            _ => self.fail_below_value(at),
         }
     }
 
@@ -130,7 +126,7 @@ impl Walk<'_> {
         };
         let found = ids.iter().position(|id| id == segment);
         if found.is_none() {
-            let list = quote(&self.path);
+            let list = quote(self.walked(&at));
             let diag = match id_key {
                 Some(key) => Diag::error(format!("no entry of {list} has the {key} {}", quote(segment))),
                 None => Diag::error(format!("{list} has no entry {}; it has {}", quote(segment), items.len())),
@@ -143,6 +139,17 @@ impl Walk<'_> {
 
     fn is_null(&self, node: NodeId) -> bool {
         matches!(self.tree.node(node).map(|n| &n.kind), Some(Kind::Scalar { text, plain: true }) if text.is_empty())
+    }
+
+    /// The path as far as it was walked, as it was typed.
+    fn walked(&self, at: &Range<usize>) -> &str {
+        let argument = self.tree.source(self.source).map_or("", |s| s.text.as_str());
+        argument.get(..at.start.saturating_sub(1)).unwrap_or_default()
+    }
+
+    fn fail_below_value(&mut self, at: Range<usize>) {
+        let diag = Diag::error(format!("{} is a single value, nothing is below it", quote(self.walked(&at))));
+        self.fail(at, diag.hint("end the path before this"));
     }
 
     fn fail(&mut self, range: Range<usize>, diag: Diag) {

@@ -9,8 +9,15 @@ pub fn closest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>) ->
     let given = plain(word);
     // One slip in three letters is near; `ip` for `rpy` is not.
     let reach = (given.chars().count() / 3).max(1);
+    // `joint7` is not a slip for `joint6`: it counts on.
+    let words = |text: &str| text.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned();
+    let counts_on = |candidate: &str| {
+        let candidate = plain(candidate);
+        candidate != given && words(&candidate) == words(&given) && words(&given).len() < given.len()
+    };
     candidates
         .into_iter()
+        .filter(|candidate| !counts_on(candidate))
         .map(|candidate| (strsim::damerau_levenshtein(&given, &plain(candidate)), candidate))
         .filter(|(distance, candidate)| {
             *distance <= reach && (given.chars().count() > 2 || plain(candidate).chars().count() <= 3)

@@ -65,6 +65,8 @@ pub struct Tree {
     diags: Vec<Diag>,
     /// Nodes from which something was left out, so that nobody complains of its absence.
     pub(super) damaged: HashSet<NodeId>,
+    /// Where keys belong that stand in the wrong place.
+    homes: Option<fn(&str) -> Option<String>>,
     /// Mistakes beyond the number that is listed.
     pub(super) unlisted: usize,
 }
@@ -224,6 +226,15 @@ impl Tree {
     /// Whether something that was written in a node is not in the tree, because it stood there twice.
     pub fn is_damaged(&self, id: NodeId) -> bool {
         self.damaged.contains(&id)
+    }
+
+    /// Gives the tree a way to tell in which group a key belongs, for hints.
+    pub fn know_homes(&mut self, homes: fn(&str) -> Option<String>) {
+        self.homes = Some(homes);
+    }
+
+    pub(super) fn home_of(&self, key: &str) -> Option<String> {
+        self.homes.and_then(|homes| homes(key))
     }
 
     /// A label on a node; of lists and groups only the first line is marked.
