@@ -1,0 +1,231 @@
+//! Checks `hardware`: names, joints, adapters, addresses, options, limits.
+
+use crate::blueprint::limits;
+use crate::blueprint::resolve::{Arm, Checker};
+use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
+use crate::hardware::registry::{AdapterSpec, SIM};
+use crate::joint::{MAX_DOF, make_joints};
+use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
+
+/// The arms, and what tasks may refer to.
+pub(super) struct Found {
+    /// The arms without mistakes.
+    pub(super) arms: Vec<Arm>,
+    /// Every entry of `hardware`, with its mistakes.
+    pub(super) entries: Vec<Entry>,
+    /// Whether all ids and joints are known: nothing was lost to a mistake.
+    pub(super) complete: bool,
+}
+
+/// An entry of `hardware`, as far as it is understood.
+pub(super) struct Entry {
+    /// Its id; empty when that was lost.
+    pub(super) id: String,
+    /// Where it says so.
+    pub(super) at: NodeId,
+    /// Its joints.
+    pub(super) joints: Vec<String>,
+    /// Its adapter's row, where known.
+    pub(super) adapter: Option<AdapterSpec>,
+}
+
+pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEntry>]) -> Found {
+    let complete = !checker.list_lost("hardware");
+    let mut found = Found { arms: Vec::new(), entries: Vec::new(), complete };
+    let root = checker.root;
+    if hardware.is_empty() && !checker.list_lost("hardware") {
+        let at = checker.tree.entry(root, "hardware").map_or(root, |(key, _)| key);
+        let diag = Diag::error("the blueprint has no arm: `hardware` is empty");
+        let hint = "add one: hardware: [{hardware_id: arm, adapter_type: mock, joints: {prefix: arm, count: 6}}]";
+        checker.error(at, diag.hint(hint));
+    }
+    let mut joint_places: Vec<(String, NodeId)> = Vec::new();
+    for entry in hardware {
+        let id_known = checker.has(entry.at, "hardware_id");
+        let id = if id_known { entry.hardware_id.value.clone() } else { String::new() };
+        let twin = found.entries.iter().find(|e| id_known && e.id == id).map(|e| e.at);
+        if id_known {
+            checker.check_name(&entry.hardware_id, "hardware_id");
+        }
+        if let Some(first) = twin {
+            let also = checker.tree.label(first).with_text("first used here");
+            let diag = Diag::error(format!("two arms have the hardware_id {}", quote(&id)));
+            checker.error(entry.hardware_id.at, diag.also(also).hint("give each arm a name of its own"));
+        }
+        let (joints, joints_known) = joints(checker, entry, twin.is_some(), &mut joint_places);
+        let adapter = adapter(checker, entry);
+        if let Some(row) = &adapter {
+            dof(checker, entry, row, joints.len(), joints_known);
+            if checker.has(entry.at, "options") {
+                let node = entry.options.as_ref().map(|o| o.at);
+                let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
+                (row.options.check)(checker.tree, node);
+            }
+        }
+        let address = address(checker, entry, adapter.as_ref());
+        let own = adapter.as_ref().filter(|_| joints_known && !joints.is_empty()).map(|row| (row.limits)(joints.len()));
+        let limits = match joints_known {
+            true => limits::resolve(checker, &entry.limits, &joints, own.as_ref()),
+            false => Vec::new(),
+        };
+        found.complete &= id_known && joints_known;
+        if let Some(adapter) = adapter {
+            let default = if adapter.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
+            found.arms.push(Arm {
+                hardware_id: id.clone(),
+                hardware_type: entry.hardware_type,
+                joints: joints.clone(),
+                adapter,
+                adapter_type: entry.adapter_type.value.clone(),
+                simulated: address == SIM && adapter.emulate.is_some(),
+                address,
+                auto_enable: entry.auto_enable,
+                on_exit: entry.on_exit.unwrap_or(default),
+                on_exit_given: entry.on_exit.is_some(),
+                options: match entry.options.as_ref().map(|o| o.value.clone()) {
+                    None | Some(serde_json::Value::Null) => serde_json::json!({}),
+                    Some(options) => options,
+                },
+                limits,
+            });
+        }
+        found.entries.push(Entry { id, at: entry.hardware_id.at, joints, adapter });
+    }
+    found
+}
+
+/// The joints' names, and whether they are all known.
+fn joints(
+    checker: &mut Checker<'_>,
+    entry: &Located<HardwareEntry>,
+    twin: bool,
+    places: &mut Vec<(String, NodeId)>,
+) -> (Vec<String>, bool) {
+    if !checker.has(entry.at, "joints") || checker.lost.contains(entry.joints.at) {
+        return (Vec::new(), false);
+    }
+    let mut known = true;
+    let names: Vec<Located<String>> = match &entry.joints.value {
+        Joints::Names(names) => {
+            for name in names {
+                known &= checker.check_name(name, "joint name");
+            }
+            names.clone()
+        }
+        Joints::Counted(counted) => {
+            known &= checker.check_name(&counted.prefix, "joint prefix");
+            let count = counted.count.value;
+            if count == 0 || count > MAX_DOF as u64 {
+                let diag = Diag::error(format!("an arm has 1 to {MAX_DOF} joints, not {count}"));
+                checker
+                    .error(counted.count.at, diag.hint(format!("`count` is the number of joints, at most {MAX_DOF}")));
+                return (Vec::new(), false);
+            }
+            let name = |value| Located { at: entry.joints.at, value };
+            make_joints(&counted.prefix, count as usize).into_iter().map(name).collect()
+        }
+    };
+    if names.is_empty() || names.len() > MAX_DOF {
+        let diag = match names.is_empty() {
+            true => Diag::error("the arm has no joints"),
+            false => Diag::error(format!("an arm has at most {MAX_DOF} joints, not {}", names.len())),
+        };
+        checker.error(entry.joints.at, diag.hint("for example `joints: {prefix: arm, count: 6}`"));
+        known = false;
+    }
+    // An arm given twice has all its joints twice; once is enough to say so.
+    if !twin {
+        let mut collisions = Vec::new();
+        for name in &names {
+            match places.iter().find(|(other, _)| *other == name.value) {
+                Some((_, first)) => collisions.push((name.clone(), *first)),
+                None => places.push((name.value.clone(), name.at)),
+            }
+        }
+        report_collisions(checker, &collisions);
+    }
+    (names.into_iter().map(|name| name.value).collect(), known)
+}
+
+/// Reports joints that were named before; those of one pattern once.
+fn report_collisions(checker: &mut Checker<'_>, collisions: &[(Located<String>, NodeId)]) {
+    let mut reported: Vec<NodeId> = Vec::new();
+    for (name, first) in collisions {
+        if reported.contains(&name.at) {
+            continue;
+        }
+        reported.push(name.at);
+        let more = collisions.iter().filter(|(other, _)| other.at == name.at).count() - 1;
+        let rest = if more > 0 { format!(" and {more} more") } else { String::new() };
+        let also = checker.tree.label(*first).with_text("first named here");
+        let diag = Diag::error(format!("the joint {}{rest} is named twice", quote(name)));
+        let diag =
+            if more > 0 { Diag::error(format!("the joints {}{rest} are named twice", quote(name))) } else { diag };
+        checker.error(name.at, diag.also(also).hint("a joint belongs to one arm, and its name is unique in the run"));
+    }
+}
+
+fn adapter(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>) -> Option<AdapterSpec> {
+    if !checker.has(entry.at, "adapter_type") {
+        return None;
+    }
+    let row = checker.adapters.get(&entry.adapter_type).copied();
+    if row.is_none() {
+        let diag = Diag::error(format!("there is no adapter {}", quote(&entry.adapter_type)));
+        let hint = did_you_mean(&entry.adapter_type, checker.adapters.names(), "there are");
+        checker.error(entry.adapter_type.at, diag.maybe_hint(hint));
+    }
+    row
+}
+
+/// Whether the adapter takes that many joints.
+fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, count: usize, known: bool) {
+    let (fewest, most) = row.dof;
+    if !known || (fewest..=most).contains(&count) {
+        return;
+    }
+    let at = match &entry.joints.value {
+        Joints::Counted(counted) => counted.count.at,
+        Joints::Names(_) => entry.joints.at,
+    };
+    let takes = if fewest == most { format!("{fewest}") } else { format!("{fewest} to {most}") };
+    let also = checker.tree.label(entry.adapter_type.at).with_text(format!("takes {takes} joints"));
+    let diag = Diag::error(format!("{} cannot have {count} joints", quote(row.name))).also(also);
+    checker.error(at, diag.hint(format!("name {takes} joints, or choose another adapter")));
+}
+
+/// Checks the address and gives it; empty where there is none.
+fn address(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: Option<&AdapterSpec>) -> String {
+    let given = entry.address.as_ref();
+    let Some(row) = row.filter(|_| checker.has(entry.at, "address")) else {
+        return given.map(|a| a.value.clone()).unwrap_or_default();
+    };
+    let form = row.address.form;
+    let or_sim = if row.emulate.is_some() { ", or `sim` for the emulator" } else { "" };
+    match given {
+        None if row.address.required => {
+            if !checker.incomplete {
+                let diag = Diag::error(format!("{} needs an address", quote(row.name)));
+                let hint = format!("add `address: {form}`{or_sim}");
+                checker.error(entry.adapter_type.at, diag.hint(hint));
+            }
+        }
+        None => {}
+        Some(address) if address.value == SIM && row.emulate.is_some() => {}
+        Some(address) if address.value == SIM && row.address.required => {
+            let diag = Diag::error(format!("{} has no emulator", quote(row.name)));
+            checker.error(address.at, diag.hint(format!("give the arm's address: {form}")));
+        }
+        Some(address) => {
+            let needless = !row.address.required && matches!(form, "" | "-" | "none");
+            if needless {
+                let diag = Diag::warning(format!("{} needs no address; this one is ignored", quote(row.name)));
+                checker.error(address.at, diag.hint("remove it"));
+            } else if let Err(reason) = (row.address.check)(address) {
+                let diag = Diag::error(format!("{} is no address of {}: {reason}", quote(address), quote(row.name)));
+                checker.error(address.at, diag.hint(format!("write it as {form}{or_sim}")));
+            }
+        }
+    }
+    given.map(|a| a.value.clone()).unwrap_or_default()
+}

@@ -1,0 +1,97 @@
+//! The JSON Schema of blueprints, for editors: the types of `schema.rs`, joined with the adapters' options and the
+//! task types' parameters.
+
+use std::collections::BTreeMap;
+use std::sync::OnceLock;
+
+use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
+use serde_json::{Value, json};
+
+use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::schema::BlueprintFile;
+use crate::hardware::registry::Registry;
+
+/// The JSON Schema (draft 2020-12) of a blueprint whose arms are those of `adapters`.
+pub fn json_schema(adapters: &Registry) -> Value {
+    let mut generator = SchemaSettings::draft2020_12().into_generator();
+    // One generator for all: it keeps types of equal name apart.
+    let options: Vec<(&str, Value)> =
+        adapters.rows().iter().map(|row| (row.name, (row.options.schema)(&mut generator).to_value())).collect();
+    let params = [
+        ("trajectory", subschema::<TrajectoryParams>(&mut generator)),
+        ("servo", subschema::<ServoParams>(&mut generator)),
+        ("velocity", subschema::<VelocityParams>(&mut generator)),
+    ];
+    let mut schema = generator.into_root_schema_for::<BlueprintFile>().to_value();
+    let names: Vec<&str> = adapters.names();
+    if let Some(hardware) = schema.pointer_mut("/$defs/HardwareEntry") {
+        join(hardware, "adapter_type", "options", options);
+        if let Some(adapter) = hardware.pointer_mut("/properties/adapter_type").and_then(Value::as_object_mut)
+            && !names.is_empty()
+        {
+            adapter.insert("enum".to_owned(), json!(names));
+        }
+    }
+    if let Some(task) = schema.pointer_mut("/$defs/TaskEntry") {
+        join(task, "type", "params", params);
+    }
+    schema
+}
+
+/// The group in which a key belongs: `coordinator` for `tick_rate`, an empty name for the top of the file. For keys of
+/// one group only.
+pub(super) fn home_of(key: &str) -> Option<String> {
+    static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
+    let homes = HOMES.get_or_init(|| {
+        let mut homes: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();
+        let schema = json_schema(&Registry::default());
+        for (pointer, name) in GROUPS {
+            let keys = schema.pointer(&format!("{pointer}/properties")).and_then(Value::as_object);
+            for key in keys.into_iter().flat_map(|keys| keys.keys()) {
+                homes.entry(key.clone()).or_default().push(name);
+            }
+        }
+        homes
+    });
+    match homes.get(key).map(Vec::as_slice) {
+        Some([home]) => Some((*home).to_owned()),
+        _ => None,
+    }
+}
+
+/// Groups of the schema, and how they are called.
+const GROUPS: [(&str, &str); 10] = [
+    ("", ""),
+    ("/$defs/CoordinatorConfig", "coordinator"),
+    ("/$defs/HardwareEntry", "hardware"),
+    ("/$defs/LimitsEntry", "limits"),
+    ("/$defs/TaskEntry", "tasks"),
+    ("/$defs/TrajectoryParams", "params"),
+    ("/$defs/PlannerConfig", "planner"),
+    ("/$defs/RobotConfig", "planner.robots"),
+    ("/$defs/RecordingConfig", "recording"),
+    ("/$defs/ViewConfig", "view"),
+];
+
+fn subschema<T: JsonSchema>(generator: &mut SchemaGenerator) -> Value {
+    generator.subschema_for::<T>().to_value()
+}
+
+/// Adds "if the key `by` is this word, then the key `what` is of that type" for each word. `required` keeps the
+/// condition from holding where `by` is absent.
+fn join<'w>(group: &mut Value, by: &str, what: &str, types: impl IntoIterator<Item = (&'w str, Value)>) {
+    let rules: Vec<Value> = types
+        .into_iter()
+        .map(|(word, schema)| {
+            json!({
+                "if": { "properties": { by: { "const": word } }, "required": [by] },
+                "then": { "properties": { what: { "anyOf": [schema, { "type": "null" }] } } }
+            })
+        })
+        .collect();
+    if let Some(group) = group.as_object_mut()
+        && !rules.is_empty()
+    {
+        group.insert("allOf".to_owned(), Value::Array(rules));
+    }
+}

@@ -1,0 +1,176 @@
+//! From a file to a checked blueprint, with every mistake in it.
+
+use serde::Serialize;
+
+use crate::blueprint::include::{Includer, RULES};
+use crate::blueprint::json_schema::home_of;
+use crate::blueprint::registry::{Found, SearchPath};
+use crate::blueprint::resolve::{Blueprint, Checker, resolve};
+use crate::blueprint::schema::BlueprintFile;
+use crate::hardware::registry::{Registry, SIM};
+use crate::yaml::{self, Diag, Label, Missing, NodeId, Report, Severity, Tree, quote, read};
+
+/// What the command line changes in a blueprint.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Overrides {
+    /// `--set path=value`, in the order given.
+    pub set: Vec<String>,
+    /// `--sim`: every arm's address becomes `sim`. Fails where an adapter has no emulator and is none itself.
+    pub sim: bool,
+}
+
+/// A blueprint that was read, and what is wrong with it.
+#[derive(Debug, Clone)]
+pub struct Loaded {
+    /// The blueprint; `None` when there is any error.
+    pub blueprint: Option<Blueprint>,
+    tree: Tree,
+    diags: Vec<Diag>,
+}
+
+impl Loaded {
+    /// Everything that is wrong, file by file from top to bottom.
+    pub fn diagnostics(&self) -> &[Diag] {
+        &self.diags
+    }
+
+    /// Number of errors.
+    pub fn errors(&self) -> usize {
+        self.diags.iter().filter(|d| d.severity == Severity::Error).count() + self.tree.unlisted()
+    }
+
+    /// Number of warnings.
+    pub fn warnings(&self) -> usize {
+        self.diags.iter().filter(|d| d.severity == Severity::Warning).count()
+    }
+
+    /// Everything that is wrong, for people; ends with a line that counts it. Empty when nothing is.
+    pub fn render(&self, colour: bool) -> String {
+        let mut out = String::new();
+        for diag in &self.diags {
+            out.push_str(&yaml::render(&self.tree, diag, colour));
+            out.push_str("\n\n");
+        }
+        if self.tree.unlisted() > 0 {
+            out.push_str("There are more mistakes than are listed; put these right first.\n");
+        }
+        let count = |n: usize, what: &str| match n {
+            0 => None,
+            1 => Some(format!("1 {what}")),
+            n => Some(format!("{n} {what}s")),
+        };
+        let counts: Vec<String> =
+            [count(self.errors(), "error"), count(self.warnings(), "warning")].into_iter().flatten().collect();
+        if !counts.is_empty() {
+            out.push_str(&format!("{}\n", counts.join(", ")));
+        }
+        out
+    }
+
+    /// Everything that is wrong, as data.
+    pub fn reports(&self) -> Vec<Report> {
+        self.diags.iter().map(|diag| diag.located(&self.tree)).collect()
+    }
+
+    /// Everything that is wrong, as JSON: `{"ok", "errors", "warnings", "diagnostics": […]}`.
+    pub fn to_json(&self) -> serde_json::Value {
+        #[derive(Serialize)]
+        struct Document {
+            ok: bool,
+            errors: usize,
+            warnings: usize,
+            diagnostics: Vec<Report>,
+        }
+        let document = Document {
+            ok: self.errors() == 0,
+            errors: self.errors(),
+            warnings: self.warnings(),
+            diagnostics: self.reports(),
+        };
+        serde_json::to_value(document).unwrap_or_default()
+    }
+
+    /// The first error in one line, with its place.
+    pub(super) fn first_problem(&self) -> Option<String> {
+        let report = self.reports().into_iter().find(|r| r.severity == Severity::Error)?;
+        Some(match (report.line, report.column) {
+            (Some(line), Some(column)) => format!("{line}:{column}: {}", report.message),
+            _ => report.message,
+        })
+    }
+}
+
+/// Reads and checks a blueprint; includes are looked for in the folders of the environment.
+pub fn load(found: &Found, overrides: &Overrides, adapters: &Registry) -> Loaded {
+    load_from(&SearchPath::from_env(), found, overrides, adapters)
+}
+
+/// Reads and checks a blueprint; includes are looked for in `search`.
+pub fn load_from(search: &SearchPath, found: &Found, overrides: &Overrides, adapters: &Registry) -> Loaded {
+    let mut tree = Tree::new();
+    let blueprint = read_blueprint(&mut tree, search, found, overrides, adapters);
+    let mut diags = tree.diags().to_vec();
+    // The main file is the first source, the arguments are the last; what has no place comes first of all.
+    diags.sort_by_key(|d| d.at.as_ref().map(|at| (at.source, at.range.start)));
+    let failed = tree.unlisted() > 0 || diags.iter().any(|d| d.severity == Severity::Error);
+    Loaded { blueprint: blueprint.filter(|_| !failed), tree, diags }
+}
+
+fn read_blueprint(
+    tree: &mut Tree,
+    search: &SearchPath,
+    found: &Found,
+    overrides: &Overrides,
+    adapters: &Registry,
+) -> Option<Blueprint> {
+    tree.know_homes(home_of);
+    let mut includer = Includer::new(tree, search);
+    let root = includer.read(found);
+    let incomplete = includer.incomplete;
+    let root = root?;
+    let sources = tree.sources().iter().map(|s| (s.name.clone(), s.text.clone())).collect();
+
+    for argument in &overrides.set {
+        yaml::set(tree, root, argument, &RULES);
+    }
+    if overrides.sim {
+        simulate(tree, root, adapters);
+    }
+    let missing = if incomplete { Missing::Ignore } else { Missing::Report };
+    let (file, lost) = read::<BlueprintFile>(tree, root, missing);
+    let checker = Checker { tree, root, lost, adapters, incomplete };
+    let mut blueprint = resolve(checker, file?, &found.name);
+    blueprint.sources = sources;
+    blueprint.source_yaml = write(tree, root, &blueprint.name);
+    Some(blueprint)
+}
+
+/// `--sim`: gives every arm the address of its emulator. An arm that would stay real is an error.
+fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
+    let source = tree.add_source("--sim", "--sim");
+    let hardware = tree.get(root, "hardware").map(|list| tree.items(list).to_vec()).unwrap_or_default();
+    for entry in hardware {
+        let name = tree.get(entry, "adapter_type").and_then(|node| tree.text(node));
+        let Some(row) = name.and_then(|name| adapters.get(name)) else { continue };
+        if row.emulate.is_some() {
+            tree.put_text(entry, "address", SIM, (source, 0..5));
+        } else if row.address.required {
+            let at = tree.get(entry, "adapter_type").map(|node| tree.label(node));
+            let diag =
+                Diag::error(format!("{} has no emulator: with --sim its arm would be the real one", quote(row.name)));
+            let diag = diag.at(Label { source, range: 0..5, text: String::new() });
+            let diag = at.into_iter().fold(diag, |diag, at| diag.also(at.with_text("this arm")));
+            tree.report(diag.hint("run without --sim, or use `adapter_type: mock` for this arm"));
+        }
+    }
+}
+
+/// The merged blueprint as YAML.
+fn write(tree: &mut Tree, root: NodeId, name: &str) -> String {
+    let (value, _) = read::<serde_yaml::Value>(tree, root, Missing::Ignore);
+    let Some(serde_yaml::Value::Mapping(merged)) = value else { return String::new() };
+    let mut whole = serde_yaml::Mapping::new();
+    whole.insert("name".into(), name.into());
+    whole.extend(merged.into_iter().filter(|(key, _)| !matches!(key.as_str(), Some("name" | "include"))));
+    serde_yaml::to_string(&whole).unwrap_or_default()
+}

@@ -1,0 +1,31 @@
+//! Blueprints: the YAML files that say which arms there are and what is done with them.
+//!
+//! ```text
+//! name ─▶ registry (which file) ─▶ load (includes, --set, --sim) ─▶ schema (as typed) ─▶ resolve (checked, indices)
+//!                                     └────────── every mistake, each at its place: Loaded::render ──────────┘
+//! ```
+
+mod arms;
+mod include;
+mod json_schema;
+mod limits;
+mod load;
+pub mod params;
+pub mod planner;
+mod planner_check;
+mod range;
+mod reference;
+mod registry;
+mod resolve;
+pub mod schema;
+mod summary;
+mod tasks;
+
+pub use json_schema::json_schema;
+pub use limits::JointOverride;
+pub use load::{Loaded, Overrides, load, load_from};
+pub use reference::reference;
+pub use registry::{FindError, Found, Listing, SearchPath, Source, find, list};
+pub use resolve::{Arm, Blueprint, Task, TaskKind};
+pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
+pub use summary::{ArmSummary, From, JointSummary, Limit, Summary, TaskSummary};

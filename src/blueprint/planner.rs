@@ -1,0 +1,139 @@
+//! The sections `planner` and `view` as they are typed.
+
+use std::collections::BTreeMap;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::blueprint::range::positive;
+use crate::yaml::{Keyed, Located, Raw, Text};
+
+/// Motion planning.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct PlannerConfig {
+    /// The longest time one planning request may take [s].
+    #[serde(deserialize_with = "positive")]
+    #[schemars(extend("exclusiveMinimum" = 0.0))]
+    pub planning_timeout: f64,
+    /// The robots that are planned for.
+    pub robots: Vec<Located<RobotConfig>>,
+    /// Obstacles that are there from the start, by name.
+    #[schemars(with = "serde_json::Map<String, serde_json::Value>")]
+    pub world: BTreeMap<String, Raw>,
+    /// The same as the section `view`; only one of the two may be given.
+    pub visualization: Option<Located<ViewConfig>>,
+}
+
+impl Default for PlannerConfig {
+    fn default() -> Self {
+        Self { planning_timeout: 10.0, robots: Vec::new(), world: BTreeMap::new(), visualization: None }
+    }
+}
+
+/// A robot that is planned for.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RobotConfig {
+    /// Unique name of the robot: letters, digits, `_` and `-`.
+    pub name: Located<String>,
+    /// The robot's `.urdf` or `.xacro` file.
+    pub model_path: Located<String>,
+    /// Folders that `package://NAME` stands for, by name.
+    #[serde(default)]
+    pub package_paths: BTreeMap<String, String>,
+    /// Arguments of the xacro file.
+    #[serde(default)]
+    pub xacro_args: BTreeMap<String, Text>,
+    /// Where the robot's base is, in the frame `map`.
+    #[serde(default)]
+    pub base_pose: Located<PoseEntry>,
+    /// Root link of the robot.
+    #[serde(default = "base_link")]
+    pub base_link: String,
+    /// The link that pose goals are for.
+    pub end_effector_link: Located<String>,
+    /// The joints that are planned for, as the model names them, base first.
+    pub joint_names: Located<Vec<Located<String>>>,
+    /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
+    #[serde(default)]
+    pub joint_prefix: Option<Located<String>>,
+    /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
+    #[serde(default)]
+    pub joint_name_mapping: Keyed<Located<String>>,
+    /// The trajectory task that executes the robot's motions.
+    #[serde(default)]
+    pub coordinator_task_name: Option<Located<String>>,
+    /// Pairs of links that may touch: `[[finger_left, finger_right]]`.
+    #[serde(default)]
+    pub collision_exclusion_pairs: Vec<(String, String)>,
+    /// Whether mesh files of other formats are converted for the planner.
+    #[serde(default = "yes")]
+    pub auto_convert_meshes: bool,
+    /// Highest joint speed, on top of the model's own limits [rad/s].
+    #[serde(default = "max_velocity", deserialize_with = "positive")]
+    #[schemars(extend("exclusiveMinimum" = 0.0))]
+    pub max_velocity: f64,
+    /// Highest joint acceleration, on top of the model's own limits [rad/s²].
+    #[serde(default = "max_acceleration", deserialize_with = "positive")]
+    #[schemars(extend("exclusiveMinimum" = 0.0))]
+    pub max_acceleration: f64,
+    /// Poses with a name: one position for each of `joint_names` [rad].
+    #[serde(default)]
+    pub named_poses: Keyed<Located<Vec<f64>>>,
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn base_link() -> String {
+    "base_link".to_owned()
+}
+
+fn max_velocity() -> f64 {
+    1.0
+}
+
+fn max_acceleration() -> f64 {
+    2.0
+}
+
+/// A pose.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct PoseEntry {
+    /// x, y, z [m].
+    pub xyz: [f64; 3],
+    /// Roll, pitch, yaw about fixed axes [rad].
+    pub rpy: Option<[f64; 3]>,
+    /// A quaternion x, y, z, w, in place of `rpy`.
+    pub quat: Option<[f64; 4]>,
+}
+
+/// The live view in the browser.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct ViewConfig {
+    /// Which view.
+    pub backend: ViewBackend,
+    /// Port of its page on this machine; 0 = any free one.
+    pub port: u16,
+}
+
+impl Default for ViewConfig {
+    fn default() -> Self {
+        Self { backend: ViewBackend::Meshcat, port: 7000 }
+    }
+}
+
+/// Which view.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ViewBackend {
+    /// A page in the browser.
+    #[default]
+    Meshcat,
+    /// None.
+    None,
+}

@@ -1,0 +1,178 @@
+//! Checks what `planner`, `view` and `assets` refer to.
+
+use crate::blueprint::arms::Found;
+use crate::blueprint::planner::{PlannerConfig, RobotConfig, ViewConfig};
+use crate::blueprint::resolve::Checker;
+use crate::blueprint::schema::{AssetEntry, JointNames, TaskEntry};
+use crate::yaml::{Diag, Keyed, Located, did_you_mean, quote};
+
+pub(super) fn check(
+    checker: &mut Checker<'_>,
+    planner: &Located<PlannerConfig>,
+    view: Option<&Located<ViewConfig>>,
+    tasks: &[Located<TaskEntry>],
+    found: &Found,
+) {
+    if let (Some(view), Some(visualization)) = (view, &planner.visualization) {
+        let also = checker.tree.label(view.at).with_text("the same thing");
+        let diag = Diag::error("`planner.visualization` and `view` are the same thing, and both are given").also(also);
+        let at = checker.tree.entry(planner.at, "visualization").map_or(visualization.at, |(key, _)| key);
+        checker.error(at, diag.hint("remove one of the two"));
+    }
+    for (number, robot) in planner.robots.iter().enumerate() {
+        if checker.has(robot.at, "name") {
+            checker.check_name(&robot.name, "robot's name");
+            let twin = planner.robots.iter().take(number).find(|r| r.name.value == robot.name.value);
+            if let Some(twin) = twin {
+                let also = checker.tree.label(twin.name.at).with_text("first used here");
+                let diag = Diag::error(format!("two robots are named {}", quote(&robot.name))).also(also);
+                checker.error(robot.name.at, diag.hint("give each robot a name of its own"));
+            }
+        }
+        pose(checker, robot);
+        let task = task(checker, robot, tasks);
+        joints(checker, robot, found, task);
+        named_poses(checker, robot);
+    }
+}
+
+fn pose(checker: &mut Checker<'_>, robot: &RobotConfig) {
+    let pose = &robot.base_pose;
+    if pose.rpy.is_some() && pose.quat.is_some() {
+        let diag = Diag::error("`rpy` and `quat` both give the orientation");
+        checker.error(pose.at, diag.hint("remove one of the two"));
+    }
+    if let Some(quat) = pose.quat
+        && !(0.99..=1.01).contains(&quat.iter().map(|v| v * v).sum::<f64>().sqrt())
+    {
+        let at = checker.tree.get(pose.at, "quat").unwrap_or(pose.at);
+        let diag = Diag::error("the quaternion's length is not 1");
+        checker.error(at, diag.hint("write [x, y, z, w]; no rotation is [0, 0, 0, 1]"));
+    }
+}
+
+/// The task that executes the robot's motions, when it exists and can.
+fn task<'t>(
+    checker: &mut Checker<'_>,
+    robot: &RobotConfig,
+    tasks: &'t [Located<TaskEntry>],
+) -> Option<&'t Located<TaskEntry>> {
+    let name = robot.coordinator_task_name.as_ref()?;
+    let task = tasks.iter().find(|t| t.name.value == name.value);
+    let unnamed = tasks.iter().any(|t| !checker.has(t.at, "name"));
+    match task {
+        Some(task) if checker.has(task.at, "type") && task.kind.value != "trajectory" => {
+            let also = checker.tree.label(task.kind.at).with_text("its type");
+            let diag = Diag::error(format!("the task {} is not a trajectory task", quote(name))).also(also);
+            checker.error(name.at, diag.hint("the planner's motions are executed by a task of type `trajectory`"));
+            None
+        }
+        None if !unnamed && !checker.list_lost("tasks") => {
+            let names = tasks.iter().map(|t| t.name.as_str());
+            let hint = did_you_mean(name, names, "tasks").or_else(|| Some("the blueprint has no tasks".to_owned()));
+            checker.error(name.at, Diag::error(format!("there is no task {}", quote(name))).maybe_hint(hint));
+            None
+        }
+        found => found,
+    }
+}
+
+/// Whether the robot's joints are joints of the coordinator, and of the task.
+fn joints(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, found: &Found, task: Option<&Located<TaskEntry>>) {
+    let (model, mapping) = (&robot.joint_names, &robot.joint_name_mapping);
+    let good = checker.has(robot.at, "joint_names") && !checker.lost.contains(model.at);
+    if good && model.is_empty() {
+        let diag = Diag::error("the robot has no joints");
+        checker.error(model.at, diag.hint("name those of the model that are planned for, base first"));
+    }
+    if let (Some(prefix), Some((first, _))) = (&robot.joint_prefix, mapping.0.first()) {
+        let also = checker.tree.label(first.at).with_text("given here too");
+        let diag = Diag::error("`joint_prefix` and `joint_name_mapping` both map the joints' names").also(also);
+        checker.error(prefix.at, diag.hint("remove one of the two"));
+        return;
+    }
+    // Names of the coordinator's joints, with the place that says so.
+    let mut wanted: Vec<Located<String>> = Vec::new();
+    for (ours, theirs) in &mapping.0 {
+        wanted.push(ours.clone());
+        if good && !model.iter().any(|j| j.value == theirs.value) {
+            let diag = Diag::error(format!("the robot has no joint {}", quote(theirs)));
+            let hint = did_you_mean(theirs, model.iter().map(|j| j.as_str()), "its joint_names");
+            checker.error(theirs.at, diag.maybe_hint(hint));
+        }
+    }
+    if mapping.0.is_empty() && good && checker.has(robot.at, "joint_name_mapping") {
+        if !checker.has(robot.at, "joint_prefix") {
+            return;
+        }
+        let prefix = robot.joint_prefix.as_ref();
+        for joint in &model.value {
+            let name = format!("{}{}", prefix.map_or("", |p| p.as_str()), joint.value);
+            wanted.push(Located { at: prefix.map_or(joint.at, |p| p.at), value: name });
+        }
+    }
+    if !found.complete {
+        return;
+    }
+    let ours: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
+    let of_task = task.filter(|t| checker.has(t.at, "joint_names")).map(|t| match &t.joint_names.value {
+        JointNames::Names(names) => names.iter().map(|n| n.value.clone()).collect::<Vec<_>>(),
+        JointNames::Hardware(arm) => {
+            found.entries.iter().filter(|e| e.id == arm.hardware.value).flat_map(|e| e.joints.clone()).collect()
+        }
+    });
+    let mut told = Vec::new();
+    for name in &wanted {
+        if told.contains(&name.at) {
+            continue;
+        }
+        if !ours.contains(&name.as_str()) {
+            told.push(name.at);
+            let diag = Diag::error(format!("no arm has a joint {}", quote(name)));
+            let (hint, given) = (did_you_mean(name, ours.iter().copied(), "joints"), robot.joint_prefix.is_some());
+            let diag = match given {
+                true => diag.note("`joint_prefix` and each of `joint_names` make the coordinator's joint names"),
+                false => diag,
+            };
+            checker.error(name.at, diag.maybe_hint(hint));
+        } else if let (Some(task), Some(joints)) = (task, &of_task)
+            && !joints.is_empty()
+            && !joints.contains(&name.value)
+        {
+            told.push(name.at);
+            let also = checker.tree.label(task.joint_names.at).with_text("the task's joints");
+            let diag = Diag::error(format!("the task {} does not command {}", quote(&task.name), quote(name)));
+            checker.error(name.at, diag.also(also).hint("add the joint to the task, or name another task"));
+        }
+    }
+}
+
+fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotConfig>) {
+    let count = robot.joint_names.len();
+    if !checker.has(robot.at, "joint_names") || checker.lost.contains(robot.joint_names.at) {
+        return;
+    }
+    for (_, pose) in &robot.named_poses.0 {
+        if pose.len() != count && !checker.lost.contains(pose.at) {
+            let diag = Diag::error(format!("{} positions for {count} joints", pose.len()));
+            checker.error(pose.at, diag.hint("give one for each of `joint_names`, in the same order"));
+        }
+    }
+}
+
+/// Addresses and check sums of files that are fetched.
+pub(super) fn assets(checker: &mut Checker<'_>, assets: &Keyed<AssetEntry>) {
+    for (name, asset) in &assets.0 {
+        checker.check_name(name, "asset's name");
+        let (url, sum) = (&asset.url, &asset.sha256);
+        let schemes = ["https://", "http://", "file://"];
+        if !url.is_empty() && !schemes.iter().any(|s| url.starts_with(s)) {
+            let diag = Diag::error(format!("{} is no address of a file", quote(url)));
+            checker.error(url.at, diag.hint("it starts with https://, http:// or file://"));
+        }
+        if !sum.is_empty() && (sum.len() != 64 || !sum.chars().all(|c| c.is_ascii_hexdigit())) {
+            let diag = Diag::error("a SHA-256 has 64 hexadecimal digits");
+            checker.error(sum.at, diag.hint("`sha256sum FILE` prints it"));
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! A blueprint as it is meant: checked, indices instead of names, SI units.
+
+use serde::Serialize;
+
+use crate::blueprint::limits::JointOverride;
+use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::planner::{PlannerConfig, ViewConfig};
+use crate::blueprint::schema::{
+    AssetEntry, BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
+};
+use crate::blueprint::{arms, planner_check, tasks};
+use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
+
+/// A blueprint without mistakes.
+#[derive(Debug, Clone)]
+pub struct Blueprint {
+    /// Its name; the run's name unless `--name` gives another.
+    pub name: String,
+    /// One line.
+    pub description: String,
+    /// The control loop.
+    pub coordinator: CoordinatorConfig,
+    /// The arms, in the blueprint's order.
+    pub arms: Vec<Arm>,
+    /// The tasks, in the blueprint's order.
+    pub tasks: Vec<Task>,
+    /// Motion planning, as typed; names in it have been checked.
+    pub planner: Option<PlannerConfig>,
+    /// The live view, given as `view` or as `planner.visualization`.
+    pub view: Option<ViewConfig>,
+    /// The log.
+    pub recording: RecordingConfig,
+    /// The socket.
+    pub rpc: RpcConfig,
+    /// Files that are fetched on first use, by name.
+    pub assets: Keyed<AssetEntry>,
+    /// The whole blueprint as one YAML text, includes and arguments merged in: what the log keeps.
+    pub source_yaml: String,
+    /// The files it was read from: name and text, the main one first.
+    pub sources: Vec<(String, String)>,
+}
+
+impl Blueprint {
+    /// The names of all joints, arm by arm: what [`Task::joints`] counts.
+    pub fn joint_names(&self) -> Vec<&str> {
+        self.arms.iter().flat_map(|arm| arm.joints.iter().map(String::as_str)).collect()
+    }
+}
+
+/// An arm.
+#[derive(Debug, Clone)]
+pub struct Arm {
+    /// Its name.
+    pub hardware_id: String,
+    /// What kind of hardware it is.
+    pub hardware_type: HardwareType,
+    /// Its joints' names, base first.
+    pub joints: Vec<String>,
+    /// The adapter's row.
+    pub adapter: AdapterSpec,
+    /// The adapter's name.
+    pub adapter_type: String,
+    /// Where the arm is; `sim` for the emulator; empty where no address is needed.
+    pub address: String,
+    /// Whether the adapter's emulator stands in for the arm.
+    pub simulated: bool,
+    /// Whether the motors are enabled when the run starts.
+    pub auto_enable: bool,
+    /// What happens to the motors when the run ends.
+    pub on_exit: OnExit,
+    /// Whether the blueprint says so, or the default was taken.
+    pub on_exit_given: bool,
+    /// The adapter's own options: an object.
+    pub options: serde_json::Value,
+    /// Limits narrower than the arm's own, one entry for each joint.
+    pub limits: Vec<JointOverride>,
+}
+
+/// What a task does, with its parameters.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "type", content = "params", rename_all = "snake_case")]
+pub enum TaskKind {
+    /// Executes trajectories.
+    Trajectory(TrajectoryParams),
+    /// Follows streamed positions.
+    Servo(ServoParams),
+    /// Follows streamed velocities.
+    Velocity(VelocityParams),
+}
+
+impl TaskKind {
+    /// The word used in blueprints.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Trajectory(_) => "trajectory",
+            Self::Servo(_) => "servo",
+            Self::Velocity(_) => "velocity",
+        }
+    }
+}
+
+/// A task.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Task {
+    /// Its name.
+    pub name: String,
+    /// What it does.
+    pub kind: TaskKind,
+    /// The joints it commands, counted over all arms' joints in the blueprint's order.
+    pub joints: Vec<usize>,
+    /// The arms those joints belong to.
+    pub arms: Vec<usize>,
+    /// Who wins a joint: the higher number.
+    pub priority: i32,
+    /// Whether it is started with the run.
+    pub auto_start: bool,
+}
+
+/// What every check needs: the tree to point into, and what reading had to leave out.
+pub(super) struct Checker<'t> {
+    pub(super) tree: &'t mut Tree,
+    /// The blueprint's own group.
+    pub(super) root: NodeId,
+    pub(super) lost: Lost,
+    pub(super) adapters: &'t Registry,
+    /// A file could not be read: names may be missing for that reason.
+    pub(super) incomplete: bool,
+}
+
+impl Checker<'_> {
+    /// Reports a mistake at a node.
+    pub(super) fn error(&mut self, at: NodeId, diag: Diag) {
+        let diag = if at == NOWHERE { diag } else { diag.at(self.tree.label(at)) };
+        self.tree.report(diag);
+    }
+
+    /// Whether a key of a group was read as it stands there (or is rightly absent).
+    pub(super) fn has(&self, group: NodeId, key: &str) -> bool {
+        !self.lost.key(group, key)
+    }
+
+    /// Whether an entry of a list at the top, or all of it, was left out.
+    pub(super) fn list_lost(&self, key: &str) -> bool {
+        let damaged = |list| self.tree.is_damaged(list) || self.tree.items(list).iter().any(|i| self.lost.dropped(*i));
+        self.incomplete || !self.has(self.root, key) || self.tree.get(self.root, key).is_some_and(damaged)
+    }
+
+    /// Reports a name that cannot be one.
+    pub(super) fn check_name(&mut self, name: &Located<String>, what: &str) -> bool {
+        let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+        let problem = match name.value.chars().find(|c| !good(*c)) {
+            _ if name.is_empty() => format!("the {what} is empty"),
+            Some(' ') => format!("the {what} {} contains a space", quote(name)),
+            Some(c) => format!("the {what} {} contains {}", quote(name), quote(&c.to_string())),
+            None if name.starts_with('-') => format!("the {what} {} starts with a dash", quote(name)),
+            None if name.len() > 64 => format!("the {what} {} is longer than 64 characters", quote(name)),
+            None => return true,
+        };
+        let instead: String = name.value.chars().map(|c| if good(c) { c } else { '_' }).take(64).collect();
+        let instead = instead.trim_start_matches('-');
+        let hint = match name.value.is_ascii() && instead.chars().any(|c| c.is_ascii_alphanumeric()) {
+            true => format!("use letters, digits, `_` and `-`: {instead}"),
+            false => "use the letters a to z and A to Z, digits, `_` and `-`".to_owned(),
+        };
+        self.error(name.at, Diag::error(problem).hint(hint));
+        false
+    }
+}
+
+/// Checks the meaning of a blueprint as typed. What it gives is only of use when nothing was reported.
+pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_name: &str) -> Blueprint {
+    let root = checker.root;
+    let name = file.name.unwrap_or_else(|| default_name.to_owned().into());
+    if checker.has(root, "name") {
+        let at = if name.at == NOWHERE { root } else { name.at };
+        checker.check_name(&Located { at, value: name.value.clone() }, "blueprint's name");
+    }
+    let found = arms::resolve(&mut checker, &file.hardware);
+    let tasks = tasks::resolve(&mut checker, &file.tasks, &found);
+    planner_check::assets(&mut checker, &file.assets);
+    if let Some(planner) = &file.planner {
+        planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
+    }
+    let planner = file.planner.map(|p| p.value);
+    let view = file.view.or_else(|| planner.as_ref().and_then(|p| p.visualization.clone()));
+    Blueprint {
+        name: name.value,
+        description: file.description,
+        coordinator: file.coordinator,
+        arms: found.arms,
+        tasks,
+        planner,
+        view: view.map(|v| v.value),
+        recording: file.recording,
+        rpc: file.rpc,
+        assets: file.assets,
+        source_yaml: String::new(),
+        sources: Vec::new(),
+    }
+}

@@ -1,0 +1,323 @@
+//! A blueprint as it is typed. The doc comments here become `docs/blueprint-reference.md` and the JSON Schema.
+
+use std::fmt;
+
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Serialize};
+
+use crate::blueprint::limits::LimitsEntry;
+use crate::blueprint::planner::{PlannerConfig, ViewConfig};
+use crate::blueprint::range::tick_rate;
+use crate::yaml::{Keyed, Located, Raw};
+
+/// A blueprint: which arms there are, and what is done with them.
+#[derive(Debug, Clone, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+#[schemars(title = "dimos blueprint")]
+pub struct BlueprintFile {
+    /// Name of the blueprint. Default: the file's name.
+    pub name: Option<Located<String>>,
+    /// One line for `dimos list-blueprints`.
+    pub description: String,
+    /// Blueprints that this one builds on: names, or paths relative to this file. They are merged first; entries of
+    /// `hardware`, `tasks` and `planner.robots` are matched by id, everything else is replaced key by key.
+    pub include: Vec<Located<String>>,
+    /// The control loop.
+    pub coordinator: CoordinatorConfig,
+    /// The arms.
+    pub hardware: Vec<Located<HardwareEntry>>,
+    /// What may command the arms' joints.
+    pub tasks: Vec<Located<TaskEntry>>,
+    /// Motion planning.
+    pub planner: Option<Located<PlannerConfig>>,
+    /// The live view in the browser.
+    pub view: Option<Located<ViewConfig>>,
+    /// The log of the run.
+    pub recording: RecordingConfig,
+    /// The socket by which other programs talk to the run.
+    pub rpc: RpcConfig,
+    /// Files that are fetched on first use, by name.
+    pub assets: Keyed<AssetEntry>,
+}
+
+/// The control loop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct CoordinatorConfig {
+    /// How often the arms are read and commanded [Hz].
+    #[serde(deserialize_with = "tick_rate")]
+    #[schemars(range(min = 1.0, max = 2000.0))]
+    pub tick_rate: f64,
+    /// Whether the joint state is published to other programs.
+    pub publish_joint_state: bool,
+    /// The frame named in published joint states.
+    pub joint_state_frame_id: String,
+}
+
+impl Default for CoordinatorConfig {
+    fn default() -> Self {
+        Self { tick_rate: 100.0, publish_joint_state: true, joint_state_frame_id: "coordinator".to_owned() }
+    }
+}
+
+/// An arm.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct HardwareEntry {
+    /// Unique name of the arm: letters, digits, `_` and `-`.
+    pub hardware_id: Located<String>,
+    /// What kind of hardware it is.
+    #[serde(default)]
+    pub hardware_type: HardwareType,
+    /// The arm's joints, base first: a list of names, or `{prefix: arm, count: 6}` for `arm_joint1` … `arm_joint6`.
+    pub joints: Located<Joints>,
+    /// The adapter that talks to the arm; see `dimos list-adapters`.
+    pub adapter_type: Located<String>,
+    /// Where the arm is, in the form that `dimos list-adapters` shows; `sim` starts the adapter's emulator.
+    #[serde(default)]
+    pub address: Option<Located<String>>,
+    /// Whether the motors are enabled when the run starts.
+    #[serde(default = "yes")]
+    pub auto_enable: bool,
+    /// What happens to the motors when the run ends. Default: `hold` where the arm falls when its motors are
+    /// disabled, `disable` where it has brakes.
+    #[serde(default)]
+    pub on_exit: Option<OnExit>,
+    /// The adapter's own options.
+    #[serde(default)]
+    pub options: Option<Raw>,
+    /// Limits narrower than the arm's own.
+    #[serde(default)]
+    pub limits: LimitsEntry,
+}
+
+fn yes() -> bool {
+    true
+}
+
+/// What kind of hardware it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum HardwareType {
+    /// An arm.
+    #[default]
+    Manipulator,
+}
+
+/// What happens to the motors when the run ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OnExit {
+    /// They stay enabled and hold the pose.
+    Hold,
+    /// They are disabled, and the arm's brakes hold it.
+    Disable,
+}
+
+impl OnExit {
+    /// The name used in blueprints and tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hold => "hold",
+            Self::Disable => "disable",
+        }
+    }
+}
+
+/// The joints of an arm.
+#[derive(Debug, Clone)]
+pub enum Joints {
+    /// Their names.
+    Names(Vec<Located<String>>),
+    /// `prefix_joint1` … `prefix_jointN`.
+    Counted(CountedJoints),
+}
+
+/// Joints named by a pattern.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CountedJoints {
+    /// What the names start with: `arm` for `arm_joint1`.
+    pub prefix: Located<String>,
+    /// How many there are.
+    #[schemars(range(min = 1, max = 16))]
+    pub count: Located<u64>,
+}
+
+impl<'de> Deserialize<'de> for Joints {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(JointsVisitor)
+    }
+}
+
+/// A list or a group: `untagged` would lose the places.
+struct JointsVisitor;
+
+impl<'de> Visitor<'de> for JointsVisitor {
+    type Value = Joints;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a list of joint names or {prefix: NAME, count: N}")
+    }
+
+    fn visit_unit<E>(self) -> Result<Joints, E> {
+        Ok(Joints::Names(Vec::new()))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<Joints, A::Error> {
+        let mut names = Vec::new();
+        while let Some(name) = seq.next_element()? {
+            names.push(name);
+        }
+        Ok(Joints::Names(names))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<Joints, A::Error> {
+        CountedJoints::deserialize(MapAccessDeserializer::new(map)).map(Joints::Counted)
+    }
+}
+
+impl JsonSchema for Joints {
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "Joints".into()
+    }
+
+    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
+        let counted = generator.subschema_for::<CountedJoints>();
+        json_schema!({
+            "anyOf": [{ "type": "array", "items": { "type": "string" }, "minItems": 1, "maxItems": 16 }, counted]
+        })
+    }
+}
+
+/// A task: something that may command joints.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TaskEntry {
+    /// Unique name of the task: letters, digits, `_` and `-`.
+    pub name: Located<String>,
+    /// What the task does: `trajectory` executes trajectories, `servo` follows streamed positions, `velocity` follows
+    /// streamed velocities. (`cartesian_ik` is not in this version.)
+    #[serde(rename = "type")]
+    #[schemars(extend("enum" = ["trajectory", "servo", "velocity"]))]
+    pub kind: Located<String>,
+    /// The joints it commands: a list of names, or `{hardware: arm}` for all joints of an arm.
+    pub joint_names: Located<JointNames>,
+    /// Who wins when two tasks want the same joint: the higher number.
+    #[serde(default = "default_priority")]
+    pub priority: i32,
+    /// Whether the task is started with the run.
+    #[serde(default)]
+    pub auto_start: bool,
+    /// Parameters of the task type.
+    #[serde(default)]
+    pub params: Option<Raw>,
+}
+
+fn default_priority() -> i32 {
+    10
+}
+
+/// The joints of a task.
+#[derive(Debug, Clone)]
+pub enum JointNames {
+    /// Their names.
+    Names(Vec<Located<String>>),
+    /// All joints of an arm.
+    Hardware(HardwareJoints),
+}
+
+/// All joints of an arm.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct HardwareJoints {
+    /// The arm's `hardware_id`.
+    pub hardware: Located<String>,
+}
+
+impl<'de> Deserialize<'de> for JointNames {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(JointNamesVisitor)
+    }
+}
+
+struct JointNamesVisitor;
+
+impl<'de> Visitor<'de> for JointNamesVisitor {
+    type Value = JointNames;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a list of joint names or {hardware: ID}")
+    }
+
+    fn visit_unit<E>(self) -> Result<JointNames, E> {
+        Ok(JointNames::Names(Vec::new()))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<JointNames, A::Error> {
+        let mut names = Vec::new();
+        while let Some(name) = seq.next_element()? {
+            names.push(name);
+        }
+        Ok(JointNames::Names(names))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<JointNames, A::Error> {
+        HardwareJoints::deserialize(MapAccessDeserializer::new(map)).map(JointNames::Hardware)
+    }
+}
+
+impl JsonSchema for JointNames {
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "JointNames".into()
+    }
+
+    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
+        let hardware = generator.subschema_for::<HardwareJoints>();
+        json_schema!({ "anyOf": [{ "type": "array", "items": { "type": "string" }, "minItems": 1 }, hardware] })
+    }
+}
+
+/// The log of the run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RecordingConfig {
+    /// Whether the run is recorded. `--no-record` turns it off.
+    pub enabled: bool,
+    /// Folder of the logs. Default: `$XDG_STATE_HOME/dimos`.
+    pub directory: Option<String>,
+    /// How many logs are kept there, the newest ones; 0 = all.
+    pub keep: u32,
+}
+
+impl Default for RecordingConfig {
+    fn default() -> Self {
+        Self { enabled: true, directory: None, keep: 20 }
+    }
+}
+
+/// The socket by which other programs talk to the run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RpcConfig {
+    /// Whether there is one. Without it `dimos status`, `move`, `stop` and all other verbs cannot reach the run.
+    pub enabled: bool,
+}
+
+impl Default for RpcConfig {
+    fn default() -> Self {
+        Self { enabled: true }
+    }
+}
+
+/// A file that is fetched on first use.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct AssetEntry {
+    /// Where it is: `https://`, `http://` or `file://`.
+    pub url: Located<String>,
+    /// SHA-256 of the file, 64 hexadecimal digits.
+    pub sha256: Located<String>,
+}

@@ -1,0 +1,176 @@
+//! What `dimos check` shows of a blueprint: arms, their joints' limits and where each comes from, tasks.
+
+use serde::Serialize;
+
+use crate::blueprint::resolve::{Arm, Blueprint, TaskKind};
+use crate::blueprint::schema::{CoordinatorConfig, OnExit};
+use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK, JointLimits};
+
+/// Where a value comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum From {
+    /// The adapter states it.
+    Adapter,
+    /// The blueprint says so.
+    Blueprint,
+    /// Nobody says anything.
+    Default,
+}
+
+impl From {
+    /// The word used in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Adapter => "adapter",
+            Self::Blueprint => "blueprint",
+            Self::Default => "default",
+        }
+    }
+}
+
+/// A limit and where it comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Limit {
+    /// The limit; its unit is that of the field.
+    pub value: f64,
+    /// Where it comes from.
+    pub from: From,
+}
+
+/// A joint with the limits it is held to.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct JointSummary {
+    /// Its name.
+    pub name: String,
+    /// Lowest position [rad]; absent where the adapter states none and the blueprint gives none.
+    pub position_lower: Option<Limit>,
+    /// Highest position [rad].
+    pub position_upper: Option<Limit>,
+    /// Highest speed [rad/s].
+    pub velocity: Option<Limit>,
+    /// Highest acceleration [rad/s²].
+    pub acceleration: Limit,
+    /// Highest jerk [rad/s³].
+    pub jerk: Limit,
+}
+
+/// An arm.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ArmSummary {
+    /// Its name.
+    pub hardware_id: String,
+    /// The adapter's name.
+    pub adapter: String,
+    /// How far that has been proven.
+    pub level: String,
+    /// Where the arm is; empty where no address is needed.
+    pub address: String,
+    /// Whether the emulator stands in for it.
+    pub simulated: bool,
+    /// Whether the motors are enabled at the start.
+    pub auto_enable: bool,
+    /// What happens to the motors at the end.
+    pub on_exit: OnExit,
+    /// Where that comes from.
+    pub on_exit_from: From,
+    /// Whether the arm keeps its pose when its motors are disabled.
+    pub holds_when_disabled: bool,
+    /// Its joints.
+    pub joints: Vec<JointSummary>,
+}
+
+/// A task.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TaskSummary {
+    /// Its name.
+    pub name: String,
+    /// What it does, with its parameters.
+    #[serde(flatten)]
+    pub kind: TaskKind,
+    /// The joints it commands.
+    pub joints: Vec<String>,
+    /// The arms those belong to.
+    pub arms: Vec<String>,
+    /// Who wins a joint: the higher number.
+    pub priority: i32,
+    /// Whether it is started with the run.
+    pub auto_start: bool,
+}
+
+/// A blueprint as it will be run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Its name.
+    pub name: String,
+    /// Its description.
+    pub description: String,
+    /// The files it was read from, the main one first.
+    pub files: Vec<String>,
+    /// The control loop.
+    pub coordinator: CoordinatorConfig,
+    /// The arms.
+    pub arms: Vec<ArmSummary>,
+    /// The tasks.
+    pub tasks: Vec<TaskSummary>,
+    /// Robots that are planned for.
+    pub planner_robots: Vec<String>,
+}
+
+impl Summary {
+    /// Sums a blueprint up.
+    pub fn of(blueprint: &Blueprint) -> Self {
+        let joints = blueprint.joint_names();
+        let tasks = blueprint.tasks.iter().map(|task| TaskSummary {
+            name: task.name.clone(),
+            kind: task.kind.clone(),
+            joints: task.joints.iter().filter_map(|i| joints.get(*i)).map(|j| (*j).to_owned()).collect(),
+            arms: task.arms.iter().filter_map(|i| blueprint.arms.get(*i)).map(|a| a.hardware_id.clone()).collect(),
+            priority: task.priority,
+            auto_start: task.auto_start,
+        });
+        let robots = blueprint.planner.iter().flat_map(|p| p.robots.iter().map(|r| r.name.value.clone()));
+        Self {
+            name: blueprint.name.clone(),
+            description: blueprint.description.clone(),
+            files: blueprint.sources.iter().map(|(name, _)| name.clone()).collect(),
+            coordinator: blueprint.coordinator.clone(),
+            arms: blueprint.arms.iter().map(arm).collect(),
+            tasks: tasks.collect(),
+            planner_robots: robots.collect(),
+        }
+    }
+}
+
+fn arm(arm: &Arm) -> ArmSummary {
+    let own = (arm.adapter.limits)(arm.joints.len());
+    ArmSummary {
+        hardware_id: arm.hardware_id.clone(),
+        adapter: arm.adapter_type.clone(),
+        level: arm.adapter.level.name().to_owned(),
+        address: arm.address.clone(),
+        simulated: arm.simulated,
+        auto_enable: arm.auto_enable,
+        on_exit: arm.on_exit,
+        on_exit_from: if arm.on_exit_given { From::Blueprint } else { From::Default },
+        holds_when_disabled: arm.adapter.holds_when_disabled,
+        joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, &own, joint)).collect(),
+    }
+}
+
+fn joint_summary(arm: &Arm, own: &JointLimits, joint: usize) -> JointSummary {
+    let given = arm.limits.get(joint).copied().unwrap_or_default();
+    let pick = |given: Option<f64>, own: &[f64]| {
+        let own = own.get(joint).map(|value| Limit { value: *value, from: From::Adapter });
+        given.map(|value| Limit { value, from: From::Blueprint }).or(own)
+    };
+    let or = |limit: Option<Limit>, value: f64| limit.unwrap_or(Limit { value, from: From::Default });
+    JointSummary {
+        name: arm.joints.get(joint).cloned().unwrap_or_default(),
+        position_lower: pick(given.position_lower, &own.position_lower),
+        position_upper: pick(given.position_upper, &own.position_upper),
+        velocity: pick(given.velocity, &own.velocity_max),
+        acceleration: or(pick(given.acceleration, &own.acceleration_max), DEFAULT_ACCELERATION),
+        jerk: or(pick(given.jerk, &own.jerk_max), DEFAULT_JERK),
+    }
+}

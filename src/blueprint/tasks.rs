@@ -1,0 +1,229 @@
+//! Checks `tasks`: names, types, joints, modes, parameters, and who shares a joint with whom.
+
+use serde::de::DeserializeOwned;
+
+use crate::blueprint::arms::Found;
+use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::resolve::{Checker, Task, TaskKind};
+use crate::blueprint::schema::{JointNames, TaskEntry};
+use crate::joint::ControlMode;
+use crate::yaml::{Diag, Located, Missing, NodeId, did_you_mean, quote, read};
+
+/// The task types of this version.
+pub(super) const KINDS: [&str; 3] = ["trajectory", "servo", "velocity"];
+/// A task type of the guide that comes later.
+const LATER: &str = "cartesian_ik";
+
+/// A task as far as it is understood, with its places.
+struct Checked<'e> {
+    entry: &'e Located<TaskEntry>,
+    joints: Vec<usize>,
+}
+
+pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>], found: &Found) -> Vec<Task> {
+    let root = checker.root;
+    if entries.is_empty() && !checker.list_lost("tasks") {
+        let at = checker.tree.entry(root, "tasks").map_or(root, |(key, _)| key);
+        let diag = Diag::warning("the blueprint has no task: nothing can move the arms");
+        checker
+            .error(at, diag.hint("add one: tasks: [{name: traj_arm, type: trajectory, joint_names: {hardware: arm}}]"));
+    }
+    let mut tasks = Vec::new();
+    let mut checked: Vec<Checked<'_>> = Vec::new();
+    for entry in entries {
+        if checker.has(entry.at, "name") {
+            checker.check_name(&entry.name, "task name");
+            let named = |c: &&Checked<'_>| c.entry.name.value == entry.name.value;
+            if let Some(first) = checked.iter().find(named).map(|c| c.entry.name.at) {
+                let also = checker.tree.label(first).with_text("first used here");
+                let diag = Diag::error(format!("two tasks are named {}", quote(&entry.name))).also(also);
+                checker.error(entry.name.at, diag.hint("give each task a name of its own"));
+            }
+        }
+        let (joints, arms) = joints(checker, entry, found);
+        if let Some(kind) = kind(checker, entry, &joints, found) {
+            modes(checker, entry, &kind, &arms, found);
+            tasks.push(Task {
+                name: entry.name.value.clone(),
+                kind,
+                joints: joints.clone(),
+                arms,
+                priority: entry.priority,
+                auto_start: entry.auto_start,
+            });
+        }
+        checked.push(Checked { entry, joints });
+    }
+    report_sharing(checker, &checked, found);
+    tasks
+}
+
+/// The joints of a task, counted over all arms, and those arms.
+fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) -> (Vec<usize>, Vec<usize>) {
+    let mut joints: Vec<usize> = Vec::new();
+    if !checker.has(entry.at, "joint_names") {
+        return (joints, Vec::new());
+    }
+    let all: Vec<(usize, &str)> = found
+        .entries
+        .iter()
+        .enumerate()
+        .flat_map(|(arm, e)| e.joints.iter().map(move |joint| (arm, joint.as_str())))
+        .collect();
+    match &entry.joint_names.value {
+        JointNames::Hardware(by_arm) => {
+            let id = &by_arm.hardware;
+            match found.entries.iter().position(|e| e.id == id.value) {
+                Some(arm) => joints = (0..all.len()).filter(|i| all.get(*i).is_some_and(|(a, _)| *a == arm)).collect(),
+                None if found.entries.iter().any(|e| e.id.is_empty()) || checker.incomplete || !found.complete => {}
+                None => {
+                    let diag = Diag::error(format!("there is no arm {}", quote(id)));
+                    let ids = found.entries.iter().map(|e| e.id.as_str());
+                    let hint = did_you_mean(id, ids, "arms in `hardware`");
+                    checker.error(id.at, diag.maybe_hint(hint));
+                }
+            }
+        }
+        JointNames::Names(names) => {
+            if names.is_empty() && !checker.lost.contains(entry.joint_names.at) {
+                let diag = Diag::error("the task has no joints");
+                checker.error(entry.joint_names.at, diag.hint("for example `joint_names: {hardware: arm}`"));
+            }
+            for (number, name) in names.iter().enumerate() {
+                if let Some(first) = names.iter().take(number).find(|n| n.value == name.value) {
+                    let also = checker.tree.label(first.at).with_text("first named here");
+                    let diag = Diag::error(format!("the joint {} is named twice", quote(name))).also(also);
+                    checker.error(name.at, diag.hint("remove one of the two"));
+                    continue;
+                }
+                match all.iter().position(|(_, joint)| *joint == name.value) {
+                    Some(joint) => joints.push(joint),
+                    None if found.complete => {
+                        let diag = Diag::error(format!("no arm has a joint {}", quote(name)));
+                        let hint = did_you_mean(name, all.iter().map(|(_, joint)| *joint), "joints");
+                        checker.error(name.at, diag.maybe_hint(hint));
+                    }
+                    None => {}
+                }
+            }
+        }
+    }
+    let mut arms: Vec<usize> = joints.iter().filter_map(|i| all.get(*i)).map(|(arm, _)| *arm).collect();
+    arms.sort_unstable();
+    arms.dedup();
+    (joints, arms)
+}
+
+/// The task's type, with its parameters.
+fn kind(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, joints: &[usize], found: &Found) -> Option<TaskKind> {
+    if !checker.has(entry.at, "type") {
+        return None;
+    }
+    let params = entry.params.as_ref().filter(|p| !p.value.is_null()).map(|p| p.at);
+    let params = params.filter(|_| checker.has(entry.at, "params"));
+    match entry.kind.as_str() {
+        "trajectory" => Some(TaskKind::Trajectory(read_params::<TrajectoryParams>(checker, params))),
+        "servo" => {
+            let servo = read_params::<ServoParams>(checker, params);
+            check_default_positions(checker, entry, params, &servo, joints, found);
+            Some(TaskKind::Servo(servo))
+        }
+        "velocity" => Some(TaskKind::Velocity(read_params::<VelocityParams>(checker, params))),
+        LATER => {
+            let diag = Diag::error(format!("`{LATER}` is not in this version"));
+            let hint = "use `servo` and stream joint positions, or leave the task out";
+            checker.error(entry.kind.at, diag.hint(hint));
+            None
+        }
+        other => {
+            let diag = Diag::error(format!("there is no task type {}", quote(other)));
+            checker.error(entry.kind.at, diag.maybe_hint(did_you_mean(other, KINDS, "there are")));
+            None
+        }
+    }
+}
+
+fn read_params<T: DeserializeOwned + Default>(checker: &mut Checker<'_>, params: Option<NodeId>) -> T {
+    let Some(node) = params else { return T::default() };
+    let (value, lost) = read::<T>(checker.tree, node, Missing::Report);
+    checker.lost.extend(lost);
+    value.unwrap_or_default()
+}
+
+fn check_default_positions(
+    checker: &mut Checker<'_>,
+    entry: &Located<TaskEntry>,
+    params: Option<NodeId>,
+    servo: &ServoParams,
+    joints: &[usize],
+    found: &Found,
+) {
+    let place = params.and_then(|params| checker.tree.get(params, "default_positions"));
+    let (Some(positions), Some(place)) = (&servo.default_positions, place) else { return };
+    let known = checker.has(entry.at, "joint_names") && found.complete && !joints.is_empty();
+    if known && positions.len() != joints.len() && !checker.lost.contains(place) {
+        let diag = Diag::error(format!("{} positions for {} joints", positions.len(), joints.len()));
+        checker.error(place, diag.hint("give one for each joint of the task, in the same order"));
+    }
+}
+
+/// Whether every arm of the task can be commanded the way the task does.
+fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, kind: &TaskKind, arms: &[usize], found: &Found) {
+    let wanted: &[ControlMode] = match kind {
+        TaskKind::Trajectory(_) | TaskKind::Servo(_) => &[ControlMode::ServoPosition, ControlMode::Position],
+        TaskKind::Velocity(_) => &[ControlMode::Velocity],
+    };
+    for (id, row) in arms.iter().filter_map(|i| found.entries.get(*i)).filter_map(|e| Some((&e.id, e.adapter?))) {
+        if row.modes.iter().any(|mode| wanted.contains(mode)) {
+            continue;
+        }
+        let needs = wanted.iter().map(|m| m.name()).collect::<Vec<_>>().join(" or ");
+        let has = row.modes.iter().map(|m| m.name()).collect::<Vec<_>>().join(", ");
+        let diag = Diag::error(format!("`{}` tasks need the mode {needs}, which arm {} lacks", kind.name(), quote(id)));
+        let diag = diag.note(format!("its adapter `{}` has: {has}", row.name));
+        let can = |m: ControlMode| row.modes.contains(&m);
+        let hint = match kind {
+            _ if can(ControlMode::Velocity) => "a `velocity` task would work with this arm",
+            _ if can(ControlMode::ServoPosition) || can(ControlMode::Position) => {
+                "a `servo` or `trajectory` task would work with this arm"
+            }
+            _ => "no task type works with this arm; leave the task out",
+        };
+        checker.error(entry.kind.at, diag.hint(hint));
+    }
+}
+
+/// Two tasks of equal priority on one joint: the blueprint's order decides, which is rarely meant.
+fn report_sharing(checker: &mut Checker<'_>, tasks: &[Checked<'_>], found: &Found) {
+    let names: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
+    for (number, second) in tasks.iter().enumerate() {
+        for first in tasks.iter().take(number) {
+            let (a, b) = (&first.entry, &second.entry);
+            let known = checker.has(a.at, "priority") && checker.has(b.at, "priority");
+            if !known || a.priority != b.priority || a.name.value == b.name.value {
+                continue;
+            }
+            let shared: Vec<usize> = second.joints.iter().copied().filter(|j| first.joints.contains(j)).collect();
+            let Some(joint) = shared.first().and_then(|j| names.get(*j)) else { continue };
+            let more = if shared.len() > 1 { format!(" and {} more", shared.len() - 1) } else { String::new() };
+            let message = format!(
+                "tasks {} and {} share the joint `{joint}`{more} at the same priority, {}",
+                quote(&a.name),
+                quote(&b.name),
+                a.priority
+            );
+            let both = a.auto_start && b.auto_start;
+            let diag = if both { Diag::error(message) } else { Diag::warning(message) };
+            let diag = diag.note(match both {
+                true => "both are started with the run, so one of them would never get its joints",
+                false => "when both are active, the one that stands first wins",
+            });
+            let at = checker.tree.get(b.at, "priority").unwrap_or(b.name.at);
+            let also = checker.tree.label(checker.tree.get(a.at, "priority").unwrap_or(a.name.at));
+            checker.error(
+                at,
+                diag.also(also.with_text("the other one")).hint("give the more important task a higher priority"),
+            );
+        }
+    }
+}

@@ -1,0 +1,403 @@
+//! The Deserializer over a [`Tree`]. What healing decided (entries left out, stand-ins put in) is applied while
+//! reading; the tree itself is not touched. Each level adds its node to a passing error.
+
+use std::collections::{HashMap, HashSet};
+
+use serde::de::value::{BorrowedStrDeserializer, U32Deserializer};
+use serde::de::{
+    DeserializeSeed, Deserializer, EnumAccess, IntoDeserializer, MapAccess, SeqAccess, VariantAccess, Visitor,
+};
+use serde::forward_to_deserialize_any;
+
+use crate::yaml::error::{ReadError, What};
+use crate::yaml::located::{LOCATED, TEXT};
+use crate::yaml::scalar::{self, Scalar};
+use crate::yaml::stand_in::StandIn;
+use crate::yaml::tree::{Kind, NodeId, Tree};
+
+/// What a read must work round.
+#[derive(Debug, Default)]
+pub(super) struct Detour {
+    /// Values and list elements to leave out.
+    pub(super) dropped: HashSet<NodeId>,
+    /// Keys to put stand-ins for, by group.
+    pub(super) stand_ins: HashMap<NodeId, Vec<&'static str>>,
+}
+
+/// One node, about to be read.
+#[derive(Clone, Copy)]
+pub(super) struct De<'a> {
+    pub(super) tree: &'a Tree,
+    pub(super) detour: &'a Detour,
+    pub(super) node: NodeId,
+    /// It is a key: always text.
+    pub(super) key: bool,
+}
+
+impl<'a> De<'a> {
+    fn of(&self, node: NodeId) -> Self {
+        Self { node, key: false, ..*self }
+    }
+
+    fn kind(&self) -> Result<&'a Kind, ReadError> {
+        self.tree.node(self.node).map(|n| &n.kind).ok_or_else(|| ReadError::value("there is no such value", None))
+    }
+
+    fn found(&self) -> String {
+        match self.tree.node(self.node).map(|n| &n.kind) {
+            Some(Kind::Scalar { text, plain }) => scalar::describe(text, *plain),
+            Some(Kind::Seq(_)) => "a list".to_owned(),
+            Some(Kind::Map(_)) => "a group of keys".to_owned(),
+            None => "nothing".to_owned(),
+        }
+    }
+
+    fn wrong(&self, expected: &str, hint: Option<String>) -> ReadError {
+        ReadError::value(format!("expected {expected}, found {}", self.found()), hint)
+    }
+
+    fn scalar(&self) -> Option<(&'a str, bool, Scalar<'a>)> {
+        match self.kind() {
+            Ok(Kind::Scalar { text, plain }) => Some((text, *plain, scalar::resolve(text, *plain && !self.key))),
+            _ => None,
+        }
+    }
+
+    fn is_null(&self) -> bool {
+        matches!(self.scalar(), Some((_, _, Scalar::Null)))
+    }
+
+    fn integer(&self, expected: &str) -> Result<i128, ReadError> {
+        match self.scalar() {
+            Some((_, _, Scalar::Int(value))) => Ok(value),
+            Some((_, _, Scalar::Float(value))) if value.fract() == 0.0 && value.abs() < 1e15 => {
+                Err(self.wrong(expected, Some(format!("write {value:.0}"))))
+            }
+            Some((text, plain, _)) => Err(self.wrong(expected, scalar::number_hint(text, plain))),
+            None => Err(self.wrong(expected, None)),
+        }
+    }
+
+    fn float(&self) -> Result<f64, ReadError> {
+        let value = match self.scalar() {
+            Some((_, _, Scalar::Int(value))) => value as f64,
+            Some((_, _, Scalar::Float(value))) => value,
+            Some((text, plain, _)) => {
+                let hint = match text.trim_start_matches(['-', '+']).to_lowercase().as_str() {
+                    "inf" | "infinity" | "nan" => Some("numbers must be finite".to_owned()),
+                    _ => scalar::number_hint(text, plain),
+                };
+                return Err(self.wrong("a number", hint));
+            }
+            None => return Err(self.wrong("a number", None)),
+        };
+        self.finite(value)
+    }
+
+    fn finite(&self, value: f64) -> Result<f64, ReadError> {
+        match value.is_finite() {
+            true => Ok(value),
+            false => Err(self.wrong("a finite number", Some("infinity and NaN are not accepted anywhere".to_owned()))),
+        }
+    }
+
+    fn map<V: Visitor<'a>>(self, entries: &'a [(NodeId, NodeId)], visitor: V) -> Result<V::Value, ReadError> {
+        let stand_ins = self.detour.stand_ins.get(&self.node).map_or(&[][..], Vec::as_slice);
+        visitor.visit_map(Entries { de: self, entries: entries.iter(), stand_ins: stand_ins.iter(), next: Next::None })
+    }
+
+    fn seq<V: Visitor<'a>>(self, items: &'a [NodeId], visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_seq(Items { de: self, items: items.iter() })
+    }
+}
+
+macro_rules! integers {
+    ($($method:ident $type:ty),*) => {$(
+        fn $method<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+            let expected = if <$type>::MIN == 0 { "a whole number, 0 or more" } else { "a whole number" };
+            let value = self.integer(expected)?;
+            match i64::try_from(value) {
+                _ if <$type>::try_from(value).is_err() && value < 0 && <$type>::MIN == 0 => {
+                    Err(self.wrong(expected, None))
+                }
+                Ok(value) if <$type>::try_from(value).is_ok() => visitor.visit_i64(value),
+                _ => match u64::try_from(value) {
+                    Ok(value) if <$type>::try_from(value).is_ok() => visitor.visit_u64(value),
+                    _ => Err(self.wrong(&format!("a whole number from {} to {}", <$type>::MIN, <$type>::MAX), None)),
+                },
+            }
+        }
+    )*};
+}
+
+impl<'a> Deserializer<'a> for De<'a> {
+    type Error = ReadError;
+
+    integers!(deserialize_i8 i8, deserialize_i16 i16, deserialize_i32 i32, deserialize_i64 i64,
+              deserialize_u8 u8, deserialize_u16 u16, deserialize_u32 u32, deserialize_u64 u64);
+
+    fn deserialize_any<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match self.kind()? {
+            Kind::Seq(items) => self.seq(items, visitor),
+            Kind::Map(entries) => self.map(entries, visitor),
+            Kind::Scalar { text, plain } => match scalar::resolve(text, *plain && !self.key) {
+                Scalar::Null => visitor.visit_unit(),
+                Scalar::Bool(value) => visitor.visit_bool(value),
+                Scalar::Int(value) => match (i64::try_from(value), u64::try_from(value)) {
+                    (Ok(value), _) => visitor.visit_i64(value),
+                    (_, Ok(value)) => visitor.visit_u64(value),
+                    _ => visitor.visit_f64(value as f64),
+                },
+                Scalar::Float(value) => visitor.visit_f64(self.finite(value)?),
+                Scalar::Text(text) => visitor.visit_borrowed_str(text),
+            },
+        }
+    }
+
+    fn deserialize_bool<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match self.scalar() {
+            Some((_, _, Scalar::Bool(value))) => visitor.visit_bool(value),
+            Some((text, _, _)) => Err(self.wrong("true or false", scalar::bool_hint(text))),
+            None => Err(self.wrong("true or false", None)),
+        }
+    }
+
+    fn deserialize_f32<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_f64(self.float()?)
+    }
+
+    fn deserialize_f64<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_f64(self.float()?)
+    }
+
+    fn deserialize_str<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match self.scalar() {
+            Some((_, _, Scalar::Text(text))) => visitor.visit_borrowed_str(text),
+            Some((_, _, Scalar::Null)) | None => Err(self.wrong("a text", None)),
+            Some((text, ..)) => Err(self.wrong("a text", Some(format!("write it in quotes: \"{text}\"")))),
+        }
+    }
+
+    fn deserialize_string<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        self.deserialize_str(visitor)
+    }
+
+    fn deserialize_identifier<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match self.kind()? {
+            Kind::Scalar { text, .. } => visitor.visit_borrowed_str(text),
+            _ => Err(self.wrong("a word", None)),
+        }
+    }
+
+    fn deserialize_option<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        if self.is_null() { visitor.visit_none() } else { visitor.visit_some(self) }
+    }
+
+    fn deserialize_newtype_struct<V: Visitor<'a>>(self, name: &'static str, visitor: V) -> Result<V::Value, ReadError> {
+        match name {
+            LOCATED => visitor.visit_seq(Placed { de: self, step: 0 }),
+            TEXT => match self.scalar() {
+                Some((_, _, Scalar::Null)) | None => Err(self.wrong("a word, number or boolean", None)),
+                Some((text, ..)) => visitor.visit_borrowed_str(text),
+            },
+            _ => visitor.visit_newtype_struct(self),
+        }
+    }
+
+    fn deserialize_seq<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match self.kind()? {
+            Kind::Seq(items) => self.seq(items, visitor),
+            // `tasks:` with nothing below it is an empty list: everything was commented out.
+            _ if self.is_null() => self.seq(&[], visitor),
+            Kind::Scalar { .. } => Err(self.wrong("a list", None)),
+            _ => Err(self.wrong("a list", Some("start each entry with `- `".to_owned()))),
+        }
+    }
+
+    fn deserialize_tuple<V: Visitor<'a>>(self, len: usize, visitor: V) -> Result<V::Value, ReadError> {
+        match self.kind()? {
+            Kind::Seq(items) if items.len() == len => self.seq(items, visitor),
+            Kind::Seq(items) => {
+                let hint = format!("write {len} values in brackets");
+                Err(ReadError::value(format!("expected a list of {len} values, found {}", items.len()), Some(hint)))
+            }
+            _ => Err(self.wrong(&format!("a list of {len} values"), None)),
+        }
+    }
+
+    fn deserialize_tuple_struct<V: Visitor<'a>>(
+        self,
+        _name: &'static str,
+        len: usize,
+        visitor: V,
+    ) -> Result<V::Value, ReadError> {
+        self.deserialize_tuple(len, visitor)
+    }
+
+    fn deserialize_map<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        match self.kind()? {
+            Kind::Map(entries) => self.map(entries, visitor),
+            _ if self.is_null() => self.map(&[], visitor),
+            Kind::Seq(_) => {
+                Err(self
+                    .wrong("a group of keys", Some("write its keys below it, without dashes or brackets".to_owned())))
+            }
+            Kind::Scalar { .. } => Err(self.wrong("a group of keys", None)),
+        }
+    }
+
+    fn deserialize_struct<V: Visitor<'a>>(
+        self,
+        _name: &'static str,
+        _fields: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, ReadError> {
+        self.deserialize_map(visitor)
+    }
+
+    fn deserialize_enum<V: Visitor<'a>>(
+        self,
+        _name: &'static str,
+        variants: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, ReadError> {
+        match self.kind()? {
+            Kind::Scalar { .. } if self.is_null() => Err(self.wrong(&format!("one of {}", variants.join(", ")), None)),
+            Kind::Scalar { .. } => visitor.visit_enum(Choice { de: self, word: self.node, content: None }),
+            Kind::Map(entries) => match entries.as_slice() {
+                [(word, content)] => visitor.visit_enum(Choice { de: self, word: *word, content: Some(*content) }),
+                _ => Err(ReadError::value(format!("expected one of {}", variants.join(", ")), None)),
+            },
+            Kind::Seq(_) => Err(self.wrong(&format!("one of {}", variants.join(", ")), None)),
+        }
+    }
+
+    fn deserialize_ignored_any<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_unit()
+    }
+
+    forward_to_deserialize_any! { <V: Visitor<'a>> i128 u128 char bytes byte_buf unit unit_struct }
+}
+
+/// Where a [`Located`] value gets its place and its value from.
+struct Placed<'a> {
+    de: De<'a>,
+    step: u8,
+}
+
+impl<'a> SeqAccess<'a> for Placed<'a> {
+    type Error = ReadError;
+
+    fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
+        self.step += 1;
+        match self.step {
+            1 => {
+                let at: U32Deserializer<ReadError> = self.de.node.into_deserializer();
+                seed.deserialize(at).map(Some)
+            }
+            2 => seed.deserialize(self.de).map(Some),
+            _ => Ok(None),
+        }
+    }
+}
+
+struct Items<'a> {
+    de: De<'a>,
+    items: std::slice::Iter<'a, NodeId>,
+}
+
+impl<'a> SeqAccess<'a> for Items<'a> {
+    type Error = ReadError;
+
+    fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
+        let Some(&item) = self.items.find(|item| !self.de.detour.dropped.contains(item)) else { return Ok(None) };
+        // Also errors that arise after the Deserializer returned, as those of `try_from`, belong to this element.
+        seed.deserialize(self.de.of(item)).map(Some).map_err(|e| e.inside(item))
+    }
+}
+
+enum Next {
+    None,
+    Value(NodeId),
+    StandIn,
+}
+
+struct Entries<'a> {
+    de: De<'a>,
+    entries: std::slice::Iter<'a, (NodeId, NodeId)>,
+    stand_ins: std::slice::Iter<'a, &'static str>,
+    next: Next,
+}
+
+impl<'a> MapAccess<'a> for Entries<'a> {
+    type Error = ReadError;
+
+    fn next_key_seed<K: DeserializeSeed<'a>>(&mut self, seed: K) -> Result<Option<K::Value>, ReadError> {
+        if let Some(&(key, value)) = self.entries.find(|(_, value)| !self.de.detour.dropped.contains(value)) {
+            self.next = Next::Value(value);
+            let de = De { key: true, ..self.de.of(key) };
+            return seed.deserialize(de).map(Some).map_err(|e| e.inside(key).inside(value));
+        }
+        let Some(&name) = self.stand_ins.next() else { return Ok(None) };
+        self.next = Next::StandIn;
+        seed.deserialize(BorrowedStrDeserializer::<ReadError>::new(name)).map(Some)
+    }
+
+    fn next_value_seed<V: DeserializeSeed<'a>>(&mut self, seed: V) -> Result<V::Value, ReadError> {
+        match std::mem::replace(&mut self.next, Next::None) {
+            Next::Value(value) => seed.deserialize(self.de.of(value)).map_err(|e| e.inside(value)),
+            Next::StandIn => seed.deserialize(StandIn { node: self.de.node }).map_err(|_| {
+                // Whatever it says: the missing key is what was wrong.
+                ReadError::new(What::StandIn)
+            }),
+            Next::None => Err(ReadError::value("a value without a key", None)),
+        }
+    }
+}
+
+struct Choice<'a> {
+    de: De<'a>,
+    word: NodeId,
+    content: Option<NodeId>,
+}
+
+impl<'a> EnumAccess<'a> for Choice<'a> {
+    type Error = ReadError;
+    type Variant = Self;
+
+    fn variant_seed<V: DeserializeSeed<'a>>(self, seed: V) -> Result<(V::Value, Self), ReadError> {
+        let de = De { key: true, ..self.de.of(self.word) };
+        let value = seed.deserialize(de)?;
+        Ok((value, self))
+    }
+}
+
+impl<'a> VariantAccess<'a> for Choice<'a> {
+    type Error = ReadError;
+
+    fn unit_variant(self) -> Result<(), ReadError> {
+        match self.content {
+            None => Ok(()),
+            Some(_) => Err(ReadError::value("expected a word without a value", None)),
+        }
+    }
+
+    fn newtype_variant_seed<T: DeserializeSeed<'a>>(self, seed: T) -> Result<T::Value, ReadError> {
+        let content = self.content.ok_or_else(|| ReadError::value("this word needs a value", None))?;
+        seed.deserialize(self.de.of(content)).map_err(|e| e.inside(content))
+    }
+
+    fn tuple_variant<V: Visitor<'a>>(self, len: usize, visitor: V) -> Result<V::Value, ReadError> {
+        let content = self.content.ok_or_else(|| ReadError::value("this word needs a list", None))?;
+        self.de.of(content).deserialize_tuple(len, visitor).map_err(|e| e.inside(content))
+    }
+
+    fn struct_variant<V: Visitor<'a>>(
+        self,
+        _fields: &'static [&'static str],
+        visitor: V,
+    ) -> Result<V::Value, ReadError> {
+        let content = self.content.ok_or_else(|| ReadError::value("this word needs a group", None))?;
+        self.de.of(content).deserialize_map(visitor).map_err(|e| e.inside(content))
+    }
+}

@@ -1,0 +1,149 @@
+//! A mistake: what, where, and what to do about it.
+
+use std::ops::Range;
+
+use serde::Serialize;
+
+use crate::yaml::tree::{SourceId, Tree};
+
+/// How bad it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    /// Must be put right before anything starts.
+    Error,
+    /// Works, but is probably not meant.
+    Warning,
+}
+
+/// A marked place in a source.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Label {
+    /// The source.
+    pub source: SourceId,
+    /// Bytes of its text.
+    pub range: Range<usize>,
+    /// What to write beside the mark; may be empty.
+    pub text: String,
+}
+
+impl Label {
+    /// The very start of a source.
+    pub fn start_of(source: SourceId) -> Self {
+        Self { source, range: 0..0, text: String::new() }
+    }
+
+    /// The same place with a text beside it.
+    pub fn with_text(mut self, text: impl Into<String>) -> Self {
+        self.text = text.into();
+        self
+    }
+}
+
+/// A mistake.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Diag {
+    /// How bad it is.
+    pub severity: Severity,
+    /// What is wrong, in a sentence without full stop.
+    pub message: String,
+    /// Where.
+    pub at: Option<Label>,
+    /// Other places that matter.
+    pub also: Vec<Label>,
+    /// Facts that help to understand it.
+    pub notes: Vec<String>,
+    /// What to do about it.
+    pub hint: Option<String>,
+}
+
+impl Diag {
+    fn new(severity: Severity, message: String) -> Self {
+        Self { severity, message, at: None, also: Vec::new(), notes: Vec::new(), hint: None }
+    }
+
+    /// A mistake that must be put right.
+    pub fn error(message: impl Into<String>) -> Self {
+        Self::new(Severity::Error, message.into())
+    }
+
+    /// Something that is probably not meant.
+    pub fn warning(message: impl Into<String>) -> Self {
+        Self::new(Severity::Warning, message.into())
+    }
+
+    /// Says where.
+    pub fn at(mut self, label: Label) -> Self {
+        self.at = Some(label);
+        self
+    }
+
+    /// Marks another place.
+    pub fn also(mut self, label: Label) -> Self {
+        self.also.push(label);
+        self
+    }
+
+    /// Adds a fact.
+    pub fn note(mut self, note: impl Into<String>) -> Self {
+        self.notes.push(note.into());
+        self
+    }
+
+    /// Says what to do about it.
+    pub fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+
+    /// Says what to do about it, where something is known.
+    pub fn maybe_hint(mut self, hint: Option<String>) -> Self {
+        self.hint = hint.or(self.hint);
+        self
+    }
+
+    /// The mistake as data, its place as file, line and column.
+    pub fn located(&self, tree: &Tree) -> Report {
+        let (file, line, column) = match &self.at {
+            Some(label) => {
+                let source = tree.source(label.source);
+                let text = source.map_or("", |s| s.text.as_str());
+                let before = text.get(..label.range.start).unwrap_or(text);
+                let line_start = before.rfind('\n').map_or(0, |at| at + 1);
+                let line = before.matches('\n').count() + 1;
+                let column = before.get(line_start..).map_or(0, |t| t.chars().count()) + 1;
+                (source.map(|s| s.name.clone()), Some(line), Some(column))
+            }
+            None => (None, None, None),
+        };
+        Report {
+            severity: self.severity,
+            file,
+            line,
+            column,
+            message: self.message.clone(),
+            notes: self.notes.clone(),
+            hint: self.hint.clone(),
+        }
+    }
+}
+
+/// A mistake as data, for `--json`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Report {
+    /// How bad it is.
+    pub severity: Severity,
+    /// The file, or the command-line option.
+    pub file: Option<String>,
+    /// Line, counted from 1.
+    pub line: Option<usize>,
+    /// Column in characters, counted from 1.
+    pub column: Option<usize>,
+    /// What is wrong.
+    pub message: String,
+    /// Facts that help to understand it.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub notes: Vec<String>,
+    /// What to do about it.
+    pub hint: Option<String>,
+}

@@ -1,0 +1,68 @@
+//! Merging one tree over another, for includes: groups key by key, named lists by id, everything else replaced.
+
+use crate::yaml::tree::{Kind, NodeId, Tree};
+
+/// What is merged how. Paths are keys joined by dots.
+#[derive(Debug, Clone, Copy)]
+pub struct MergeRules {
+    /// Lists whose entries are matched by the value of a key: path and key.
+    pub by_id: &'static [(&'static str, &'static str)],
+    /// Keys whose value is replaced as a whole, although it may be a group.
+    pub whole: &'static [&'static str],
+}
+
+impl MergeRules {
+    /// The key that identifies the entries of a list.
+    pub fn id_key(&self, path: &str) -> Option<&'static str> {
+        self.by_id.iter().find(|(p, _)| *p == path).map(|(_, key)| *key)
+    }
+}
+
+/// Merges `over` into `base` and gives the result's node. Both must come from separate reads.
+pub fn merge(tree: &mut Tree, base: NodeId, over: NodeId, rules: &MergeRules) -> NodeId {
+    merge_at(tree, base, over, rules, "")
+}
+
+fn merge_at(tree: &mut Tree, base: NodeId, over: NodeId, rules: &MergeRules, path: &str) -> NodeId {
+    let kinds = (tree.node(base).map(|n| n.kind.clone()), tree.node(over).map(|n| n.kind.clone()));
+    let merged = match kinds {
+        (Some(Kind::Map(mut entries)), Some(Kind::Map(more))) => {
+            for (key, value) in more {
+                let name = tree.text(key).unwrap_or_default().to_owned();
+                let inner = if path.is_empty() { name.clone() } else { format!("{path}.{name}") };
+                let found = entries.iter().position(|(k, _)| tree.text(*k) == Some(name.as_str()));
+                match found.and_then(|at| entries.get_mut(at)) {
+                    Some(entry) if rules.whole.contains(&name.as_str()) => *entry = (key, value),
+                    Some(entry) => *entry = (key, merge_at(tree, entry.1, value, rules, &inner)),
+                    None => entries.push((key, value)),
+                }
+            }
+            Kind::Map(entries)
+        }
+        (Some(Kind::Seq(mut items)), Some(Kind::Seq(more))) if rules.id_key(path).is_some() => {
+            let id_key = rules.id_key(path).unwrap_or_default();
+            let id_of = |tree: &Tree, item| tree.get(item, id_key).and_then(|id| tree.text(id).map(str::to_owned));
+            // An id that one file gives twice is merged once, so that the second is still seen as a duplicate.
+            let mut open: Vec<usize> = (0..items.len()).collect();
+            for item in more {
+                let id = id_of(tree, item);
+                let found = id.and_then(|id| {
+                    let same = |at: &usize| items.get(*at).and_then(|i| id_of(tree, *i)).is_some_and(|i| i == id);
+                    open.iter().position(same)
+                });
+                match found.map(|at| open.remove(at)).and_then(|at| items.get_mut(at)) {
+                    Some(slot) => *slot = merge_at(tree, *slot, item, rules, &format!("{path}[]")),
+                    None => items.push(item),
+                }
+            }
+            Kind::Seq(items)
+        }
+        _ => return over,
+    };
+    if tree.damaged.contains(&base) {
+        tree.damaged.insert(over);
+    }
+    // The result stands where the later text stands.
+    tree.set_kind(over, merged);
+    over
+}

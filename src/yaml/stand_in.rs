@@ -1,0 +1,102 @@
+//! What is read in place of a key that is missing.
+
+use serde::de::value::U32Deserializer;
+use serde::de::{DeserializeSeed, Deserializer, IntoDeserializer, SeqAccess, Visitor};
+use serde::forward_to_deserialize_any;
+
+use crate::yaml::error::ReadError;
+use crate::yaml::located::LOCATED;
+use crate::yaml::tree::NodeId;
+
+/// Answers for a key that is missing, so that the rest can be read: zero, empty, none. It must not make mistakes of
+/// its own; where it is refused, the group around it is left out.
+#[derive(Clone, Copy)]
+pub(super) struct StandIn {
+    pub(super) node: NodeId,
+}
+
+impl<'a> Deserializer<'a> for StandIn {
+    type Error = ReadError;
+
+    fn deserialize_any<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_unit()
+    }
+
+    fn deserialize_bool<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_bool(false)
+    }
+
+    fn deserialize_i64<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_i64(0)
+    }
+
+    fn deserialize_i32<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_i64(0)
+    }
+
+    fn deserialize_u64<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_u64(0)
+    }
+
+    fn deserialize_u32<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_u64(0)
+    }
+
+    fn deserialize_f64<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_f64(0.0)
+    }
+
+    fn deserialize_str<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_borrowed_str("")
+    }
+
+    fn deserialize_string<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_borrowed_str("")
+    }
+
+    fn deserialize_option<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_none()
+    }
+
+    fn deserialize_seq<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_seq(serde::de::value::SeqDeserializer::<_, ReadError>::new(std::iter::empty::<u32>()))
+    }
+
+    fn deserialize_map<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
+        visitor.visit_map(serde::de::value::MapDeserializer::<_, ReadError>::new(std::iter::empty::<(u32, u32)>()))
+    }
+
+    fn deserialize_newtype_struct<V: Visitor<'a>>(self, name: &'static str, visitor: V) -> Result<V::Value, ReadError> {
+        match name {
+            LOCATED => visitor.visit_seq(StandInPlaced { stand_in: self, step: 0 }),
+            _ => visitor.visit_newtype_struct(self),
+        }
+    }
+
+    forward_to_deserialize_any! {
+        <V: Visitor<'a>>
+        i8 i16 i128 u8 u16 u128 f32 char bytes byte_buf unit unit_struct tuple tuple_struct struct enum
+        identifier ignored_any
+    }
+}
+
+struct StandInPlaced {
+    stand_in: StandIn,
+    step: u8,
+}
+
+impl<'a> SeqAccess<'a> for StandInPlaced {
+    type Error = ReadError;
+
+    fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
+        self.step += 1;
+        match self.step {
+            1 => {
+                let at: U32Deserializer<ReadError> = self.stand_in.node.into_deserializer();
+                seed.deserialize(at).map(Some)
+            }
+            2 => seed.deserialize(self.stand_in).map(Some),
+            _ => Ok(None),
+        }
+    }
+}

@@ -1,0 +1,271 @@
+//! The located tree: YAML values that know where they were written.
+
+use std::collections::HashSet;
+use std::ops::Range;
+
+use crate::yaml::diag::{Diag, Label};
+
+/// The largest file that is read [bytes].
+pub const MAX_BYTES: usize = 1 << 20;
+/// The deepest nesting of lists and groups, counted through aliases.
+pub const MAX_DEPTH: usize = 32;
+/// The most values one tree may hold, counted after aliases were expanded.
+pub const MAX_NODES: usize = 200_000;
+/// More mistakes than these are not listed.
+const MAX_DIAGS: usize = 100;
+
+/// A node of a [`Tree`].
+pub type NodeId = u32;
+/// A text of a [`Tree`]: a file or a command-line argument.
+pub type SourceId = u32;
+/// The place of values that come from Rust code instead of a file.
+pub const NOWHERE: NodeId = NodeId::MAX;
+
+/// A named text that nodes point into.
+#[derive(Debug, Clone)]
+pub struct Source {
+    /// How people know it: a path, or `--set`.
+    pub name: String,
+    /// The text itself.
+    pub text: String,
+}
+
+/// A value and its place.
+#[derive(Debug, Clone)]
+pub struct Node {
+    /// The text it was written in.
+    pub source: SourceId,
+    /// Bytes of that text.
+    pub range: Range<usize>,
+    /// What it is.
+    pub kind: Kind,
+}
+
+/// What a node is.
+#[derive(Debug, Clone)]
+pub enum Kind {
+    /// A word, number or text. `plain` means written without quotes, so that it may be a number or a boolean.
+    Scalar {
+        /// The text, escapes resolved.
+        text: String,
+        /// Written without quotes.
+        plain: bool,
+    },
+    /// A list.
+    Seq(Vec<NodeId>),
+    /// A group of keys and values, in the order they were written. Keys are scalars and unique.
+    Map(Vec<(NodeId, NodeId)>),
+}
+
+/// Sources, their nodes, and the mistakes found so far.
+#[derive(Debug, Clone, Default)]
+pub struct Tree {
+    sources: Vec<Source>,
+    nodes: Vec<Node>,
+    diags: Vec<Diag>,
+    /// Nodes from which something was left out, so that nobody complains of its absence.
+    pub(super) damaged: HashSet<NodeId>,
+    /// Where keys belong that stand in the wrong place.
+    homes: Option<fn(&str) -> Option<String>>,
+    /// Mistakes beyond the number that is listed.
+    pub(super) unlisted: usize,
+}
+
+impl Tree {
+    /// An empty tree.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds a text that nodes and mistakes may point into.
+    pub fn add_source(&mut self, name: impl Into<String>, text: impl Into<String>) -> SourceId {
+        self.sources.push(Source { name: name.into(), text: text.into() });
+        (self.sources.len() - 1) as SourceId
+    }
+
+    /// Adds a file's bytes; reports what makes them no text of acceptable size.
+    pub fn add_bytes(&mut self, name: impl Into<String>, bytes: &[u8]) -> Option<SourceId> {
+        let name = name.into();
+        if bytes.len() > MAX_BYTES {
+            let source = self.add_source(name, "");
+            self.report(
+                Diag::error(format!("the file is larger than {} MiB", MAX_BYTES >> 20))
+                    .at(Label::start_of(source))
+                    .hint("a blueprint has a few hundred lines; is this the right file?"),
+            );
+            return None;
+        }
+        let (valid, problem) = match std::str::from_utf8(bytes) {
+            Ok(text) => match text.find('\0') {
+                Some(at) => (&text[..at], Some(("a NUL byte", "remove it; a blueprint is plain text"))),
+                None => (text, None),
+            },
+            Err(error) => {
+                let valid = bytes.get(..error.valid_up_to()).unwrap_or_default();
+                let hint = "save the file as UTF-8 text";
+                (std::str::from_utf8(valid).unwrap_or_default(), Some(("bytes that are not UTF-8", hint)))
+            }
+        };
+        let source = self.add_source(name, valid);
+        if let Some((what, hint)) = problem {
+            let at = Label { source, range: valid.len()..valid.len(), text: String::new() };
+            self.report(Diag::error(format!("the file has {what} here")).at(at).hint(hint));
+            return None;
+        }
+        Some(source)
+    }
+
+    /// All sources, in the order they were added.
+    pub fn sources(&self) -> &[Source] {
+        &self.sources
+    }
+
+    /// The source of an id.
+    pub fn source(&self, id: SourceId) -> Option<&Source> {
+        self.sources.get(id as usize)
+    }
+
+    pub(super) fn set_text(&mut self, id: SourceId, text: String) {
+        if let Some(source) = self.sources.get_mut(id as usize) {
+            source.text = text;
+        }
+    }
+
+    /// The node of an id.
+    pub fn node(&self, id: NodeId) -> Option<&Node> {
+        self.nodes.get(id as usize)
+    }
+
+    /// Number of nodes.
+    pub fn len(&self) -> usize {
+        self.nodes.len()
+    }
+
+    /// Whether there is no node.
+    pub fn is_empty(&self) -> bool {
+        self.nodes.is_empty()
+    }
+
+    pub(super) fn add(&mut self, source: SourceId, range: Range<usize>, kind: Kind) -> NodeId {
+        self.nodes.push(Node { source, range, kind });
+        (self.nodes.len() - 1) as NodeId
+    }
+
+    /// Adds an empty group that stands at the place of another node: for a group that was left out.
+    pub fn add_empty_map(&mut self, at: NodeId) -> NodeId {
+        let (source, range) = self.node(at).map_or((0, 0..0), |n| (n.source, n.range.clone()));
+        self.add(source, range, Kind::Map(Vec::new()))
+    }
+
+    pub(super) fn set_kind(&mut self, id: NodeId, kind: Kind) {
+        if let Some(node) = self.nodes.get_mut(id as usize) {
+            node.kind = kind;
+        }
+    }
+
+    pub(super) fn set_range(&mut self, id: NodeId, range: Range<usize>) {
+        if let Some(node) = self.nodes.get_mut(id as usize) {
+            node.range = range;
+        }
+    }
+
+    /// The text of a scalar.
+    pub fn text(&self, id: NodeId) -> Option<&str> {
+        match &self.node(id)?.kind {
+            Kind::Scalar { text, .. } => Some(text),
+            _ => None,
+        }
+    }
+
+    /// Keys and values of a group; nothing for other nodes.
+    pub fn entries(&self, id: NodeId) -> &[(NodeId, NodeId)] {
+        match self.node(id).map(|n| &n.kind) {
+            Some(Kind::Map(entries)) => entries,
+            _ => &[],
+        }
+    }
+
+    /// Elements of a list; nothing for other nodes.
+    pub fn items(&self, id: NodeId) -> &[NodeId] {
+        match self.node(id).map(|n| &n.kind) {
+            Some(Kind::Seq(items)) => items,
+            _ => &[],
+        }
+    }
+
+    /// The node of a key in a group, and that of its value.
+    pub fn entry(&self, map: NodeId, key: &str) -> Option<(NodeId, NodeId)> {
+        self.entries(map).iter().copied().find(|(k, _)| self.text(*k) == Some(key))
+    }
+
+    /// The value of a key in a group.
+    pub fn get(&self, map: NodeId, key: &str) -> Option<NodeId> {
+        self.entry(map, key).map(|(_, value)| value)
+    }
+
+    /// Takes a key out of a group.
+    pub fn remove(&mut self, map: NodeId, key: &str) {
+        let kept = self.entries(map).iter().copied().filter(|(k, _)| self.text(*k) != Some(key)).collect();
+        if matches!(self.node(map).map(|n| &n.kind), Some(Kind::Map(_))) {
+            self.set_kind(map, Kind::Map(kept));
+        }
+    }
+
+    /// Sets a key of a group; a new key and value stand at the place of `at`.
+    pub fn put_text(&mut self, map: NodeId, key: &str, value: &str, at: (SourceId, Range<usize>)) {
+        let scalar = |text: &str| Kind::Scalar { text: text.to_owned(), plain: false };
+        let value = self.add(at.0, at.1.clone(), scalar(value));
+        let mut entries = self.entries(map).to_vec();
+        match entries.iter_mut().find(|(k, _)| self.text(*k) == Some(key)) {
+            Some(entry) => entry.1 = value,
+            None => entries.push((self.add(at.0, at.1, scalar(key)), value)),
+        }
+        self.set_kind(map, Kind::Map(entries));
+    }
+
+    /// Whether something that was written in a node is not in the tree, because it stood there twice.
+    pub fn is_damaged(&self, id: NodeId) -> bool {
+        self.damaged.contains(&id)
+    }
+
+    /// Gives the tree a way to tell in which group a key belongs, for hints.
+    pub fn know_homes(&mut self, homes: fn(&str) -> Option<String>) {
+        self.homes = Some(homes);
+    }
+
+    pub(super) fn home_of(&self, key: &str) -> Option<String> {
+        self.homes.and_then(|homes| homes(key))
+    }
+
+    /// A label on a node; of lists and groups only the first line is marked.
+    pub fn label(&self, id: NodeId) -> Label {
+        let Some(node) = self.node(id) else { return Label::start_of(0) };
+        let text = self.source(node.source).map_or("", |s| s.text.as_str());
+        let end = match text.get(node.range.clone()).and_then(|t| t.find(['\n', '\r'])) {
+            Some(line) => node.range.start + line,
+            None => node.range.end,
+        };
+        Label { source: node.source, range: node.range.start..end, text: String::new() }
+    }
+
+    /// Notes a mistake; the same one at the same place is noted once.
+    pub fn report(&mut self, diag: Diag) {
+        if self.diags.contains(&diag) {
+            return;
+        }
+        match self.diags.len() < MAX_DIAGS {
+            true => self.diags.push(diag),
+            false => self.unlisted += 1,
+        }
+    }
+
+    /// Mistakes that were found but not listed, because there were too many.
+    pub fn unlisted(&self) -> usize {
+        self.unlisted
+    }
+
+    /// The mistakes noted so far, in the order they were found.
+    pub fn diags(&self) -> &[Diag] {
+        &self.diags
+    }
+}

@@ -1,0 +1,214 @@
+//! Blueprints as users meet them: the shipped ones, and a corpus of broken ones with the answer each must get.
+
+#[path = "support/fake_arms.rs"]
+mod fake_arms;
+
+use std::path::{Path, PathBuf};
+use std::{env, fs};
+
+use dimos::blueprint::{self, Loaded, OnExit, Overrides, SearchPath, Source, Summary, TaskKind, find, load, load_from};
+
+fn fixtures() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/blueprints")
+}
+
+fn load_fixture(name: &str, overrides: &Overrides) -> Loaded {
+    let search = SearchPath { folders: vec![fixtures()] };
+    let found = search.find(fixtures().join(name).to_str().unwrap()).unwrap();
+    load_from(&search, &found, overrides, &fake_arms::registry())
+}
+
+/// The rendered answer, free of this machine's paths.
+fn answer(name: &str) -> String {
+    let text = load_fixture(name, &Overrides::default()).render(false);
+    text.replace(&format!("{}/", fixtures().display()), "")
+}
+
+#[test]
+fn shipped_blueprints_have_no_mistakes() {
+    for name in ["coordinator-yourarm", "coordinator-mock", "coordinator-dual-mock"] {
+        let loaded = load(&find(name).unwrap(), &Overrides::default(), &fake_arms::registry());
+        assert_eq!(loaded.render(false), "", "{name}");
+        let blueprint = loaded.blueprint.unwrap();
+        assert_eq!(blueprint.name, name);
+        assert!(!blueprint.description.is_empty());
+        assert!(blueprint.sources[0].1.starts_with("# yaml-language-server: $schema="), "{name}");
+    }
+}
+
+#[test]
+fn every_broken_blueprint_gets_its_answer() {
+    let mut files: Vec<PathBuf> = fs::read_dir(fixtures()).unwrap().map(|e| e.unwrap().path()).collect();
+    files.retain(|f| f.extension().is_some_and(|e| e == "yaml"));
+    files.retain(|f| f.file_name().unwrap().to_str().unwrap().starts_with(|c: char| c.is_ascii_digit()));
+    files.sort();
+    assert!(files.len() >= 14, "the corpus has {} files", files.len());
+    let mut wrong = Vec::new();
+    for file in files {
+        let name = file.file_name().unwrap().to_str().unwrap().to_owned();
+        let golden = file.with_extension("txt");
+        let got = answer(&name);
+        if env::var_os("DIMOS_REGENERATE").is_some() {
+            fs::write(&golden, &got).unwrap();
+        }
+        if fs::read_to_string(&golden).unwrap_or_default() != got {
+            wrong.push(format!("=== {name}\n{got}"));
+        }
+    }
+    assert!(
+        wrong.is_empty(),
+        "answers changed; look at each, then run with DIMOS_REGENERATE=1 to keep them:\n{}",
+        wrong.join("\n")
+    );
+}
+
+/// Every `# MISTAKE` comment of the corpus marks a line that an error must point at, and errors point nowhere else.
+#[test]
+fn every_planted_mistake_is_found_and_nothing_else() {
+    let mut planted = 0;
+    for entry in fs::read_dir(fixtures()).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_str().unwrap().to_owned();
+        if path.extension().is_none_or(|e| e != "yaml") || !name.starts_with(|c: char| c.is_ascii_digit()) {
+            continue;
+        }
+        let text = String::from_utf8_lossy(&fs::read(&path).unwrap()).into_owned();
+        let mut want: Vec<usize> = Vec::new();
+        for (number, line) in text.lines().enumerate() {
+            want.extend(line.matches("MISTAKE").map(|_| number + 1));
+        }
+        let reports = load_fixture(&name, &Overrides::default()).reports();
+        let file = path.display().to_string();
+        let mut got: Vec<usize> =
+            reports.iter().filter(|r| r.file.as_deref() == Some(&file)).filter_map(|r| r.line).collect();
+        got.sort_unstable();
+        assert_eq!(got, want, "{name}: lines with mistakes found, and lines where they were planted");
+        for report in &reports {
+            assert!(report.hint.is_some(), "{name}: no hint for: {}", report.message);
+        }
+        planted += want.len();
+    }
+    assert!(planted >= 41, "only {planted} mistakes are planted");
+}
+
+#[test]
+fn the_shipped_arm_is_resolved() {
+    let loaded = load(&find("coordinator-yourarm").unwrap(), &Overrides::default(), &fake_arms::registry());
+    let blueprint = loaded.blueprint.unwrap();
+    assert_eq!(blueprint.coordinator.tick_rate, 100.0);
+    let arm = &blueprint.arms[0];
+    assert_eq!((arm.hardware_id.as_str(), arm.address.as_str(), arm.simulated), ("arm", "sim", true));
+    assert_eq!(arm.joints, ["arm_joint1", "arm_joint2", "arm_joint3", "arm_joint4", "arm_joint5", "arm_joint6"]);
+    assert_eq!(arm.on_exit, OnExit::Disable, "it has brakes");
+    let task = &blueprint.tasks[0];
+    assert_eq!((task.name.as_str(), task.priority, task.auto_start), ("traj_arm", 10, false));
+    assert_eq!((&task.joints[..], &task.arms[..]), (&[0, 1, 2, 3, 4, 5][..], &[0][..]));
+    let TaskKind::Trajectory(params) = &task.kind else { panic!("{:?}", task.kind) };
+    assert_eq!(params.start_position_tolerance, 0.05);
+}
+
+#[test]
+fn tasks_count_joints_over_all_arms() {
+    let loaded = load(&find("coordinator-dual-mock").unwrap(), &Overrides::default(), &fake_arms::registry());
+    let blueprint = loaded.blueprint.unwrap();
+    assert_eq!(blueprint.tasks[1].joints, (7..13).collect::<Vec<_>>());
+    assert_eq!(blueprint.tasks[1].arms, [1]);
+    assert_eq!(blueprint.joint_names()[7], "right_arm_joint1");
+}
+
+fn set(arguments: &[&str]) -> Loaded {
+    let overrides = Overrides { set: arguments.iter().map(|s| (*s).to_owned()).collect(), sim: false };
+    load(&find("coordinator-yourarm").unwrap(), &overrides, &fake_arms::registry())
+}
+
+#[test]
+fn set_reaches_entries_by_id() {
+    let loaded = set(&["hardware.arm.address=192.168.1.100", "coordinator.tick_rate=250", "recording.keep=3"]);
+    assert_eq!(loaded.render(false), "");
+    let blueprint = loaded.blueprint.unwrap();
+    assert_eq!(blueprint.coordinator.tick_rate, 250.0);
+    assert_eq!(blueprint.arms[0].address, "192.168.1.100");
+    assert!(!blueprint.arms[0].simulated);
+    assert_eq!(blueprint.recording.keep, 3);
+}
+
+#[test]
+fn mistakes_in_set_are_shown_in_the_argument() {
+    let loaded = set(&[
+        "hardware.amr.address=sim",
+        "coordinator.tick_rate=fast",
+        "coordinator.tick_rte=1",
+        "nonsense",
+        "tasks.traj_arm.priority.x=1",
+        "hardware.arm.options={a: [}",
+    ]);
+    insta(&loaded.render(false), "set.txt");
+}
+
+#[test]
+fn sim_gives_every_arm_its_emulator() {
+    let found = find("coordinator-yourarm").unwrap();
+    let overrides = Overrides { set: vec!["hardware.arm.address=10.0.0.1".to_owned()], sim: true };
+    let blueprint = load(&found, &overrides, &fake_arms::registry()).blueprint.unwrap();
+    assert!(blueprint.arms[0].simulated);
+}
+
+#[test]
+fn sim_refuses_an_arm_that_would_stay_real() {
+    let loaded = load_fixture("serial.yaml", &Overrides { sim: true, ..Overrides::default() });
+    assert!(loaded.blueprint.is_none());
+    assert!(loaded.render(false).contains("would be the real one"), "{}", loaded.render(false));
+    let loaded = load_fixture("serial.yaml", &Overrides::default());
+    assert_eq!(loaded.render(false), "");
+    assert_eq!(loaded.blueprint.unwrap().arms[0].on_exit, OnExit::Hold, "it falls when disabled");
+}
+
+#[test]
+fn the_written_blueprint_reads_back_the_same() {
+    let overrides = Overrides { set: vec!["description=\"yes\"".to_owned()], sim: true };
+    let first = load_fixture("full.yaml", &overrides);
+    assert_eq!(first.render(false), "");
+    let first = first.blueprint.unwrap();
+    let found = blueprint::Found {
+        name: "again".to_owned(),
+        source: Source::Embedded,
+        bytes: first.source_yaml.clone().into_bytes(),
+    };
+    let again = load(&found, &Overrides::default(), &fake_arms::registry());
+    assert_eq!(again.render(false), "", "{}", first.source_yaml);
+    let again = again.blueprint.unwrap();
+    assert_eq!(again.description, "yes");
+    let (mut a, mut b) = (Summary::of(&first), Summary::of(&again));
+    (a.files, b.files) = (Vec::new(), Vec::new());
+    assert_eq!(a, b);
+}
+
+#[test]
+fn json_has_places_and_hints() {
+    let json = set(&["hardware.arm.adress=1.2.3.4"]).to_json();
+    assert_eq!(json["ok"], false);
+    let diagnostic = &json["diagnostics"][0];
+    assert_eq!(
+        (&diagnostic["file"], &diagnostic["line"], &diagnostic["column"], &diagnostic["severity"]),
+        (&"--set".into(), &1.into(), &14.into(), &"error".into())
+    );
+    assert_eq!(diagnostic["hint"], "did you mean `address`?");
+}
+
+#[test]
+fn colour_is_only_drawn_when_asked_for() {
+    let loaded = set(&["hardware.arm.adress=1.2.3.4"]);
+    assert!(!loaded.render(false).contains('\x1b'));
+    assert!(loaded.render(true).contains('\x1b'));
+}
+
+/// Compares with a golden file beside the fixtures.
+fn insta(got: &str, golden: &str) {
+    let path = fixtures().join("golden").join(golden);
+    if env::var_os("DIMOS_REGENERATE").is_some() {
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, got).unwrap();
+    }
+    let want = fs::read_to_string(&path).unwrap_or_default();
+    assert_eq!(got, want, "run with DIMOS_REGENERATE=1 to keep the new text of {golden}");
+}

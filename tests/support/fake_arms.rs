@@ -1,0 +1,100 @@
+//! Adapter rows for tests about blueprints: they say what they can do, and do nothing.
+
+use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec, Registry};
+use dimos::hardware::spec::AdapterError;
+use dimos::joint::{ControlMode, JointLimits};
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+#[allow(dead_code)]
+struct NetOptions {
+    /// How long to wait for an answer [s].
+    timeout: f64,
+    /// What is at the flange.
+    tool: Tool,
+    /// Steps.
+    steps: Vec<u8>,
+}
+
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+enum Tool {
+    #[default]
+    None,
+    Gripper,
+}
+
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+struct NoOptions {}
+
+fn host(address: &str) -> Result<(), String> {
+    let (host, port) = address.split_once(':').unwrap_or((address, "1"));
+    match port.parse::<u16>() {
+        _ if host.is_empty() => Err("the host is missing".to_owned()),
+        _ if host.contains(char::is_whitespace) => Err("a host has no spaces".to_owned()),
+        Err(_) => Err(format!("{port:?} is no port number")),
+        Ok(_) => Ok(()),
+    }
+}
+
+const NOT_HERE: &str = "this adapter exists for tests about blueprints only";
+
+/// A network arm with 6 joints and an emulator that is never started.
+pub const YOURARM: AdapterSpec = AdapterSpec {
+    name: "yourarm",
+    about: "a network arm",
+    level: Level::Emulated,
+    transport: "tcp",
+    dof: (6, 6),
+    modes: &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity],
+    wire_units: "deg, mm",
+    native_rate: 100.0,
+    address: AddressForm { form: "HOST[:PORT]", required: true, check: host },
+    holds_when_disabled: true,
+    gripper: true,
+    options: OptionsSpec::of::<NetOptions>(),
+    limits: |dof| JointLimits::uniform(dof, 3.0, 2.0),
+    create: |_| Err(AdapterError::Rejected(NOT_HERE.to_owned())),
+    emulate: Some(|_| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
+};
+
+/// An arm in memory that needs no address.
+pub const MOCK: AdapterSpec = AdapterSpec {
+    name: "mock",
+    about: "an arm in memory",
+    transport: "memory",
+    dof: (1, 16),
+    address: AddressForm { form: "none", required: false, check: |_| Ok(()) },
+    options: OptionsSpec::of::<NoOptions>(),
+    emulate: None,
+    ..YOURARM
+};
+
+/// A serial arm without emulator that takes positions only and falls when disabled.
+pub const SERVOBOT: AdapterSpec = AdapterSpec {
+    name: "servobot",
+    about: "a serial arm",
+    transport: "serial",
+    dof: (1, 7),
+    modes: &[ControlMode::Position],
+    address: AddressForm {
+        form: "/dev/ttyX",
+        required: true,
+        check: |address| match address.starts_with("/dev/") {
+            true => Ok(()),
+            false => Err("a serial port starts with /dev/".to_owned()),
+        },
+    },
+    holds_when_disabled: false,
+    options: OptionsSpec::of::<NoOptions>(),
+    emulate: None,
+    ..YOURARM
+};
+
+/// The built-in arms with those of this file in their place.
+pub fn registry() -> Registry {
+    Registry::with(&[YOURARM, MOCK, SERVOBOT])
+}
