@@ -1,12 +1,13 @@
-<<<<<<< HEAD
-//! What the build tells the program.
+//! What the build tells the program: its version with the commit, and the shipped blueprints.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::{env, fs, io};
 
-fn main() {
+fn main() -> io::Result<()> {
     println!("cargo::rerun-if-changed=build.rs");
     version();
+    blueprints()
 }
 
 /// Sets `DIMOS_VERSION`: the package's version, with the commit where there is one: `0.1.0 (1d8ac97f)`.
@@ -25,13 +26,10 @@ fn version() {
     if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]).filter(|path| Path::new(path).exists()) {
         println!("cargo::rerun-if-changed={log}");
     }
-=======
-//! Embeds `blueprints/*.yaml` in the binary: writes a table of names and texts that `src/blueprint/registry.rs` includes.
+}
 
-use std::path::{Path, PathBuf};
-use std::{env, fs, io};
-
-fn main() -> io::Result<()> {
+/// Writes the table of names and texts of `blueprints/*.yaml` that `src/blueprint/registry.rs` includes.
+fn blueprints() -> io::Result<()> {
     let root = PathBuf::from(env::var("CARGO_MANIFEST_DIR").unwrap_or_default());
     let out = PathBuf::from(env::var("OUT_DIR").unwrap_or_default());
     let folder = root.join("blueprints");
@@ -46,6 +44,5 @@ fn main() -> io::Result<()> {
         format!("    ({name:?}, include_str!({:?})),\n", path.display().to_string())
     };
     let rows: String = files.iter().map(row).collect();
-    fs::write(Path::new(&out).join("blueprints.rs"), format!("&[\n{rows}]\n"))
->>>>>>> 9a7084b5f46a78faca807b1dbef242e7972c99ae
+    fs::write(out.join("blueprints.rs"), format!("&[\n{rows}]\n"))
 }

@@ -274,6 +274,7 @@ impl ManipulatorAdapter for MockAdapter {
             native_rate: 1000.0,
             modes: MODES,
             holds_when_disabled: true,
+            whole_state_at_once: true,
         }
     }
 

@@ -335,12 +335,7 @@ mod tests {
     use super::*;
 
     fn point(t: f64, p: &[f64], v: &[f64], a: &[f64]) -> TrajectoryPoint {
-        TrajectoryPoint {
-            time_from_start: t,
-            positions: p.to_vec(),
-            velocities: v.to_vec(),
-            accelerations: a.to_vec(),
-        }
+        TrajectoryPoint { time_from_start: t, positions: p.to_vec(), velocities: v.to_vec(), accelerations: a.to_vec() }
     }
 
     fn trajectory(points: Vec<TrajectoryPoint>) -> JointTrajectory {

@@ -1,21 +1,25 @@
-<<<<<<< HEAD
 //! The command line: one file per verb. stdout is data, stderr is diagnostics; exit codes are a contract ([`exit`]).
 
 pub mod arguments;
 pub mod arm;
 pub mod banner;
 pub mod cancel;
+pub mod check;
 pub mod down;
 pub mod execute;
 pub mod exit;
 mod follow;
 pub mod list_adapters;
+pub mod list_blueprints;
 pub mod move_to;
 pub mod output;
+pub mod replay;
 pub mod run;
+pub mod schema;
 pub mod state;
 pub mod status;
 pub mod stop;
+mod text_log;
 mod trajectory_file;
 
 use std::ffi::OsString;
@@ -44,6 +48,8 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Start a run from a blueprint, and keep it up until Ctrl-C
+    Run(run::Args),
     /// Show all runs, or one in full: arms, tasks, timing, faults
     Status(status::Args),
     /// Show the joints of a run, and gripper, pose, force where there are such
@@ -62,6 +68,14 @@ enum Command {
     Down(down::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),
+    /// List the blueprints that `run` finds by name
+    ListBlueprints(list_blueprints::Args),
+    /// Report every mistake of a blueprint, or show what it comes to
+    Check(check::Args),
+    /// Print the JSON Schema of blueprints, for editors
+    Schema(schema::Args),
+    #[command(about = "Play a log back to the terminal")]
+    Replay(replay::ReplayArgs),
 }
 
 /// Runs the command line, with more adapters than those in the box. What `main` of an embedding program calls.
@@ -70,6 +84,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
     let cli = Cli::parse_from(std::env::args_os().map(spelled_out));
     let registry = Registry::with(adapters);
     let result = match &cli.command {
+        Command::Run(args) => run::run(args, &registry),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
         Command::Move(args) => move_to::run(args),
@@ -79,6 +94,18 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Arm(args) => arm::run(args),
         Command::Down(args) => down::run(args),
         Command::ListAdapters(args) => list_adapters::run(args, &registry),
+        Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
+        Command::Check(args) => check::run(args, &registry),
+        Command::Schema(args) => schema::run(args, &registry),
+        Command::Replay(args) => {
+            return match replay::run(args) {
+                Ok(code) => ExitCode::from(code),
+                Err(e) => {
+                    output::failure(&exit::Failure::new(exit::Exit::Failed, e.to_string()));
+                    ExitCode::from(exit::Exit::Failed as u8)
+                }
+            };
+        }
     };
     let exit = result.unwrap_or_else(|failure| {
         output::failure(&failure);
@@ -147,8 +174,3 @@ mod tests {
         }
     }
 }
-=======
-//! The command line: one file per verb.
-
-pub mod replay;
->>>>>>> 2621c0636747fa33917181abc09c19dcc7bbd3e3

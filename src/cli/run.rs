@@ -1,9 +1,18 @@
-//! `dimos run NAME|PATH`: its arguments. See [`banner`](super::banner) for what it prints.
+//! `dimos run NAME|PATH`: starts a run and keeps it up until a signal, its time, `dimos down` or a fault ends it.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
+use serde::Serialize;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::iterator::Signals;
+
 use super::arguments::{duration, setting};
+use super::exit::{Exit, Failure, Result};
+use super::{banner, check, output, text_log};
+use crate::blueprint::Overrides;
+use crate::hardware::registry::Registry;
+use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
 
 /// Arguments of `run`.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
@@ -35,4 +44,104 @@ pub struct Args {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
+}
+
+impl Args {
+    /// What the arguments change in the blueprint.
+    pub fn overrides(&self) -> Overrides {
+        Overrides { set: self.set.iter().map(|(path, value)| format!("{path}={value}")).collect(), sim: self.sim }
+    }
+
+    fn options(&self) -> Options {
+        let record = match &self.record {
+            Some(path) => Record::To(path.clone()),
+            None if self.no_record => Record::Off,
+            None => Record::AsBlueprint,
+        };
+        Options { name: self.name.clone(), record, ..Options::default() }
+    }
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    if args.check {
+        return check::report(&args.blueprint, &args.overrides(), registry, args.json);
+    }
+    let loaded = check::load(&args.blueprint, &args.overrides(), registry)?;
+    let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
+    check::print_warnings(&loaded);
+    text_log::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the text log: {e}")))?;
+    // Taken before anything is connected: a signal during the start ends the run as soon as it is up, controlled.
+    let signals = Signals::new([SIGINT, SIGTERM, SIGHUP])
+        .map_err(|e| Failure::new(Exit::Failed, format!("signals cannot be watched: {e}")))?;
+    let run = Run::start(blueprint, args.options()).map_err(|error| Failure {
+        exit: if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed },
+        what: error.to_string(),
+        hint: Some(error.hint().to_owned()),
+    })?;
+    watch(signals, &run)?;
+    let report = run.status();
+    banner::print(&report, run.socket().unwrap_or_else(|| std::path::Path::new("none")), args.json);
+    let ending = run.wait(args.duration);
+    if !args.json {
+        output::note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
+    }
+    let ended = run.stop();
+    say_goodbye(&report, &ending, &ended, args.json);
+    Ok(match ending {
+        Ending::Fault(_) => Exit::Fault,
+        Ending::Signal(signal) => Exit::by_signal(signal),
+        Ending::Duration | Ending::Asked => Exit::Ok,
+    })
+}
+
+/// Hands signals to the run for as long as the process lives: a second one is taken note of and changes nothing.
+fn watch(mut signals: Signals, run: &Run) -> Result<()> {
+    let endings = run.endings();
+    let watching = std::thread::Builder::new().name("signals".into()).spawn(move || {
+        for signal in signals.forever() {
+            let _ = endings.send(Ending::Signal(signal));
+        }
+    });
+    watching.map(|_| ()).map_err(|e| Failure::new(Exit::Failed, format!("no thread for signals: {e}")))
+}
+
+fn why(ending: &Ending) -> String {
+    match ending {
+        Ending::Signal(signal) => match *signal {
+            SIGINT => "SIGINT".to_owned(),
+            SIGTERM => "SIGTERM".to_owned(),
+            SIGHUP => "SIGHUP".to_owned(),
+            other => format!("signal {other}"),
+        },
+        Ending::Duration => "its time is over".to_owned(),
+        Ending::Asked => "asked to end".to_owned(),
+        Ending::Fault(what) => format!("FAULT: {what}"),
+    }
+}
+
+fn say_goodbye(report: &crate::rpc::report::StatusReport, ending: &Ending, ended: &Ended, json: bool) {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        event: &'static str,
+        run: &'a str,
+        why: String,
+        troubles: &'a [String],
+        log: Option<&'a PathBuf>,
+    }
+    if json {
+        let log = ended.log.as_ref();
+        let (run, troubles) = (report.run.as_str(), ended.troubles.as_slice());
+        return output::json(&Line { event: "ended", run, why: why(ending), troubles, log });
+    }
+    for trouble in &ended.troubles {
+        output::note(format_args!("warning: {trouble}"));
+    }
+    for arm in &report.arms {
+        output::note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
+    }
+    match &ended.log {
+        Some(log) => output::note(format_args!("run {} ended; its log: {}", report.run, log.display())),
+        None => output::note(format_args!("run {} ended; no log was written", report.run)),
+    }
 }

@@ -237,9 +237,7 @@ impl Coordinator {
             Request::Execute { task, motion } => self.execute(now, task, motion),
             Request::Servo { task, target } => self.stream(now, task, &target, true),
             Request::Velocity { task, target } => self.stream(now, task, &target, false),
-            Request::Reset { arm } => {
-                self.with_arm(arm, |a| a.failsafe.reset(arm, &a.state, a.fresh(), now))
-            }
+            Request::Reset { arm } => self.with_arm(arm, |a| a.failsafe.reset(arm, &a.state, a.fresh(), now)),
             Request::Ready { arm } => self.ready(arm, now),
             Request::Park { arm } => {
                 let outcome = self.with_arm(arm, |a| {

@@ -4,9 +4,7 @@
 //! states", RSS 2021). Between two changes of jerk each joint follows a cubic, so points at all changes, with
 //! positions and velocities, reproduce the motion exactly.
 
-use rsruckig::prelude::{
-    DataArrayOrVec, InputParameter, Ruckig, Synchronization, ThrowErrorHandler, Trajectory,
-};
+use rsruckig::prelude::{DataArrayOrVec, InputParameter, Ruckig, Synchronization, ThrowErrorHandler, Trajectory};
 
 use crate::joint::JointLimits;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};

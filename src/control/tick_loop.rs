@@ -105,7 +105,7 @@ pub fn run(
     pulse.fifo.store(host::enter_realtime(host::TICK_PRIORITY), Ordering::Relaxed);
     let mut states = vec![ArmState::default(); ports.states.len()];
     let mut deadline = clock.now().after(period);
-    let (mut tick, mut skips_before, mut dropped) = (0u64, 0u32, 0u32);
+    let (mut tick, mut skips_before, mut late_before, mut dropped) = (0u64, 0u32, 0u64, 0u32);
     pulse.beat.beat(clock.now());
     while !pulse.stop.load(Ordering::Relaxed) {
         host::sleep_until(deadline);
@@ -122,7 +122,9 @@ pub fn run(
             *state = slot.read();
         }
         let requests = &mut ports.requests;
-        let time = TickTime { now: deadline, next, skipped, late_ns };
+        // What was skipped before this tick is told with the lateness that cost it.
+        let worst = if skips_before > 0 { late_ns.max(late_before) } else { late_ns };
+        let time = TickTime { now: deadline, next, skipped, late_ns: worst };
         let output = coordinator.tick(time, &states, || requests.pop().ok());
         let mut overwritten = 0;
         for (slot, command) in ports.commands.iter_mut().zip(&output.commands) {
@@ -178,7 +180,7 @@ pub fn run(
         pulse.ticks.store(tick + 1, Ordering::Release);
         pulse.cpu_ns.store(host::thread_cpu_time().as_nanos() as u64, Ordering::Relaxed);
         tick += 1;
-        skips_before = skips_after;
+        (skips_before, late_before) = (skips_after, late_ns);
         deadline = next;
     }
 }

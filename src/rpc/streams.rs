@@ -156,6 +156,11 @@ impl Streams {
         publish(&self.joint_state, build);
     }
 
+    /// Whether anybody listens to the joint state.
+    pub fn has_joint_state_readers(&self) -> bool {
+        self.joint_state.receiver_count() > 0
+    }
+
     /// Publishes an event. `build` is only called when somebody listens. Allocates: not for the tick.
     pub fn publish_event(&self, build: impl FnOnce() -> EventReport) {
         publish(&self.events, build);

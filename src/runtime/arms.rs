@@ -88,7 +88,8 @@ pub fn bring_up(
     }
     let answers: Vec<_> = arms.devices.iter().map(|d| d.connect()).collect();
     let limit = Instant::now() + CONNECT_LIMIT;
-    let results: Vec<_> = answers.into_iter().map(|a| a.wait(limit.saturating_duration_since(Instant::now()))).collect();
+    let results: Vec<_> =
+        answers.into_iter().map(|a| a.wait(limit.saturating_duration_since(Instant::now()))).collect();
     let mut connected = Vec::new();
     for (arm, result) in blueprint.arms.iter().zip(results) {
         let brought = result.map_err(|e| hardware(arm, &e)).and_then(|c| {
@@ -182,7 +183,10 @@ fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartEr
     let usable = (0..arm.joints.len()).all(|j| {
         let at = |list: &[f64]| list.get(j).copied().filter(|v| v.is_finite());
         let range = at(&limits.position_lower).zip(at(&limits.position_upper)).is_some_and(|(l, u)| l < u);
-        range && [&limits.velocity_max, &limits.acceleration_max, &limits.jerk_max].iter().all(|l| at(l).is_some_and(|v| v > 0.0))
+        range
+            && [&limits.velocity_max, &limits.acceleration_max, &limits.jerk_max]
+                .iter()
+                .all(|l| at(l).is_some_and(|v| v > 0.0))
     });
     if usable {
         return Ok(limits);

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
-use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -134,7 +133,7 @@ impl Run {
         };
         let publish = {
             let service = service.clone();
-            move || service.publish()
+            move |ticked| service.publish(ticked)
         };
         let io = |what: &str, e: std::io::Error| StartError::other(format!("no {what} thread: {e}"), "see ulimit -u");
         let courier = Courier::start(dispatcher.clone(), reply_wake, reply_consumer, retired_consumer, publish)
@@ -367,9 +366,4 @@ fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: devic
 fn split_hint(text: &str) -> StartError {
     let (what, hint) = text.split_once("\nhint: ").unwrap_or((text, "run with --no-record"));
     StartError::other(what, hint)
-}
-
-/// Marks a run as ended when it is: other threads look at it.
-pub(super) fn is_ending(pulse: &Pulse) -> bool {
-    pulse.stop.load(Ordering::Acquire)
 }

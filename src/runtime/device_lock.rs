@@ -42,14 +42,8 @@ pub fn take(folder: &Path, adapter: &str, address: &str) -> Result<DeviceLock, D
     let plain = |c: char| if c.is_ascii_alphanumeric() || matches!(c, '.' | '-') { c } else { '_' };
     let name: String = canonical(address).chars().map(plain).collect();
     let path = folder.join(format!("device-{adapter}-{name}.held"));
-    let mut file = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .create(true)
-        .truncate(false)
-        .mode(0o600)
-        .open(path)
-        .map_err(io)?;
+    let mut file =
+        OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path).map_err(io)?;
     match file.try_lock() {
         Ok(()) => {
             // The file stays when the lock is gone: removing it would let two processes lock two files.

@@ -44,12 +44,7 @@ pub enum NotTold {
 impl Dispatcher {
     /// A dispatcher in front of a ring.
     pub fn new(requests: rtrb::Producer<Envelope>, notes: Sender<Note>) -> Self {
-        Self {
-            requests: Mutex::new(requests),
-            waiting: Mutex::default(),
-            next_id: AtomicU64::new(1),
-            notes,
-        }
+        Self { requests: Mutex::new(requests), waiting: Mutex::default(), next_id: AtomicU64::new(1), notes }
     }
 
     /// A number for a motion or a request, given once.
@@ -117,13 +112,13 @@ pub struct Courier {
 }
 
 impl Courier {
-    /// Starts the thread `courier`. `publish` is called after every tick that woke it.
+    /// Starts the thread `courier`. `publish` is called after every tick that woke it (`true`), and now and then.
     pub fn start(
         dispatcher: Arc<Dispatcher>,
         wake: Wake,
         mut replies: rtrb::Consumer<(u64, Outcome)>,
         mut retired: rtrb::Consumer<Box<Motion>>,
-        mut publish: impl FnMut() + Send + 'static,
+        mut publish: impl FnMut(bool) + Send + 'static,
     ) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopping, waiting) = (stop.clone(), wake.clone());
@@ -134,9 +129,7 @@ impl Courier {
                     dispatcher.answered(id, outcome);
                 }
                 while retired.pop().is_ok() {}
-                if woken {
-                    publish();
-                }
+                publish(woken);
             }
         })?;
         Ok(Self { stop, wake, thread: Some(thread) })

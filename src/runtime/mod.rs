@@ -69,13 +69,7 @@ pub struct Options {
 
 impl Default for Options {
     fn default() -> Self {
-        Self {
-            name: None,
-            record: Record::AsBlueprint,
-            folder: RunFolder::standard(),
-            probe: None,
-            hold_latency: true,
-        }
+        Self { name: None, record: Record::AsBlueprint, folder: RunFolder::standard(), probe: None, hold_latency: true }
     }
 }
 

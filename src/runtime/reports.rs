@@ -83,8 +83,7 @@ impl Service {
                 .then(|| CauseReport { name: view.cause.name().to_owned(), text: cause_text(view.cause) }),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
-            error: (view.state.error != 0)
-                .then(|| DeviceError { code: view.state.error, text: health.error_text() }),
+            error: (view.state.error != 0).then(|| DeviceError { code: view.state.error, text: health.error_text() }),
             state_age_ms: self.age_ms(&view.state),
             measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),
             native_rate_hz: info.native_rate,
@@ -161,7 +160,8 @@ impl Service {
         let Some((planned, end)) = motions.get(number) else {
             return Err(RpcError::new(Code::UnknownMotion, format!("no motion {number}, or too long ago")));
         };
-        let mut report = MotionReport { motion: number, task: self.parts.names.task(planned.task), ..Default::default() };
+        let mut report =
+            MotionReport { motion: number, task: self.parts.names.task(planned.task), ..Default::default() };
         let view = self.task_view(planned.task as usize);
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);
@@ -221,9 +221,12 @@ impl Service {
         })
     }
 
-    /// Publishes the joint state of the last tick to those who listen.
-    pub fn publish(&self) {
-        if !self.parts.blueprint.coordinator.publish_joint_state {
+    /// Publishes the joint state of the last tick to those who listen, if there was a tick since the last time.
+    pub fn publish(&self, ticked: bool) {
+        let listened_to = self.parts.streams.has_joint_state_readers();
+        let wanted = listened_to && self.parts.blueprint.coordinator.publish_joint_state;
+        self.parts.pulse.streaming.store(wanted, Relaxed);
+        if !(wanted && ticked) {
             return;
         }
         self.parts.streams.publish_joint_state(|| {
@@ -281,4 +284,3 @@ fn rfc3339(wall_ns: i64) -> String {
     // Whole seconds are enough for people.
     jiff::Timestamp::from_second(time.as_second()).unwrap_or_default().to_string()
 }
-

@@ -253,8 +253,7 @@ impl Service {
 
     /// Hands a trajectory to its task. Everything about it is checked before anything moves.
     async fn begin(&self, task: u16, joints: Vec<u16>, trajectory: &JointTrajectory) -> Result<u64, RpcError> {
-        let spline =
-            Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
+        let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_limits(&joints, &spline)?;
         let number = self.parts.dispatcher.number();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
@@ -274,12 +273,8 @@ impl Service {
         for (k, &joint) in joints.iter().enumerate() {
             let Some((arm, j)) = self.locate(joint) else { continue };
             let l = &self.parts.config.arms[arm].limits;
-            let bounds = Bounds::inside(
-                l.position_lower[j],
-                l.position_upper[j],
-                l.velocity_max[j],
-                l.acceleration_max[j],
-            );
+            let bounds =
+                Bounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j]);
             let e = spline.extremes(k);
             let name = self.parts.names.joint(joint);
             let refuse = |what: String, by: f64, hint: &str| {
@@ -300,7 +295,8 @@ impl Service {
                 if got > most * SLACK + 1e-9 {
                     let text = format!("{name} would move {what} {got:.3} {unit}, and may {most:.3} {unit}");
                     let slower = if unit == "rad/s" { got / most } else { (got / most).sqrt() };
-                    let hint = format!("make the trajectory {slower:.2} times as long, or raise the limit in the blueprint");
+                    let hint =
+                        format!("make the trajectory {slower:.2} times as long, or raise the limit in the blueprint");
                     return refuse(text, got - most, &hint);
                 }
             }

@@ -129,7 +129,8 @@ impl TrajectoryTask {
         }
         let left = 1.0 - smooth_step(self.elapsed / self.fade);
         for (k, &joint) in motion.joints.iter().enumerate() {
-            let (Some(s), Some(offset), Some(asked)) = (self.samples.get(k), self.offsets.get(k), self.asked.get_mut(k))
+            let (Some(s), Some(offset), Some(asked)) =
+                (self.samples.get(k), self.offsets.get(k), self.asked.get_mut(k))
             else {
                 continue;
             };

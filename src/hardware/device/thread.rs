@@ -82,9 +82,7 @@ impl Worker {
     /// Runs until it is told to finish. A panic of the adapter costs this arm only.
     pub(super) fn run(mut self, mut adapter: Box<dyn ManipulatorAdapter>, orders: Receiver<Order>) {
         host::enter_realtime(host::DEVICE_PRIORITY);
-        let outcome = catch_unwind(AssertUnwindSafe(|| {
-            while !self.cycle(&mut *adapter, &orders) {}
-        }));
+        let outcome = catch_unwind(AssertUnwindSafe(|| while !self.cycle(&mut *adapter, &orders) {}));
         if let Err(panic) = outcome {
             let what = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
             let what = what.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();

@@ -247,6 +247,7 @@ impl ManipulatorAdapter for MockArm {
             native_rate: NATIVE_RATE,
             modes: MODES,
             holds_when_disabled: self.options.brakes,
+            whole_state_at_once: true,
         }
     }
 

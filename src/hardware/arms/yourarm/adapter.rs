@@ -230,6 +230,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             native_rate: NATIVE_RATE,
             modes: MODES,
             holds_when_disabled: HOLDS_WHEN_DISABLED,
+            whole_state_at_once: true,
         }
     }
 

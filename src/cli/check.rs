@@ -1,0 +1,120 @@
+//! `dimos check NAME|PATH`: every mistake of a blueprint at once, or what it comes to. Connects to nothing.
+
+use serde_json::json;
+
+use super::arguments::setting;
+use super::exit::{Exit, Failure, Result};
+use super::output::{self, Table};
+use crate::blueprint::{self, Limit, Loaded, OnExit, Overrides, Summary};
+use crate::hardware::registry::Registry;
+
+/// Arguments of `check`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The blueprint: a name that `list-blueprints` shows, or a file
+    #[arg(value_name = "NAME|PATH")]
+    pub blueprint: String,
+    /// Change a field of the blueprint first: hardware.arm.address=192.168.1.100 (repeatable)
+    #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
+    pub set: Vec<(String, String)>,
+    /// Let emulators stand in for all arms
+    #[arg(long)]
+    pub sim: bool,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    let set = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+    report(&args.blueprint, &Overrides { set, sim: args.sim }, registry, args.json)
+}
+
+/// Finds and reads a blueprint; what is wrong with it is in the result.
+pub fn load(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
+    let found = blueprint::find(name).map_err(|e| Failure::usage(e.message).hint(e.hint))?;
+    Ok(blueprint::load(&found, overrides, registry))
+}
+
+/// Why a blueprint cannot be run: all its mistakes, shown.
+pub fn refuse(loaded: &Loaded) -> Failure {
+    output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
+    Failure::usage("the blueprint has mistakes: nothing was connected")
+}
+
+/// Shows the warnings of a blueprint that can be run.
+pub fn print_warnings(loaded: &Loaded) {
+    if loaded.warnings() > 0 {
+        output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
+    }
+}
+
+/// Checks and says what it found.
+pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: bool) -> Result {
+    let loaded = load(name, overrides, registry)?;
+    let summary = loaded.blueprint.as_ref().map(Summary::of);
+    if as_json {
+        let mut document = loaded.to_json();
+        document["blueprint"] = json!(summary);
+        output::json(&document);
+        return Ok(if summary.is_some() { Exit::Ok } else { Exit::Usage });
+    }
+    let Some(summary) = summary else { return Err(refuse(&loaded)) };
+    print_warnings(&loaded);
+    print(&summary);
+    Ok(Exit::Ok)
+}
+
+fn print(summary: &Summary) {
+    let rate = summary.coordinator.tick_rate;
+    output::line(format_args!("{}: {}", summary.name, summary.description));
+    output::line(format_args!("files: {}; tick: {rate} Hz", summary.files.join(", ")));
+    for arm in &summary.arms {
+        let address = if arm.address.is_empty() { String::new() } else { format!(" at {}", arm.address) };
+        let simulated = if arm.simulated { ", SIMULATED" } else { "" };
+        output::line("");
+        output::line(format_args!("arm {}: {}{address}{simulated}", arm.hardware_id, arm.adapter));
+        let motors = if arm.auto_enable { "enabled at start" } else { "not enabled at start" };
+        let exit = match arm.on_exit {
+            OnExit::Hold => "stay on and hold the pose",
+            OnExit::Disable if arm.holds_when_disabled => "are disabled, its brakes hold it",
+            OnExit::Disable => "are disabled, it FALLS unless supported",
+        };
+        output::line(format_args!("  motors: {motors}; at exit they {exit} ({})", arm.on_exit_from.name()));
+        let mut table =
+            Table::new(&["  JOINT", ">LOWER rad", ">UPPER rad", ">rad/s", ">rad/s²", ">rad/s³", "WHERE FROM"]);
+        for joint in &arm.joints {
+            let limits = [
+                joint.position_lower,
+                joint.position_upper,
+                joint.velocity,
+                Some(joint.acceleration),
+                Some(joint.jerk),
+            ];
+            let mut cells = vec![format!("  {}", joint.name)];
+            cells.extend(limits.iter().map(|l| output::number(l.map(|l| l.value), 3)));
+            cells.push(origins(&limits));
+            table.row(cells);
+        }
+        table.print();
+    }
+    output::line("");
+    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "JOINTS"]);
+    for task in &summary.tasks {
+        let kind = task.kind.name().to_owned();
+        table.row([task.name.clone(), kind, task.priority.to_string(), task.joints.join(" ")]);
+    }
+    table.print();
+    output::line("");
+    output::line("no mistakes");
+}
+
+/// Where a joint's limits come from, in the order of the columns; one word when it is the same for all.
+fn origins(limits: &[Option<Limit>]) -> String {
+    let mut words: Vec<&str> = limits.iter().flatten().map(|l| l.from.name()).collect();
+    if words.windows(2).all(|w| w[0] == w[1]) {
+        words.truncate(1);
+    }
+    words.join(" ")
+}

@@ -1,0 +1,17 @@
+//! `dimos schema`: the JSON Schema of blueprints.
+
+use super::exit::{Exit, Result};
+use super::output;
+use crate::blueprint;
+use crate::hardware::registry::Registry;
+
+/// Arguments of `schema`.
+#[derive(Debug, clap::Args)]
+pub struct Args {}
+
+/// Runs the verb.
+pub fn run(_: &Args, registry: &Registry) -> Result {
+    // A value made of maps and lists always encodes.
+    output::line(serde_json::to_string_pretty(&blueprint::json_schema(registry)).unwrap_or_default());
+    Ok(Exit::Ok)
+}
