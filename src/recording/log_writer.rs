@@ -74,6 +74,8 @@ impl<W: Write + Seek> LogWriter<W> {
             .profile("ros2")
             .library(concat!("dimos/", env!("CARGO_PKG_VERSION")))
             .chunk_size(Some(CHUNK_SIZE))
+            // Chunks of 100 ms are too short for the higher levels to make them any shorter.
+            .compression_level(1)
             // Worker threads would compete with the tick, and seeking back would leave half a chunk after a crash.
             .compression_threads(0)
             .disable_seeking(true)
@@ -117,6 +119,8 @@ impl<W: Write + Seek> LogWriter<W> {
         message.put(&mut self.encoder);
         let header =
             MessageHeader { channel_id: channel.id, sequence: channel.sequence, log_time: time, publish_time: time };
+        // The first word on a topic does not wait.
+        self.flush.urgent |= channel.sequence == 0;
         channel.sequence = channel.sequence.wrapping_add(1);
         self.mcap.write_to_known_channel(&header, self.encoder.bytes())?;
         self.written += 1;
@@ -134,6 +138,11 @@ impl<W: Write + Seek> LogWriter<W> {
         Ok(due)
     }
 
+    /// Makes the next `flush_if_due` flush, whatever the time: what is logged now matters.
+    pub fn do_not_wait(&mut self) {
+        self.flush.urgent = true;
+    }
+
     /// Messages logged so far.
     pub fn written(&self) -> u64 {
         self.written
@@ -148,19 +157,19 @@ impl<W: Write + Seek> LogWriter<W> {
     }
 }
 
-/// When to flush: the first message at once, then every [`FLUSH_EVERY`], if there is anything to flush.
+/// When to flush: at once if it is urgent, else every [`FLUSH_EVERY`], and only if there is anything to flush.
 #[derive(Debug, Default)]
 struct FlushTimer {
-    last: Option<Mono>,
+    last: Mono,
     pending: bool,
+    urgent: bool,
 }
 
 impl FlushTimer {
     fn due(&mut self, now: Mono) -> bool {
-        let due = self.pending && self.last.is_none_or(|last| now.since(last) >= FLUSH_EVERY);
+        let due = self.pending && (self.urgent || now.since(self.last) >= FLUSH_EVERY);
         if due {
-            self.last = Some(now);
-            self.pending = false;
+            *self = Self { last: now, pending: false, urgent: false };
         }
         due
     }
@@ -198,20 +207,27 @@ mod tests {
     }
 
     #[test]
-    fn the_first_message_is_on_disk_at_once_and_the_others_after_100_ms() {
+    fn the_first_message_of_a_topic_is_on_disk_at_once_and_the_others_after_100_ms() {
         let sink = Shared::default();
         let mut log = LogWriter::create(sink.clone(), 0, &[], BTreeMap::new()).unwrap();
-        let say = |log: &mut LogWriter<Shared>| log.publish("/a", 1, &Text { data: "x".into() }).unwrap();
+        let say = |log: &mut LogWriter<Shared>, topic| log.publish(topic, 1, &Text { data: "x".into() }).unwrap();
         let at = |ms: u64| Mono(ms * 1_000_000);
-        assert!(!log.flush_if_due(at(5)).unwrap(), "nothing to flush yet");
-        say(&mut log);
-        assert!(log.flush_if_due(at(10)).unwrap());
+        assert!(!log.flush_if_due(at(1005)).unwrap(), "nothing to flush yet");
+        say(&mut log, "/a");
+        assert!(log.flush_if_due(at(1010)).unwrap());
         assert_eq!(readable(&sink), 1);
-        say(&mut log);
-        assert!(!log.flush_if_due(at(109)).unwrap());
-        assert!(log.flush_if_due(at(110)).unwrap());
+        say(&mut log, "/a");
+        assert!(!log.flush_if_due(at(1109)).unwrap());
+        assert!(log.flush_if_due(at(1110)).unwrap());
         assert_eq!(readable(&sink), 2);
-        assert!(!log.flush_if_due(at(500)).unwrap(), "nothing new");
+        say(&mut log, "/b");
+        assert!(log.flush_if_due(at(1111)).unwrap());
+        say(&mut log, "/b");
+        assert!(!log.flush_if_due(at(1112)).unwrap());
+        log.do_not_wait();
+        assert!(log.flush_if_due(at(1113)).unwrap());
+        assert_eq!(readable(&sink), 4);
+        assert!(!log.flush_if_due(at(5000)).unwrap(), "nothing new");
     }
 
     #[test]

@@ -9,6 +9,7 @@
 
 mod arm_messages;
 pub mod cdr;
+mod entries;
 pub mod files;
 pub mod log_writer;
 pub mod messages;

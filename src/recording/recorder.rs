@@ -20,7 +20,9 @@ use crate::telemetry::describe::{Described, Names, Severity};
 use crate::telemetry::{Event, Sample};
 
 /// How often the ring is emptied.
-const DRAIN_EVERY: Duration = Duration::from_millis(10);
+const DRAIN_EVERY: Duration = Duration::from_millis(20);
+/// The same in the first second, so that a run's first state is on disk soon.
+const DRAIN_EVERY_AT_FIRST: Duration = Duration::from_millis(2);
 /// Room for the write buffer: more than what a run logs between two flushes.
 const BUFFER: usize = 256 * 1024;
 
@@ -161,9 +163,12 @@ impl Recorder {
         let stop = Arc::new(AtomicBool::new(false));
         let stopping = stop.clone();
         let thread = std::thread::Builder::new().name("recorder".into()).spawn(move || {
+            let started = MonotonicClock.now();
             while !stopping.load(Ordering::Acquire) {
-                worker.step(MonotonicClock.now());
-                std::thread::park_timeout(DRAIN_EVERY);
+                let now = MonotonicClock.now();
+                worker.step(now);
+                let young = now.since(started) < Duration::from_secs(1);
+                std::thread::park_timeout(if young { DRAIN_EVERY_AT_FIRST } else { DRAIN_EVERY });
             }
             worker.finish(MonotonicClock.now())
         });

@@ -1,20 +1,16 @@
 //! Reads a log back: its messages, decoded, in the order of their time, up to where the file was cut.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 
 use mcap::parse_record;
-use mcap::records::{Channel, MessageHeader, Record, op};
-use serde::Serialize;
+use mcap::records::{Record, op};
 
-use super::messages::{ArmInput, ArmOutput, ArmStatus, Event, JointState, Log, Text, Tick, WrenchStamped};
+use super::entries::{Channels, message};
 use super::records::{RawRecord, RecordReader, chunk_header, unpack_chunk};
-use super::wire::Message;
 
+pub use super::entries::{Entry, Payload};
 pub use super::records::ReplayError;
-
-/// Longest topic or schema name that is kept [bytes].
-const LONGEST_NAME: usize = 1024;
 
 /// Which messages to read.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -45,54 +41,6 @@ pub struct LogInfo {
     /// Topics and their schemas.
     pub topics: BTreeMap<String, String>,
 }
-
-/// A message of a log.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Entry {
-    /// Its topic.
-    pub topic: String,
-    /// Its Unix time [ns].
-    pub log_time: u64,
-    /// What it says.
-    pub data: Payload,
-}
-
-macro_rules! payloads {
-    ($($name:ident)*) => {
-        /// What a message says, for the types that logs of a run contain.
-        #[derive(Debug, Clone, PartialEq, Serialize)]
-        #[serde(untagged)]
-        pub enum Payload {
-            $(
-                #[doc = concat!("A [`", stringify!($name), "`](super::messages::", stringify!($name), ").")]
-                $name($name),
-            )*
-            /// A type that is not known here.
-            Unknown {
-                /// Name of its schema.
-                schema: String,
-                /// Its length.
-                bytes: usize,
-            },
-            /// Not what its schema says.
-            Damaged {
-                /// Name of its schema.
-                schema: String,
-                /// What is wrong.
-                error: String,
-            },
-        }
-
-        fn decode(schema: &str, bytes: &[u8]) -> Payload {
-            let decoded = match schema {
-                $($name::SCHEMA => $name::decode(bytes).map(Payload::$name),)*
-                _ => return Payload::Unknown { schema: schema.into(), bytes: bytes.len() },
-            };
-            decoded.unwrap_or_else(|e| Payload::Damaged { schema: schema.into(), error: e.to_string() })
-        }
-    };
-}
-payloads! { JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput }
 
 /// A log, being read.
 pub struct LogReader {
@@ -270,85 +218,5 @@ fn parse_metadata(record: &RawRecord) -> Option<BTreeMap<String, String>> {
     match parse_record(record.opcode, &record.body) {
         Ok(Record::Metadata(m)) if m.name == "dimos" => Some(m.metadata),
         _ => None,
-    }
-}
-
-fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])> {
-    if opcode != op::MESSAGE {
-        return None;
-    }
-    let Ok(Record::Message { header, .. }) = parse_record(opcode, body) else { return None };
-    Some((header, body.get(22..)?))
-}
-
-/// What is known about the channels of a log so far.
-#[derive(Default)]
-struct Channels {
-    /// Name and encoding of each schema.
-    schemas: HashMap<u16, (String, bool)>,
-    channels: HashMap<u16, KnownChannel>,
-}
-
-struct KnownChannel {
-    topic: String,
-    schema: String,
-    /// Whether its messages are CDR with a ROS 2 schema.
-    readable: bool,
-}
-
-impl Channels {
-    /// Takes schema and channel records. What cannot be one is passed over: its messages are passed over as well.
-    fn learn(&mut self, opcode: u8, body: &[u8]) {
-        match opcode {
-            op::SCHEMA => {
-                if let Ok(Record::Schema { header, .. }) = parse_record(opcode, body)
-                    && header.name.len() <= LONGEST_NAME
-                {
-                    self.schemas.insert(header.id, (header.name, header.encoding == "ros2msg"));
-                }
-            }
-            op::CHANNEL => {
-                if let Ok(Record::Channel(channel)) = parse_record(opcode, body)
-                    && channel.topic.len() <= LONGEST_NAME
-                {
-                    self.add(channel);
-                }
-            }
-            _ => {}
-        }
-    }
-
-    fn add(&mut self, channel: Channel) {
-        let (schema, ros2) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-        let readable = ros2 && channel.message_encoding == "cdr";
-        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, readable });
-    }
-
-    fn take(&mut self, opcode: u8, body: &[u8], wanted: &Selection, ready: &mut VecDeque<Entry>, lost: &mut u64) {
-        self.learn(opcode, body);
-        let Some((header, bytes)) = message(opcode, body) else { return };
-        let Some(channel) = self.channels.get(&header.channel_id) else { return };
-        if header.log_time < wanted.from || header.log_time > wanted.to {
-            return;
-        }
-        let chosen = wanted.topics.is_empty() || wanted.topics.contains(&channel.topic);
-        if !chosen && channel.schema != Tick::SCHEMA {
-            return;
-        }
-        let data = if channel.readable {
-            decode(&channel.schema, bytes)
-        } else {
-            Payload::Unknown { schema: channel.schema.clone(), bytes: bytes.len() }
-        };
-        if let Payload::Tick(tick) = &data {
-            *lost += u64::from(tick.dropped);
-        }
-        if chosen {
-            ready.push_back(Entry { topic: channel.topic.clone(), log_time: header.log_time, data });
-        }
-    }
-
-    fn topics(&self) -> BTreeMap<String, String> {
-        self.channels.values().map(|c| (c.topic.clone(), c.schema.clone())).collect()
     }
 }

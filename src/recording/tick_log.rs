@@ -159,6 +159,9 @@ impl TickLog {
         for (index, d) in std::mem::take(&mut self.events) {
             self.line(log, d.severity, tick.deadline, &d.text)?;
             let time = self.wall.wall(tick.deadline);
+            if d.severity == Severity::Error {
+                log.do_not_wait();
+            }
             log.publish("/dimos/events", time, &self.event_message(&tick, index, d))?;
         }
         Ok(tick.dropped)

@@ -56,6 +56,8 @@ impl Waiting for RealTime {
 
 /// Plays a part of a log.
 pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dyn Waiting) -> anyhow::Result<End> {
+    // A cut after the part that is played is no loss to it.
+    let reaches_end = log.info().span.is_none_or(|(_, end)| part.to >= end);
     loop {
         let mut end = End::default();
         log.select(Selection { topics: part.topics.clone(), from: part.from, to: part.to })?;
@@ -74,7 +76,7 @@ pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dy
                 }
                 Ok(None) => break,
                 Err(cut @ ReplayError::Cut { .. }) => {
-                    end.cut = Some(cut);
+                    end.cut = Some(cut).filter(|_| reaches_end);
                     break;
                 }
                 Err(e) => return Err(e.into()),
@@ -120,6 +122,22 @@ mod tests {
         }
         fn end(&mut self) -> io::Result<()> {
             Ok(())
+        }
+    }
+
+    #[test]
+    fn a_cut_is_told_if_the_part_reaches_it() {
+        let folder = tempfile::tempdir().unwrap();
+        drop(log(&folder));
+        let path = folder.path().join("a.mcap");
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() - 1]).unwrap();
+        let mut log = LogReader::open(&path).unwrap();
+        for (to, told) in [(450, false), (900, true)] {
+            let mut notes = Notes { seen: Vec::new(), room: 99 };
+            let end = play(&mut log, &part(0, to), &mut notes, &mut VirtualClock::default()).unwrap();
+            assert_eq!(end.cut.is_some(), told, "up to {to} ms");
+            assert_eq!(notes.seen.len() as u64, to / 100 + 1);
         }
     }
 

@@ -1,4 +1,4 @@
-//! Bytes and schemas as others make them.
+//! Bytes and schemas as others make them, and what a log says about itself.
 //!
 //! The bytes were made with PyPI mcap-ros2-support 0.6.0: `serialize_dynamic(name, definition)[name](message).hex()`,
 //! with ROS 2's own definitions of the first three types.
@@ -103,4 +103,38 @@ fn a_schema_is_its_fields_and_then_what_they_need() {
     ];
     assert_eq!(without_comments, expected);
     assert!(schema.contains("# [Nm].\ngeometry_msgs/Vector3 torque\n"), "units are told");
+}
+
+#[test]
+fn a_log_says_who_made_it_and_when() {
+    let (_folder, path) = folder();
+    record(&path, (0..11).flat_map(tick));
+    let mut log = LogReader::open(&path).unwrap();
+    let info = log.info().clone();
+    assert_eq!(info.span, Some((WALL, WALL + 10 * PERIOD)));
+    assert!(info.complete);
+    assert_eq!((info.metadata["run"].as_str(), info.metadata["tick_rate"].as_str()), ("test", "100"));
+    assert!(info.metadata["arms"].contains(r#""right":["right_joint1","right_joint2"]"#));
+    assert_eq!(info.metadata["wall_offset_ns"], (WALL - 1_000_000_000).to_string());
+    assert_eq!(info.topics["/wrench/right"], "geometry_msgs/msg/WrenchStamped");
+    assert!(!info.topics.contains_key("/wrench/left"), "only what there is");
+    let selection = Selection { topics: vec!["/dimos/tick".into()], from: WALL + 3 * PERIOD, to: WALL + 5 * PERIOD };
+    log.select(selection).unwrap();
+    let mut ticks = Vec::new();
+    while let Some(entry) = log.next_entry().unwrap() {
+        let Payload::Tick(t) = entry.data else { panic!("{}", entry.topic) };
+        ticks.push(t.tick);
+    }
+    assert_eq!(ticks, [3, 4, 5]);
+}
+
+#[test]
+fn the_page_on_the_format_names_every_topic_and_schema() {
+    let page = include_str!("../../../docs/log-format.md");
+    let (_folder, path) = folder();
+    record(&path, (0..11).flat_map(tick));
+    for (topic, schema) in &LogReader::open(&path).unwrap().info().topics {
+        let topic = topic.replace("/left", "/<arm>").replace("/right", "/<arm>");
+        assert!(page.contains(&format!("| `{topic}` | {schema} |")), "{topic} with {schema} is not in the page");
+    }
 }

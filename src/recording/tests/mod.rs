@@ -302,29 +302,6 @@ fn lost_samples_are_counted_and_never_mixed_into_another_tick() {
 }
 
 #[test]
-fn a_log_says_who_made_it_and_when() {
-    let (_folder, path) = folder();
-    record(&path, (0..11).flat_map(tick));
-    let mut log = LogReader::open(&path).unwrap();
-    let info = log.info().clone();
-    assert_eq!(info.span, Some((WALL, WALL + 10 * PERIOD)));
-    assert!(info.complete);
-    assert_eq!((info.metadata["run"].as_str(), info.metadata["tick_rate"].as_str()), ("test", "100"));
-    assert!(info.metadata["arms"].contains(r#""right":["right_joint1","right_joint2"]"#));
-    assert_eq!(info.metadata["wall_offset_ns"], (WALL - 1_000_000_000).to_string());
-    assert_eq!(info.topics["/wrench/right"], "geometry_msgs/msg/WrenchStamped");
-    assert!(!info.topics.contains_key("/wrench/left"), "only what there is");
-    let selection = Selection { topics: vec!["/dimos/tick".into()], from: WALL + 3 * PERIOD, to: WALL + 5 * PERIOD };
-    log.select(selection).unwrap();
-    let mut ticks = Vec::new();
-    while let Some(entry) = log.next_entry().unwrap() {
-        let Payload::Tick(t) = entry.data else { panic!("{}", entry.topic) };
-        ticks.push(t.tick);
-    }
-    assert_eq!(ticks, [3, 4, 5]);
-}
-
-#[test]
 fn a_log_is_never_overwritten() {
     let (_folder, path) = folder();
     record(&path, tick(0));
@@ -351,15 +328,4 @@ fn without_a_log_events_are_told_all_the_same() {
     recorder.finish().unwrap();
     assert_eq!(producer.slots(), 64, "the ring is empty");
     assert_eq!(*told.lock().unwrap(), ["degraded"]);
-}
-
-#[test]
-fn the_page_on_the_format_names_every_topic_and_schema() {
-    let page = include_str!("../../../docs/log-format.md");
-    let (_folder, path) = folder();
-    record(&path, (0..11).flat_map(tick));
-    for (topic, schema) in &LogReader::open(&path).unwrap().info().topics {
-        let topic = topic.replace("/left", "/<arm>").replace("/right", "/<arm>");
-        assert!(page.contains(&format!("| `{topic}` | {schema} |")), "{topic} with {schema} is not in the page");
-    }
 }
