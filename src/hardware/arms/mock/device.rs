@@ -8,7 +8,8 @@ use super::limits;
 use super::options::Options;
 use crate::clock::{Clock, Mono};
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript};
-use crate::hardware::sim::plant::{Gripper, Plant, Tracking};
+use crate::hardware::sim::gripper::Gripper;
+use crate::hardware::sim::plant::{Plant, Tracking};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::{Joints, MAX_DOF};
 

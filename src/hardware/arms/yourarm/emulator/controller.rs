@@ -7,7 +7,8 @@ use super::kinematics;
 use super::wire::{Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript};
-use crate::hardware::sim::plant::{Drive, Gripper, Plant, Tracking};
+use crate::hardware::sim::gripper::Gripper;
+use crate::hardware::sim::plant::{Drive, Plant, Tracking};
 use crate::joint::{JointLimits, Joints};
 
 /// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
