@@ -1,5 +1,7 @@
 //! Scripted faults of simulated arms: what goes wrong, when, and for how long.
 
+use std::time::Duration;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -19,7 +21,7 @@ pub enum FaultKind {
     Disconnect,
     /// The arm goes into error `code`: it stops and refuses motion until the error is cleared.
     ErrorCode,
-    /// The E-stop line opens: the arm stops and its motors lose power. It closes after `duration`, if one is given.
+    /// The E-stop line opens: the arm stops and its motors lose power. It closes after `duration`; never without one.
     Estop,
     /// The arm loses power: its connection breaks, its motors are off, it is unreachable for `duration`.
     PowerLoss,
@@ -88,6 +90,8 @@ fn default_joint() -> usize {
     1
 }
 
+/// How long a stall lasts that states no duration.
+pub const DEFAULT_STALL: Duration = Duration::from_secs(1);
 /// Longest time in a script [s]: eleven days.
 const LONGEST: f64 = 1e6;
 
@@ -139,9 +143,14 @@ impl Fault {
         self
     }
 
-    /// When the fault is over [s since the first connection], where it has a duration.
-    pub fn end(&self) -> Option<f64> {
-        (self.duration > 0.0).then_some(self.at + self.duration)
+    /// How long from `now` [s since the first connection] the fault still lasts, where it has a duration.
+    pub fn left(&self, now: f64) -> Option<Duration> {
+        let left = (self.at + self.duration - now).clamp(0.0, LONGEST);
+        (self.duration > 0.0).then(|| Duration::from_secs_f64(left))
+    }
+
+    fn over(&self, now: f64) -> bool {
+        self.duration > 0.0 && now >= self.at + self.duration
     }
 }
 
@@ -176,7 +185,7 @@ impl FaultScript {
 
     fn over((fault, struck): &(Fault, u32), now: f64) -> bool {
         let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
-        (limit > 0 && *struck >= limit) || fault.end().is_some_and(|end| now >= end)
+        (limit > 0 && *struck >= limit) || fault.over(now)
     }
 }
 

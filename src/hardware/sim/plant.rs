@@ -1,12 +1,12 @@
 //! The joints of a simulated arm: position, velocity, limits, and how they follow what they are told.
 //!
-//! Time is passed in ([`Plant::advance`]), so the same inputs give the same motion on any machine. Nothing here
-//! allocates after construction.
+//! Time is passed in ([`Plant::advance`]) and integrated in steps of one length, so the same inputs give the same
+//! motion however often somebody looks. Nothing here allocates after construction.
 
 use crate::joint::{JointLimits, Joints, MAX_DOF};
 
-/// The longest step of integration [s].
-const STEP: f64 = 0.002;
+/// The step of integration [s].
+const STEP: f64 = 0.0005;
 /// The most waiting time that an ideal joint may make up for in one jump [s].
 const CREDIT: f64 = 0.1;
 /// Speed at which a sagging joint sinks [rad/s].
@@ -71,6 +71,8 @@ pub struct Plant {
     /// Time since the last servo set point, and between the two before [s].
     since_set_point: f64,
     interval: f64,
+    /// Time that has passed but is less than a step [s].
+    pending: f64,
 }
 
 impl Plant {
@@ -88,13 +90,26 @@ impl Plant {
             joint.acceleration = of(&limits.acceleration_max);
             joint.position = of(initial).clamp(joint.lower, joint.upper);
         }
-        let (speed, sag, since_set_point, interval) = (1.0, 0.0, 0.0, 0.0);
-        Self { joints, dof, drive: Drive::Disabled, tracking, speed, fall, sag, since_set_point, interval }
+        Self {
+            joints,
+            dof,
+            drive: Drive::Disabled,
+            tracking,
+            speed: 1.0,
+            fall,
+            sag: 0.0,
+            since_set_point: 0.0,
+            interval: 0.0,
+            pending: 0.0,
+        }
     }
 
     /// Joint positions [rad].
     pub fn positions(&self) -> Joints {
-        self.joints.map(|joint| joint.position)
+        // An ideal servo is where it was sent; all else goes on between the steps.
+        let exact = self.drive == Drive::Servo && self.tracking == Tracking::Ideal;
+        let on = if exact { 0.0 } else { self.pending };
+        self.joints.map(|joint| (joint.position + joint.velocity * on).clamp(joint.lower, joint.upper))
     }
 
     /// Joint velocities [rad/s].
@@ -183,17 +198,18 @@ impl Plant {
 
     /// Lets `dt` [s] pass.
     pub fn advance(&mut self, dt: f64) {
-        let mut left = if dt.is_finite() { dt.max(0.0) } else { 0.0 };
-        while left > 0.0 {
+        self.pending += if dt.is_finite() { dt.max(0.0) } else { 0.0 };
+        // The margin keeps a sum of rounded times from being a step short.
+        while self.pending > STEP * (1.0 - 1e-6) {
             if self.at_rest() {
-                self.since_set_point += left;
-                self.active_mut().iter_mut().for_each(|joint| joint.credit = (joint.credit + left).min(CREDIT));
+                let passed = self.pending;
+                self.since_set_point += passed;
+                self.active_mut().iter_mut().for_each(|joint| joint.credit = (joint.credit + passed).min(CREDIT));
+                self.pending = 0.0;
                 return;
             }
-            // Steps of equal length up to the end, so that a remainder of rounding is not a step of its own.
-            let h = if left < STEP * 1.5 { left } else { STEP };
-            self.step(h);
-            left -= h;
+            self.step(STEP);
+            self.pending = (self.pending - STEP).max(0.0);
         }
     }
 
@@ -325,42 +341,6 @@ impl Joint {
     fn fall(&mut self, speed: f64, h: f64) {
         self.velocity = if self.position > self.lower { -speed } else { 0.0 };
         self.travel(h);
-    }
-}
-
-/// A gripper with finite speed.
-#[derive(Debug, Clone, Copy)]
-pub struct Gripper {
-    /// Opening [m].
-    pub position: f64,
-    target: f64,
-    max: f64,
-    speed: f64,
-}
-
-impl Gripper {
-    /// A gripper that opens to `max` [m] at `speed` [m/s]; half open.
-    pub fn new(max: f64, speed: f64) -> Self {
-        Self { position: max / 2.0, target: max / 2.0, max, speed }
-    }
-
-    /// Moves to an opening [m].
-    pub fn move_to(&mut self, target: f64) {
-        if target.is_finite() {
-            self.target = target.clamp(0.0, self.max);
-        }
-    }
-
-    /// Stays where it is.
-    pub fn stop(&mut self) {
-        self.target = self.position;
-    }
-
-    /// Lets `dt` [s] pass.
-    pub fn advance(&mut self, dt: f64) {
-        let reach = self.speed * dt.max(0.0);
-        let error = self.target - self.position;
-        self.position = if error.abs() <= reach { self.target } else { self.position + reach.copysign(error) };
     }
 }
 

@@ -120,13 +120,3 @@ fn nonsense_moves_nothing() {
     plant.advance(0.1);
     assert_eq!(plant.positions()[..2], [0.5, -0.5]);
 }
-
-#[test]
-fn gripper_has_a_finite_speed() {
-    let mut gripper = Gripper::new(0.08, 0.1);
-    gripper.move_to(1.0);
-    gripper.advance(0.1);
-    assert!((gripper.position - 0.05).abs() < 1e-12);
-    gripper.advance(10.0);
-    assert_eq!(gripper.position, 0.08);
-}

@@ -1,6 +1,7 @@
 //! An ideal arm in memory, for trying things out and for tests: no wire, but a real plant and scripted faults.
 
 mod adapter;
+mod device;
 mod options;
 #[cfg(test)]
 mod tests;

@@ -48,3 +48,11 @@ pub const MOVING_REPLY: &str = "594101830300030006000058f8";
 pub const IN_ERROR_REPLY: &str = "5941019108000300080200067c";
 /// Good reply to [`STOP`].
 pub const STOP_REPLY: &str = "59410186feff010000470a";
+
+#[test]
+fn the_samples_of_the_sheet_are_these() {
+    let sheet = include_str!("../../../../docs/yourarm-protocol.md").replace(' ', "");
+    for frame in [HELLO, GET_STATE, SET_MODE, MOVING_REPLY, SERVO_JOINTS, GRIPPER] {
+        assert!(sheet.contains(&format!("`{frame}`")), "{frame}");
+    }
+}

@@ -1,11 +1,14 @@
 //! The emulated controller: what it does with a request. Time is passed in and nothing here knows of sockets.
 
+use std::time::Duration;
+
 use super::super::{GRIPPER_MAX, limits, protocol::DOF};
 use super::kinematics;
 use super::wire::{Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
-use crate::hardware::sim::faults::{Fault, FaultKind, FaultScript};
-use crate::hardware::sim::plant::{Drive, Gripper, Plant, Tracking};
+use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript};
+use crate::hardware::sim::gripper::Gripper;
+use crate::hardware::sim::plant::{Drive, Plant, Tracking};
 use crate::joint::{JointLimits, Joints};
 
 /// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
@@ -39,8 +42,8 @@ pub struct Received {
 pub enum Delivery {
     /// It is sent.
     Send,
-    /// It is sent so many seconds later; nobody is served until then.
-    Stall(f64),
+    /// It is sent so much later; nobody is served until then.
+    Stall(Duration),
     /// It is lost.
     Silent,
     /// Noise goes before it.
@@ -51,8 +54,8 @@ pub enum Delivery {
     Truncated,
     /// The connection ends.
     Disconnect,
-    /// The connection ends, and there is no power for so many seconds.
-    PowerLoss(f64),
+    /// The connection ends, and there is no power for so long.
+    PowerLoss(Duration),
 }
 
 /// The controller's memory.
@@ -103,7 +106,7 @@ impl Controller {
             if now.seconds_since(self.advanced_to) > timeout {
                 self.plant.advance(timeout);
                 self.plant.stop();
-                self.advanced_to = self.advanced_to.after(std::time::Duration::from_secs_f64(timeout.max(0.0)));
+                self.advanced_to = self.advanced_to.after(Duration::from_secs_f64(timeout.max(0.0)));
             }
         }
         let dt = now.seconds_since(self.advanced_to).max(0.0);
@@ -199,7 +202,7 @@ impl Controller {
     fn suffer(&mut self, t: f64, now: Mono) {
         if let Some(fault) = self.script.take(FaultKind::Estop, t) {
             self.press_estop();
-            self.estop_until = fault.end().map(|end| now.after(std::time::Duration::from_secs_f64((end - t).max(0.0))));
+            self.estop_until = fault.left(t).map(|left| now.after(left));
         }
         if let Some(fault) = self.script.take(FaultKind::ErrorCode, t) {
             self.error = fault.code;
@@ -212,13 +215,13 @@ impl Controller {
     /// Faults of the wire.
     fn delivery(&mut self, t: f64, now: Mono) -> Delivery {
         if let Some(fault) = self.script.take(FaultKind::PowerLoss, t) {
-            let back = now.after(std::time::Duration::from_secs_f64(fault.duration));
-            (self.mode, self.error, self.powered_up) = (0, 0, back);
+            let dark = fault.left(t).unwrap_or_default();
+            (self.mode, self.error, self.powered_up) = (0, 0, now.after(dark));
             self.plant.enable(false);
-            return Delivery::PowerLoss(fault.duration);
+            return Delivery::PowerLoss(dark);
         }
         if let Some(fault) = self.script.take(FaultKind::Stall, t) {
-            return Delivery::Stall(fault.end().map_or(1.0, |end| end - t));
+            return Delivery::Stall(fault.left(t).unwrap_or(DEFAULT_STALL));
         }
         let faults = [
             (FaultKind::Disconnect, Delivery::Disconnect),

@@ -18,9 +18,11 @@ use std::f64::consts::FRAC_PI_2;
 
 use super::super::protocol::DOF;
 
+/// Where joints 1 and 2 meet [m].
+const SHOULDER: [f64; 3] = [0.0, 0.0, 0.25];
 /// Offset before each joint [m] and the joint's axis.
 const JOINTS: [([f64; 3], [f64; 3]); DOF] = [
-    ([0.0, 0.0, 0.25], [0.0, 0.0, 1.0]),
+    (SHOULDER, [0.0, 0.0, 1.0]),
     ([0.0, 0.0, 0.0], [0.0, 1.0, 0.0]),
     ([0.0, 0.0, 0.30], [0.0, 1.0, 0.0]),
     ([0.30, 0.0, 0.0], [1.0, 0.0, 0.0]),
@@ -30,8 +32,10 @@ const JOINTS: [([f64; 3], [f64; 3]); DOF] = [
 /// Offset of the flange after joint 6 [m].
 const FLANGE: [f64; 3] = [0.10, 0.0, 0.0];
 /// Most steps of the inverse, and when it has arrived [m and rad].
-const STEPS: usize = 200;
+const STEPS: usize = 60;
 const CLOSE: f64 = 1e-6;
+/// Farther than this from joint 2 nothing is in reach [m].
+const REACH: f64 = 0.70;
 /// Damping of the inverse.
 const DAMPING: f64 = 1e-4;
 
@@ -48,6 +52,9 @@ pub fn forward(joints: &[f64; DOF]) -> Isometry3<f64> {
 /// Joint positions [rad] near `start` that bring the flange to `goal`, by damped least squares; `None` when that
 /// does not lead there. Knows no joint limits.
 pub fn inverse(goal: &Isometry3<f64>, start: &[f64; DOF]) -> Option<[f64; DOF]> {
+    if (goal.translation.vector - Vector3::from(SHOULDER)).norm() > REACH {
+        return None;
+    }
     let mut joints = *start;
     for _ in 0..STEPS {
         let pose = forward(&joints);

@@ -234,8 +234,8 @@ fn deliver(shared: &Shared, stream: &mut TcpStream, delivery: Delivery, reply: &
     match delivery {
         Delivery::Send => {}
         Delivery::Silent => return true,
-        Delivery::Stall(seconds) => {
-            lock(&shared.line).stalled_until = Instant::now() + Duration::from_secs_f64(seconds.max(0.0));
+        Delivery::Stall(time) => {
+            lock(&shared.line).stalled_until = Instant::now() + time;
             shared.wait(|line| line.stalled_until);
         }
         Delivery::Garbage => {
@@ -253,8 +253,8 @@ fn deliver(shared: &Shared, stream: &mut TcpStream, delivery: Delivery, reply: &
             let _ = stream.shutdown(Shutdown::Both);
             return false;
         }
-        Delivery::PowerLoss(seconds) => {
-            lock(&shared.line).dark_until = Instant::now() + Duration::from_secs_f64(seconds.max(0.0));
+        Delivery::PowerLoss(time) => {
+            lock(&shared.line).dark_until = Instant::now() + time;
             let _ = stream.shutdown(Shutdown::Both);
             shared.wake();
             return false;
