@@ -233,7 +233,7 @@ fn kind(value: &Value, schema: &Value) -> String {
             let name = if name == "integer" { "whole number" } else { "number" };
             match (bound("minimum"), bound("maximum"), bound("exclusiveMinimum")) {
                 (Some(low), Some(high), _) => format!("{name} {low} to {high}"),
-                (Some(low), None, _) if low == 0.0 => format!("{name}, 0 or more"),
+                (Some(0.0), None, _) => format!("{name}, 0 or more"),
                 (None, None, Some(_)) => format!("{name} above 0"),
                 _ => name.to_owned(),
             }
