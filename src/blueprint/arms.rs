@@ -203,12 +203,9 @@ fn address(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: Optio
     let form = row.address.form;
     let or_sim = if row.emulate.is_some() { ", or `sim` for the emulator" } else { "" };
     match given {
-        None if row.address.required => {
-            if !checker.incomplete {
-                let diag = Diag::error(format!("{} needs an address", quote(row.name)));
-                let hint = format!("add `address: {form}`{or_sim}");
-                checker.error(entry.adapter_type.at, diag.hint(hint));
-            }
+        None if row.address.required && !checker.incomplete => {
+            let diag = Diag::error(format!("{} needs an address", quote(row.name)));
+            checker.error(entry.adapter_type.at, diag.hint(format!("add `address: {form}`{or_sim}")));
         }
         None => {}
         Some(address) if address.value == SIM && row.emulate.is_some() => {}

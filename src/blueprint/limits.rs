@@ -195,9 +195,11 @@ pub(super) fn resolve(
             }
         }
     }
-    type Slot = fn(&mut JointOverride) -> &mut Option<f64>;
+    /// What it is, its unit, what the blueprint gives, the arm's own, and where the result goes.
+    type Top<'e> =
+        (&'e str, &'e str, &'e Option<Located<PerJoint>>, &'e [f64], fn(&mut JointOverride) -> &mut Option<f64>);
     let none: &[f64] = &[];
-    let tops: [(&str, &str, &Option<Located<PerJoint>>, &[f64], Slot); 3] = [
+    let tops: [Top<'_>; 3] = [
         ("speed", "rad/s", &entry.velocity, own.map_or(none, |o| &o.velocity_max), |o| &mut o.velocity),
         ("acceleration", "rad/s²", &entry.acceleration, own.map_or(none, |o| &o.acceleration_max), |o| {
             &mut o.acceleration

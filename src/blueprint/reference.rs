@@ -2,9 +2,16 @@
 
 use std::fmt::Write;
 
+use serde::de::{Deserialize, Deserializer, Visitor};
 use serde_json::Value;
 
 use crate::blueprint::json_schema::json_schema;
+use crate::blueprint::limits::LimitsEntry;
+use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::planner::{PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
+use crate::blueprint::schema::{
+    AssetEntry, BlueprintFile, CoordinatorConfig, CountedJoints, HardwareEntry, RecordingConfig, RpcConfig, TaskEntry,
+};
 use crate::hardware::registry::Registry;
 
 const INTRODUCTION: &str = "\
@@ -25,34 +32,104 @@ This page is generated. Regenerate it with `DIMOS_REGENERATE=1 cargo test --lib 
 
 ";
 
-/// The sections of the page: a title, what comes first, and where the keys are in the schema.
-const SECTIONS: [(&str, &str, &str); 16] = [
-    ("Top level", "", ""),
-    ("`coordinator`", "", "/$defs/CoordinatorConfig"),
-    ("`hardware[]`", "A list of arms, merged by `hardware_id` when blueprints are included.", "/$defs/HardwareEntry"),
-    ("`hardware[].limits`", "", "/$defs/LimitsEntry"),
-    ("`tasks[]`", "A list of tasks, merged by `name` when blueprints are included.", "/$defs/TaskEntry"),
-    ("`params` of `trajectory`", "", "/$defs/TrajectoryParams"),
-    ("`params` of `servo`", "", "/$defs/ServoParams"),
-    ("`params` of `velocity`", "", "/$defs/VelocityParams"),
-    ("`planner`", "", "/$defs/PlannerConfig"),
-    ("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotConfig"),
-    ("`base_pose`", "", "/$defs/PoseEntry"),
-    ("`view`", "", "/$defs/ViewConfig"),
-    ("`recording`", "", "/$defs/RecordingConfig"),
-    ("`rpc`", "", "/$defs/RpcConfig"),
-    ("`assets`", "A group of files by name.", "/$defs/AssetEntry"),
-    ("`joints`", "The short form of a list of joints.", "/$defs/CountedJoints"),
+/// A section of the page.
+struct Section {
+    title: &'static str,
+    /// What comes first; where empty, the type's own description.
+    first: &'static str,
+    /// Where its keys are in the schema.
+    pointer: &'static str,
+    /// Its keys in the order of the type.
+    keys: fn() -> &'static [&'static str],
+}
+
+const fn section(title: &'static str, first: &'static str, pointer: &'static str, keys: fn() -> Keys) -> Section {
+    Section { title, first, pointer, keys }
+}
+
+const ARMS: &str = "A list of arms, merged by `hardware_id` when blueprints are included.";
+const TASKS: &str = "A list of tasks, merged by `name` when blueprints are included.";
+
+const SECTIONS: [Section; 16] = [
+    section("Top level", "", "", keys::<BlueprintFile>),
+    section("`coordinator`", "", "/$defs/CoordinatorConfig", keys::<CoordinatorConfig>),
+    section("`hardware[]`", ARMS, "/$defs/HardwareEntry", keys::<HardwareEntry>),
+    section("`hardware[].joints`, short form", "", "/$defs/CountedJoints", keys::<CountedJoints>),
+    section("`hardware[].limits`", "", "/$defs/LimitsEntry", keys::<LimitsEntry>),
+    section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
+    section("`params` of `trajectory`", "", "/$defs/TrajectoryParams", keys::<TrajectoryParams>),
+    section("`params` of `servo`", "", "/$defs/ServoParams", keys::<ServoParams>),
+    section("`params` of `velocity`", "", "/$defs/VelocityParams", keys::<VelocityParams>),
+    section("`planner`", "", "/$defs/PlannerConfig", keys::<PlannerConfig>),
+    section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotConfig", keys::<RobotConfig>),
+    section("`planner.robots[].base_pose`", "", "/$defs/PoseEntry", keys::<PoseEntry>),
+    section("`view`", "", "/$defs/ViewConfig", keys::<ViewConfig>),
+    section("`recording`", "", "/$defs/RecordingConfig", keys::<RecordingConfig>),
+    section("`rpc`", "", "/$defs/RpcConfig", keys::<RpcConfig>),
+    section("`assets`", "A group of files by name.", "/$defs/AssetEntry", keys::<AssetEntry>),
 ];
+
+type Keys = &'static [&'static str];
+
+/// The keys of a type in the order of its fields, which the schema does not keep.
+fn keys<T: Deserialize<'static>>() -> Keys {
+    match T::deserialize(AskKeys) {
+        Err(Asked(keys)) => keys,
+        Ok(_) => &[],
+    }
+}
+
+/// Is told the keys of the type that is read from it, and gives them as its error.
+struct AskKeys;
+
+#[derive(Debug)]
+struct Asked(Keys);
+
+impl std::fmt::Display for Asked {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:?}", self.0)
+    }
+}
+
+impl std::error::Error for Asked {}
+
+impl serde::de::Error for Asked {
+    fn custom<T: std::fmt::Display>(_: T) -> Self {
+        Self(&[])
+    }
+}
+
+impl Deserializer<'static> for AskKeys {
+    type Error = Asked;
+
+    fn deserialize_any<V: Visitor<'static>>(self, _visitor: V) -> Result<V::Value, Asked> {
+        Err(Asked(&[]))
+    }
+
+    fn deserialize_struct<V: Visitor<'static>>(
+        self,
+        _name: &'static str,
+        fields: Keys,
+        _visitor: V,
+    ) -> Result<V::Value, Asked> {
+        Err(Asked(fields))
+    }
+
+    serde::forward_to_deserialize_any! {
+        <V: Visitor<'static>>
+        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf option unit unit_struct
+        newtype_struct seq tuple tuple_struct map enum identifier ignored_any
+    }
+}
 
 /// The page `docs/blueprint-reference.md`, with the adapters' own options.
 pub fn reference(adapters: &Registry) -> String {
     let schema = json_schema(adapters);
     let mut page = INTRODUCTION.to_owned();
-    for (title, first, pointer) in SECTIONS {
+    for Section { title, first, pointer, keys } in SECTIONS {
         let Some(group) = schema.pointer(pointer) else { continue };
         let first = if first.is_empty() { text(group, "description") } else { first.to_owned() };
-        section(&mut page, title, &first, group, &schema);
+        write_section(&mut page, title, &first, keys(), group, &schema);
     }
     for row in adapters.rows() {
         let title = format!("`options` of `{}`", row.name);
@@ -64,7 +141,7 @@ pub fn reference(adapters: &Registry) -> String {
         let options = rule.and_then(|rule| rule.pointer("/then/properties/options/anyOf/0"));
         if let Some(options) = options.map(|options| follow(options, &schema)) {
             let form = format!("{}. Address: `{}`.", row.about.trim_end_matches('.'), row.address.form);
-            section(&mut page, &title, &form, options, &schema);
+            write_section(&mut page, &title, &form, &[], options, &schema);
         }
     }
     page.truncate(page.trim_end().len());
@@ -72,7 +149,7 @@ pub fn reference(adapters: &Registry) -> String {
     page
 }
 
-fn section(page: &mut String, title: &str, first: &str, group: &Value, schema: &Value) {
+fn write_section(page: &mut String, title: &str, first: &str, order: Keys, group: &Value, schema: &Value) {
     let _ = write!(page, "## {title}\n\n{}\n", first.replace('\n', " "));
     let keys = group.get("properties").and_then(Value::as_object);
     let Some(keys) = keys.filter(|keys| !keys.is_empty()) else {
@@ -82,12 +159,14 @@ fn section(page: &mut String, title: &str, first: &str, group: &Value, schema: &
     page.push_str("\n| key | value | default | meaning |\n|---|---|---|---|\n");
     let required: Vec<&str> =
         group.get("required").and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_str).collect();
-    // The schema's own order is that of the types.
+    let mut keys: Vec<(&String, &Value)> = keys.iter().collect();
+    keys.sort_by_key(|(key, _)| order.iter().position(|k| k == key).unwrap_or(usize::MAX));
     for (key, value) in keys {
         let default = match value.get("default") {
             _ if required.contains(&key.as_str()) => "**required**".to_owned(),
             Some(Value::Null) | None => String::new(),
             Some(Value::Object(_)) => String::new(),
+            Some(Value::String(default)) if default.is_empty() => String::new(),
             Some(default) => format!("`{}`", default.to_string().trim_matches('"')),
         };
         let meaning = text(value, "description").replace('\n', " ").replace('|', "\\|");
@@ -143,6 +222,7 @@ fn kind(value: &Value, schema: &Value) -> String {
     match name {
         "string" => "text".to_owned(),
         "boolean" => "true, false".to_owned(),
+        "array" if value.get("prefixItems").is_some() => "list".to_owned(),
         "array" => match value.get("items") {
             Some(items) => format!("list of {}", plural(&kind(items, schema))),
             None => "list".to_owned(),
@@ -153,7 +233,7 @@ fn kind(value: &Value, schema: &Value) -> String {
             let name = if name == "integer" { "whole number" } else { "number" };
             match (bound("minimum"), bound("maximum"), bound("exclusiveMinimum")) {
                 (Some(low), Some(high), _) => format!("{name} {low} to {high}"),
-                (Some(low), None, _) if low == 0.0 => format!("{name}, 0 or more"),
+                (Some(0.0), None, _) => format!("{name}, 0 or more"),
                 (None, None, Some(_)) => format!("{name} above 0"),
                 _ => name.to_owned(),
             }
@@ -164,7 +244,7 @@ fn kind(value: &Value, schema: &Value) -> String {
 
 fn plural(kind: &str) -> String {
     match kind {
-        "text" | "number" | "group" | "pair" => format!("{kind}s"),
+        "text" | "number" | "group" | "pair" | "list" => format!("{kind}s"),
         other => other.to_owned(),
     }
 }

@@ -108,23 +108,19 @@ impl SearchPath {
     pub fn find(&self, name_or_path: &str) -> Result<Found, FindError> {
         let path = Path::new(name_or_path);
         if looks_like_path(name_or_path) || path.is_file() {
-            return Found::file_at(path).map_err(|error| self.cannot_open(path, &error));
+            return self.open(path);
         }
-        match self.by_name(name_or_path) {
-            Some(result) => result,
-            None => Err(FindError {
-                message: format!("there is no blueprint {}", quote(name_or_path)),
-                hint: self.hint(name_or_path),
-            }),
-        }
+        self.find_name(name_or_path)
+    }
+
+    fn open(&self, path: &Path) -> Result<Found, FindError> {
+        Found::file_at(path).map_err(|error| self.cannot_open(path, &error))
     }
 
     fn by_name(&self, name: &str) -> Option<Result<Found, FindError>> {
         let files = self.folders.iter().flat_map(|folder| EXTENSIONS.map(|ext| folder.join(format!("{name}.{ext}"))));
-        for path in files.filter(|path| path.is_file()) {
-            return Some(Found::file_at(&path).map_err(|error| self.cannot_open(&path, &error)));
-        }
-        Found::embedded(name).map(Ok)
+        let file = files.filter(|path| path.is_file()).map(|path| self.open(&path)).next();
+        file.or_else(|| Found::embedded(name).map(Ok))
     }
 
     /// The file that an `include` stands for: a path relative to the including file, a file beside it, or a name.
@@ -139,7 +135,7 @@ impl SearchPath {
         if looks_like_path(name) {
             let path = from.folder().unwrap_or(Path::new("")).join(path);
             return match from.source {
-                Source::Path(_) => Found::file_at(&path).map_err(|error| self.cannot_open(&path, &error)),
+                Source::Path(_) => self.open(&path),
                 Source::Embedded => self.find(name),
             };
         }

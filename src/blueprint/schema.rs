@@ -87,6 +87,7 @@ pub struct HardwareEntry {
     pub on_exit: Option<OnExit>,
     /// The adapter's own options.
     #[serde(default)]
+    #[schemars(with = "Option<serde_json::Map<String, serde_json::Value>>")]
     pub options: Option<Raw>,
     /// Limits narrower than the arm's own.
     #[serde(default)]
@@ -213,6 +214,7 @@ pub struct TaskEntry {
     pub auto_start: bool,
     /// Parameters of the task type.
     #[serde(default)]
+    #[schemars(with = "Option<serde_json::Map<String, serde_json::Value>>")]
     pub params: Option<Raw>,
 }
 

@@ -251,13 +251,17 @@ impl<'t> Builder<'t> {
             "check the indentation, and that each key is followed by a colon and a space"
         };
         let mut diag = Diag::error(format!("YAML syntax: {info}")).hint(hint);
-        if let Some(open) = self.open.iter().rfind(|open| open.flow)
-            && let Some(start) = self.tree.node(open.node).map(|n| n.range.start)
-        {
-            let range = start..(start + 1).min(self.text.len());
-            diag = diag.also(Label { source: self.source, range, text: "this bracket is open".to_owned() });
+        if let Some(start) = self.open_bracket() {
+            diag = diag.also(Label { source: self.source, range: start..start + 1, text: "open bracket".to_owned() });
         }
         self.fail(at..at, diag);
+    }
+
+    /// Where the innermost bracket stands that is not closed yet. A pair in a list, `[a: b]`, is a group without one.
+    fn open_bracket(&self) -> Option<usize> {
+        let starts = self.open.iter().rev().filter(|open| open.flow);
+        let mut starts = starts.filter_map(|open| self.tree.node(open.node)).map(|node| node.range.start);
+        starts.find(|start| self.text.get(*start..).is_some_and(|text| text.starts_with(['[', '{'])))
     }
 
     fn fail(&mut self, mut range: Range<usize>, diag: Diag) {

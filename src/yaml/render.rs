@@ -67,13 +67,13 @@ fn windows<'a>(tree: &'a Tree, at: &'a Label, also: &'a [Label]) -> Vec<Window<'
     for (label, primary) in std::iter::once((at, true)).chain(also.iter().map(|label| (label, false))) {
         let Some(source) = tree.source(label.source) else { continue };
         let text = source.text.as_str();
-        let place = label.range.start.min(text.len());
+        let place = text.floor_char_boundary(label.range.start);
         let start = text.get(..place).and_then(|t| t.rfind('\n')).map_or(0, |i| i + 1);
         let end = text.get(place..).and_then(|t| t.find('\n')).map_or(text.len(), |i| place + i);
         let line = text.get(..start).map_or(0, |t| t.matches('\n').count()) + 1;
         let mark = |from: usize| Mark {
             start: place - from,
-            end: label.range.end.clamp(place, end) - from,
+            end: text.ceil_char_boundary(label.range.end).clamp(place, end) - from,
             text: &label.text,
             primary,
         };

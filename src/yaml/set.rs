@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use crate::yaml::diag::{Diag, Label};
 use crate::yaml::merge::MergeRules;
+use crate::yaml::scalar::{Scalar, resolve};
 use crate::yaml::suggest::{did_you_mean, quote};
 use crate::yaml::tree::{Kind, NodeId, SourceId, Tree};
 
@@ -138,7 +139,8 @@ impl Walk<'_> {
     }
 
     fn is_null(&self, node: NodeId) -> bool {
-        matches!(self.tree.node(node).map(|n| &n.kind), Some(Kind::Scalar { text, plain: true }) if text.is_empty())
+        let kind = self.tree.node(node).map(|n| &n.kind);
+        matches!(kind, Some(Kind::Scalar { text, plain }) if resolve(text, *plain) == Scalar::Null)
     }
 
     /// The path as far as it was walked, as it was typed.
