@@ -9,10 +9,11 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use super::api::{MAX_LINE, Method};
-use super::error::{Code, RpcError, nearest};
+use super::error::{Code, RpcError};
 use super::place::{LiveRun, PlaceError, RunFolder};
 use super::server::CALL_LIMIT;
 use super::wire::Incoming;
+use crate::yaml::did_you_mean;
 
 /// How long to wait for a reply: a little longer than the run takes to give up.
 const PATIENCE: Duration = CALL_LIMIT.saturating_add(Duration::from_secs(2));
@@ -68,11 +69,7 @@ impl ClientError {
             Self::SeveralRuns(_) => Some("say which with --run NAME".into()),
             Self::UnknownRun { live, .. } if live.is_empty() => Self::NoRun.hint(),
             Self::UnknownRun { name, live } => {
-                let known: Vec<&str> = live.iter().map(|r| r.name.as_str()).collect();
-                Some(match nearest(name, &known) {
-                    Some(best) => format!("did you mean {best:?}?"),
-                    None => format!("live: {}", names(live)),
-                })
+                did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live")
             }
             Self::Place(error) => Some(error.hint().into()),
             Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::telemetry::Outcome;
+use crate::yaml::did_you_mean;
 
 /// What went wrong, for programs. In JSON: `START_STATE_MISMATCH`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -132,24 +133,7 @@ impl RpcError {
     /// `what` has no entry called `name`; the hint suggests the nearest of `known`, or lists them.
     pub fn unknown<S: AsRef<str>>(code: Code, what: &str, name: &str, known: &[S]) -> Self {
         let error = Self::new(code, format!("no {what} named {name:?}"));
-        match nearest(name, known) {
-            Some(best) => error.hint(format!("did you mean {best:?}?")),
-            None if known.is_empty() => error.hint(format!("there is no {what} here")),
-            None => {
-                let list: Vec<&str> = known.iter().map(AsRef::as_ref).collect();
-                error.hint(format!("known: {}", list.join(", ")))
-            }
-        }
+        let hint = did_you_mean(name, known.iter().map(AsRef::as_ref), "there is");
+        error.hint(hint.unwrap_or_else(|| format!("there is no {what} here")))
     }
-}
-
-/// The entry of `known` that `name` was probably meant to be.
-pub fn nearest<'a, S: AsRef<str>>(name: &str, known: &'a [S]) -> Option<&'a str> {
-    let name = name.to_lowercase();
-    known
-        .iter()
-        .map(|k| (strsim::jaro_winkler(&name, &k.as_ref().to_lowercase()), k.as_ref()))
-        .filter(|(likeness, _)| *likeness > 0.8)
-        .max_by(|a, b| a.0.total_cmp(&b.0))
-        .map(|(_, k)| k)
 }

@@ -22,7 +22,6 @@ pub mod report;
 pub mod server;
 pub mod streams;
 mod wire;
-pub mod words;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};
 pub use error::{Code, RpcError};

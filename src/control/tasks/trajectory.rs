@@ -56,8 +56,7 @@ impl TrajectoryTask {
     pub fn check_start(&self, cx: &Context<'_>, motion: &Motion) -> Result<(), Outcome> {
         for (k, &joint) in motion.joints.iter().enumerate() {
             let distance = (motion.spline.start(k) - cx.joint(joint).position).abs();
-            // Not `>`: a distance that is not a number must not pass either.
-            if !(distance <= self.params.start_position_tolerance) {
+            if distance.is_nan() || distance > self.params.start_position_tolerance {
                 return Err(Outcome::StartStateMismatch(joint, distance));
             }
         }
