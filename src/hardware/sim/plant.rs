@@ -11,6 +11,8 @@ const STEP: f64 = 0.0005;
 const CREDIT: f64 = 0.1;
 /// Speed at which a sagging joint sinks [rad/s].
 const SAG_SPEED: f64 = 0.25;
+/// Part of its acceleration that a joint plans to brake with: the rest is for landing in a whole number of steps.
+const BRAKING: f64 = 0.85;
 /// Viscous friction [Nm·s/rad].
 const FRICTION: f64 = 0.5;
 /// Below these a joint that follows a target has arrived [rad, rad/s].
@@ -71,8 +73,8 @@ pub struct Plant {
     /// Time since the last servo set point, and between the two before [s].
     since_set_point: f64,
     interval: f64,
-    /// Time that has passed but is less than a step [s].
-    pending: f64,
+    /// How far the joints have been integrated beyond the present [s]: less than a step.
+    ahead: f64,
 }
 
 impl Plant {
@@ -100,16 +102,16 @@ impl Plant {
             sag: 0.0,
             since_set_point: 0.0,
             interval: 0.0,
-            pending: 0.0,
+            ahead: 0.0,
         }
     }
 
     /// Joint positions [rad].
     pub fn positions(&self) -> Joints {
-        // An ideal servo is where it was sent; all else goes on between the steps.
+        // Back from the end of the last step to the present; but an ideal servo is where it was sent.
         let exact = self.drive == Drive::Servo && self.tracking == Tracking::Ideal;
-        let on = if exact { 0.0 } else { self.pending };
-        self.joints.map(|joint| (joint.position + joint.velocity * on).clamp(joint.lower, joint.upper))
+        let back = if exact { 0.0 } else { self.ahead };
+        self.joints.map(|joint| joint.position - joint.velocity * back)
     }
 
     /// Joint velocities [rad/s].
@@ -165,16 +167,16 @@ impl Plant {
         if !self.drive_to(Drive::Servo, target) {
             return;
         }
-        self.interval = self.since_set_point.clamp(1e-3, CREDIT);
-        self.since_set_point = 0.0;
+        self.interval = (self.since_set_point - self.ahead).clamp(1e-3, CREDIT);
+        self.since_set_point = self.ahead;
         if self.tracking == Tracking::Ideal {
-            let interval = self.interval;
+            let (interval, ahead) = (self.interval, self.ahead);
             for joint in self.active_mut().iter_mut().filter(|joint| !joint.blocked) {
-                let reach = joint.velocity_max * joint.credit;
+                let reach = joint.velocity_max * (joint.credit - ahead).max(0.0);
                 let step = (joint.target - joint.position).clamp(-reach, reach);
                 joint.position += step;
                 joint.velocity = (step / interval).clamp(-joint.velocity_max, joint.velocity_max);
-                joint.credit = 0.0;
+                joint.credit = ahead;
             }
         }
     }
@@ -198,18 +200,18 @@ impl Plant {
 
     /// Lets `dt` [s] pass.
     pub fn advance(&mut self, dt: f64) {
-        self.pending += if dt.is_finite() { dt.max(0.0) } else { 0.0 };
-        // The margin keeps a sum of rounded times from being a step short.
-        while self.pending > STEP * (1.0 - 1e-6) {
+        self.ahead -= if dt.is_finite() { dt.max(0.0) } else { 0.0 };
+        // The margin keeps a sum of rounded times from being a step too many.
+        while self.ahead < -1e-6 * STEP {
             if self.at_rest() {
-                let passed = self.pending;
+                let passed = -self.ahead;
                 self.since_set_point += passed;
                 self.active_mut().iter_mut().for_each(|joint| joint.credit = (joint.credit + passed).min(CREDIT));
-                self.pending = 0.0;
+                self.ahead = 0.0;
                 return;
             }
             self.step(STEP);
-            self.pending = (self.pending - STEP).max(0.0);
+            self.ahead += STEP;
         }
     }
 
@@ -290,6 +292,7 @@ impl Plant {
 /// The speed from which a joint can still stop within `distance` [rad], braking at `acceleration` [rad/s²] in
 /// steps of `h` [s].
 fn braking_speed(distance: f64, acceleration: f64, h: f64) -> f64 {
+    let acceleration = acceleration * BRAKING;
     let dv = acceleration * h;
     let speed = 0.5 * ((dv * dv + 8.0 * acceleration * distance).sqrt() - dv);
     speed.min(distance / h)

@@ -120,3 +120,21 @@ fn nonsense_moves_nothing() {
     plant.advance(0.1);
     assert_eq!(plant.positions()[..2], [0.5, -0.5]);
 }
+
+#[test]
+fn a_planned_move_never_passes_its_target() {
+    for i in (1..400).step_by(7) {
+        let target = 0.5 + 0.0031 * f64::from(i);
+        let mut plant = plant(Tracking::Lag(0.02));
+        plant.move_to(&[target, -0.5], 0.9);
+        let mut k = 0;
+        while plant.moving() {
+            k += 1;
+            plant.advance(1e-4 * (1.0 + 0.37 * f64::from(k % 3)));
+            let over = plant.positions()[0] - target;
+            assert!(over < 1e-9, "{over:e} past {target}");
+        }
+        plant.advance(1e-3);
+        assert_eq!(plant.positions()[0], target);
+    }
+}

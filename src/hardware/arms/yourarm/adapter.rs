@@ -8,7 +8,8 @@
 
 use std::time::Duration;
 
-use super::protocol::{self, Command, DOF, Hello, Mode, Status, WireJoints};
+use super::frame::{self, MAX_FRAME, Reply, Status};
+use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
 use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
@@ -80,9 +81,9 @@ impl YourArmAdapter {
         let link = self.link.as_mut().ok_or(AdapterError::NotConnected)?;
         self.sequence = self.sequence.wrapping_add(1);
         let (sequence, opcode) = (self.sequence, command.opcode());
-        let mut frame = [0; protocol::MAX_FRAME];
+        let mut frame = [0; MAX_FRAME];
         let result = link.send(protocol::encode(command, sequence, &mut frame)).and_then(|()| {
-            link.receive(timeout, |bytes| match protocol::scan(bytes, opcode, sequence) {
+            link.receive(timeout, |bytes| match frame::scan(bytes, opcode, sequence) {
                 Scan::More => Scan::More,
                 Scan::Skip(n) => Scan::Skip(n),
                 Scan::Take(n, reply) => Scan::Take(n, read_reply(command, &reply, &decode)),
@@ -147,11 +148,7 @@ impl YourArmAdapter {
 }
 
 /// Turns refusals into errors and data into what they mean.
-fn read_reply<T>(
-    command: &Command,
-    reply: &protocol::Reply<'_>,
-    decode: impl Fn(&[u8]) -> Option<T>,
-) -> AdapterResult<T> {
+fn read_reply<T>(command: &Command, reply: &Reply<'_>, decode: impl Fn(&[u8]) -> Option<T>) -> AdapterResult<T> {
     let name = command.name();
     match reply.status {
         Status::Ok => decode(reply.data)

@@ -3,24 +3,7 @@
 //!
 //! Encoders write into the caller's buffer. Decoders answer `None` or skip for whatever bytes come; none panics.
 
-use crate::hardware::transport::tcp::Scan;
-
-// --- Frame: "YA" | version | opcode | sequence u16 | length u16 | payload | CRC-16; all little-endian ---
-
-/// The two bytes that every frame begins with.
-const MAGIC: [u8; 2] = *b"YA";
-/// The protocol version that follows them.
-const VERSION: u8 = 1;
-/// Bytes before the payload.
-const HEADER: usize = 8;
-/// Bytes after the payload.
-const CRC: usize = 2;
-/// Longest payload.
-const MAX_PAYLOAD: usize = 256;
-/// Longest frame; the size of a frame buffer.
-pub const MAX_FRAME: usize = HEADER + MAX_PAYLOAD + CRC;
-/// Set in the opcode of a reply.
-const REPLY: u8 = 0x80;
+use super::frame::{MAX_FRAME, Reader, Writer};
 
 /// Number of joints.
 pub const DOF: usize = 6;
@@ -131,7 +114,7 @@ impl Mode {
 
 /// Writes the frame of a command into `frame`; the answer is the part that was written.
 pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAME]) -> &'a [u8] {
-    let mut out = Writer { frame, at: HEADER };
+    let mut out = Writer::new(frame);
     match command {
         Command::Hello | Command::GetState | Command::ClearError | Command::Stop => {}
         Command::SetMode(mode) => out.put(&[*mode as u8]),
@@ -147,81 +130,13 @@ pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAM
         }
         Command::Gripper(opening) => out.floats(&[*opening]),
     }
-    let end = out.at;
-    let length = (end - HEADER) as u16;
-    out.at = 0;
-    out.put(&MAGIC);
-    out.put(&[VERSION, command.opcode()]);
-    out.put(&sequence.to_le_bytes());
-    out.put(&length.to_le_bytes());
-    let checksum = crc16(frame.get(..end).unwrap_or_default());
-    Writer { frame, at: end }.put(&checksum.to_le_bytes());
-    frame.get(..end + CRC).unwrap_or_default()
-}
-
-/// CRC-16/CCITT-FALSE: polynomial 0x1021, start value 0xFFFF, not reflected. Of "123456789" it is 0x29B1.
-fn crc16(bytes: &[u8]) -> u16 {
-    bytes.iter().fold(0xFFFF, |crc, byte| {
-        (0..8).fold(
-            crc ^ (u16::from(*byte) << 8),
-            |crc, _| {
-                if crc & 0x8000 != 0 { (crc << 1) ^ 0x1021 } else { crc << 1 }
-            },
-        )
-    })
+    out.finish(command.opcode(), sequence)
 }
 
 // --- Replies: status u8, then data; a refusal carries the controller's error code (u16) ---
 
-/// A whole reply with a good checksum.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reply<'a> {
-    /// What the controller made of the command.
-    pub status: Status,
-    /// What follows the status.
-    pub data: &'a [u8],
-}
-
-/// What the controller made of a command.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Status {
-    /// Done, or begun.
-    Ok,
-    /// Refused, with the number of the reason; [`status_text`] explains it.
-    Refused(u8),
-}
-
 /// Refused because the controller is in error; the data tell which.
 pub const IN_ERROR: u8 = 8;
-
-/// Finds the reply to the command with this opcode and sequence number at the front of `bytes`. Noise, damaged
-/// frames and replies to other commands are skipped.
-pub fn scan<'a>(bytes: &'a [u8], opcode: u8, sequence: u16) -> Scan<Reply<'a>> {
-    // A frame can only begin where the magic is; a lone first byte of it may still become one.
-    let begins = |at: &[u8]| at.starts_with(&MAGIC) || at == &MAGIC[..1];
-    let noise = (0..bytes.len()).take_while(|i| !bytes.get(*i..).is_some_and(begins)).count();
-    if noise > 0 {
-        return Scan::Skip(noise);
-    }
-    let Some([_, _, version, code, s0, s1, l0, l1]) = bytes.first_chunk::<HEADER>() else { return Scan::More };
-    let length = usize::from(u16::from_le_bytes([*l0, *l1]));
-    if *version != VERSION || length > MAX_PAYLOAD {
-        return Scan::Skip(1);
-    }
-    let Some(frame) = bytes.get(..HEADER + length + CRC) else { return Scan::More };
-    let Some((body, checksum)) = frame.split_last_chunk::<CRC>() else { return Scan::More };
-    if crc16(body) != u16::from_le_bytes(*checksum) {
-        return Scan::Skip(1);
-    }
-    let answers = *code == opcode | REPLY && u16::from_le_bytes([*s0, *s1]) == sequence;
-    match body.get(HEADER..).and_then(<[u8]>::split_first) {
-        Some((status, data)) if answers => {
-            let status = if *status == 0 { Status::Ok } else { Status::Refused(*status) };
-            Scan::Take(frame.len(), Reply { status, data })
-        }
-        _ => Scan::Skip(frame.len()),
-    }
-}
 
 /// Why the controller refused, in words.
 pub fn status_text(status: u8) -> &'static str {
@@ -271,11 +186,11 @@ pub struct Hello {
 impl Hello {
     /// Decodes the data of a good reply.
     pub fn decode(data: &[u8]) -> Option<Self> {
-        let mut data = Reader(data);
+        let mut data = Reader::new(data);
         let model = data.text()?;
         let [dof, major, minor, patch] = data.take()?;
         let serial = data.text()?;
-        data.0.is_empty().then_some(Self { model, dof: dof.into(), firmware: [major, minor, patch], serial })
+        data.is_empty().then_some(Self { model, dof: dof.into(), firmware: [major, minor, patch], serial })
     }
 }
 
@@ -309,7 +224,7 @@ pub struct State {
 impl State {
     /// Decodes the data of a good reply. `None` also when a number is not finite: such a packet is not to be trusted.
     pub fn decode(data: &[u8]) -> Option<Self> {
-        let mut data = Reader(data);
+        let mut data = Reader::new(data);
         let time_us = u64::from_le_bytes(data.take()?);
         let [state, mode, flags, dof] = data.take()?;
         if usize::from(dof) != DOF {
@@ -328,63 +243,13 @@ impl State {
             gripper: data.float()?,
             pose: data.floats()?,
         };
-        data.0.is_empty().then_some(decoded)
+        data.is_empty().then_some(decoded)
     }
 }
 
 /// The controller's error code in the data of a refusal.
 pub fn decode_refusal(data: &[u8]) -> Option<u16> {
-    Reader(data).take().map(u16::from_le_bytes)
-}
-
-/// Puts bytes one after the other into a frame; what does not fit is left out.
-struct Writer<'a> {
-    frame: &'a mut [u8; MAX_FRAME],
-    at: usize,
-}
-
-impl Writer<'_> {
-    fn put(&mut self, bytes: &[u8]) {
-        if let Some(to) = self.frame.get_mut(self.at..self.at + bytes.len()) {
-            to.copy_from_slice(bytes);
-            self.at += bytes.len();
-        }
-    }
-
-    fn floats(&mut self, values: &[f64]) {
-        values.iter().for_each(|value| self.put(&(*value as f32).to_le_bytes()));
-    }
-}
-
-/// Takes bytes one after the other from a payload; `None` when there are not enough.
-struct Reader<'a>(&'a [u8]);
-
-impl Reader<'_> {
-    fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
-        let (taken, rest) = self.0.split_first_chunk::<N>()?;
-        self.0 = rest;
-        Some(*taken)
-    }
-
-    fn float(&mut self) -> Option<f64> {
-        let value = f32::from_le_bytes(self.take()?);
-        value.is_finite().then_some(f64::from(value))
-    }
-
-    fn floats<const N: usize>(&mut self) -> Option<[f64; N]> {
-        let mut values = [0.0; N];
-        for value in &mut values {
-            *value = self.float()?;
-        }
-        Some(values)
-    }
-
-    /// 16 bytes of ASCII, padded with NUL.
-    fn text(&mut self) -> Option<String> {
-        let bytes: [u8; 16] = self.take()?;
-        let text: Vec<u8> = bytes.into_iter().take_while(|byte| *byte != 0).collect();
-        String::from_utf8(text).ok().filter(|text| text.is_ascii())
-    }
+    Reader::new(data).take().map(u16::from_le_bytes)
 }
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 use super::*;
+use crate::hardware::arms::yourarm::frame::{Reply, Status, scan};
 use crate::hardware::arms::yourarm::golden::{self, JOINTS, POSE, bytes};
+use crate::hardware::transport::tcp::Scan;
 use proptest::prelude::*;
 
 #[test]

@@ -61,7 +61,8 @@ fn units_go_both_ways_and_the_arm_gets_there() {
     emulator.record();
     arm.write_joint_positions(&target, 0.5).unwrap();
     until("arrival", || close(&read(&mut *arm).unwrap().position, &target));
-    assert!(close(&emulator.joints().0, &target), "it stays there");
+    let there = emulator.joints();
+    assert!(close(&there.0, &target), "it stays there: {there:?}");
     let [first, ..] = emulator.trace()[..] else { panic!("nothing recorded") };
     let degrees = target.map(|v: f64| v.to_degrees() as f32);
     assert_eq!(first.request, Request::MoveJoints(50.0, degrees), "deg and % on the wire");
