@@ -6,7 +6,7 @@ mod fake_arms;
 use std::fs;
 use std::path::Path;
 
-use dimos::blueprint::{From, Overrides, SearchPath, Source, Summary, find, json_schema, load_from, reference};
+use dimos::blueprint::{Origin, Overrides, SearchPath, Source, Summary, find, json_schema, load_from, reference};
 use dimos::hardware::registry::Registry;
 
 /// Two folders: the first has `one` and a broken one, the second has another `one` and `two`.
@@ -92,12 +92,12 @@ fn the_summary_says_where_limits_come_from() {
     let summary = Summary::of(&blueprint);
     let joint = &summary.arms[0].joints[0];
     let lower = joint.position_lower.unwrap();
-    assert_eq!((lower.value, lower.from), (-1.0, From::Blueprint));
-    assert_eq!((joint.jerk.value, joint.jerk.from), (20.0, From::Default));
+    assert_eq!((lower.value, lower.from), (-1.0, Origin::Blueprint));
+    assert_eq!((joint.jerk.value, joint.jerk.from), (20.0, Origin::Default));
     let other = &summary.arms[0].joints[5];
-    assert_eq!(other.position_lower.unwrap().from, From::Adapter);
-    assert_eq!((other.jerk.value, other.jerk.from), (5.0, From::Blueprint));
-    assert_eq!(summary.arms[0].on_exit_from, From::Blueprint);
+    assert_eq!(other.position_lower.unwrap().from, Origin::Adapter);
+    assert_eq!((other.jerk.value, other.jerk.from), (5.0, Origin::Blueprint));
+    assert_eq!(summary.arms[0].on_exit_from, Origin::Blueprint);
     let json = serde_json::to_value(&summary).unwrap();
     assert_eq!(json["tasks"][1]["type"], "servo");
     assert_eq!(json["arms"][0]["joints"][0]["velocity"], serde_json::json!({"value": 1.5, "from": "blueprint"}));
