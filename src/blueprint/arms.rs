@@ -9,12 +9,14 @@ use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
 
 /// The arms, and what tasks may refer to.
 pub(super) struct Found {
-    /// The arms without mistakes.
+    /// The arms, as far as their adapters are known.
     pub(super) arms: Vec<Arm>,
-    /// Every entry of `hardware`, with its mistakes.
+    /// Every entry of `hardware`.
     pub(super) entries: Vec<Entry>,
-    /// Whether all ids and joints are known: nothing was lost to a mistake.
-    pub(super) complete: bool,
+    /// Whether all ids are known: none was lost to a mistake.
+    pub(super) ids_known: bool,
+    /// Whether all joints are known.
+    pub(super) joints_known: bool,
 }
 
 /// An entry of `hardware`, as far as it is understood.
@@ -30,68 +32,88 @@ pub(super) struct Entry {
 }
 
 pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEntry>]) -> Found {
-    let complete = !checker.list_lost("hardware");
-    let mut found = Found { arms: Vec::new(), entries: Vec::new(), complete };
-    let root = checker.root;
-    if hardware.is_empty() && !checker.list_lost("hardware") {
+    let whole = !checker.list_lost("hardware");
+    if hardware.is_empty() && whole {
+        let root = checker.root;
         let at = checker.tree.entry(root, "hardware").map_or(root, |(key, _)| key);
         let diag = Diag::error("the blueprint has no arm: `hardware` is empty");
         let hint = "add one: hardware: [{hardware_id: arm, adapter_type: mock, joints: {prefix: arm, count: 6}}]";
         checker.error(at, diag.hint(hint));
     }
-    let mut joint_places: Vec<(String, NodeId)> = Vec::new();
+    let known = whole && !hardware.is_empty();
+    let mut found = Found { arms: Vec::new(), entries: Vec::new(), ids_known: known, joints_known: known };
+    let mut places: Vec<(String, NodeId)> = Vec::new();
     for entry in hardware {
-        let id_known = checker.has(entry.at, "hardware_id");
-        let id = if id_known { entry.hardware_id.value.clone() } else { String::new() };
-        let twin = found.entries.iter().find(|e| id_known && e.id == id).map(|e| e.at);
-        if id_known {
-            checker.check_name(&entry.hardware_id, "hardware_id");
-        }
-        if let Some(first) = twin {
-            let also = checker.tree.label(first).with_text("first used here");
-            let diag = Diag::error(format!("two arms have the hardware_id {}", quote(&id)));
-            checker.error(entry.hardware_id.at, diag.also(also).hint("give each arm a name of its own"));
-        }
-        let (joints, joints_known) = joints(checker, entry, twin.is_some(), &mut joint_places);
+        let (id, twin) = id(checker, entry, &found.entries);
+        let (joints, joints_known) = joints(checker, entry, twin, &mut places);
         let adapter = adapter(checker, entry);
-        if let Some(row) = &adapter {
-            dof(checker, entry, row, joints.len(), joints_known);
-            if checker.has(entry.at, "options") {
-                let node = entry.options.as_ref().map(|o| o.at);
-                let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
-                (row.options.check)(checker.tree, node);
-            }
-        }
-        let address = address(checker, entry, adapter.as_ref());
-        let own = adapter.as_ref().filter(|_| joints_known && !joints.is_empty()).map(|row| (row.limits)(joints.len()));
-        let limits = match joints_known {
-            true => limits::resolve(checker, &entry.limits, &joints, own.as_ref()),
-            false => Vec::new(),
-        };
-        found.complete &= id_known && joints_known;
-        if let Some(adapter) = adapter {
-            let default = if adapter.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
-            found.arms.push(Arm {
-                hardware_id: id.clone(),
-                hardware_type: entry.hardware_type,
-                joints: joints.clone(),
-                adapter,
-                adapter_type: entry.adapter_type.value.clone(),
-                simulated: address == SIM && adapter.emulate.is_some(),
-                address,
-                auto_enable: entry.auto_enable,
-                on_exit: entry.on_exit.unwrap_or(default),
-                on_exit_given: entry.on_exit.is_some(),
-                options: match entry.options.as_ref().map(|o| o.value.clone()) {
-                    None | Some(serde_json::Value::Null) => serde_json::json!({}),
-                    Some(options) => options,
-                },
-                limits,
-            });
+        found.ids_known &= !id.is_empty();
+        found.joints_known &= joints_known;
+        match adapter {
+            Some(row) => found.arms.push(arm(checker, entry, row, &id, &joints, joints_known)),
+            None if joints_known => drop(limits::resolve(checker, &entry.limits, &joints, None)),
+            None => {}
         }
         found.entries.push(Entry { id, at: entry.hardware_id.at, joints, adapter });
     }
     found
+}
+
+/// The id, empty when it was lost, and whether another arm has it too.
+fn id(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, others: &[Entry]) -> (String, bool) {
+    if !checker.has(entry.at, "hardware_id") {
+        return (String::new(), false);
+    }
+    let id = &entry.hardware_id;
+    checker.check_name(id, "hardware_id");
+    let twin = others.iter().find(|other| other.id == id.value && !id.is_empty());
+    if let Some(first) = twin {
+        let also = checker.tree.label(first.at).with_text("first used here");
+        let diag = Diag::error(format!("two arms have the hardware_id {}", quote(id)));
+        checker.error(id.at, diag.also(also).hint("give each arm a name of its own"));
+    }
+    (id.value.clone(), twin.is_some())
+}
+
+/// Checks what depends on the adapter, and puts the arm together.
+fn arm(
+    checker: &mut Checker<'_>,
+    entry: &Located<HardwareEntry>,
+    row: AdapterSpec,
+    id: &str,
+    joints: &[String],
+    joints_known: bool,
+) -> Arm {
+    let fits = joints_known && dof(checker, entry, &row, joints.len());
+    if checker.has(entry.at, "options") {
+        let node = entry.options.as_ref().map(|o| o.at);
+        let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
+        (row.options.check)(checker.tree, node);
+    }
+    let address = address(checker, entry, &row);
+    let own = fits.then(|| (row.limits)(joints.len()));
+    let limits = match joints_known {
+        true => limits::resolve(checker, &entry.limits, joints, own.as_ref()),
+        false => Vec::new(),
+    };
+    let default_on_exit = if row.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
+    Arm {
+        hardware_id: id.to_owned(),
+        hardware_type: entry.hardware_type,
+        joints: joints.to_vec(),
+        adapter: row,
+        adapter_type: row.name.to_owned(),
+        simulated: address == SIM && row.emulate.is_some(),
+        address,
+        auto_enable: entry.auto_enable,
+        on_exit: entry.on_exit.unwrap_or(default_on_exit),
+        on_exit_given: entry.on_exit.is_some(),
+        options: match entry.options.as_ref().map(|o| o.value.clone()) {
+            None | Some(serde_json::Value::Null) => serde_json::json!({}),
+            Some(options) => options,
+        },
+        limits,
+    }
 }
 
 /// The joints' names, and whether they are all known.
@@ -156,11 +178,12 @@ fn report_collisions(checker: &mut Checker<'_>, collisions: &[(Located<String>, 
         }
         reported.push(name.at);
         let more = collisions.iter().filter(|(other, _)| other.at == name.at).count() - 1;
-        let rest = if more > 0 { format!(" and {more} more") } else { String::new() };
+        let message = match more {
+            0 => format!("the joint {} is named twice", quote(name)),
+            more => format!("the joints {} and {more} more are named twice", quote(name)),
+        };
         let also = checker.tree.label(*first).with_text("first named here");
-        let diag = Diag::error(format!("the joint {}{rest} is named twice", quote(name)));
-        let diag =
-            if more > 0 { Diag::error(format!("the joints {}{rest} are named twice", quote(name))) } else { diag };
+        let diag = Diag::error(message);
         checker.error(name.at, diag.also(also).hint("a joint belongs to one arm, and its name is unique in the run"));
     }
 }
@@ -179,10 +202,10 @@ fn adapter(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>) -> Option<
 }
 
 /// Whether the adapter takes that many joints.
-fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, count: usize, known: bool) {
+fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, count: usize) -> bool {
     let (fewest, most) = row.dof;
-    if !known || (fewest..=most).contains(&count) {
-        return;
+    if (fewest..=most).contains(&count) {
+        return true;
     }
     let at = match &entry.joints.value {
         Joints::Counted(counted) => counted.count.at,
@@ -192,14 +215,15 @@ fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, coun
     let also = checker.tree.label(entry.adapter_type.at).with_text(format!("takes {takes} joints"));
     let diag = Diag::error(format!("{} cannot have {count} joints", quote(row.name))).also(also);
     checker.error(at, diag.hint(format!("name {takes} joints, or choose another adapter")));
+    false
 }
 
 /// Checks the address and gives it; empty where there is none.
-fn address(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: Option<&AdapterSpec>) -> String {
+fn address(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: &AdapterSpec) -> String {
     let given = entry.address.as_ref();
-    let Some(row) = row.filter(|_| checker.has(entry.at, "address")) else {
-        return given.map(|a| a.value.clone()).unwrap_or_default();
-    };
+    if !checker.has(entry.at, "address") {
+        return String::new();
+    }
     let form = row.address.form;
     let or_sim = if row.emulate.is_some() { ", or `sim` for the emulator" } else { "" };
     match given {

@@ -13,6 +13,13 @@ use crate::hardware::registry::Registry;
 
 /// The JSON Schema (draft 2020-12) of a blueprint whose arms are those of `adapters`.
 pub fn json_schema(adapters: &Registry) -> Value {
+    let mut schema = full_schema(adapters);
+    allow_partial_entries(&mut schema);
+    schema
+}
+
+/// The schema of a blueprint that includes no other: every key that is needed is required.
+pub(super) fn full_schema(adapters: &Registry) -> Value {
     let mut generator = SchemaSettings::draft2020_12().into_generator();
     // One generator for all: it keeps types of equal name apart.
     let options: Vec<(&str, Value)> =
@@ -44,7 +51,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
     static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
     let homes = HOMES.get_or_init(|| {
         let mut homes: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();
-        let schema = json_schema(&Registry::default());
+        let schema = full_schema(&Registry::default());
         for (pointer, name) in GROUPS {
             let keys = schema.pointer(&format!("{pointer}/properties")).and_then(Value::as_object);
             for key in keys.into_iter().flat_map(|keys| keys.keys()) {
@@ -72,6 +79,35 @@ const GROUPS: [(&str, &str); 10] = [
     ("/$defs/RecordingConfig", "recording"),
     ("/$defs/ViewConfig", "view"),
 ];
+
+/// A blueprint that includes others may give a part of an entry: only the id is required then. What else is required
+/// moves to the top, under the condition that nothing is included.
+fn allow_partial_entries(schema: &mut Value) {
+    let mut without_include = json!({});
+    for (definition, id, pointer) in [
+        ("HardwareEntry", "hardware_id", &["hardware"][..]),
+        ("TaskEntry", "name", &["tasks"]),
+        ("RobotConfig", "name", &["planner", "robots"]),
+    ] {
+        let Some(group) = schema.pointer_mut(&format!("/$defs/{definition}")).and_then(Value::as_object_mut) else {
+            continue;
+        };
+        let Some(needed) = group.insert("required".to_owned(), json!([id])) else { continue };
+        let entry = json!({ "items": { "required": needed } });
+        let rule = pointer.iter().rev().fold(entry, |inner, key| json!({ "properties": { *key: inner } }));
+        let (Some(all), Some(more)) = (without_include.as_object_mut(), rule["properties"].as_object()) else {
+            continue;
+        };
+        let properties = all.entry("properties").or_insert_with(|| json!({}));
+        if let Some(properties) = properties.as_object_mut() {
+            properties.extend(more.clone());
+        }
+    }
+    if let Some(root) = schema.as_object_mut() {
+        root.insert("if".to_owned(), json!({ "not": { "required": ["include"] } }));
+        root.insert("then".to_owned(), without_include);
+    }
+}
 
 fn subschema<T: JsonSchema>(generator: &mut SchemaGenerator) -> Value {
     generator.subschema_for::<T>().to_value()

@@ -112,8 +112,7 @@ pub fn load_from(search: &SearchPath, found: &Found, overrides: &Overrides, adap
     let mut diags = tree.diags().to_vec();
     // The main file is the first source, the arguments are the last; what has no place comes first of all.
     diags.sort_by_key(|d| d.at.as_ref().map(|at| (at.source, at.range.start)));
-    let failed = tree.unlisted() > 0 || diags.iter().any(|d| d.severity == Severity::Error);
-    Loaded { blueprint: blueprint.filter(|_| !failed), tree, diags }
+    Loaded { blueprint, tree, diags }
 }
 
 fn read_blueprint(
@@ -141,6 +140,9 @@ fn read_blueprint(
     let checker = Checker { tree, root, lost, adapters, incomplete };
     let mut blueprint = resolve(checker, file?, &found.name);
     blueprint.sources = sources;
+    if tree.has_errors() {
+        return None;
+    }
     blueprint.source_yaml = write(tree, root, &blueprint.name);
     Some(blueprint)
 }

@@ -28,4 +28,4 @@ pub use reference::reference;
 pub use registry::{FindError, Found, Listing, SearchPath, Source, find, list};
 pub use resolve::{Arm, Blueprint, Task, TaskKind};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
-pub use summary::{ArmSummary, From, JointSummary, Limit, Summary, TaskSummary};
+pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

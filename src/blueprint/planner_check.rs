@@ -111,11 +111,12 @@ fn joints(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, found: &Found
             wanted.push(Located { at: prefix.map_or(joint.at, |p| p.at), value: name });
         }
     }
-    if !found.complete {
+    if !found.joints_known {
         return;
     }
     let ours: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
-    let of_task = task.filter(|t| checker.has(t.at, "joint_names")).map(|t| match &t.joint_names.value {
+    let known = |t: &&Located<TaskEntry>| checker.has(t.at, "joint_names") && !checker.lost.contains(t.joint_names.at);
+    let of_task = task.filter(known).map(|t| match &t.joint_names.value {
         JointNames::Names(names) => names.iter().map(|n| n.value.clone()).collect::<Vec<_>>(),
         JointNames::Hardware(arm) => {
             found.entries.iter().filter(|e| e.id == arm.hardware.value).flat_map(|e| e.joints.clone()).collect()

@@ -5,7 +5,7 @@ use std::fmt::Write;
 use serde::de::{Deserialize, Deserializer, Visitor};
 use serde_json::Value;
 
-use crate::blueprint::json_schema::json_schema;
+use crate::blueprint::json_schema::full_schema;
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::planner::{PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
@@ -124,7 +124,7 @@ impl Deserializer<'static> for AskKeys {
 
 /// The page `docs/blueprint-reference.md`, with the adapters' own options.
 pub fn reference(adapters: &Registry) -> String {
-    let schema = json_schema(adapters);
+    let schema = full_schema(adapters);
     let mut page = INTRODUCTION.to_owned();
     for Section { title, first, pointer, keys } in SECTIONS {
         let Some(group) = schema.pointer(pointer) else { continue };
@@ -252,6 +252,7 @@ fn plural(kind: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::blueprint::json_schema::json_schema;
 
     /// Compares a generated file with the committed one.
     fn check(path: &str, generated: &str) {

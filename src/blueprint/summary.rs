@@ -9,7 +9,7 @@ use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK, JointLimits};
 /// Where a value comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum From {
+pub enum Origin {
     /// The adapter states it.
     Adapter,
     /// The blueprint says so.
@@ -18,7 +18,7 @@ pub enum From {
     Default,
 }
 
-impl From {
+impl Origin {
     /// The word used in tables.
     pub fn name(self) -> &'static str {
         match self {
@@ -35,7 +35,7 @@ pub struct Limit {
     /// The limit; its unit is that of the field.
     pub value: f64,
     /// Where it comes from.
-    pub from: From,
+    pub from: Origin,
 }
 
 /// A joint with the limits it is held to.
@@ -73,7 +73,7 @@ pub struct ArmSummary {
     /// What happens to the motors at the end.
     pub on_exit: OnExit,
     /// Where that comes from.
-    pub on_exit_from: From,
+    pub on_exit_from: Origin,
     /// Whether the arm keeps its pose when its motors are disabled.
     pub holds_when_disabled: bool,
     /// Its joints.
@@ -152,7 +152,7 @@ fn arm(arm: &Arm) -> ArmSummary {
         simulated: arm.simulated,
         auto_enable: arm.auto_enable,
         on_exit: arm.on_exit,
-        on_exit_from: if arm.on_exit_given { From::Blueprint } else { From::Default },
+        on_exit_from: if arm.on_exit_given { Origin::Blueprint } else { Origin::Default },
         holds_when_disabled: arm.adapter.holds_when_disabled,
         joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, &own, joint)).collect(),
     }
@@ -161,10 +161,10 @@ fn arm(arm: &Arm) -> ArmSummary {
 fn joint_summary(arm: &Arm, own: &JointLimits, joint: usize) -> JointSummary {
     let given = arm.limits.get(joint).copied().unwrap_or_default();
     let pick = |given: Option<f64>, own: &[f64]| {
-        let own = own.get(joint).map(|value| Limit { value: *value, from: From::Adapter });
-        given.map(|value| Limit { value, from: From::Blueprint }).or(own)
+        let own = own.get(joint).map(|value| Limit { value: *value, from: Origin::Adapter });
+        given.map(|value| Limit { value, from: Origin::Blueprint }).or(own)
     };
-    let or = |limit: Option<Limit>, value: f64| limit.unwrap_or(Limit { value, from: From::Default });
+    let or = |limit: Option<Limit>, value: f64| limit.unwrap_or(Limit { value, from: Origin::Default });
     JointSummary {
         name: arm.joints.get(joint).cloned().unwrap_or_default(),
         position_lower: pick(given.position_lower, &own.position_lower),

@@ -71,11 +71,12 @@ fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) 
         .flat_map(|(arm, e)| e.joints.iter().map(move |joint| (arm, joint.as_str())))
         .collect();
     match &entry.joint_names.value {
+        JointNames::Hardware(_) if checker.lost.contains(entry.joint_names.at) => {}
         JointNames::Hardware(by_arm) => {
             let id = &by_arm.hardware;
             match found.entries.iter().position(|e| e.id == id.value) {
                 Some(arm) => joints = (0..all.len()).filter(|i| all.get(*i).is_some_and(|(a, _)| *a == arm)).collect(),
-                None if found.entries.iter().any(|e| e.id.is_empty()) || checker.incomplete || !found.complete => {}
+                None if !found.ids_known => {}
                 None => {
                     let diag = Diag::error(format!("there is no arm {}", quote(id)));
                     let ids = found.entries.iter().map(|e| e.id.as_str());
@@ -98,7 +99,7 @@ fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) 
                 }
                 match all.iter().position(|(_, joint)| *joint == name.value) {
                     Some(joint) => joints.push(joint),
-                    None if found.complete => {
+                    None if found.joints_known => {
                         let diag = Diag::error(format!("no arm has a joint {}", quote(name)));
                         let hint = did_you_mean(name, all.iter().map(|(_, joint)| *joint), "joints");
                         checker.error(name.at, diag.maybe_hint(hint));
@@ -160,7 +161,8 @@ fn check_default_positions(
 ) {
     let place = params.and_then(|params| checker.tree.get(params, "default_positions"));
     let (Some(positions), Some(place)) = (&servo.default_positions, place) else { return };
-    let known = checker.has(entry.at, "joint_names") && found.complete && !joints.is_empty();
+    let named = checker.has(entry.at, "joint_names") && !checker.lost.contains(entry.joint_names.at);
+    let known = named && found.joints_known && !joints.is_empty();
     if known && positions.len() != joints.len() && !checker.lost.contains(place) {
         let diag = Diag::error(format!("{} positions for {} joints", positions.len(), joints.len()));
         checker.error(place, diag.hint("give one for each joint of the task, in the same order"));

@@ -3,16 +3,13 @@
 
 use std::collections::{HashMap, HashSet};
 
-use serde::de::value::{BorrowedStrDeserializer, U32Deserializer};
-use serde::de::{
-    DeserializeSeed, Deserializer, EnumAccess, IntoDeserializer, MapAccess, SeqAccess, VariantAccess, Visitor,
-};
+use serde::de::{Deserializer, Visitor};
 use serde::forward_to_deserialize_any;
 
-use crate::yaml::error::{ReadError, What};
+use crate::yaml::access::{Choice, Entries, Items, Placed};
+use crate::yaml::error::ReadError;
 use crate::yaml::located::{LOCATED, TEXT};
 use crate::yaml::scalar::{self, Scalar};
-use crate::yaml::stand_in::StandIn;
 use crate::yaml::tree::{Kind, NodeId, Tree};
 
 /// What a read must work round.
@@ -35,7 +32,7 @@ pub(super) struct De<'a> {
 }
 
 impl<'a> De<'a> {
-    fn of(&self, node: NodeId) -> Self {
+    pub(super) fn of(&self, node: NodeId) -> Self {
         Self { node, key: false, ..*self }
     }
 
@@ -102,12 +99,11 @@ impl<'a> De<'a> {
     }
 
     fn map<V: Visitor<'a>>(self, entries: &'a [(NodeId, NodeId)], visitor: V) -> Result<V::Value, ReadError> {
-        let stand_ins = self.detour.stand_ins.get(&self.node).map_or(&[][..], Vec::as_slice);
-        visitor.visit_map(Entries { de: self, entries: entries.iter(), stand_ins: stand_ins.iter(), next: Next::None })
+        visitor.visit_map(Entries::new(self, entries))
     }
 
     fn seq<V: Visitor<'a>>(self, items: &'a [NodeId], visitor: V) -> Result<V::Value, ReadError> {
-        visitor.visit_seq(Items { de: self, items: items.iter() })
+        visitor.visit_seq(Items::new(self, items))
     }
 }
 
@@ -195,7 +191,7 @@ impl<'a> Deserializer<'a> for De<'a> {
 
     fn deserialize_newtype_struct<V: Visitor<'a>>(self, name: &'static str, visitor: V) -> Result<V::Value, ReadError> {
         match name {
-            LOCATED => visitor.visit_seq(Placed { de: self, step: 0 }),
+            LOCATED => visitor.visit_seq(Placed::new(self)),
             TEXT => match self.scalar() {
                 Some((_, _, Scalar::Null)) | None => Err(self.wrong("a word, number or boolean", None)),
                 Some((text, ..)) => visitor.visit_borrowed_str(text),
@@ -263,9 +259,9 @@ impl<'a> Deserializer<'a> for De<'a> {
     ) -> Result<V::Value, ReadError> {
         match self.kind()? {
             Kind::Scalar { .. } if self.is_null() => Err(self.wrong(&format!("one of {}", variants.join(", ")), None)),
-            Kind::Scalar { .. } => visitor.visit_enum(Choice { de: self, word: self.node, content: None }),
+            Kind::Scalar { .. } => visitor.visit_enum(Choice::new(self, self.node, None)),
             Kind::Map(entries) => match entries.as_slice() {
-                [(word, content)] => visitor.visit_enum(Choice { de: self, word: *word, content: Some(*content) }),
+                [(word, content)] => visitor.visit_enum(Choice::new(self, *word, Some(*content))),
                 _ => Err(ReadError::value(format!("expected one of {}", variants.join(", ")), None)),
             },
             Kind::Seq(_) => Err(self.wrong(&format!("one of {}", variants.join(", ")), None)),
@@ -277,127 +273,4 @@ impl<'a> Deserializer<'a> for De<'a> {
     }
 
     forward_to_deserialize_any! { <V: Visitor<'a>> i128 u128 char bytes byte_buf unit unit_struct }
-}
-
-/// Where a [`Located`] value gets its place and its value from.
-struct Placed<'a> {
-    de: De<'a>,
-    step: u8,
-}
-
-impl<'a> SeqAccess<'a> for Placed<'a> {
-    type Error = ReadError;
-
-    fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
-        self.step += 1;
-        match self.step {
-            1 => {
-                let at: U32Deserializer<ReadError> = self.de.node.into_deserializer();
-                seed.deserialize(at).map(Some)
-            }
-            2 => seed.deserialize(self.de).map(Some),
-            _ => Ok(None),
-        }
-    }
-}
-
-struct Items<'a> {
-    de: De<'a>,
-    items: std::slice::Iter<'a, NodeId>,
-}
-
-impl<'a> SeqAccess<'a> for Items<'a> {
-    type Error = ReadError;
-
-    fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
-        let Some(&item) = self.items.find(|item| !self.de.detour.dropped.contains(item)) else { return Ok(None) };
-        // Also errors that arise after the Deserializer returned, as those of `try_from`, belong to this element.
-        seed.deserialize(self.de.of(item)).map(Some).map_err(|e| e.inside(item))
-    }
-}
-
-enum Next {
-    None,
-    Value(NodeId),
-    StandIn,
-}
-
-struct Entries<'a> {
-    de: De<'a>,
-    entries: std::slice::Iter<'a, (NodeId, NodeId)>,
-    stand_ins: std::slice::Iter<'a, &'static str>,
-    next: Next,
-}
-
-impl<'a> MapAccess<'a> for Entries<'a> {
-    type Error = ReadError;
-
-    fn next_key_seed<K: DeserializeSeed<'a>>(&mut self, seed: K) -> Result<Option<K::Value>, ReadError> {
-        if let Some(&(key, value)) = self.entries.find(|(_, value)| !self.de.detour.dropped.contains(value)) {
-            self.next = Next::Value(value);
-            let de = De { key: true, ..self.de.of(key) };
-            return seed.deserialize(de).map(Some).map_err(|e| e.inside(key).inside(value));
-        }
-        let Some(&name) = self.stand_ins.next() else { return Ok(None) };
-        self.next = Next::StandIn;
-        seed.deserialize(BorrowedStrDeserializer::<ReadError>::new(name)).map(Some)
-    }
-
-    fn next_value_seed<V: DeserializeSeed<'a>>(&mut self, seed: V) -> Result<V::Value, ReadError> {
-        match std::mem::replace(&mut self.next, Next::None) {
-            Next::Value(value) => seed.deserialize(self.de.of(value)).map_err(|e| e.inside(value)),
-            Next::StandIn => seed.deserialize(StandIn { node: self.de.node }).map_err(|_| {
-                // Whatever it says: the missing key is what was wrong.
-                ReadError::new(What::StandIn)
-            }),
-            Next::None => Err(ReadError::value("a value without a key", None)),
-        }
-    }
-}
-
-struct Choice<'a> {
-    de: De<'a>,
-    word: NodeId,
-    content: Option<NodeId>,
-}
-
-impl<'a> EnumAccess<'a> for Choice<'a> {
-    type Error = ReadError;
-    type Variant = Self;
-
-    fn variant_seed<V: DeserializeSeed<'a>>(self, seed: V) -> Result<(V::Value, Self), ReadError> {
-        let de = De { key: true, ..self.de.of(self.word) };
-        let value = seed.deserialize(de)?;
-        Ok((value, self))
-    }
-}
-
-impl<'a> VariantAccess<'a> for Choice<'a> {
-    type Error = ReadError;
-
-    fn unit_variant(self) -> Result<(), ReadError> {
-        match self.content {
-            None => Ok(()),
-            Some(_) => Err(ReadError::value("expected a word without a value", None)),
-        }
-    }
-
-    fn newtype_variant_seed<T: DeserializeSeed<'a>>(self, seed: T) -> Result<T::Value, ReadError> {
-        let content = self.content.ok_or_else(|| ReadError::value("this word needs a value", None))?;
-        seed.deserialize(self.de.of(content)).map_err(|e| e.inside(content))
-    }
-
-    fn tuple_variant<V: Visitor<'a>>(self, len: usize, visitor: V) -> Result<V::Value, ReadError> {
-        let content = self.content.ok_or_else(|| ReadError::value("this word needs a list", None))?;
-        self.de.of(content).deserialize_tuple(len, visitor).map_err(|e| e.inside(content))
-    }
-
-    fn struct_variant<V: Visitor<'a>>(
-        self,
-        _fields: &'static [&'static str],
-        visitor: V,
-    ) -> Result<V::Value, ReadError> {
-        let content = self.content.ok_or_else(|| ReadError::value("this word needs a group", None))?;
-        self.de.of(content).deserialize_map(visitor).map_err(|e| e.inside(content))
-    }
 }

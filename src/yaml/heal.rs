@@ -145,10 +145,11 @@ impl Healer {
         }
     }
 
-    /// Reports a bad value, unless something in it was left out before: then this is only a consequence.
+    /// Reports a bad value, unless something in it was left out before, or another read of the same place
+    /// has reported it: then this is only a consequence.
     fn report_value(&self, tree: &mut Tree, trail: &[NodeId], message: String, hint: Option<String>) {
         let Some(&at) = trail.first() else { return };
-        if self.lost.contains(at) {
+        if self.lost.contains(at) || tree.has_report_at(at) {
             return;
         }
         let name = name_of(tree, trail);

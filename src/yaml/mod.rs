@@ -10,6 +10,7 @@
 //! * **healing**: [`read`] notes an error, works round it and reads again, until nothing is left to report;
 //! * [`Located`] values, so that whoever checks the meaning afterwards can point at the exact place too.
 
+mod access;
 mod de;
 mod diag;
 mod error;

@@ -150,7 +150,13 @@ impl<'t> Builder<'t> {
         // The parser ends a block where the next thing starts; people see it end with its last value.
         let range = match flow {
             true => own.start..self.range(span).end,
-            false => of(first).map_or(own.start, |r| r.start)..of(last).map_or(own.end, |r| r.end),
+            false => {
+                let first = of(first).map_or(own.start, |r| r.start);
+                // A list starts with its dash, when that stands before its first value.
+                let dash = self.text.get(own.start..first).is_some_and(|t| t.starts_with('-') && !t.contains('\n'));
+                let start = if dash { own.start } else { first };
+                start..of(last).map_or(own.end, |r| r.end)
+            }
         };
         // An alias points back to where its value was written.
         let range = if range.end < range.start { own } else { range };

@@ -13,7 +13,8 @@ pub fn closest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>) ->
     let words = |text: &str| text.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned();
     let counts_on = |candidate: &str| {
         let candidate = plain(candidate);
-        candidate != given && words(&candidate) == words(&given) && words(&given).len() < given.len()
+        let digits = given.len() - words(&given).len();
+        candidate != given && words(&candidate) == words(&given) && (1..=2).contains(&digits)
     };
     candidates
         .into_iter()

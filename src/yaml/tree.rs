@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Range;
 
-use crate::yaml::diag::{Diag, Label};
+use crate::yaml::diag::{Diag, Label, Severity};
 
 /// The largest file that is read [bytes].
 pub const MAX_BYTES: usize = 1 << 20;
@@ -262,6 +262,17 @@ impl Tree {
     /// Mistakes that were found but not listed, because there were too many.
     pub fn unlisted(&self) -> usize {
         self.unlisted
+    }
+
+    /// Whether a mistake was noted at exactly this node.
+    pub(super) fn has_report_at(&self, id: NodeId) -> bool {
+        let label = self.label(id);
+        self.diags.iter().any(|d| d.at.as_ref().is_some_and(|at| at.source == label.source && at.range == label.range))
+    }
+
+    /// Whether any mistake noted so far must be put right.
+    pub fn has_errors(&self) -> bool {
+        self.unlisted > 0 || self.diags.iter().any(|d| d.severity == Severity::Error)
     }
 
     /// The mistakes noted so far, in the order they were found.
