@@ -68,9 +68,7 @@ impl ClientError {
             Self::NoRun => Some("start one: dimos run coordinator-yourarm".into()),
             Self::SeveralRuns(_) => Some("say which with --run NAME".into()),
             Self::UnknownRun { live, .. } if live.is_empty() => Self::NoRun.hint(),
-            Self::UnknownRun { name, live } => {
-                did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live")
-            }
+            Self::UnknownRun { name, live } => did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live"),
             Self::Place(error) => Some(error.hint().into()),
             Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
                 Some("the process lives but does not answer; its log may say why".into())
