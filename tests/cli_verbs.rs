@@ -70,7 +70,7 @@ fn without_a_run_every_verb_says_how_to_start_one() {
     let overview = home.run("status").with(0);
     assert!(overview.out.is_empty() && overview.err.contains("hint:"));
     assert_eq!(home.run("status --json").with(0).out, "[]\n");
-    assert!(home.run("state --run x").with(2).err.contains("no live run is named \"x\""));
+    assert!(home.run("state --run x").with(2).err.contains("no live run is named `x`"));
 }
 
 #[test]
@@ -80,7 +80,7 @@ fn several_runs_need_a_name() {
     let (_server, right) = start(&home.runs(), "right", FakeBackend::default());
     let ended = home.run("state").with(2);
     assert!(ended.err.contains("left, right") && ended.err.contains("hint: say which with --run"), "{}", ended.err);
-    assert!(home.run("state --run rihgt").with(2).err.contains("did you mean \"right\"?"));
+    assert!(home.run("state --run rihgt").with(2).err.contains("did you mean `right`?"));
     assert!(home.run("state --run right").with(0).out.contains("arm_joint1"));
     assert_eq!(right.asked().len(), 1);
     let overview = home.run("status").with(0).out;
@@ -154,7 +154,7 @@ fn what_cannot_be_is_refused_before_it_is_sent() {
     assert!(home.run("mvoe arm 0").err.contains("'move'"));
     assert_eq!(run.asked(), []);
     let unknown = home.run("move rarm 0").with(2);
-    assert_eq!(unknown.err, "error: no arm named \"rarm\" [UNKNOWN_ARM]\nhint: did you mean \"arm\"?\n");
+    assert_eq!(unknown.err, "error: no arm named `rarm` [UNKNOWN_ARM]\nhint: did you mean `arm`?\n");
 }
 
 #[test]

@@ -91,7 +91,7 @@ fn what_is_no_request_is_refused_and_the_connection_lives() {
     refused(r#"{"id":6,"method":"move","params":{"arm":"arm","target":[NaN]}}"#, "MALFORMED");
     refused(&format!("{}{}", "[".repeat(5000), "]".repeat(5000)), "MALFORMED");
     let reply = refused(r#"{"id":7,"method":"stats"}"#, "UNKNOWN_METHOD");
-    assert!(reply["error"]["hint"].as_str().unwrap().contains("\"status\""), "{reply}");
+    assert!(reply["error"]["hint"].as_str().unwrap().contains("`status`"), "{reply}");
     refused(r#"{"id":8,"method":"move","params":{"arm":"arm","target":[1],"sped":0.5}}"#, "INVALID_PARAMS");
     refused(r#"{"id":8,"method":"move","params":{"arm":"arm","target":["1"]}}"#, "INVALID_PARAMS");
     refused(r#"{"id":8,"method":"move","params":{"arm":"arm","target":[1],"speed":7}}"#, "INVALID_PARAMS");
@@ -319,7 +319,7 @@ fn a_name_is_taken_once_and_given_back_at_the_end() {
     assert_eq!(names(&place), ["other", "test"]);
     assert!(matches!(Client::find(&place, None), Err(ClientError::SeveralRuns(runs)) if runs.len() == 2));
     let error = Client::find(&place, Some("tset")).unwrap_err();
-    assert!(error.hint().unwrap().contains("\"test\""), "{:?}", error.hint());
+    assert!(error.hint().unwrap().contains("`test`"), "{:?}", error.hint());
     drop(other);
     assert_eq!(Client::find(&place, None).unwrap().run(), "test");
     drop(server);

@@ -13,7 +13,7 @@ use super::error::{Code, RpcError};
 use super::place::{LiveRun, PlaceError, RunFolder};
 use super::server::CALL_LIMIT;
 use super::wire::Incoming;
-use crate::yaml::did_you_mean;
+use crate::yaml::{did_you_mean, quote};
 
 /// How long to wait for a reply: a little longer than the run takes to give up.
 const PATIENCE: Duration = CALL_LIMIT.saturating_add(Duration::from_secs(2));
@@ -30,7 +30,7 @@ pub enum ClientError {
     #[error("several runs are live: {}", names(.0))]
     SeveralRuns(Vec<LiveRun>),
     /// No live run has the name.
-    #[error("no live run is named {name:?}")]
+    #[error("no live run is named {}", quote(name))]
     UnknownRun {
         /// The name asked for.
         name: String,

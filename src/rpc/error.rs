@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::telemetry::Outcome;
-use crate::yaml::did_you_mean;
+use crate::yaml::{did_you_mean, quote};
 
 /// What went wrong, for programs. In JSON: `START_STATE_MISMATCH`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -132,7 +132,7 @@ impl RpcError {
 
     /// `what` has no entry called `name`; the hint suggests the nearest of `known`, or lists them.
     pub fn unknown<S: AsRef<str>>(code: Code, what: &str, name: &str, known: &[S]) -> Self {
-        let error = Self::new(code, format!("no {what} named {name:?}"));
+        let error = Self::new(code, format!("no {what} named {}", quote(name)));
         let hint = did_you_mean(name, known.iter().map(AsRef::as_ref), "there is");
         error.hint(hint.unwrap_or_else(|| format!("there is no {what} here")))
     }
