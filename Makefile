@@ -11,7 +11,7 @@ run:
 
 # Installs `dimos` for this user.
 install:
-	cargo install --path . --locked --profile dist
+	cargo install --path . --locked
 
 check:
 	cargo fmt --check

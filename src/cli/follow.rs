@@ -92,8 +92,8 @@ fn print(report: &MotionReport, json: bool) {
         let tone = if off.abs() <= CLOSE { Tone::Good } else { Tone::Warning };
         table.row([
             joint.joint.as_str().into(),
-            format!("{:.4}", joint.target).into(),
-            format!("{:.4}", joint.actual).into(),
+            output::number(Some(joint.target), 4).into(),
+            output::number(Some(joint.actual), 4).into(),
             toned(format_args!("{off:+.4}"), tone),
             toned(format_args!("{:+.3}", off.to_degrees()), tone),
         ]);

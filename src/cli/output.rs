@@ -97,7 +97,13 @@ impl Table {
 
 /// A number with so many decimals, or `-` where there is none.
 pub fn number(value: Option<f64>, decimals: usize) -> String {
-    value.map_or_else(|| "-".into(), |v| format!("{v:.decimals$}"))
+    let Some(value) = value else { return "-".into() };
+    let text = format!("{value:.decimals$}");
+    // A small negative number that rounds to nothing is nothing.
+    match text.strip_prefix('-') {
+        Some(digits) if digits.bytes().all(|b| matches!(b, b'0' | b'.')) => digits.to_owned(),
+        _ => text,
+    }
 }
 
 /// A span of time as people say it: `2 h 5 min`, `12.3 s`.

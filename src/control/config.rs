@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
+
 use crate::joint::{ControlMode, JointLimits};
 
 /// A step of a command further than this from the one before it is refused [rad].
@@ -12,7 +14,7 @@ pub const POSITION_MARGIN: f64 = 0.01;
 pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 
 /// Everything a coordinator knows beforehand.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CoordinatorConfig {
     /// Ticks per second [Hz].
     pub rate: f64,
@@ -30,7 +32,7 @@ impl CoordinatorConfig {
 }
 
 /// One arm.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ArmConfig {
     /// Its `hardware_id`.
     pub name: String,
@@ -54,7 +56,7 @@ impl ArmConfig {
 }
 
 /// One task.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TaskConfig {
     /// Its name.
     pub name: String,
@@ -69,7 +71,8 @@ pub struct TaskConfig {
 }
 
 /// Type of a task, with its parameters.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum TaskKind {
     /// Executes trajectories.
     Trajectory(TrajectoryParams),
@@ -91,7 +94,7 @@ impl TaskKind {
 }
 
 /// Parameters of a trajectory task.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryParams {
     /// How far the first point may be from the arm [rad].
     pub start_position_tolerance: f64,
@@ -110,7 +113,7 @@ impl Default for TrajectoryParams {
 }
 
 /// Parameters of a servo task.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ServoParams {
     /// How long a target stands without a new one [s]; 0 = for ever.
     pub timeout: f64,
@@ -125,7 +128,7 @@ impl Default for ServoParams {
 }
 
 /// Parameters of a velocity task.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VelocityParams {
     /// How long a target stands without a new one [s]; 0 = for ever.
     pub timeout: f64,

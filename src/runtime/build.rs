@@ -88,7 +88,7 @@ impl Run {
             run: name.clone(),
             names: names.clone(),
             frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
-            attachments: attachments(blueprint),
+            attachments: attachments(blueprint, &config),
             metadata: metadata(blueprint),
             wall,
         };
@@ -327,7 +327,9 @@ fn retain(blueprint: &Blueprint, log: &Option<PathBuf>) {
     }
 }
 
-fn attachments(blueprint: &Blueprint) -> Vec<LogAttachment> {
+/// The blueprint as read and as resolved, and what the coordinator was made from: with these and its messages a log
+/// can be run again.
+fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> Vec<LogAttachment> {
     let yaml = |name: String, text: &str| LogAttachment {
         name,
         media_type: "application/yaml".to_owned(),
@@ -335,6 +337,12 @@ fn attachments(blueprint: &Blueprint) -> Vec<LogAttachment> {
     };
     let mut all = vec![yaml("blueprint.yaml".to_owned(), &blueprint.source_yaml)];
     all.extend(blueprint.sources.iter().map(|(name, text)| yaml(format!("source/{name}"), text)));
+    all.push(LogAttachment {
+        name: "coordinator.json".to_owned(),
+        media_type: "application/json".to_owned(),
+        // Plain structs with string keys always encode.
+        data: serde_json::to_vec_pretty(config).unwrap_or_default(),
+    });
     all
 }
 

@@ -13,6 +13,7 @@ mod dispatch;
 mod motions;
 mod reports;
 mod service;
+mod throttle;
 mod watchdog;
 
 use std::path::PathBuf;

@@ -253,10 +253,14 @@ impl Service {
 
     /// Tells an event to the text log and to those who listen.
     pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
-        match described.severity {
-            Severity::Info => tracing::debug!("{}", described.text),
-            Severity::Warn => tracing::warn!("{}", described.text),
-            Severity::Error => tracing::error!("{}", described.text),
+        let admitted = lock(&self.throttle).admit(described.kind, self.now());
+        if let Some(unsaid) = admitted {
+            let more = if unsaid > 0 { format!(" ({unsaid} more like this were not shown)") } else { String::new() };
+            match described.severity {
+                Severity::Info => tracing::debug!("{}{more}", described.text),
+                Severity::Warn => tracing::warn!("{}{more}", described.text),
+                Severity::Error => tracing::error!("{}{more}", described.text),
+            }
         }
         self.parts.streams.publish_event(|| EventReport {
             tick,

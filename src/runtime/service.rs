@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::{Motions, Planned};
+use super::throttle::Throttle;
 use crate::blueprint::Blueprint;
 use crate::clock::{Mono, WallOffset};
 use crate::control::config::{CoordinatorConfig, TaskKind};
@@ -68,6 +69,7 @@ pub struct Service {
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
+    pub(super) throttle: Mutex<Throttle>,
     closed: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
@@ -79,6 +81,7 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
+            throttle: Mutex::default(),
             closed: AtomicBool::new(false),
             claim: Mutex::new(None),
         }

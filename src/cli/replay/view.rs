@@ -7,6 +7,7 @@ use std::time::Duration;
 use comfy_table::{Cell, CellAlignment, Table, presets};
 
 use super::player::Part;
+use crate::cli::output;
 use crate::clock::Mono;
 use crate::recording::messages::JointState;
 use crate::recording::replay::{Entry, Payload};
@@ -215,10 +216,7 @@ fn right(text: impl ToString) -> Cell {
 
 /// A value with its digits, or a dash where there is none.
 fn number(values: &[f64], i: usize, digits: usize) -> String {
-    match values.get(i) {
-        Some(value) if !value.is_nan() => format!("{value:.digits$}"),
-        _ => "-".into(),
-    }
+    output::number(values.get(i).copied().filter(|v| !v.is_nan()), digits)
 }
 
 fn level(level: u8) -> &'static str {
