@@ -1,6 +1,7 @@
-//! `dimos replay`: plays a log back to the terminal, in the time it took.
+//! `dimos replay`: plays a log back to the terminal, in the time it took, or runs it again and compares.
 
 mod player;
+mod verify;
 mod view;
 
 use std::io::{self, IsTerminal};
@@ -12,9 +13,12 @@ use thiserror::Error;
 
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use crate::replay::recorded::RecordedError;
 use player::{Part, RealTime, play};
 use view::{JsonLines, Live, Plain, View};
 
+/// Exit code: the log comes out differently when it is run again.
+const DIFFERENT: u8 = 1;
 /// Exit code: the log is not there, not a log, or does not have what was asked for.
 const USAGE: u8 = 2;
 /// Exit code: data was lost while recording, or the log was cut.
@@ -24,6 +28,10 @@ const DATA_LOST: u8 = 3;
 ///
 /// In the time it took: a joint table and a progress bar on a terminal, a line a second elsewhere, a JSON object per
 /// message with --json. Exits with 3 if the log was cut, or if the recorder lost data.
+///
+/// With --verify nothing is played: what every tick read and was told goes through the same control code again, and
+/// every command has to come out the same, bit for bit. Exits with 1 and the first difference if not; with 3 if a part
+/// is missing in the log, up to which it came out the same.
 #[derive(Debug, Clone, Args)]
 pub struct ReplayArgs {
     /// Log file (.mcap)
@@ -47,6 +55,9 @@ pub struct ReplayArgs {
     /// Play these topics only, separated by commas
     #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
     pub topics: Vec<String>,
+    /// Run all of the log through the control code again, and compare its commands bit for bit
+    #[arg(long, conflicts_with_all = ["rate", "looping", "start_offset", "duration", "topics"])]
+    pub verify: bool,
     /// Print a JSON object per message
     #[arg(long)]
     pub json: bool,
@@ -88,7 +99,7 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<u8> {
     match try_run(args) {
         Ok(code) => Ok(code),
         Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(0),
-        Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() => {
+        Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
             eprintln!("error: {e}");
             Ok(USAGE)
         }
@@ -98,6 +109,9 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<u8> {
 
 fn try_run(args: &ReplayArgs) -> anyhow::Result<u8> {
     let path = log_path(args)?;
+    if args.verify {
+        return Ok(verify::run(&path, args.json)?);
+    }
     let mut log = LogReader::open(&path)?;
     let part = choose(args, log.info(), &path)?;
     let out = io::stdout();

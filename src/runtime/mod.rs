@@ -24,6 +24,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 pub use device_lock::DeviceTaken;
+pub use dispatch::log_of;
 
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
