@@ -180,6 +180,7 @@ fn is_told_by(now: &Described, then: &Event) -> bool {
     now.kind == then.kind
         && now.status == then.status
         && now.request.as_slice() == then.request
-        && (name(&now.arm), name(&now.task), name(&now.joint)) == (then.arm.clone(), then.task.clone(), then.joint.clone())
+        && (name(&now.arm), name(&now.task), name(&now.joint))
+            == (then.arm.clone(), then.task.clone(), then.joint.clone())
         && bits(&now.values) == bits(&then.values)
 }

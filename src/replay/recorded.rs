@@ -83,7 +83,8 @@ fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Res
     for arm in &config.arms {
         check_limits(arm)?;
         let joints = joints.get(&arm.name).filter(|j| j.len() == arm.dof);
-        let joints = joints.ok_or_else(|| format!("its metadata does not name the {} joints of {}", arm.dof, arm.name))?;
+        let joints =
+            joints.ok_or_else(|| format!("its metadata does not name the {} joints of {}", arm.dof, arm.name))?;
         arms.push(ArmNames { hardware_id: arm.name.clone(), joints: joints.clone() });
     }
     let all: usize = config.arms.iter().map(|a| a.dof).sum();
@@ -97,7 +98,8 @@ fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Res
 fn check_limits(arm: &ArmConfig) -> Result<(), String> {
     let l = &arm.limits;
     let lists = [&l.position_lower, &l.position_upper, &l.velocity_max, &l.acceleration_max];
-    let whole = arm.dof <= MAX_DOF && lists.iter().all(|list| list.len() == arm.dof && list.iter().all(|v| v.is_finite()));
+    let whole =
+        arm.dof <= MAX_DOF && lists.iter().all(|list| list.len() == arm.dof && list.iter().all(|v| v.is_finite()));
     let room = || l.position_lower.iter().zip(&l.position_upper).all(|(lower, upper)| lower < upper);
     let speed = || l.velocity_max.iter().chain(&l.acceleration_max).all(|v| *v > 0.0);
     if whole && room() && speed() { Ok(()) } else { Err(format!("the limits of {} leave no room to move", arm.name)) }
