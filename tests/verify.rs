@@ -201,9 +201,14 @@ fn what_is_missing_ends_the_verification_there() {
     tamper(&log, &copy, "/dimos/requests", 0, |m: &mut Text| m.data = m.data.replace("ready", "dance"));
     assert!(incomplete(&copy).1.contains("dance"));
     let bytes = std::fs::read(&log).unwrap();
-    std::fs::write(&copy, &bytes[..bytes.len() / 2]).unwrap();
-    let (tick, why) = incomplete(&copy);
-    assert!(tick > 50 && tick < ticks && why.contains("ends"), "{tick}: {why}");
+    let mut before = 0;
+    for length in [bytes.len() / 4, bytes.len() / 2, bytes.len() - 1] {
+        std::fs::write(&copy, &bytes[..length]).unwrap();
+        let (tick, why) = incomplete(&copy);
+        assert!(tick >= before && why.contains("ends"), "{tick}: {why}");
+        before = tick;
+    }
+    assert_eq!(before, ticks - 1, "events of the last tick may have been cut off");
     without_attachments(&log, &copy);
     let error = verify(&copy).unwrap_err();
     assert!(matches!(error, RecordedError::NoCoordinator { .. }), "{error}");
@@ -245,11 +250,8 @@ fn wait_for_end(client: &mut Client, motion: u64) -> String {
     panic!("the motion does not end");
 }
 
-fn move_arm(client: &mut Client, target: &[f64]) -> u64 {
-    client.call(api::Move { arm: "arm".into(), target: target.to_vec(), speed: 0.8 }).unwrap().motion
-}
-
-/// Moves, cancel, stop, reset, enable, gripper, on a loop that now and then is late.
+/// Moves, cancel, stop, reset, enable, gripper, on a loop that now and then is late. What comes of all that depends
+/// on the machine; what matters is that it comes out the same again.
 fn exercise(name: &str, dof: usize) {
     let folder = tempfile::tempdir().unwrap();
     let probe = Box::new(|tick| {
@@ -258,24 +260,26 @@ fn exercise(name: &str, dof: usize) {
         }
     });
     let (run, mut client) = start(folder.path(), &blueprint(name, &[]), Some(probe));
+    let begin = |client: &mut Client, target: Vec<f64>| {
+        client.call(api::Move { arm: "arm".into(), target, speed: 0.8 }).ok().map(|begun| begun.motion)
+    };
     let goal: Vec<f64> = (0..dof).map(|j| 0.1 + 0.02 * j as f64).collect();
-    let motion = move_arm(&mut client, &goal);
-    assert_eq!(wait_for_end(&mut client, motion), "COMPLETED");
-    let motion = move_arm(&mut client, &vec![0.0; dof]);
+    let motion = begin(&mut client, goal.clone()).expect("the arm is ready");
+    wait_for_end(&mut client, motion);
+    let motion = begin(&mut client, vec![0.0; dof]);
     client.call(api::Cancel { task: None, arm: None }).unwrap();
-    assert_eq!(wait_for_end(&mut client, motion), "ABORTED");
-    client.call(api::Gripper { arm: "arm".into(), position: 0.03 }).unwrap();
-    move_arm(&mut client, &vec![0.2; dof]);
+    motion.map(|motion| wait_for_end(&mut client, motion));
+    let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03 });
+    begin(&mut client, vec![0.25; dof]);
     client.call(api::Stop { arm: None }).unwrap();
-    client.call(api::ArmReset { arm: "arm".into() }).unwrap();
-    client.call(api::ArmEnable { arm: "arm".into() }).unwrap();
-    let motion = move_arm(&mut client, &goal);
-    assert_eq!(wait_for_end(&mut client, motion), "COMPLETED");
+    let _ = client.call(api::ArmReset { arm: "arm".into() });
+    let _ = client.call(api::ArmEnable { arm: "arm".into() });
+    begin(&mut client, goal).map(|motion| wait_for_end(&mut client, motion));
     // The run ends in mid-motion.
-    move_arm(&mut client, &vec![0.0; dof]);
+    begin(&mut client, vec![0.0; dof]);
     let ended = run.stop();
     let found = reproducible(&ended.log.unwrap());
-    assert!(found.ticks > 100 && found.requests >= 10 && found.events > 20, "{found:?}");
+    assert!(found.ticks > 100 && found.requests >= 6 && found.events > 12, "{found:?}");
 }
 
 #[test]
