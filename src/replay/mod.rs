@@ -6,7 +6,10 @@
 //! ```
 
 pub mod compare;
+pub mod fit;
 mod inputs;
+pub mod motion;
+pub mod onto;
 pub mod recorded;
 mod requests;
 pub mod verify;
