@@ -73,7 +73,8 @@ fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, Reco
                 Payload::JointState(m) if entry.topic == "/joint_states" => measured = positions(m),
                 Payload::JointState(m) => commanded = positions(m),
                 Payload::Tick(t) if rows.last().is_none_or(|row| t.tick > row.tick) => {
-                    let now = (std::mem::replace(&mut measured, nothing()), std::mem::replace(&mut commanded, nothing()));
+                    let now =
+                        (std::mem::replace(&mut measured, nothing()), std::mem::replace(&mut commanded, nothing()));
                     rows.push(Row { tick: t.tick, measured: now.0, commanded: now.1 });
                 }
                 _ => {}
