@@ -2,7 +2,7 @@
 //!
 //! The commands are the control points of a quadratic B-spline: its velocity runs in straight lines through the
 //! differences of the commands, so velocity and acceleration stay within those that were commanded, and the curve
-//! passes each command by an eighth of what its second difference is (0.03 mrad at 2 rad/s² and 100 Hz). Between the
+//! passes each command by an eighth of what its second difference is (0.025 mrad at 2 rad/s² and 100 Hz). Between the
 //! middles of two ticks it is a parabola, which points with positions and velocities reproduce exactly. Points that a
 //! cubic between their neighbours reproduces as well are left out.
 

@@ -13,7 +13,7 @@ use super::player::Part as Span;
 use crate::blueprint::{Blueprint, Overrides};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::{Signals, show_deviation};
-use crate::cli::{check, output, text_log};
+use crate::cli::{banner, check, output, text_log};
 use crate::hardware::registry::Registry;
 use crate::replay::fit::fit;
 use crate::replay::motion::RecordedMotion;
@@ -58,8 +58,12 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     let show = Show { bars: !args.json && io::stderr().is_terminal(), quiet: args.json };
     let driver = Driver { run: &run, blueprint: &blueprint, plan: &plan, signals: &signals, show, rate: args.rate };
     let result = driver.drive(&wanted);
+    let report = run.status();
     let ended = run.stop();
     say_goodbye(&result, &ended, args.json);
+    for arm in report.arms.iter().filter(|_| !args.json) {
+        output::note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
+    }
     result.map(|_| Exit::Ok).or_else(|end| match end {
         End::Failed(failure) => Err(failure),
         End::Signal(signal) => Ok(Exit::by_signal(signal)),
