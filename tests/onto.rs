@@ -166,8 +166,9 @@ fn assert_followed(recorded: &Path, again: &Path) {
         let nearest = is.rows.windows(2).map(|w| distance(pose, &w[0], &w[1])).fold(f64::MAX, f64::min);
         assert!(nearest <= PATH, "{pose:?} is {nearest} rad from the path");
     }
-    let ends = was.rows.last().unwrap().iter().zip(is.rows.last().unwrap());
-    assert!(ends.clone().all(|(a, b)| (a - b).abs() <= 1e-6), "{ends:?}");
+    // A task may end a step before its goal, when the arm is there within the goal tolerance.
+    let (end, goal) = (is.rows.last().unwrap(), was.rows.last().unwrap());
+    assert!(end.iter().zip(goal).all(|(a, b)| (a - b).abs() <= PATH), "{end:?} is not {goal:?}");
 }
 
 #[test]
