@@ -328,7 +328,6 @@ fn a_slow_servo_stream_makes_a_smooth_motion() {
         let mut rig = Rig::one_arm(one(servo()));
         let wave = |t: f64| 0.6 * (1.0 - (1.2 * t).cos());
         let (mut due, mut worst, mut slowest, mut k) = (0.0, 0.0f64, f64::MAX, 0u64);
-        let (mut last_v, mut roughest) = (0.0, 0.0f64);
         for tick in 0..500 {
             let t = tick as f64 * rig.dt();
             if t + 1e-9 >= due {
@@ -345,13 +344,10 @@ fn a_slow_servo_stream_makes_a_smooth_motion() {
                 if true_v > 0.3 {
                     slowest = slowest.min(rig.speed(0) / true_v);
                 }
-                roughest = roughest.max((rig.speed(0) - last_v).abs() / rig.dt());
             }
-            last_v = rig.speed(0);
         }
-        println!("{rate} Hz jitter {jitter}: lag {worst:.4} slowest {slowest:.2} roughest {roughest:.2}");
         assert!(worst < 0.72 * 2.5 / rate, "{rate} Hz: off by {worst} rad");
-        assert!(slowest > 0.5, "{rate} Hz, jitter {jitter}: down to {slowest} of the speed: stop and go");
+        assert!(slowest > 0.85, "{rate} Hz, jitter {jitter}: down to {slowest} of the speed: stop and go");
     }
 }
 

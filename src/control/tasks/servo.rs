@@ -29,9 +29,10 @@ struct Target {
 
 impl Target {
     fn reached(&self, cx: &Context<'_>) -> Joints {
-        // A target counts from its tick on, so the first step is made at once.
+        // A target counts from its tick on, so the first step is made at once. The line is a tick longer than the
+        // stream's period: the next target may come so much later without a halt in between.
         let done = if self.period > 1.5 * cx.dt {
-            ((cx.now.seconds_since(self.at) + cx.dt) / self.period).clamp(0.0, 1.0)
+            ((cx.now.seconds_since(self.at) + cx.dt) / (self.period + cx.dt)).clamp(0.0, 1.0)
         } else {
             1.0
         };
