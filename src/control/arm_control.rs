@@ -143,14 +143,17 @@ impl ArmControl {
     }
 
     /// The arm was enabled: starts the hold. Where the arm has been under power since the last command and is
-    /// still near it, that command stays: starting from the measured pose would sink a little at every enable.
+    /// still near it, that command stays: starting from the measured pose would sink a little at every enable. An
+    /// arm that is still being brought to rest goes on with that.
     pub fn seed(&mut self) {
+        if self.command.mode.is_some() {
+            return;
+        }
         for (limiter, q) in self.limiters.iter_mut().zip(&self.state.position) {
             let near = (limiter.position() - q).abs() <= CARRIED_BY_POSITION_ERROR;
             let start = if self.command_stands && near { limiter.position() } else { *q };
             limiter.seed(start);
         }
-        self.command.mode = None;
         self.stop_owed = false;
     }
 
