@@ -352,7 +352,7 @@ impl Coordinator {
         }
         let Some(t) = self.tasks.get_mut(task as usize) else { return Outcome::WrongTask(task) };
         match (&mut t.body, positions) {
-            (Body::Servo(body), true) => body.set_target(&cx, target),
+            (Body::Servo(body), true) => body.set_target(&cx, &t.joints, target),
             (Body::Velocity(body), false) => body.set_target(&cx, target),
             _ => return Outcome::WrongTask(task),
         }
