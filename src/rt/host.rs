@@ -34,7 +34,7 @@ const FIFO_REMEDY: &str = "allow it: add `@realtime - rtprio 95` to /etc/securit
 const MEMLOCK_REMEDY: &str =
     "allow it: `@realtime - memlock unlimited` in /etc/security/limits.d/ (LimitMEMLOCK=infinity under systemd)";
 const LATENCY_REMEDY: &str =
-    "allow it: run as root or let your group write /dev/cpu_dma_latency by a udev rule; or give `realtime: false`";
+    "allow it: let your group write /dev/cpu_dma_latency by a udev rule, or run as root";
 
 /// Holds idle states off for as long as it lives.
 #[derive(Debug)]
