@@ -185,11 +185,14 @@ impl Run {
         self.watchdog.stand_down();
         self.end_tick(&mut ended);
         ended.troubles.extend(self.arms.release());
-        drop(self.server.take());
-        drop(self.courier);
-        if let Err(e) = self.recorder.finish() {
+        let Self { arms, server, courier, recorder, .. } = self;
+        drop(courier);
+        if let Err(e) = recorder.finish() {
             ended.troubles.push(e.to_string());
         }
+        // Last of all: who sees that the run is gone finds its log closed and its devices free.
+        drop(arms);
+        drop(server);
         ended
     }
 
@@ -211,7 +214,8 @@ impl Run {
                 }
                 answer = None;
             }
-            if self.pulse.at_rest.load(Ordering::Acquire) {
+            // That nothing is commanded to move is half of it: an arm that lags, or that was let go of, still moves.
+            if self.pulse.at_rest.load(Ordering::Acquire) && self.service.at_standstill() {
                 return;
             }
         }

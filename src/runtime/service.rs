@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::{Motions, Planned};
+use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
 use crate::clock::{Mono, WallOffset};
 use crate::control::config::{CoordinatorConfig, TaskKind};
@@ -42,6 +43,8 @@ const ORDER_LIMIT: Duration = Duration::from_secs(5);
 const READY_LIMIT: Duration = Duration::from_secs(2);
 /// Trajectories may exceed a velocity or acceleration by this factor: rounding in files.
 const SLACK: f64 = 1.001;
+/// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
+const STANDSTILL: f64 = 0.02;
 
 /// What a service is made from.
 pub struct ServiceParts {
@@ -112,6 +115,13 @@ impl Service {
     /// The latest sample of an arm.
     pub(super) fn arm_view(&self, arm: usize) -> Option<ArmSample> {
         lock(&self.parts.arm_views).get_mut(arm).map(SlotReader::read)
+    }
+
+    /// Whether every arm that can be seen is measured to stand still.
+    pub fn at_standstill(&self) -> bool {
+        let still = |state: &ArmState| state.velocity.iter().take(state.dof).all(|v| v.abs() <= STANDSTILL);
+        let mut views = lock(&self.parts.arm_views);
+        views.iter_mut().map(SlotReader::read).all(|view| view.state.link != Link::Up || still(&view.state))
     }
 
     pub(super) fn task_view(&self, task: usize) -> TaskView {
@@ -354,7 +364,7 @@ impl Service {
     /// How far an arm's stop has come; `None`: not yet known.
     fn confirmation(&self, arm: usize) -> Option<api::Confirmation> {
         let (view, device) = (self.arm_view(arm)?, self.parts.devices.get(arm)?);
-        if view.state.link != crate::arm::Link::Up {
+        if view.state.link != Link::Up {
             return Some(api::Confirmation::NotSent);
         }
         if !view.state.enabled {
