@@ -23,6 +23,9 @@ const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::fr
 const PLAUSIBLE_AFTER: u32 = 3;
 /// How long `activate` waits for plausible states, and for the motors.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
+/// How long a stopped arm gets to stand still before its motors are disabled, and what counts as standing [rad/s].
+const REST_LIMIT: Duration = Duration::from_secs(1);
+const STANDSTILL: f64 = 0.02;
 
 pub(super) struct Worker {
     config: DeviceConfig,
@@ -237,6 +240,7 @@ impl Worker {
         if self.connected {
             result = adapter.deactivate();
             if disable {
+                self.wait_for_standstill(adapter);
                 result = result.and(adapter.write_enable(false));
             }
         }
@@ -246,6 +250,22 @@ impl Worker {
         self.state.link = Link::Down;
         self.states.write(&self.state);
         result
+    }
+
+    /// Motors are not switched off, and brakes not closed, under an arm that still moves; but not for ever either.
+    fn wait_for_standstill(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let limit = self.config.clock.now().after(REST_LIMIT);
+        loop {
+            let before = (self.state.position, self.state.stamp);
+            std::thread::sleep(self.config.read_period());
+            self.read(adapter);
+            let past = self.state.stamp.seconds_since(before.1).max(1e-3);
+            let moved = self.state.position.iter().zip(before.0).take(self.config.dof);
+            let still = moved.map(|(now, then)| (now - then).abs() / past).all(|v| v <= STANDSTILL);
+            if !self.connected || (still && self.state.stamp > before.1) || self.config.clock.now() >= limit {
+                return;
+            }
+        }
     }
 
     fn pass_on_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
