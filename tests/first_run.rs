@@ -151,7 +151,7 @@ fn motors_and_gripper_are_switched_and_moved() {
     eventually("the gripper is there", || {
         (home.dimos("state --json").json()["arms"][0]["gripper"].as_f64().unwrap() - 0.02).abs() < 1e-3
     });
-    home.dimos("arm gripper arm -0.01").with(2).says(&["hint: "]);
+    home.dimos("arm gripper arm -0.01").with(2).says(&["cannot be negative"]);
     home.dimos("arm gripper arm 9").with(1);
     assert_eq!(home.status()["arms"][0]["phase"], "ready", "a wrong opening is refused and harms nothing");
     assert!(home.dimos("arm disable arm").with(0).out.contains("disabled"));
@@ -201,7 +201,7 @@ fn arguments_of_run_take_effect() {
     assert!((50..200).contains(&ticks), "{ticks} ticks in 0.5 s");
     // A log that exists is not written over, and nothing is connected for it.
     home.dimos(&format!("run {RUN} --record here.mcap")).with(1).says(&["here.mcap", "hint: "]);
-    let started = home.run(&format!("{RUN} --json --duration 100ms --no-record")).wait_json();
+    let started = home.start(&format!("run {RUN} --json --duration 100ms --no-record")).wait_json();
     assert_eq!(started.iter().map(|e| e["event"].clone()).collect::<Vec<_>>(), ["started", "ended"]);
 }
 
@@ -322,15 +322,16 @@ fn a_signal_during_the_start_ends_it() {
 #[test]
 fn a_run_survives_that_nobody_reads_what_it_says() {
     let home = Home::new();
+    let (heard, unheard) = std::io::pipe().unwrap();
     let mut command = home.command(&format!("run {RUN}"));
-    let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    drop((child.stdout.take(), child.stderr.take()));
+    let run = Started::unheard(command.stdout(unheard.try_clone().unwrap()).stderr(unheard));
+    drop((command, heard));
     eventually("the run is up", || home.dimos("state").code == Some(0));
     home.dimos(THERE).with(0);
     home.dimos("stop").with(0);
     home.dimos("move arm 0 0 0 0 0 0").with(1);
     home.dimos("down").with(0);
-    assert_eq!(child.wait().unwrap().code(), Some(0));
+    run.wait().with(0);
 }
 
 #[test]
@@ -342,14 +343,11 @@ fn a_terminal_that_stands_still_holds_up_nothing() {
     while std::io::Write::write(&mut writer, &[0; 512]).is_ok() {}
     rustix::io::ioctl_fionbio(&writer, false).unwrap();
     let mut command = home.command(&format!("run {RUN}"));
-    let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(writer).spawn().unwrap();
+    let run = Started::unheard(command.stdout(Stdio::null()).stderr(writer));
     eventually("the run is up", || home.dimos("state").code == Some(0));
     home.dimos("move arm 2 -0.3 0.6 0 0.8 0 --no-wait").with(0);
-    let pid = rustix::process::Pid::from_raw(child.id() as i32).unwrap();
-    rustix::process::kill_process(pid, Signal::TERM).unwrap();
-    eventually("the run is gone", || home.runs().runs().unwrap().is_empty());
-    eventually("the process ends", || child.try_wait().unwrap().is_some());
-    assert_eq!(child.wait().unwrap().code(), Some(143));
+    let ended = run.end(Signal::TERM).with(143);
+    assert!(ended.took < Duration::from_secs(5), "{:?}", ended.took);
     drop(reader);
 }
 

@@ -122,11 +122,18 @@ pub struct Started {
 }
 
 impl Started {
+    /// Starts a command and collects what it says.
     pub fn of(command: &mut Command) -> Self {
-        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        let (out, err) = (Text::default(), Text::default());
-        let readers = vec![collect(child.stdout.take().unwrap(), &out), collect(child.stderr.take().unwrap(), &err)];
-        Self { child: Some(child), out, err, readers }
+        let mut started = Self::unheard(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
+        let child = started.child.as_mut().unwrap();
+        let (out, err) = (child.stdout.take().unwrap(), child.stderr.take().unwrap());
+        started.readers = vec![collect(out, &started.out), collect(err, &started.err)];
+        started
+    }
+
+    /// Starts a command whose output goes where it says.
+    pub fn unheard(command: &mut Command) -> Self {
+        Self { child: Some(command.spawn().unwrap()), out: Text::default(), err: Text::default(), readers: Vec::new() }
     }
 
     pub fn pid(&self) -> u32 {
