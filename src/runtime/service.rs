@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::{Motions, Planned};
+use super::repeats::Repeats;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
 use crate::clock::{Mono, WallOffset};
@@ -41,6 +42,8 @@ const STOP_LIMIT: Duration = Duration::from_secs(3);
 const ORDER_LIMIT: Duration = Duration::from_secs(5);
 /// How long an enabled arm gets to be ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
+/// How long a device takes to refuse an opening of its gripper.
+const GRIPPER_REPLY: Duration = Duration::from_millis(20);
 /// Trajectories may exceed a velocity or acceleration by this factor: rounding in files.
 const SLACK: f64 = 1.001;
 /// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
@@ -71,6 +74,7 @@ pub struct Service {
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
+    pub(super) repeats: Repeats,
     closed: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
@@ -82,6 +86,7 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
+            repeats: Repeats::default(),
             closed: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
@@ -445,7 +450,16 @@ impl Service {
         if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
             return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
         }
+        let device = self.device(arm)?;
+        let refusals = device.health().write_errors.load(Ordering::Relaxed);
         self.ask(Request::Gripper { arm, opening: call.position }).await?;
+        // The tick hands the opening over without knowing what the gripper can do; the arm says so at once.
+        tokio::time::sleep(self.period() + GRIPPER_REPLY).await;
+        if device.health().write_errors.load(Ordering::Relaxed) > refusals {
+            let why = device.health().episodes().pop().map_or_else(String::new, |e| e.text);
+            let error = RpcError::new(Code::DeviceRefused, format!("{}: {why}", call.arm));
+            return Err(error.hint("`dimos state` shows the gripper's opening now, in metres"));
+        }
         Ok(Reply::Gripper(Done {}))
     }
 
