@@ -1,6 +1,7 @@
 //! What a run tells of itself: status, state, motions, streams.
 
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Instant;
 
 use super::dispatch::lock;
 use super::service::Service;
@@ -253,10 +254,12 @@ impl Service {
 
     /// Tells an event to the text log and to those who listen.
     pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
-        match described.severity {
-            Severity::Info => tracing::debug!("{}", described.text),
-            Severity::Warn => tracing::warn!("{}", described.text),
-            Severity::Error => tracing::error!("{}", described.text),
+        if let Some(line) = self.repeats.line(described, Instant::now()) {
+            match described.severity {
+                Severity::Info => tracing::debug!("{line}"),
+                Severity::Warn => tracing::warn!("{line}"),
+                Severity::Error => tracing::error!("{line}"),
+            }
         }
         self.parts.streams.publish_event(|| EventReport {
             tick,
