@@ -33,8 +33,7 @@ pub struct Grant {
 const FIFO_REMEDY: &str = "allow it: add `@realtime - rtprio 95` to /etc/security/limits.d/ and yourself to that group, or `setcap cap_sys_nice,cap_ipc_lock+ep` on the binary";
 const MEMLOCK_REMEDY: &str =
     "allow it: `@realtime - memlock unlimited` in /etc/security/limits.d/ (LimitMEMLOCK=infinity under systemd)";
-const LATENCY_REMEDY: &str =
-    "allow it: run as root or let your group write /dev/cpu_dma_latency by a udev rule; or give `realtime: false`";
+const LATENCY_REMEDY: &str = "allow it: let your group write /dev/cpu_dma_latency by a udev rule, or run as root";
 
 /// Holds idle states off for as long as it lives.
 #[derive(Debug)]

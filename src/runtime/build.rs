@@ -13,7 +13,7 @@ use super::service::{Service, ServiceParts};
 use super::watchdog::Watchdog;
 use super::{Ending, Options, Record, Run, StartError};
 use crate::arm::ArmState;
-use crate::blueprint::{Blueprint, TaskKind as Typed};
+use crate::blueprint::{Arm, Blueprint, TaskKind as Typed};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::control::config::{
     ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
@@ -185,7 +185,11 @@ impl Run {
             let _ = self.dispatcher.send(request, log);
         }
         let limit = std::time::Instant::now() + READY_LIMIT;
-        while !which().all(|arm| self.service.phase(arm) == Phase::Ready) {
+        let settled = |arm: usize, a: &Arm| match self.service.phase(arm) {
+            Phase::Ready => true,
+            phase => !a.auto_enable && phase != Phase::Unknown,
+        };
+        while !blueprint.arms.iter().enumerate().all(|(i, a)| settled(i, a)) {
             if std::time::Instant::now() >= limit {
                 break; // The banner and `status` say how far it came.
             }

@@ -11,9 +11,9 @@ mod build;
 mod device_lock;
 mod dispatch;
 mod motions;
+mod repeats;
 mod reports;
 mod service;
-mod throttle;
 mod watchdog;
 
 use std::path::PathBuf;
@@ -39,6 +39,8 @@ use watchdog::Watchdog;
 
 /// How long moving arms get to come to rest.
 const REST_LIMIT: Duration = Duration::from_secs(2);
+/// How long an arm stands still before it is taken to be at rest: an instant is also where it turns round.
+const STILL_FOR: Duration = Duration::from_millis(50);
 /// How long the tick gets to end.
 const TICK_END_LIMIT: Duration = Duration::from_millis(300);
 
@@ -186,11 +188,14 @@ impl Run {
         self.watchdog.stand_down();
         self.end_tick(&mut ended);
         ended.troubles.extend(self.arms.release());
-        drop(self.server.take());
-        drop(self.courier);
-        if let Err(e) = self.recorder.finish() {
+        let Self { arms, server, courier, recorder, .. } = self;
+        drop(courier);
+        if let Err(e) = recorder.finish() {
             ended.troubles.push(e.to_string());
         }
+        // Last of all: who sees that the run is gone finds its log closed and its devices free.
+        drop(arms);
+        drop(server);
         ended
     }
 
@@ -204,6 +209,7 @@ impl Run {
         let told = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
         let Ok(answer) = told else { return ended.troubles.push("the coordinator takes no requests".to_owned()) };
         let mut answer = Some(answer);
+        let mut still_since = Instant::now();
         while self.tick_lives() && Instant::now() < limit {
             std::thread::sleep(Duration::from_millis(2));
             if let Some(waiting) = &mut answer {
@@ -212,7 +218,10 @@ impl Run {
                 }
                 answer = None;
             }
-            if self.pulse.at_rest.load(Ordering::Acquire) {
+            // That nothing is commanded to move is half of it: an arm that lags, or that was let go of, still moves.
+            if !self.pulse.at_rest.load(Ordering::Acquire) || !self.service.at_standstill() {
+                still_since = Instant::now();
+            } else if still_since.elapsed() >= STILL_FOR.max(2 * self.service.period()) {
                 return;
             }
         }

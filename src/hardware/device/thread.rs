@@ -23,6 +23,10 @@ const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::fr
 const PLAUSIBLE_AFTER: u32 = 3;
 /// How long `activate` waits for plausible states, and for the motors.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
+/// How long a stopped arm gets to stand still before its motors are disabled, and what counts as standing [rad/s, s].
+const REST_LIMIT: Duration = Duration::from_secs(1);
+const STANDSTILL: f64 = 0.02;
+const STILL_FOR: f64 = 0.03;
 
 pub(super) struct Worker {
     config: DeviceConfig,
@@ -244,6 +248,7 @@ impl Worker {
         if self.connected {
             result = adapter.deactivate();
             if disable {
+                self.wait_for_standstill(adapter);
                 result = result.and(adapter.write_enable(false));
             }
         }
@@ -253,6 +258,25 @@ impl Worker {
         self.state.link = Link::Down;
         self.states.write(&self.state);
         result
+    }
+
+    /// Motors are not switched off, and brakes not closed, under an arm that still moves; but not for ever either.
+    fn wait_for_standstill(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let limit = self.config.clock.now().after(REST_LIMIT);
+        let mut still_for = 0.0;
+        loop {
+            let before = (self.state.position, self.state.stamp);
+            std::thread::sleep(self.config.read_period());
+            self.read(adapter);
+            let past = self.state.stamp.seconds_since(before.1).max(1e-3);
+            let moved = self.state.position.iter().zip(before.0).take(self.config.dof);
+            let still = moved.map(|(now, then)| (now - then).abs() / past).all(|v| v <= STANDSTILL);
+            // One instant is not enough: it is also where a joint turns round.
+            still_for = if still { still_for + self.state.stamp.seconds_since(before.1) } else { 0.0 };
+            if !self.connected || still_for >= STILL_FOR || self.config.clock.now() >= limit {
+                return;
+            }
+        }
     }
 
     /// Takes the newest command. Answers the one before it.
@@ -292,10 +316,12 @@ impl Worker {
         before: &ArmCommand,
         command: &ArmCommand,
     ) -> AdapterResult<()> {
-        if command.gripper_seq != before.gripper_seq {
-            adapter.write_gripper_position(command.gripper)?;
-        }
-        let Some(mode) = command.mode else { return Ok(()) };
+        // A refused gripper costs the joints nothing.
+        let gripper = match command.gripper_seq == before.gripper_seq {
+            true => Ok(()),
+            false => adapter.write_gripper_position(command.gripper),
+        };
+        let Some(mode) = command.mode else { return gripper };
         if adapter.get_control_mode() != mode {
             adapter.set_control_mode(mode)?;
         }
@@ -306,7 +332,7 @@ impl Worker {
         }
         self.state.written = command.seq;
         self.health.writes.fetch_add(1, Relaxed);
-        Ok(())
+        gripper
     }
 
     /// Asks the arm to stop by its own means, again and again until it has taken it.

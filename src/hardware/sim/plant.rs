@@ -48,6 +48,8 @@ struct Joint {
     velocity: f64,
     /// Target position [rad] or velocity [rad/s].
     target: f64,
+    /// How fast the set points move, by the last two of them [rad/s].
+    pace: f64,
     lower: f64,
     upper: f64,
     velocity_max: f64,
@@ -164,13 +166,18 @@ impl Plant {
 
     /// Follows a set point [rad].
     pub fn servo(&mut self, target: &[f64]) {
+        let following = self.drive == Drive::Servo;
+        let before = self.joints.map(|joint| joint.target);
         if !self.drive_to(Drive::Servo, target) {
             return;
         }
         self.interval = (self.since_set_point - self.ahead).clamp(1e-3, CREDIT);
         self.since_set_point = self.ahead;
+        let (interval, ahead) = (self.interval, self.ahead);
+        for (joint, before) in self.active_mut().iter_mut().zip(before) {
+            joint.pace = if following { (joint.target - before) / interval } else { 0.0 };
+        }
         if self.tracking == Tracking::Ideal {
-            let (interval, ahead) = (self.interval, self.ahead);
             for joint in self.active_mut().iter_mut().filter(|joint| !joint.blocked) {
                 let reach = joint.velocity_max * (joint.credit - ahead).max(0.0);
                 let step = (joint.target - joint.position).clamp(-reach, reach);
@@ -265,8 +272,11 @@ impl Plant {
             match (drive, tracking) {
                 (Drive::Disabled, _) => joint.fall(fall, h),
                 (Drive::Stop, _) => joint.accelerate(0.0, h),
-                (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, h),
-                (Drive::Servo, Tracking::Lag(lag)) => joint.approach(joint.velocity_max, lag, h),
+                (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, 0.0, h),
+                (Drive::Servo, Tracking::Lag(lag)) => {
+                    let pace = if pause { 0.0 } else { joint.pace };
+                    joint.approach(joint.velocity_max, lag, pace, h);
+                }
                 (Drive::Servo, Tracking::Ideal) => joint.follow(pause, h),
                 (Drive::Velocity, Tracking::Lag(_)) => {
                     let room = if joint.target > 0.0 { joint.upper } else { joint.lower } - joint.position;
@@ -313,15 +323,17 @@ impl Joint {
         self.travel(h);
     }
 
-    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time.
-    fn approach(&mut self, top: f64, lag: f64, h: f64) {
+    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time: not before a
+    /// target that moves on at `pace` [rad/s], only relative to it.
+    fn approach(&mut self, top: f64, lag: f64, pace: f64, h: f64) {
         let error = self.target - self.position;
-        if error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(self.acceleration * h) {
+        let arrived = error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(self.acceleration * h);
+        if arrived && pace == 0.0 {
             (self.position, self.velocity) = (self.target, 0.0);
             return;
         }
         let wanted = error.abs() / lag.max(h);
-        let brake = braking_speed(error.abs(), self.acceleration, h);
+        let brake = braking_speed(error.abs(), self.acceleration, h) + (pace * error.signum()).max(0.0);
         self.accelerate(wanted.min(brake).min(top).copysign(error), h);
     }
 
