@@ -32,7 +32,7 @@ impl VelocityEstimator {
         }
         if state.seq != self.seq {
             let gap = state.stamp.seconds_since(self.stamp);
-            if self.seq == 0 || gap > LONGEST_GAP || gap < 0.0 {
+            if self.seq == 0 || !(0.0..=LONGEST_GAP).contains(&gap) {
                 self.velocity = [0.0; MAX_DOF];
             } else if gap > 0.0 {
                 let weight = gap / (TIME_CONSTANT + gap);

@@ -51,8 +51,7 @@ pub fn point_to_point(
         // A joint that starts outside may stay or come in.
         let (lower, upper) = (bounds.lower.min(start[j]), bounds.upper.max(start[j]));
         let excess = (lower - target[j]).max(target[j] - upper);
-        // Not `>`: what is not a number is outside.
-        if !(excess <= 1e-9) {
+        if excess > 1e-9 || excess.is_nan() {
             return Err(NoMotion::OutOfLimits { joint: joint.clone(), target: target[j], lower, upper, excess });
         }
     }

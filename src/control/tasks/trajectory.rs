@@ -67,8 +67,8 @@ impl TrajectoryTask {
     fn away_from_start(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
         motion.joints.iter().enumerate().find_map(|(k, &joint)| {
             let error = cx.joint(joint).position - motion.spline.start(k);
-            // Not `>`: a distance that is not a number must not pass either.
-            (!(error.abs() <= self.params.start_position_tolerance)).then_some((joint, error))
+            let away = error.abs() > self.params.start_position_tolerance || error.is_nan();
+            away.then_some((joint, error))
         })
     }
 
