@@ -590,13 +590,13 @@ fn scenario(seed: u64, ticks: u64) -> Vec<u64> {
     for k in 0..ticks {
         let v = random.within(-0.3, 0.3);
         match random.below(60) {
-            0..=9 => drop(rig.servo(0, &vec![0.5 * v; 7])),
-            10..=15 => drop(rig.servo(1, &vec![-0.5 * v; 3])),
-            16..=25 => drop(rig.velocity(2, &vec![v; 6])),
-            26 => drop(rig.send(Request::Execute { task: 3, motion: sweep(k, 0..13, rig.arms[0].q[0], v, 1.0) })),
-            27 => drop(rig.send(Request::Execute { task: 4, motion: sweep(k, 7..13, rig.arms[1].q[0], v, 0.9) })),
-            28 => drop(rig.send(Request::Cancel { task: None })),
-            29 => drop(rig.send(Request::Stop { arm: Some(random.below(2) as u16) })),
+            0..=9 => _ = rig.servo(0, &[0.5 * v; 7]),
+            10..=15 => _ = rig.servo(1, &[-0.5 * v; 3]),
+            16..=25 => _ = rig.velocity(2, &[v; 6]),
+            26 => _ = rig.send(Request::Execute { task: 3, motion: sweep(k, 0..13, rig.arms[0].q[0], v, 1.0) }),
+            27 => _ = rig.send(Request::Execute { task: 4, motion: sweep(k, 7..13, rig.arms[1].q[0], v, 0.9) }),
+            28 => _ = rig.send(Request::Cancel { task: None }),
+            29 => _ = rig.send(Request::Stop { arm: Some(random.below(2) as u16) }),
             30..=33 => {
                 for arm in 0..2 {
                     rig.send(Request::Reset { arm });
@@ -624,7 +624,7 @@ fn scenario(seed: u64, ticks: u64) -> Vec<u64> {
 #[test]
 fn f14_the_same_inputs_give_the_same_commands_over_a_thousand_seeds() {
     for seed in 0..1000 {
-        assert!(scenario(seed, 60) == scenario(seed, 60), "seed {seed}");
+        assert!(scenario(seed, 40) == scenario(seed, 40), "seed {seed}");
     }
 }
 
@@ -633,7 +633,7 @@ fn a_long_random_scenario_is_repeated_bit_for_bit() {
     let seed = std::env::var("DIMOS_TEST_SEED").ok().and_then(|s| s.parse().ok());
     let seed = seed.unwrap_or_else(|| u64::from(std::process::id()));
     println!("DIMOS_TEST_SEED={seed}");
-    assert!(scenario(seed, 20_000) == scenario(seed, 20_000), "DIMOS_TEST_SEED={seed}");
+    assert!(scenario(seed, 10_000) == scenario(seed, 10_000), "DIMOS_TEST_SEED={seed}");
 }
 
 #[test]
