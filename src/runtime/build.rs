@@ -357,8 +357,11 @@ fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: devic
         device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),
         device::Note::Over(text) => (Severity::Info, format!("{id}: over: {text}")),
     };
-    // Whoever read that it began should read that it is over.
-    tracing::warn!("{text}");
+    // One line per episode, without DIMOS_LOG=info.
+    match severity {
+        Severity::Info => tracing::info!("{text}"),
+        _ => tracing::warn!("{text}"),
+    }
     let stamp = MonotonicClock.now();
     // Only a run that is ending has no recorder any more.
     let _ = notes.send(Note::ArmText { arm: arm as u16, text: text.clone() });
