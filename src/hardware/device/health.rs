@@ -50,7 +50,8 @@ pub struct Health {
     pub stop_confirmed: AtomicU32,
     /// `ArmCommand::stop_seq` of the last stop that was sent.
     pub stop_sent: AtomicU32,
-    rate_mhz: AtomicU64,
+    /// Mean time between states [ns]; a mean of rates would count short pauses for too much.
+    interval_ns: AtomicU64,
     text: Mutex<Text>,
 }
 
@@ -65,16 +66,19 @@ struct Text {
 impl Health {
     /// How often states come [Hz].
     pub fn rate(&self) -> f64 {
-        self.rate_mhz.load(Ordering::Relaxed) as f64 * 1e-3
+        match self.interval_ns.load(Ordering::Relaxed) {
+            0 => 0.0,
+            ns => 1e9 / ns as f64,
+        }
     }
 
     /// A state came, so long after the one before [s].
     pub(super) fn state_came(&self, interval: f64) {
         self.reads.fetch_add(1, Ordering::Relaxed);
         if interval > 0.0 {
-            let old = self.rate();
-            let new = if old > 0.0 { old + 0.05 * (1.0 / interval - old) } else { 1.0 / interval };
-            self.rate_mhz.store((new * 1e3) as u64, Ordering::Relaxed);
+            let (old, new) = (self.interval_ns.load(Ordering::Relaxed) as f64, interval * 1e9);
+            let mean = if old > 0.0 { old + 0.05 * (new - old) } else { new };
+            self.interval_ns.store(mean.max(1.0) as u64, Ordering::Relaxed);
         }
     }
 
