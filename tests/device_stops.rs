@@ -31,6 +31,7 @@ fn bench(native_rate: f64) -> Bench {
     let (state_writer, states) = slot(ArmState::default());
     let (commands, command_reader) = slot(ArmCommand::default());
     let config = DeviceConfig {
+        realtime: true,
         hardware_id: "arm".into(),
         dof: 6,
         tick_period: Duration::from_millis(10),

@@ -156,8 +156,8 @@ fn f01_an_arm_that_blocks_for_5_s_hurts_only_itself() {
     home.dimos("arm enable b").with(0);
     home.dimos("move b 0 -0.3 0.6 0 0.8 0 --speed 1").with(0);
     let ended = run.end(Signal::INT).with(130);
-    let told = ended.err.lines().filter(|l| l.contains("b: ")).count();
-    assert!(told <= 4, "one line per kind of trouble:\n{}", ended.err);
+    let told = ended.err.lines().filter(|l| l.contains("WARN b: ")).count();
+    assert!(told <= 2, "reads fail, and writes fail:\n{}", ended.err);
 
     let (log, _) = played(&home, "log.mcap", "/dimos/tick,/arm_status/b");
     let deadline = |m: &Value| Mono(m["data"]["deadline_ns"].as_u64().unwrap());
@@ -221,13 +221,13 @@ fn f08_the_wire_never_asks_for_more_than_the_limits() {
     arm.record();
     home.dimos("move arm 2 0.4 -0.6 2 -0.8 4 --speed 1").with(0);
     home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --speed 1").with(0);
-    // A stream that jumps as far as it may, with joints at odds; sent unevenly.
+    // A stream that jumps about, with joints at odds, sent unevenly: even three targets in one tick are below a jump.
     let (mut random, mut client) = (Random::new(), home.client());
     let mut target = vec![0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
     for _ in 0..150 {
-        target.iter_mut().for_each(|t| *t = (*t + 0.38 * (random.next() - 0.5)).clamp(-1.0, 1.0));
+        target.iter_mut().for_each(|t| *t = (*t + 0.12 * (random.next() - 0.5)).clamp(-1.0, 1.0));
         client.call(Servo { task: "servo".into(), positions: target.clone() }).unwrap();
-        std::thread::sleep(Duration::from_secs_f64(0.02 * random.next()));
+        std::thread::sleep(Duration::from_secs_f64(0.004 + 0.016 * random.next()));
     }
     // One that jumps further is refused and held.
     target[0] += 0.5;

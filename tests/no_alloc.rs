@@ -349,6 +349,7 @@ fn a_device_thread_in_health_takes_and_gives_back_no_memory() {
     let (state_writer, mut states) = slot(ArmState::default());
     let (mut commands, command_reader) = slot(ArmCommand::default());
     let device = DeviceConfig {
+        realtime: true,
         hardware_id: "arm".into(),
         dof: 6,
         tick_period: Duration::from_millis(2),

@@ -14,6 +14,8 @@ pub const WATCHDOG_PRIORITY: i32 = 82;
 pub const DEVICE_PRIORITY: i32 = 81;
 /// FIFO priority of the tick.
 pub const TICK_PRIORITY: i32 = 80;
+/// FIFO priority of emulators: they stand for controllers, which do not wait for this host's other work.
+pub const EMULATOR_PRIORITY: i32 = 79;
 /// Stack of a timed thread [bytes].
 pub const STACK: usize = 256 * 1024;
 
@@ -88,6 +90,11 @@ pub fn set_fifo(priority: i32) -> io::Result<()> {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     }
+}
+
+/// Whether the process may schedule in real time.
+pub fn may_use_fifo() -> bool {
+    probe_fifo().granted
 }
 
 fn set_other() {

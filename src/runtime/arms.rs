@@ -61,6 +61,7 @@ pub fn bring_up(
 ) -> Result<BroughtUp, StartError> {
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
     let mut arms = Arms { devices: Vec::new(), disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
+    let realtime = crate::rt::host::may_use_fifo();
     let mut slots = Slots::default();
     let mut state_timeouts = Vec::new();
     for (index, arm) in blueprint.arms.iter().enumerate() {
@@ -75,6 +76,7 @@ pub fn bring_up(
             tick_period: period,
             native_rate: arm.adapter.native_rate,
             velocity_max: (arm.adapter.limits)(arm.joints.len()).velocity_max.iter().copied().fold(0.1, f64::max),
+            realtime,
             beat: beat.clone(),
             clock: Arc::new(MonotonicClock),
             notes: Box::new(move |what| note(index, what)),

@@ -365,6 +365,7 @@ fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: devic
         device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),
         device::Note::Over(text) => (Severity::Info, format!("{id}: over: {text}")),
     };
+    // One line per episode, without DIMOS_LOG=info.
     match severity {
         Severity::Info => tracing::info!("{text}"),
         _ => tracing::warn!("{text}"),

@@ -2,8 +2,8 @@
 //! with the process.
 
 use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
-use std::io::{Read, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::io::Write;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
 /// A device that is ours for as long as this lives.
@@ -52,13 +52,21 @@ pub fn take(folder: &Path, adapter: &str, address: &str) -> Result<DeviceLock, D
             Ok(DeviceLock(file))
         }
         Err(TryLockError::WouldBlock) => {
-            let mut pid = String::new();
-            let _ = file.read_to_string(&mut pid);
-            let pid = if pid.trim().is_empty() { "unknown".to_owned() } else { pid.trim().to_owned() };
+            let pid = holder(&file).map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
             Err(DeviceTaken::By { adapter: adapter.into(), address: address.into(), pid })
         }
         Err(TryLockError::Error(error)) => Err(io(error)),
     }
+}
+
+/// Who holds a lock, by the kernel's own list: what stands in the file may not be written yet, or be of the last one.
+fn holder(file: &File) -> Option<u32> {
+    let inode = file.metadata().ok()?.ino().to_string();
+    let locks = std::fs::read_to_string("/proc/locks").ok()?;
+    // 1: FLOCK  ADVISORY  WRITE 4242 00:2e:1234 0 EOF
+    let of_file = |line: &&str| line.split_whitespace().nth(5).and_then(|f| f.rsplit(':').next()) == Some(&inode);
+    let line = locks.lines().filter(|line| line.contains(" FLOCK ")).find(of_file)?;
+    line.split_whitespace().nth(4)?.parse().ok()
 }
 
 /// The same device under another spelling: case, a name for the loopback, a leading zero in the port.

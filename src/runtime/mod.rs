@@ -201,7 +201,11 @@ impl Run {
 
     fn tick_lives(&self) -> bool {
         self.tick.as_ref().is_some_and(|t| !t.is_finished())
-            && self.pulse.beat.silence(self.arms.now()).is_none_or(|s| s < Duration::from_millis(300))
+            && self
+                .pulse
+                .beat
+                .silence(self.arms.now())
+                .is_none_or(|s| s < watchdog::silence_limit(self.service.period()))
     }
 
     fn come_to_rest(&self, ended: &mut Ended) {
@@ -232,8 +236,10 @@ impl Run {
 
     fn end_tick(&mut self, ended: &mut Ended) {
         self.pulse.stop.store(true, Ordering::Release);
+        let hangs = !self.tick_lives();
         let Some(tick) = self.tick.take() else { return };
-        let limit = Instant::now() + TICK_END_LIMIT.max(2 * self.service.period());
+        let patience = if hangs { Duration::ZERO } else { TICK_END_LIMIT.max(2 * self.service.period()) };
+        let limit = Instant::now() + patience;
         while !tick.is_finished() && Instant::now() < limit {
             std::thread::sleep(Duration::from_millis(1));
         }

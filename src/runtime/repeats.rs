@@ -12,7 +12,10 @@ const EVERY: Duration = Duration::from_secs(1);
 
 /// When lines of each kind were told last, and how many were not since.
 #[derive(Debug, Default)]
-pub struct Repeats(Mutex<HashMap<(&'static str, &'static str), (Instant, u64)>>);
+pub struct Repeats(Mutex<HashMap<Kind, (Instant, u64)>>);
+
+/// Kind and status of what is told.
+type Kind = (&'static str, &'static str);
 
 impl Repeats {
     /// The line to tell now, if any. What arms and tasks do is told always: it happens once an episode.

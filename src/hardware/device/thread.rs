@@ -107,9 +107,7 @@ impl Worker {
         let due = if self.connected { self.next_read } else { self.reconnect.0 };
         let now = self.config.clock.now();
         let idle = if self.wanted { due.since(now) } else { Duration::from_secs(1) };
-        // Whoever watches must look more often than a slow arm is read.
-        let look = if self.moving() { self.config.beat_timeout() / 5 } else { Duration::from_secs(1) };
-        self.wake.wait(idle.min(look));
+        self.wake.wait(idle.min(Duration::from_secs(1)).min(self.until_silent(now)));
         loop {
             match orders.try_recv() {
                 Ok(order) => {
@@ -359,10 +357,15 @@ impl Worker {
         self.after_error(adapter, error);
     }
 
+    /// How long the tick may still be silent, where its silence would matter.
+    fn until_silent(&self, now: Mono) -> Duration {
+        let silence = self.config.beat.silence(now).filter(|_| self.moving());
+        silence.map_or(Duration::MAX, |silence| self.config.beat_timeout().saturating_sub(silence))
+    }
+
     /// The checker is not the checked: when the tick falls silent, this thread holds the arm.
     fn watch_the_tick(&mut self) {
-        let silence = self.config.beat.silence(self.config.clock.now());
-        if self.moving() && silence.is_some_and(|s| s > self.config.beat_timeout()) {
+        if self.until_silent(self.config.clock.now()).is_zero() {
             self.state.self_held = true;
             self.stop_owed = true;
             self.trouble("the tick fell silent: held by the device thread");
