@@ -19,6 +19,7 @@ use dimos::rt::wake::Wake;
 use dimos::telemetry::{ArmSample, Cause, Phase, Sample, TaskView};
 
 use crate::bed::{self, Bed, DOF, Load, SETTLED};
+use crate::support::measure::quantile;
 
 const PERIOD: Duration = Duration::from_millis(10);
 
@@ -101,6 +102,21 @@ pub fn whole(arms: usize, load: Load, pace: Pace, plant: Plant, ticks: usize) ->
         let clock: &dyn Clock = if pace == Pace::Free { &clock } else { &MonotonicClock };
         tick_loop::run(coordinator, ports, PERIOD, clock, Some(Box::new(probe)));
         result.recv().expect("the probe sends before it stops the loop")
+    })
+}
+
+/// Median processor time that a real-time thread needs to sleep and wake up at 100 Hz [µs]: what the machine takes
+/// for itself.
+pub fn sleeper(ticks: usize) -> f64 {
+    on_a_thread(move || {
+        host::enter_realtime(host::TICK_PRIORITY);
+        let start = MonotonicClock.now();
+        let times = (1..=ticks as u32).map(|tick| {
+            let before = host::thread_cpu_time();
+            host::sleep_until(start.after(PERIOD * tick));
+            (host::thread_cpu_time() - before).as_nanos() as f64 * 1e-3
+        });
+        quantile(&times.collect::<Vec<_>>(), 0.5)
     })
 }
 

@@ -6,7 +6,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::time::Duration;
 
-use crate::clock::Mono;
+use crate::clock::{Clock, Mono, MonotonicClock};
 
 /// FIFO priority of the watchdog: above everything it watches.
 pub const WATCHDOG_PRIORITY: i32 = 82;
@@ -159,6 +159,10 @@ fn hold_cpu_latency() -> io::Result<LatencyHold> {
 
 /// Sleeps until a point of the monotonic clock; returns at once when it is past.
 pub fn sleep_until(deadline: Mono) {
+    // To the kernel a timer that is due already is a timer like any other, and costs as much.
+    if MonotonicClock.now() >= deadline {
+        return;
+    }
     let at = rustix::time::Timespec {
         tv_sec: (deadline.0 / 1_000_000_000) as i64,
         tv_nsec: (deadline.0 % 1_000_000_000) as i64,

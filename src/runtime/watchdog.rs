@@ -12,8 +12,8 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::rt::beat::Beat;
 use crate::rt::host;
 
-/// How often it looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// How often it looks: each look costs a wake-up of the processor.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// A tick silent for this long is taken to hang: long enough for a machine that stalls, short enough to end a run
 /// within a second.
@@ -36,7 +36,7 @@ impl Watchdog {
             host::enter_realtime(host::WATCHDOG_PRIORITY);
             let limit = silence_limit(period);
             while !stopping.load(Ordering::Acquire) {
-                std::thread::sleep(LOOK_EVERY);
+                std::thread::park_timeout(LOOK_EVERY);
                 let silence = beat.silence(MonotonicClock.now()).unwrap_or_default();
                 if silence > limit && !stopping.load(Ordering::Acquire) {
                     let what = format!("the tick has been silent for {} ms", silence.as_millis());
@@ -58,6 +58,7 @@ impl Drop for Watchdog {
     fn drop(&mut self) {
         self.stand_down();
         if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
             let _ = thread.join();
         }
     }
