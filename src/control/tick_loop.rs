@@ -151,12 +151,10 @@ pub fn run(
         }
         let timing = TickSample { tick, deadline, late_ns, compute_ns, skipped, dropped };
         let wanted = output.arms.len() + output.events.len() + 1;
-        if ports.samples.slots() >= wanted {
+        if let Ok(chunk) = ports.samples.write_chunk_uninit(wanted) {
             let arms = output.arms.iter().map(|a| Sample::Arm(*a));
             let events = output.events.iter().map(|e| Sample::Event(tick, *e));
-            for sample in arms.chain(events).chain([Sample::Tick(timing)]) {
-                let _ = ports.samples.push(sample);
-            }
+            chunk.fill_from_iter(arms.chain(events).chain([Sample::Tick(timing)]));
             dropped = 0;
         } else {
             // A tick is logged whole or not at all, and what is missing is counted.
