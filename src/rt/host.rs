@@ -99,7 +99,7 @@ fn set_other() {
 }
 
 /// Makes the calling thread fit for timed work: FIFO when permitted, otherwise the shortest timer slack; its stack
-/// is touched so that no page fault comes later. Returns whether it runs under FIFO.
+/// is touched, and locked as far as the limit allows, so that no page fault comes later. Returns whether it runs under FIFO.
 pub fn enter_realtime(priority: i32) -> bool {
     let fifo = set_fifo(priority).is_ok();
     // SAFETY: PR_SET_TIMERSLACK takes one integer and concerns the calling thread only.
@@ -114,6 +114,7 @@ fn touch_stack() {
     for byte in pages.iter_mut().step_by(4096) {
         *byte = 1;
     }
+    lock_pages(&pages);
     std::hint::black_box(&mut pages);
 }
 
@@ -122,7 +123,7 @@ fn touch_stack() {
 fn lock_memory() -> Grant {
     let what = "memory locked";
     if !may_lock_all() {
-        let detail = "only slots, rings and stacks, as far as the limit allows".to_owned();
+        let detail = "only rings and stacks, as far as the limit allows".to_owned();
         return Grant { what, granted: false, detail, remedy: MEMLOCK_REMEDY };
     }
     // SAFETY: takes flags only; concerns the whole process and moves nothing.
