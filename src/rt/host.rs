@@ -6,7 +6,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::time::Duration;
 
-use crate::clock::Mono;
+use crate::clock::{Clock, Mono, MonotonicClock};
 
 /// FIFO priority of the watchdog: above everything it watches.
 pub const WATCHDOG_PRIORITY: i32 = 82;
@@ -105,7 +105,7 @@ fn set_other() {
 }
 
 /// Makes the calling thread fit for timed work: FIFO when permitted, otherwise the shortest timer slack; its stack
-/// is touched so that no page fault comes later. Returns whether it runs under FIFO.
+/// is touched, and locked as far as the limit allows, so that no page fault comes later. Returns whether it runs under FIFO.
 pub fn enter_realtime(priority: i32) -> bool {
     let fifo = set_fifo(priority).is_ok();
     // SAFETY: PR_SET_TIMERSLACK takes one integer and concerns the calling thread only.
@@ -120,6 +120,7 @@ fn touch_stack() {
     for byte in pages.iter_mut().step_by(4096) {
         *byte = 1;
     }
+    lock_pages(&pages);
     std::hint::black_box(&mut pages);
 }
 
@@ -128,7 +129,7 @@ fn touch_stack() {
 fn lock_memory() -> Grant {
     let what = "memory locked";
     if !may_lock_all() {
-        let detail = "only slots, rings and stacks, as far as the limit allows".to_owned();
+        let detail = "only rings and stacks, as far as the limit allows".to_owned();
         return Grant { what, granted: false, detail, remedy: MEMLOCK_REMEDY };
     }
     // SAFETY: takes flags only; concerns the whole process and moves nothing.
@@ -165,6 +166,10 @@ fn hold_cpu_latency() -> io::Result<LatencyHold> {
 
 /// Sleeps until a point of the monotonic clock; returns at once when it is past.
 pub fn sleep_until(deadline: Mono) {
+    // To the kernel a timer that is due already is a timer like any other, and costs as much.
+    if MonotonicClock.now() >= deadline {
+        return;
+    }
     let at = rustix::time::Timespec {
         tv_sec: (deadline.0 / 1_000_000_000) as i64,
         tv_nsec: (deadline.0 % 1_000_000_000) as i64,

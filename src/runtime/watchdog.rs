@@ -12,8 +12,8 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::rt::beat::Beat;
 use crate::rt::host;
 
-/// How often it looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// How often it looks: each look costs a wake-up of the processor.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// A tick silent for this long is taken to hang: long enough for a machine that stalls, short enough to end a run
 /// within a second.
@@ -37,7 +37,7 @@ impl Watchdog {
             let limit = silence_limit(period);
             let (mut last, mut silent_for, mut looked) = (None, Duration::ZERO, MonotonicClock.now());
             while !stopping.load(Ordering::Acquire) {
-                std::thread::sleep(LOOK_EVERY);
+                std::thread::park_timeout(LOOK_EVERY);
                 let now = MonotonicClock.now();
                 let beat = beat.last();
                 // A process that was stopped and goes on finds its tick silent, but the tick has had no chance to beat:
@@ -65,6 +65,7 @@ impl Drop for Watchdog {
     fn drop(&mut self) {
         self.stand_down();
         if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
             let _ = thread.join();
         }
     }
