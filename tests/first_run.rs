@@ -159,7 +159,7 @@ fn motors_and_gripper_are_switched_and_moved() {
     home.dimos(THERE).with(1).says(&["ARM_NOT_READY"]);
     assert!(home.dimos("arm enable arm").with(0).out.contains("ready"));
     home.dimos(THERE).with(0);
-    home.dimos("arm enable amr").with(2).says(&["amr", "hint: known: arm"]);
+    home.dimos("arm enable amr").with(2).says(&["amr", "hint: did you mean `arm`?"]);
 }
 
 #[test]

@@ -27,7 +27,8 @@ fn main() {
     let before = machine::CpuTimes::now();
     // As in a run: memory locked, idle states held off, where that is granted.
     let (_grants, _hold) = dimos::rt::host::prepare_process(true);
-    let sections: [(&str, fn(Effort)); 5] =
+    type Section = (&'static str, fn(Effort));
+    let sections: [Section; 5] =
         [("ticks", ticks), ("arms", arms), ("tasks", task_types), ("start", start), ("runs", runs)];
     let named: Vec<String> = std::env::args().collect();
     let all = sections.iter().all(|(name, _)| !named.iter().any(|n| n == name));
