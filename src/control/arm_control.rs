@@ -232,6 +232,7 @@ impl ArmControl {
 
     fn stop(&mut self) {
         self.stop_owed = false;
+        self.settling = 0.0;
         self.command.stop_seq = self.command.stop_seq.wrapping_add(1);
     }
 
