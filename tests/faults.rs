@@ -1,4 +1,4 @@
-//! The faults of `docs/faults.md` that need a process, a wire or a real clock. The number in a test's name is the
+//! The faults of the fault table that need a process, a wire or a real clock. The number in a test's name is the
 //! fault's. Each prints what it measured. Those of pure logic are in `faults_virtual.rs`.
 
 #[allow(dead_code, reason = "shared with other tests")]
@@ -481,6 +481,8 @@ fn f29_a_device_has_one_program() {
         let second = home.dimos(&format!("run {RUN} --name second --set hardware.arm.address={address}"));
         second.with(3).says(&["in use by process", &first.pid().to_string(), "hint: "]);
     }
+    // Nor does it help to be somebody else: a user with other folders.
+    Home::new().dimos(&format!("run {}", at(&arm))).with(3).says(&["in use by process", &first.pid().to_string()]);
     assert_eq!((seen(Request::Hello), arm.refused_clients()), (0, 0), "no byte was sent");
     first.end(Signal::INT).with(130);
 

@@ -56,7 +56,7 @@ impl Run {
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
         let BroughtUp { mut arms, slots, connected, state_timeouts } =
-            arms::bring_up(blueprint, &options, &pulse.beat, device_notes)?;
+            arms::bring_up(blueprint, &pulse.beat, device_notes)?;
         let config = coordinator_config(blueprint, &connected, &state_timeouts);
 
         let samples = ring_size(&config);
