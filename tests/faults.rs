@@ -166,7 +166,9 @@ fn f01_an_arm_that_blocks_for_5_s_hurts_only_itself() {
     let tick = ticks.iter().find(|t| t["data"]["tick"] == held["data"]["tick"]).unwrap();
     let noticed = ms(stalled, deadline(tick));
     println!("F01 noticed after {noticed:.1} ms");
-    assert!(noticed <= 100.0, "30 ms and a tick, and the time of a busy machine: {noticed} ms");
+    let realtime = status["realtime"][0]["granted"] == true;
+    let limit = if realtime { 30.0 } else { 100.0 } + 2e3 * PERIOD;
+    assert!(noticed <= limit + 50.0, "{limit} ms, and the time of a busy machine: {noticed} ms");
     let in_time = |at: Mono| at > stalled.after(Duration::from_millis(50)) && at < over;
     let expected = ticks.iter().filter(|t| in_time(deadline(t))).count();
     for i in [0, 2] {
