@@ -1,4 +1,4 @@
-//! The faults of `docs/faults.md` that need a process, a wire or a real clock. The number in a test's name is the
+//! The faults of the fault table that need a process, a wire or a real clock. The number in a test's name is the
 //! fault's. Each prints what it measured. Those of pure logic are in `faults_virtual.rs`.
 
 #[allow(dead_code, reason = "shared with other tests")]
@@ -166,7 +166,9 @@ fn f01_an_arm_that_blocks_for_5_s_hurts_only_itself() {
     let tick = ticks.iter().find(|t| t["data"]["tick"] == held["data"]["tick"]).unwrap();
     let noticed = ms(stalled, deadline(tick));
     println!("F01 noticed after {noticed:.1} ms");
-    assert!(noticed <= 100.0, "30 ms and a tick, and the time of a busy machine: {noticed} ms");
+    let realtime = status["realtime"][0]["granted"] == true;
+    let limit = if realtime { 30.0 } else { 100.0 } + 2e3 * PERIOD;
+    assert!(noticed <= limit + 50.0, "{limit} ms, and the time of a busy machine: {noticed} ms");
     let in_time = |at: Mono| at > stalled.after(Duration::from_millis(50)) && at < over;
     let expected = ticks.iter().filter(|t| in_time(deadline(t))).count();
     for i in [0, 2] {
@@ -481,6 +483,8 @@ fn f29_a_device_has_one_program() {
         let second = home.dimos(&format!("run {RUN} --name second --set hardware.arm.address={address}"));
         second.with(3).says(&["in use by process", &first.pid().to_string(), "hint: "]);
     }
+    // Nor does it help to be somebody else: a user with other folders.
+    Home::new().dimos(&format!("run {}", at(&arm))).with(3).says(&["in use by process", &first.pid().to_string()]);
     assert_eq!((seen(Request::Hello), arm.refused_clients()), (0, 0), "no byte was sent");
     first.end(Signal::INT).with(130);
 

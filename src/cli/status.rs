@@ -195,7 +195,7 @@ fn print_timing(r: &StatusReport) {
     row("lateness", &t.lateness_us);
     row("compute", &t.compute_us);
     table.print();
-    output::line(format_args!("  {} ticks, {} overruns, {} periods skipped", t.count, t.overruns, t.skipped));
+    output::line(format_args!("  ticks: {}, overruns: {}, periods skipped: {}", t.count, t.overruns, t.skipped));
     for text in r.realtime.iter().flat_map(super::banner::realtime) {
         output::line(format_args!("  {text}"));
     }

@@ -16,6 +16,8 @@ pub const DEVICE_PRIORITY: i32 = 81;
 pub const TICK_PRIORITY: i32 = 80;
 /// FIFO priority of emulators: they stand for controllers, which do not wait for this host's other work.
 pub const EMULATOR_PRIORITY: i32 = 79;
+/// What the grant of real-time scheduling is called.
+pub const SCHEDULING: &str = "real-time scheduling";
 /// Stack of a timed thread [bytes].
 pub const STACK: usize = 256 * 1024;
 
@@ -71,11 +73,11 @@ fn probe_fifo() -> Grant {
         Ok(()) => {
             set_other();
             let detail = format!("SCHED_FIFO {TICK_PRIORITY}–{WATCHDOG_PRIORITY}");
-            Grant { what: "real-time scheduling", granted: true, detail, remedy: "" }
+            Grant { what: SCHEDULING, granted: true, detail, remedy: "" }
         }
         Err(e) => {
             let detail = format!("SCHED_FIFO refused: {e}");
-            Grant { what: "real-time scheduling", granted: false, detail, remedy: FIFO_REMEDY }
+            Grant { what: SCHEDULING, granted: false, detail, remedy: FIFO_REMEDY }
         }
     }
 }

@@ -5,7 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
@@ -36,6 +36,10 @@ use crate::telemetry::{ArmSample, Cause, Phase, Sample, TaskView, TickSample};
 
 /// So many seconds of samples fit into the recorder's ring.
 const RING_SECONDS: f64 = 5.0;
+/// From when on states are stale at the earliest, where real-time scheduling is not granted.
+const ORDINARY_STATE_TIMEOUT: Duration = Duration::from_millis(100);
+/// How often an enabled arm is asked for again that is not ready yet.
+const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// How long enabled arms get until they are ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
 
@@ -56,7 +60,11 @@ impl Run {
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
         let BroughtUp { mut arms, slots, connected, state_timeouts } =
-            arms::bring_up(blueprint, &options, &pulse.beat, device_notes)?;
+            arms::bring_up(blueprint, &pulse.beat, device_notes)?;
+        // An ordinary scheduler itself keeps threads waiting for tens of ms: that is no fault of an arm.
+        let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
+        let least = if realtime { Duration::ZERO } else { ORDINARY_STATE_TIMEOUT };
+        let state_timeouts: Vec<_> = state_timeouts.into_iter().map(|t| t.max(least)).collect();
         let config = coordinator_config(blueprint, &connected, &state_timeouts);
 
         let samples = ring_size(&config);
@@ -178,20 +186,27 @@ impl Run {
     fn enable(&self, blueprint: &Blueprint) -> Result<(), StartError> {
         let which = || blueprint.arms.iter().enumerate().filter(|(_, a)| a.auto_enable).map(|(i, _)| i);
         self.arms.enable(blueprint, which())?;
-        for arm in which() {
-            let request = Request::Ready { arm: arm as u16 };
-            let log = log_of(&request);
-            // Whether it was taken shows in the arm's phase.
-            let _ = self.dispatcher.send(request, log);
-        }
-        let limit = std::time::Instant::now() + READY_LIMIT;
+        let limit = Instant::now() + READY_LIMIT;
+        let mut ask = Instant::now();
         let settled = |arm: usize, a: &Arm| match self.service.phase(arm) {
             Phase::Ready => true,
             phase => !a.auto_enable && phase != Phase::Unknown,
         };
         while !blueprint.arms.iter().enumerate().all(|(i, a)| settled(i, a)) {
-            if std::time::Instant::now() >= limit {
+            let now = Instant::now();
+            if now >= limit {
                 break; // The banner and `status` say how far it came.
+            }
+            if now >= ask {
+                ask = now + ASK_AGAIN;
+                let waiting =
+                    |&arm: &usize| !matches!(self.service.phase(arm), Phase::Activating | Phase::Ready | Phase::Held);
+                for arm in which().filter(waiting) {
+                    let request = Request::Ready { arm: arm as u16 };
+                    let log = log_of(&request);
+                    // Whether it was taken shows in the arm's phase. On a busy host the state may not be fresh just now.
+                    let _ = self.dispatcher.send(request, log);
+                }
             }
             std::thread::sleep(Duration::from_millis(5));
         }

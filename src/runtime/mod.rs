@@ -62,7 +62,7 @@ pub struct Options {
     pub name: Option<String>,
     /// Where it is logged.
     pub record: Record,
-    /// Where the socket and the locks are.
+    /// Where the socket is.
     pub folder: RunFolder,
     /// Called at each tick; for tests and benchmarks.
     pub probe: Option<Probe>,

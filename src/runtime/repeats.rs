@@ -1,4 +1,5 @@
-//! Keeps the text log readable: what repeats itself at the rate of the tick is told once a second, with a count.
+//! Keeps the text log readable: what repeats itself at the rate of the tick is told every ten
+//! seconds, with a count.
 
 use std::collections::HashMap;
 use std::sync::Mutex;
@@ -8,7 +9,7 @@ use super::dispatch::lock;
 use crate::telemetry::describe::Described;
 
 /// How often lines of one kind are told.
-const EVERY: Duration = Duration::from_secs(1);
+const EVERY: Duration = Duration::from_secs(10);
 
 /// When lines of each kind were told last, and how many were not since.
 #[derive(Debug, Default)]
@@ -45,12 +46,12 @@ mod tests {
     use crate::telemetry::{Cause, Event, Phase};
 
     #[test]
-    fn what_repeats_itself_is_told_once_a_second_with_a_count() {
+    fn what_repeats_itself_is_told_now_and_then_with_a_count() {
         let names = Names::default();
         let (repeats, start) = (Repeats::default(), Instant::now());
         let overrun = describe(&Event::Overrun(2, 20_000_000), &names);
         let lines: Vec<String> =
-            (0..250).filter_map(|tick| repeats.line(&overrun, start + Duration::from_millis(10 * tick))).collect();
+            (0..250).filter_map(|tick| repeats.line(&overrun, start + Duration::from_millis(100 * tick))).collect();
         let text = "overrun: 2 periods skipped, 20.000 ms late";
         let more = format!("{text} (and 99 more like it before)");
         assert_eq!(lines, [text, &more, &more]);

@@ -269,6 +269,13 @@ fn sag_and_zero_state_and_blocked_joints_can_be_played() {
 }
 
 #[test]
+fn an_address_in_full_has_its_port() {
+    let full = |address| (super::SPEC.address.check)(address).unwrap();
+    assert_eq!(full("arm.local"), format!("arm.local:{}", super::protocol::PORT));
+    assert_eq!(full("[::1]:7"), "[::1]:7");
+}
+
+#[test]
 fn wrong_configurations_are_refused() {
     let config = |address: &str, dof, options| AdapterConfig {
         hardware_id: "arm".into(),
