@@ -94,11 +94,6 @@ pub fn set_fifo(priority: i32) -> io::Result<()> {
     }
 }
 
-/// Whether the process may schedule in real time.
-pub fn may_use_fifo() -> bool {
-    probe_fifo().granted
-}
-
 fn set_other() {
     // SAFETY: as in `set_fifo`.
     let param: libc::sched_param = unsafe { std::mem::zeroed() };

@@ -55,12 +55,12 @@ pub struct BroughtUp {
 /// Connects all arms at once, or none: on the first that fails, all others are let go again.
 pub fn bring_up(
     blueprint: &Blueprint,
+    realtime: bool,
     beat: &Arc<Beat>,
     note: impl Fn(usize, Note) + Clone + Send + 'static,
 ) -> Result<BroughtUp, StartError> {
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
     let mut arms = Arms { devices: Vec::new(), disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
-    let realtime = crate::rt::host::may_use_fifo();
     let mut slots = Slots::default();
     let mut state_timeouts = Vec::new();
     for (index, arm) in blueprint.arms.iter().enumerate() {

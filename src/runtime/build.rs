@@ -36,8 +36,6 @@ use crate::telemetry::{ArmSample, Cause, Phase, Sample, TaskView, TickSample};
 
 /// So many seconds of samples fit into the recorder's ring.
 const RING_SECONDS: f64 = 5.0;
-/// From when on states are stale at the earliest, where real-time scheduling is not granted.
-const ORDINARY_STATE_TIMEOUT: Duration = Duration::from_millis(100);
 /// How often an enabled arm is asked for again that is not ready yet.
 const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// How long enabled arms get until they are ready.
@@ -59,12 +57,9 @@ impl Run {
             let (notes, names) = (notes.clone(), names.clone());
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
-        let BroughtUp { mut arms, slots, connected, state_timeouts } =
-            arms::bring_up(blueprint, &pulse.beat, device_notes)?;
-        // An ordinary scheduler itself keeps threads waiting for tens of ms: that is no fault of an arm.
         let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
-        let least = if realtime { Duration::ZERO } else { ORDINARY_STATE_TIMEOUT };
-        let state_timeouts: Vec<_> = state_timeouts.into_iter().map(|t| t.max(least)).collect();
+        let BroughtUp { mut arms, slots, connected, state_timeouts } =
+            arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
         let config = coordinator_config(blueprint, &connected, &state_timeouts);
 
         let samples = ring_size(&config);
