@@ -74,7 +74,7 @@ enum Command {
     Check(check::Args),
     /// Print the JSON Schema of blueprints, for editors
     Schema(schema::Args),
-    #[command(about = "Play a log back to the terminal")]
+    #[command(about = "Play a log back to the terminal, verify it, or let arms follow it")]
     Replay(replay::ReplayArgs),
 }
 
@@ -98,7 +98,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Check(args) => check::run(args, &registry),
         Command::Schema(args) => schema::run(args, &registry),
         Command::Replay(args) => {
-            return match replay::run(args) {
+            return match replay::run(args, &registry) {
                 Ok(code) => ExitCode::from(code),
                 Err(e) => {
                     output::failure(&exit::Failure::new(exit::Exit::Failed, e.to_string()));

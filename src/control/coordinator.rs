@@ -30,7 +30,7 @@ pub struct TickTime {
     pub next: Mono,
     /// Whole periods skipped before it.
     pub skipped: u32,
-    /// How late it woke up [ns].
+    /// The lateness that cost them [ns].
     pub late_ns: u64,
 }
 

@@ -149,7 +149,8 @@ pub fn run(
                 std::mem::forget(motion);
             }
         }
-        let timing = TickSample { tick, deadline, late_ns, compute_ns, skipped, dropped };
+        let timing =
+            TickSample { tick, deadline, next, late_ns, compute_ns, skipped, overrun_ns: time.late_ns, dropped };
         let wanted = output.arms.len() + output.events.len() + 1;
         if let Ok(chunk) = ports.samples.write_chunk_uninit(wanted) {
             let arms = output.arms.iter().map(|a| Sample::Arm(*a));

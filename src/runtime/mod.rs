@@ -10,6 +10,7 @@ mod arms;
 mod build;
 mod device_lock;
 mod dispatch;
+mod in_process;
 mod motions;
 mod repeats;
 mod reports;
@@ -24,10 +25,14 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 pub use device_lock::DeviceTaken;
+pub use dispatch::log_of;
 
+use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
 use crate::recording::recorder::Recorder;
+use crate::rpc::RpcError;
+use crate::rpc::api::Method;
 use crate::rpc::place::RunFolder;
 use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
@@ -164,6 +169,22 @@ impl Run {
     /// What it tells of itself.
     pub fn status(&self) -> StatusReport {
         self.service.status()
+    }
+
+    /// What its coordinator was made from: effective limits among others.
+    pub fn config(&self) -> &CoordinatorConfig {
+        &self.service.parts.config
+    }
+
+    /// Asks it what others ask over rpc, and waits for the answer. Not for a thread that runs async code.
+    pub fn call<M: Method>(&self, request: &M) -> Result<M::Reply, RpcError> {
+        let answers = self.call_together(std::slice::from_ref(request));
+        answers.into_iter().next().unwrap_or_else(|| Err(in_process::defect("no answer")))
+    }
+
+    /// Asks it several things at once: they reach the tick together, but for a tick now and then.
+    pub fn call_together<M: Method>(&self, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
+        in_process::call(&self.service, requests)
     }
 
     /// Lets other threads end it.
