@@ -140,6 +140,11 @@ fn print_arms(arms: &[ArmReport]) {
             let (ago, count) = (span(fault.since), fault.count);
             output::line(format_args!("  {name} {ago} ago, {count}×, {over}: {}", fault.text));
         }
+        if let Some(c) = &arm.commander {
+            let process = c.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
+            let held = span(c.held_for);
+            output::line(format_args!("  {name} is commanded by {}{process}, since {held}", c.program));
+        }
         let counted: Vec<String> = arm.counters.iter().map(|(what, n)| format!("{what} {n}")).collect();
         if !counted.is_empty() {
             output::line(format_args!("  {name} counted {}", counted.join(", ")));
