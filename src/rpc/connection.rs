@@ -6,18 +6,16 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::future::{Future, poll_fn, ready};
-use std::os::fd::AsFd;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
-use rustix::event::{PollFd, PollFlags, Timespec};
 use serde::Serialize;
 use serde_json::Value;
 use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
-use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::net::unix::OwnedWriteHalf;
 use tokio::sync::{broadcast, mpsc};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{Instant, timeout};
@@ -26,7 +24,7 @@ use super::api::{
     Backend, Done, Lease, LeaseReply, MAX_LINE, MAX_SUBSCRIPTIONS, Method, Release, Reply, Request, read_params,
 };
 use super::error::{Code, RpcError};
-use super::lease::{Lessee, Need, Subject, need};
+use super::lease::{Lessee, Subject};
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
 use super::wire;
@@ -87,7 +85,7 @@ type Answer = Pin<Box<dyn Future<Output = Result<Reply, RpcError>> + Send>>;
 struct Gone;
 
 impl Connection {
-    async fn converse(mut self, from: &mut BufReader<OwnedReadHalf>) {
+    async fn converse(mut self, from: &mut (impl AsyncBufRead + Unpin)) {
         let mut line = Vec::new();
         loop {
             let read = tokio::select! {
@@ -115,14 +113,14 @@ impl Connection {
                     return;
                 }
             }
-            if !line.trim_ascii().is_empty() && self.answer(&line, from.get_ref()).await.is_err() {
+            if !line.trim_ascii().is_empty() && self.answer(&line).await.is_err() {
                 return;
             }
             line.clear();
         }
     }
 
-    async fn answer(&mut self, line: &[u8], from: &OwnedReadHalf) -> Result<(), Gone> {
+    async fn answer(&mut self, line: &[u8]) -> Result<(), Gone> {
         let wire::Envelope { id, method, params } = match wire::read(line) {
             Ok(envelope) => envelope,
             Err((id, error)) => return self.reply::<Done>(&id, Err(error)).await,
@@ -151,16 +149,13 @@ impl Connection {
                 self.reply(&id, result).await
             }
             _ => match Request::read(&method, params) {
-                Ok(request) => self.request(id, method, request, from).await,
+                Ok(request) => self.request(id, method, request).await,
                 Err(error) => self.reply::<Done>(&id, Err(error)).await,
             },
         }
     }
 
-    async fn request(&mut self, id: Value, method: String, request: Request, from: &OwnedReadHalf) -> Result<(), Gone> {
-        if matches!(need(&request), Need::Lease(_)) && is_gone(from) {
-            return Err(Gone); // Its lease ends with it: what it sent before it went is not begun any more.
-        }
+    async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Gone> {
         if let Err(refusal) = self.lessee.admit(&request, &*self.backend) {
             return self.reply::<Done>(&id, Err(refusal)).await;
         }
@@ -272,15 +267,6 @@ async fn oldest(in_flight: &mut VecDeque<(Value, Answer)>) -> Result<Reply, RpcE
         Some((_, answer)) => answer.await,
         None => std::future::pending().await,
     }
-}
-
-/// Whether the client has closed both its ends: it reads no answer any more.
-fn is_gone(from: &OwnedReadHalf) -> bool {
-    let socket: &UnixStream = from.as_ref();
-    let mut watched = [PollFd::from_borrowed_fd(socket.as_fd(), PollFlags::empty())];
-    let now = Timespec { tv_sec: 0, tv_nsec: 0 };
-    let changed = rustix::event::poll(&mut watched, Some(&now)).is_ok_and(|count| count > 0);
-    changed && watched.iter().any(|fd| fd.revents().intersects(PollFlags::HUP | PollFlags::ERR))
 }
 
 /// A client's reading of a stream.
