@@ -16,10 +16,18 @@ use dimos::rpc::report::CommanderReport;
 use program::{Home, Started, eventually};
 use serde_json::Value;
 
-fn up() -> (Home, Started) {
+const BLUEPRINT: &str = "
+hardware:
+  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: mock}
+tasks:
+  - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
+  - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}
+";
+
+fn up(arguments: &str) -> (Home, Started) {
     let home = Home::new();
-    home.write("streams.yaml", include_str!("fixtures/streams.yaml"));
-    let run = home.run("streams.yaml --no-record");
+    home.write("streams.yaml", BLUEPRINT);
+    let run = home.run(&format!("streams.yaml --no-record {arguments}"));
     (home, run)
 }
 
@@ -42,7 +50,7 @@ fn is_at_rest(client: &mut Client) -> bool {
 
 #[test]
 fn one_commands_and_everyone_reads_cancels_and_stops() {
-    let (home, _run) = up();
+    let (home, _run) = up("");
     let (mut one, mut two) = (home.client(), home.client());
     one.call(target(0.1)).unwrap();
     let holder = commander(&mut two).expect("the first target took the lease");
@@ -73,7 +81,7 @@ fn one_commands_and_everyone_reads_cancels_and_stops() {
 
 #[test]
 fn a_lease_is_given_back_when_it_is_released() {
-    let (home, _run) = up();
+    let (home, _run) = up("");
     let (mut one, mut two) = (home.client(), home.client());
     assert_eq!(one.call(Lease { arm: Some("arm".into()) }).unwrap().arms, ["arm"]);
     assert_eq!(one.call(Lease::default()).unwrap().arms, ["arm"], "it holds it already");
@@ -87,7 +95,7 @@ fn a_lease_is_given_back_when_it_is_released() {
 
 #[test]
 fn the_stream_of_a_commander_that_is_gone_goes_stale_and_its_trajectory_goes_on() {
-    let (home, _run) = up();
+    let (home, _run) = up("");
     let mut watcher = home.client();
     let mut killed = home.client();
     killed.call(target(0.2)).unwrap();
@@ -113,7 +121,7 @@ fn the_stream_of_a_commander_that_is_gone_goes_stale_and_its_trajectory_goes_on(
 
 #[test]
 fn a_half_closed_commander_is_answered_and_gives_up_its_lease() {
-    let (home, _run) = up();
+    let (home, _run) = up("");
     let mut raw = raw(&home);
     let request = serde_json::json!({"id": 1, "method": "velocity", "params": target(0.05)});
     raw.write_all(format!("{request}\n{request}\n{request}\n").as_bytes()).unwrap();
@@ -128,9 +136,7 @@ fn a_half_closed_commander_is_answered_and_gives_up_its_lease() {
 
 #[test]
 fn what_a_commander_sent_before_it_went_is_not_begun_after_it() {
-    let home = Home::new();
-    home.write("streams.yaml", include_str!("fixtures/streams.yaml"));
-    let _run = home.run("streams.yaml --no-record --set coordinator.tick_rate=10");
+    let (home, _run) = up("--set coordinator.tick_rate=10");
     let mut watcher = home.client();
     let mut raw = raw(&home);
     // More than the tick takes in several seconds; the quick ones are at the end.
