@@ -75,7 +75,8 @@ impl Signals {
         Self(seen)
     }
 
-    fn last(&self) -> Option<i32> {
+    /// The last one.
+    pub fn last(&self) -> Option<i32> {
         Some(self.0.load(Ordering::Relaxed) as i32).filter(|signal| *signal != 0)
     }
 }

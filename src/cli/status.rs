@@ -8,7 +8,7 @@ use super::output::{self, Table, Tone, number, span, toned};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::LiveRun;
-use crate::rpc::report::{ArmReport, Percentiles, StatusReport};
+use crate::rpc::report::{ArmReport, Percentiles, StatusReport, TaskReport};
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
@@ -92,7 +92,7 @@ fn print(r: &StatusReport) {
     output::line("");
     print_arms(&r.arms);
     output::line("");
-    print_tasks(r);
+    print_tasks(&r.tasks);
     output::line("");
     print_timing(r);
 }
@@ -152,9 +152,10 @@ fn print_arms(arms: &[ArmReport]) {
     }
 }
 
-fn print_tasks(r: &StatusReport) {
+/// The tasks in a table.
+pub(super) fn print_tasks(tasks: &[TaskReport]) {
     let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS", "REASON"]);
-    for task in &r.tasks {
+    for task in tasks {
         let tone = match task.state.as_str() {
             "ABORTED" | "FAULT" => Tone::Bad,
             "CANCELLING" => Tone::Warning,
