@@ -16,9 +16,9 @@ use serde_json::Value;
 use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
-use tokio::sync::{broadcast, mpsc};
+use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, JoinSet};
-use tokio::time::{Instant, timeout};
+use tokio::time::timeout;
 
 use super::api::{
     Backend, Done, Lease, LeaseReply, MAX_LINE, MAX_SUBSCRIPTIONS, Method, Release, Reply, Request, read_params,
@@ -27,6 +27,7 @@ use super::error::{Code, RpcError};
 use super::lease::{Lessee, Subject};
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
+use super::subscription::{Pace, Subscription};
 use super::wire;
 
 /// Lines that wait for a client to read them.
@@ -266,59 +267,6 @@ async fn oldest(in_flight: &mut VecDeque<(Value, Answer)>) -> Result<Reply, RpcE
     match in_flight.front_mut() {
         Some((_, answer)) => answer.await,
         None => std::future::pending().await,
-    }
-}
-
-/// A client's reading of a stream.
-struct Subscription {
-    number: u64,
-    stream: &'static str,
-    from: broadcast::Receiver<Arc<str>>,
-    pace: Pace,
-}
-
-impl Subscription {
-    async fn forward(mut self, queue: mpsc::Sender<String>) {
-        let mut lost = 0;
-        loop {
-            match self.from.recv().await {
-                Ok(data) if self.pace.is_due(Instant::now()) => {
-                    let line = wire::message(self.stream, self.number, lost, &data);
-                    if queue.send(line).await.is_err() {
-                        return;
-                    }
-                    lost = 0;
-                }
-                Ok(_) => {}
-                Err(broadcast::error::RecvError::Lagged(missed)) => lost += missed,
-                Err(broadcast::error::RecvError::Closed) => return,
-            }
-        }
-    }
-}
-
-/// Thins a stream out to a rate.
-struct Pace {
-    period: Option<Duration>,
-    next: Option<Instant>,
-}
-
-impl Pace {
-    fn of(rate: Option<f64>) -> Self {
-        Self { period: rate.map(|hz| Duration::from_secs_f64(1.0 / hz)), next: None }
-    }
-
-    /// Whether a message that came now is to be sent. A quarter of a period early counts as on time, so that asking
-    /// for a stream at its own rate loses nothing to jitter.
-    fn is_due(&mut self, now: Instant) -> bool {
-        let Some(period) = self.period else { return true };
-        let next = self.next.unwrap_or(now);
-        if now + period / 4 < next {
-            return false;
-        }
-        let following = next + period;
-        self.next = Some(if following < now { now + period } else { following });
-        true
     }
 }
 

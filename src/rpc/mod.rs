@@ -24,6 +24,7 @@ pub mod place;
 pub mod report;
 pub mod server;
 pub mod streams;
+mod subscription;
 mod wire;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};
