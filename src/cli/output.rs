@@ -91,11 +91,14 @@ impl Table {
         self.0.add_row(cells.into_iter().map(Into::into).collect::<Vec<Cell>>());
     }
 
+    /// Its lines, as they are printed.
+    pub fn lines(&self) -> Vec<String> {
+        self.0.lines().map(|row| row.trim_end().to_owned()).collect()
+    }
+
     /// Prints it to stdout.
     pub fn print(&self) {
-        for row in self.0.lines() {
-            line(row.trim_end());
-        }
+        self.lines().iter().for_each(line);
     }
 }
 

@@ -9,7 +9,7 @@ use super::output::{self, Table, Tone, number, span, toned};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::LiveRun;
-use crate::rpc::report::{ArmReport, Percentiles, StatusReport};
+use crate::rpc::report::{ArmReport, Percentiles, StatusReport, TaskReport};
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
@@ -94,7 +94,7 @@ fn print(r: &StatusReport) {
     output::line("");
     print_arms(&r.arms);
     output::line("");
-    print_tasks(r);
+    print_tasks(&r.tasks);
     output::line("");
     print_timing(r);
 }
@@ -136,6 +136,11 @@ fn print_arms(arms: &[ArmReport]) {
             let (ago, count) = (span(fault.since), fault.count);
             output::line(format_args!("  {name} {ago} ago, {count}×, {over}: {}", fault.text));
         }
+        if let Some(c) = &arm.commander {
+            let process = c.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
+            let held = span(c.held_for);
+            output::line(format_args!("  {name} is commanded by {}{process}, since {held}", c.program));
+        }
         let counted: Vec<String> = arm
             .counters
             .iter()
@@ -148,9 +153,10 @@ fn print_arms(arms: &[ArmReport]) {
     }
 }
 
-fn print_tasks(r: &StatusReport) {
+/// The tasks in a table.
+pub(super) fn print_tasks(tasks: &[TaskReport]) {
     let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS"]);
-    for task in &r.tasks {
+    for task in tasks {
         let tone = match task.state.as_str() {
             "ABORTED" | "FAULT" => Tone::Bad,
             "CANCELLING" => Tone::Warning,
@@ -166,7 +172,7 @@ fn print_tasks(r: &StatusReport) {
         ]);
     }
     table.print();
-    for task in &r.tasks {
+    for task in tasks {
         if let Some(reason) = &task.reason {
             output::line(format_args!("  {} is {}: {reason}", task.name, task.state));
         }

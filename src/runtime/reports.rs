@@ -8,6 +8,7 @@ use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
 use crate::blueprint::OnExit;
 use crate::clock::WallOffset;
+use crate::hardware::device::Connected;
 use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
@@ -59,7 +60,7 @@ impl Service {
     fn arm_report(&self, index: usize) -> Option<ArmReport> {
         let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
         let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
-        let info = &self.parts.connected.get(index)?.info;
+        let Connected { info, gripper_range, .. } = self.parts.connected.get(index)?;
         let faults = health.episodes().into_iter().map(|e| FaultReport {
             since: now.seconds_since(e.since),
             over: e.until.is_some(),
@@ -89,6 +90,8 @@ impl Service {
             measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),
             native_rate_hz: info.native_rate,
             faults: faults.collect(),
+            commander: None, // the connections know
+            gripper_range: gripper_range.map(|(closed, open)| [closed, open]),
             on_exit: match arm.on_exit {
                 OnExit::Hold => "hold".to_owned(),
                 OnExit::Disable => "disable".to_owned(),

@@ -29,10 +29,10 @@ use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, Reply, Request as Call};
 use crate::rpc::place::Claim;
 use crate::rpc::streams::Streams;
-use crate::rpc::{Code, RpcError};
+use crate::rpc::{Code, RpcError, Subject};
 use crate::rt::host::Grant;
 use crate::rt::slot::SlotReader;
-use crate::telemetry::describe::Names;
+use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
@@ -513,6 +513,21 @@ impl Service {
 impl Backend for Service {
     fn call(&self, request: Call) -> BoxFuture<'_, Result<Reply, RpcError>> {
         Box::pin(self.answer(request))
+    }
+
+    fn arms_of(&self, subject: Subject<'_>) -> Vec<String> {
+        let tasks = &self.parts.config.tasks;
+        let is_meant = |(i, arm): &(usize, &ArmNames)| match subject {
+            Subject::All => true,
+            Subject::Arm(id) => arm.hardware_id == id,
+            Subject::Joints(joints) => joints.iter().any(|j| arm.joints.contains(j)),
+            Subject::Task(name) => {
+                let range = self.joints_of_arm(*i as u16);
+                tasks.iter().any(|t| t.name == name && t.joints.iter().any(|j| range.contains(j)))
+            }
+        };
+        let arms = self.parts.names.arms.iter().enumerate().filter(is_meant);
+        arms.map(|(_, arm)| arm.hardware_id.clone()).collect()
     }
 
     fn streams(&self) -> &Streams {

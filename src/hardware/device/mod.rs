@@ -74,6 +74,8 @@ pub struct Connected {
     pub info: ManipulatorInfo,
     /// Its joint limits.
     pub limits: JointLimits,
+    /// How far its gripper closes and opens [m], where it has one and says so.
+    pub gripper_range: Option<(f64, f64)>,
 }
 
 enum Order {

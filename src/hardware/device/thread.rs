@@ -187,7 +187,7 @@ impl Worker {
         self.plausible = 0;
         self.take_command();
         self.read(adapter);
-        Ok(Connected { info, limits })
+        Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range() })
     }
 
     fn connect_again(&mut self, adapter: &mut dyn ManipulatorAdapter) {
