@@ -13,6 +13,8 @@
 //!
 //! A module may use only those above it in this list; `tests/layering.rs` checks that.
 
+#![allow(rustdoc::broken_intra_doc_links, reason = "units stand in brackets: [rad]")]
+
 /// Version of this program, with the commit it was built from where that is known.
 pub const VERSION: &str = env!("DIMOS_VERSION");
 

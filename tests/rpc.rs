@@ -260,7 +260,7 @@ fn connections_and_subscriptions_are_bounded() {
     for raw in &mut taken {
         assert_eq!(raw.ask(r#"{"id":1,"method":"state"}"#)["id"], json!(1));
     }
-    for _ in 0..200 {
+    for _ in 0..1000 {
         let mut refused = Raw::connect(&server);
         assert_eq!(code(&refused.read()), "TOO_MANY_CONNECTIONS");
         assert!(refused.is_closed());

@@ -51,6 +51,12 @@ pub fn speed(text: &str) -> std::result::Result<f64, String> {
     if (lowest..=1.0).contains(&value) { Ok(value) } else { Err(format!("must be within {lowest}–1")) }
 }
 
+/// How often something is done, per second.
+pub fn rate(text: &str) -> std::result::Result<f64, String> {
+    let value = finite(text)?;
+    if (0.1..=2000.0).contains(&value) { Ok(value) } else { Err("must be within 0.1–2000 Hz".into()) }
+}
+
 /// A span of time with its unit: `10s`, `500ms`, `1m 30s`.
 pub fn duration(text: &str) -> std::result::Result<Duration, String> {
     let hint = "give a unit: 10s, 500ms, 2m";

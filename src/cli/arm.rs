@@ -3,9 +3,11 @@
 use clap::Subcommand;
 
 use super::arguments::{Target, finite};
-use super::exit::{Exit, Result};
+use super::exit::{Exit, Failure, Result};
 use super::output;
-use crate::rpc::api::{ArmDisable, ArmEnable, ArmReset, Gripper};
+use crate::rpc::api::{ArmDisable, ArmEnable, ArmReset, Gripper, Status};
+use crate::rpc::client::Client;
+use crate::rpc::report::ArmReport;
 
 /// Arguments of `arm`.
 #[derive(Debug, clap::Args)]
@@ -26,9 +28,9 @@ enum Action {
     Gripper {
         #[command(flatten)]
         which: Which,
-        /// Opening [m]
-        #[arg(value_parser = finite, allow_negative_numbers = true)]
-        position: f64,
+        /// Opening [m], or `open`, or `close`
+        #[arg(value_name = "OPENING", value_parser = opening, allow_negative_numbers = true)]
+        opening: Opening,
     },
 }
 
@@ -38,6 +40,46 @@ struct Which {
     arm: String,
     #[command(flatten)]
     target_run: Target,
+}
+
+/// How far a gripper shall open.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Opening {
+    /// So far [m].
+    Metres(f64),
+    /// As far as it goes.
+    Open,
+    /// Closed.
+    Close,
+}
+
+fn opening(text: &str) -> std::result::Result<Opening, String> {
+    match text {
+        "open" => Ok(Opening::Open),
+        "close" => Ok(Opening::Close),
+        _ => finite(text).map(Opening::Metres).map_err(|e| format!("{e}; give metres, `open` or `close`")),
+    }
+}
+
+impl Opening {
+    /// In metres: the run knows how far the gripper of its arm goes.
+    fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
+        if let Self::Metres(position) = self {
+            return Ok(position);
+        }
+        let reported = client.call(Status {})?.arms.into_iter().find(|a| a.hardware_id == arm);
+        match reported {
+            Some(ArmReport { gripper_range: Some([closed, open]), .. }) => {
+                Ok(if self == Self::Open { open } else { closed })
+            }
+            // The run says what is wrong with the name.
+            None => Ok(0.0),
+            Some(_) => {
+                let what = format!("{arm} does not say how far its gripper goes");
+                Err(Failure::new(Exit::Failed, what).hint(format!("give it in metres: dimos arm gripper {arm} 0.04")))
+            }
+        }
+    }
 }
 
 /// Runs the verb.
@@ -50,8 +92,9 @@ pub fn run(args: &Args) -> Result {
         Action::Enable(_) => client.call(ArmEnable { arm })?,
         Action::Disable(_) => client.call(ArmDisable { arm })?,
         Action::Reset(_) => client.call(ArmReset { arm })?,
-        Action::Gripper { position, .. } => {
-            let done = client.call(Gripper { arm, position: *position })?;
+        Action::Gripper { opening, .. } => {
+            let position = opening.of(&mut client, &arm)?;
+            let done = client.call(Gripper { arm, position })?;
             if which.target_run.json {
                 output::json(&done);
             } else {

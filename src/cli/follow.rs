@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::exit::{Exit, Failure, Result};
-use super::output::{self, Table, Tone, toned};
+use super::output::{self, Table, Tone, fixed, toned};
 use crate::rpc::api::{Cancel, Motion};
 use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
@@ -107,8 +107,8 @@ pub fn show_deviation(deviation: &[Deviation]) {
         let tone = if off.abs() <= CLOSE { Tone::Good } else { Tone::Warning };
         table.row([
             joint.joint.as_str().into(),
-            output::number(Some(joint.target), 4).into(),
-            output::number(Some(joint.actual), 4).into(),
+            fixed(joint.target, 4).into(),
+            fixed(joint.actual, 4).into(),
             toned(format_args!("{off:+.4}"), tone),
             toned(format_args!("{:+.3}", off.to_degrees()), tone),
         ]);

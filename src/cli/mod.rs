@@ -5,12 +5,15 @@ pub mod arm;
 pub mod banner;
 pub mod cancel;
 pub mod check;
+pub mod completions;
+pub mod doctor;
 pub mod down;
 pub mod execute;
 pub mod exit;
 mod follow;
 pub mod list_adapters;
 pub mod list_blueprints;
+pub mod man;
 pub mod move_to;
 pub mod output;
 pub mod replay;
@@ -19,6 +22,8 @@ pub mod schema;
 pub mod state;
 pub mod status;
 pub mod stop;
+mod targets;
+pub mod task;
 mod text_log;
 mod trajectory_file;
 
@@ -64,6 +69,8 @@ enum Command {
     Stop(stop::Args),
     /// Enable, disable or reset an arm, or move its gripper
     Arm(arm::Args),
+    /// List tasks, ask something of one, or stream targets to it
+    Task(task::Args),
     /// End a run, controlled: decelerate, release the arms, close the log
     Down(down::Args),
     /// List the arms that this program can talk to
@@ -74,6 +81,12 @@ enum Command {
     Check(check::Args),
     /// Print the JSON Schema of blueprints, for editors
     Schema(schema::Args),
+    /// Check this computer: real time, permissions, clock, disk, CAN links
+    Doctor(doctor::Args),
+    /// Print completions for a shell
+    Completions(completions::Args),
+    /// Print the manual page, or write one for every verb
+    Man(man::Args),
     #[command(about = "Play a log back to the terminal, verify it, or let arms follow it")]
     Replay(replay::ReplayArgs),
 }
@@ -92,10 +105,14 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Cancel(args) => cancel::run(args),
         Command::Stop(args) => stop::run(args),
         Command::Arm(args) => arm::run(args),
+        Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),
         Command::ListAdapters(args) => list_adapters::run(args, &registry),
         Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
         Command::Check(args) => check::run(args, &registry),
+        Command::Doctor(args) => doctor::run(args),
+        Command::Completions(args) => completions::run(args),
+        Command::Man(args) => man::run(args),
         Command::Schema(args) => schema::run(args, &registry),
         Command::Replay(args) => {
             return match replay::run(args, &registry) {

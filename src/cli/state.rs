@@ -1,14 +1,24 @@
-//! `dimos state`: where the joints are.
+//! `dimos state [--watch]`: where the joints are, once or again and again.
 
-use super::arguments::Target;
+use std::io::{self, IsTerminal, Write};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+use super::arguments::{Target, rate};
 use super::exit::{Exit, Result};
-use super::output::{self, Table, number};
+use super::output::{Table, number};
 use crate::rpc::api::State;
-use crate::rpc::report::{ArmStateReport, JointReport};
+use crate::rpc::report::{ArmStateReport, JointReport, StateReport};
 
 /// Arguments of `state`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
+    /// Show it again and again, until Ctrl-C or the run's end: a live table; with --json one line per state
+    #[arg(long)]
+    pub watch: bool,
+    /// How often to show it [Hz]
+    #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = rate, requires = "watch")]
+    pub rate: f64,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
@@ -16,24 +26,67 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let report = args.target_run.connect()?.call(State {})?;
-    if args.target_run.json {
-        output::json(&report);
-        return Ok(Exit::Ok);
-    }
-    for (index, arm) in report.arms.iter().enumerate() {
-        if index > 0 {
-            output::line("");
+    let mut client = args.target_run.connect()?;
+    let mut screen = Screen::new(args.watch && io::stdout().is_terminal());
+    let period = Duration::from_secs_f64(1.0 / args.rate);
+    let mut next = Instant::now();
+    loop {
+        let report = client.call(State {})?;
+        let lines = match args.target_run.json {
+            true => vec![serde_json::to_string(&report).unwrap_or_default()],
+            false => table(&report),
+        };
+        // Nobody reads it any more (`| head`): done.
+        if screen.show(&lines).is_err() || !args.watch {
+            return Ok(Exit::Ok);
         }
-        print(arm);
+        next = (next + period).max(Instant::now());
+        sleep(next.saturating_duration_since(Instant::now()));
     }
-    Ok(Exit::Ok)
 }
 
-fn print(arm: &ArmStateReport) {
+/// What is shown: drawn anew over itself on a terminal, one after the other elsewhere.
+struct Screen {
+    live: bool,
+    drawn: usize,
+}
+
+impl Screen {
+    fn new(live: bool) -> Self {
+        Self { live, drawn: 0 }
+    }
+
+    fn show(&mut self, lines: &[String]) -> io::Result<()> {
+        let mut text = match self.live && self.drawn > 0 {
+            true => format!("\x1b[{}A\x1b[J", self.drawn),
+            false => String::new(),
+        };
+        for line in lines {
+            text.push_str(line);
+            text.push('\n');
+        }
+        self.drawn = lines.len();
+        let mut out = io::stdout().lock();
+        out.write_all(text.as_bytes())?;
+        out.flush()
+    }
+}
+
+fn table(report: &StateReport) -> Vec<String> {
+    let mut lines = Vec::new();
+    for arm in &report.arms {
+        if !lines.is_empty() {
+            lines.push(String::new());
+        }
+        lines.extend(of_arm(arm));
+    }
+    lines
+}
+
+fn of_arm(arm: &ArmStateReport) -> Vec<String> {
     let simulated = if arm.simulated { "  SIMULATED" } else { "" };
     let age = arm.age_ms.map_or_else(|| "no state yet".into(), |ms| format!("state {ms:.1} ms old"));
-    output::line(format_args!("{}{simulated}  {age}", arm.hardware_id));
+    let mut lines = vec![format!("{}{simulated}  {age}", arm.hardware_id)];
     let mut table = Table::new(&["JOINT", ">POSITION rad", ">deg", ">VELOCITY rad/s", "", ">EFFORT Nm", ">COMMAND"]);
     for joint in &arm.joints {
         table.row([
@@ -46,17 +99,18 @@ fn print(arm: &ArmStateReport) {
             number(joint.command, 4),
         ]);
     }
-    table.print();
+    lines.extend(table.lines());
     if let Some(gripper) = arm.gripper {
-        output::line(format_args!("gripper  {gripper:.4} m"));
+        lines.push(format!("gripper  {gripper:.4} m"));
     }
     if let Some(pose) = arm.pose {
         let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz, pose.rpy);
-        output::line(format_args!("pose     xyz {x:.4} {y:.4} {z:.4} m, rpy {roll:.4} {pitch:.4} {yaw:.4} rad"));
+        lines.push(format!("pose     xyz {x:.4} {y:.4} {z:.4} m, rpy {roll:.4} {pitch:.4} {yaw:.4} rad"));
     }
     if let Some([fx, fy, fz, tx, ty, tz]) = arm.wrench {
-        output::line(format_args!("wrench   force {fx:.2} {fy:.2} {fz:.2} N, torque {tx:.3} {ty:.3} {tz:.3} Nm"));
+        lines.push(format!("wrench   force {fx:.2} {fy:.2} {fz:.2} N, torque {tx:.3} {ty:.3} {tz:.3} Nm"));
     }
+    lines
 }
 
 /// Only what is not measured is worth a word.

@@ -200,6 +200,11 @@ pub trait ManipulatorAdapter: Send {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         Ok(None)
     }
+    /// How far the gripper closes and opens [m], as the data sheet says: what `open` and `close` mean. `None` when
+    /// there is no gripper, or nobody knows.
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        None
+    }
     /// Commands the gripper opening [m].
     fn write_gripper_position(&mut self, _position: f64) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)

@@ -11,6 +11,7 @@ use serde_json::Value;
 
 pub use super::arm_api::*;
 use super::error::{Code, RpcError};
+use super::lease::Subject;
 pub use super::motion_api::*;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::streams::Streams;
@@ -32,6 +33,9 @@ pub trait Backend: Send + Sync + 'static {
     /// Answers one request. Called from the server's thread, so it may wait but must not block; when it takes
     /// longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is dropped.
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
+    /// The arms that `subject` is about, by `hardware_id`; none where it names something that is not there. Who
+    /// moves an arm needs its lease.
+    fn arms_of(&self, subject: Subject<'_>) -> Vec<String>;
     /// What the run publishes.
     fn streams(&self) -> &Streams;
 }
@@ -62,7 +66,7 @@ macro_rules! methods {
         pub enum Reply { $($(#[$doc])* $variant($reply),)* }
 
         /// Names of all methods, those that the connection itself answers at the end.
-        pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe"];
+        pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe", "lease", "release"];
 
         $(impl Method for $variant {
             const NAME: &'static str = $name;

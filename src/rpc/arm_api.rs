@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::api::finite;
+use super::api::{Method, finite};
 
 /// Parameters of `stop`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -76,6 +76,41 @@ pub struct ArmReply {
     pub arm: String,
     /// Its phase now.
     pub phase: String,
+}
+
+/// Parameters of `lease`: takes the right to move one arm, or all, for this connection.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Lease {
+    /// This arm only; without it, all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
+}
+
+/// Parameters of `release`: gives back what this connection took.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Release {
+    /// This arm only; without it, all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
+}
+
+/// Reply to `lease` and `release`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct LeaseReply {
+    /// The arms that were taken, or given back.
+    pub arms: Vec<String>,
+}
+
+impl Method for Lease {
+    const NAME: &'static str = "lease";
+    type Reply = LeaseReply;
+}
+
+impl Method for Release {
+    const NAME: &'static str = "release";
+    type Reply = LeaseReply;
 }
 
 /// Parameters of `gripper`.

@@ -1,38 +1,58 @@
-//! One client's conversation: requests are answered one after the other, subscriptions run beside them, and a writer
-//! sends what both have to say. Every queue is bounded: who does not read is not read from either.
+//! One client's conversation: requests are answered in their order, subscriptions run beside them, and a writer sends
+//! what both have to say. Every queue is bounded: who does not read is not read from either.
+//!
+//! A request is done before the next one begins, except that targets of a stream are handed on as they come: each is
+//! answered by the tick that takes it, and the next ones may be on their way before that.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::future::{Future, poll_fn, ready};
+use std::pin::Pin;
 use std::sync::Arc;
+use std::task::Poll;
 use std::time::Duration;
 
+use serde::Serialize;
 use serde_json::Value;
 use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
-use tokio::sync::{broadcast, mpsc};
+use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, JoinSet};
-use tokio::time::{Instant, timeout};
+use tokio::time::timeout;
 
-use super::api::{Backend, Done, MAX_LINE, MAX_SUBSCRIPTIONS, Method, Request, read_params};
+use super::api::{
+    Backend, Done, Lease, LeaseReply, MAX_LINE, MAX_SUBSCRIPTIONS, Method, Release, Reply, Request, read_params,
+};
 use super::error::{Code, RpcError};
+use super::lease::{Lessee, Subject};
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
+use super::subscription::{Pace, Subscription};
 use super::wire;
 
 /// Lines that wait for a client to read them.
 const QUEUE: usize = 64;
+/// Targets of one client that may wait for the tick at once.
+const IN_FLIGHT: usize = 32;
 /// Time for the client to take the last replies, and for the rest of an oversize line to pass.
 const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Serves one client until it closes its end, or sends a line that is too long.
-pub(super) async fn serve(stream: UnixStream, backend: Arc<dyn Backend>) {
+pub(super) async fn serve(stream: UnixStream, backend: Arc<dyn Backend>, lessee: Lessee) {
     let (from_client, to_client) = stream.into_split();
     let (queue, waiting) = mpsc::channel(QUEUE);
     let mut writer = tokio::spawn(write(to_client, waiting));
     let mut from_client = BufReader::new(from_client);
-    Connection { backend, queue, running: JoinSet::new(), subscriptions: BTreeMap::new(), next: 1 }
-        .converse(&mut from_client)
-        .await;
+    let connection = Connection {
+        backend,
+        lessee,
+        queue,
+        in_flight: VecDeque::new(),
+        running: JoinSet::new(),
+        subscriptions: BTreeMap::new(),
+        next: 1,
+    };
+    connection.converse(&mut from_client).await;
     if timeout(FAREWELL, &mut writer).await.is_err() {
         writer.abort();
     }
@@ -48,12 +68,19 @@ async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) {
 
 struct Connection {
     backend: Arc<dyn Backend>,
+    /// What it holds of the leases; they end with the conversation.
+    lessee: Lessee,
     queue: mpsc::Sender<String>,
+    /// Targets that the tick has not answered yet, the oldest first.
+    in_flight: VecDeque<(Value, Answer)>,
     /// The subscriptions' tasks; dropping the set ends them.
     running: JoinSet<()>,
     subscriptions: BTreeMap<u64, AbortHandle>,
     next: u64,
 }
+
+/// The answer to a request, when it comes.
+type Answer = Pin<Box<dyn Future<Output = Result<Reply, RpcError>> + Send>>;
 
 /// The client is gone.
 struct Gone;
@@ -62,60 +89,144 @@ impl Connection {
     async fn converse(mut self, from: &mut (impl AsyncBufRead + Unpin)) {
         let mut line = Vec::new();
         loop {
-            line.clear();
-            match read_line(from, &mut line).await {
+            let read = tokio::select! {
+                biased;
+                done = oldest(&mut self.in_flight), if !self.in_flight.is_empty() => {
+                    if self.send_oldest(done).await.is_err() {
+                        return;
+                    }
+                    continue;
+                }
+                // Begins again where it was when an answer came first: what it read so far is in `line`.
+                read = read_line(from, &mut line), if self.in_flight.len() < IN_FLIGHT => read,
+            };
+            match read {
                 Line::Whole => {}
-                Line::End => return,
+                Line::End => {
+                    let _ = self.settle().await;
+                    return;
+                }
                 Line::TooLong => {
                     let error = RpcError::new(Code::TooLarge, format!("the line is longer than {MAX_LINE} bytes"));
                     let error = error.hint("send less at once; the connection is closed now");
-                    let _ = self.send(wire::reply::<()>(&Value::Null, Err(error))).await;
+                    let _ = self.reply::<Done>(&Value::Null, Err(error)).await;
                     let _ = timeout(FAREWELL, skip_line(from)).await;
                     return;
                 }
             }
-            if line.trim_ascii().is_empty() {
-                continue;
-            }
-            if self.answer(&line).await.is_err() {
+            if !line.trim_ascii().is_empty() && self.answer(&line).await.is_err() {
                 return;
             }
+            line.clear();
         }
     }
 
     async fn answer(&mut self, line: &[u8]) -> Result<(), Gone> {
         let wire::Envelope { id, method, params } = match wire::read(line) {
             Ok(envelope) => envelope,
-            Err((id, error)) => return self.send(wire::reply::<()>(&id, Err(error))).await,
+            Err((id, error)) => return self.reply::<Done>(&id, Err(error)).await,
         };
         match method.as_str() {
             Subscribe::NAME => match self.subscribe(params) {
                 Ok((reply, subscription)) => {
-                    self.send(wire::reply(&id, Ok(reply))).await?; // before the first message
+                    self.reply(&id, Ok(reply)).await?; // before the first message
                     let handle = self.running.spawn(subscription.forward(self.queue.clone()));
                     self.subscriptions.insert(reply.subscription, handle);
                     Ok(())
                 }
-                Err(error) => self.send(wire::reply::<()>(&id, Err(error))).await,
+                Err(error) => self.reply::<Done>(&id, Err(error)).await,
             },
             Unsubscribe::NAME => {
-                let reply = wire::reply(&id, self.unsubscribe(params));
-                self.send(reply).await
+                let result = self.unsubscribe(params);
+                self.reply(&id, result).await
             }
-            _ => {
-                let reply = wire::reply(&id, self.call(&method, params).await);
-                self.send(reply).await
+            Lease::NAME => {
+                let result = self.lease(params);
+                self.reply(&id, result).await
             }
+            Release::NAME => {
+                self.settle().await?; // targets that are on their way were sent under the lease
+                let result = self.release(params);
+                self.reply(&id, result).await
+            }
+            _ => match Request::read(&method, params) {
+                Ok(request) => self.request(id, method, request).await,
+                Err(error) => self.reply::<Done>(&id, Err(error)).await,
+            },
         }
     }
 
-    async fn call(&self, method: &str, params: Value) -> Result<super::Reply, RpcError> {
-        let request = Request::read(method, params)?;
-        timeout(CALL_LIMIT, self.backend.call(request)).await.unwrap_or_else(|_| {
-            let waited = CALL_LIMIT.as_secs();
-            Err(RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"))
-                .hint("it may still take effect; ask for `status`"))
+    async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Gone> {
+        if let Err(refusal) = self.lessee.admit(&request, &*self.backend) {
+            return self.reply::<Done>(&id, Err(refusal)).await;
+        }
+        let is_target = matches!(request, Request::Servo(_) | Request::Velocity(_));
+        let mut answer = self.call(method, request);
+        if !is_target {
+            self.settle().await?;
+            let result = answer.await;
+            return self.reply(&id, result).await;
+        }
+        // Polled once, it is on its way to the tick, whatever is read next.
+        if let Poll::Ready(result) = poll_fn(|cx| Poll::Ready(answer.as_mut().poll(cx))).await {
+            answer = Box::pin(ready(result));
+        }
+        self.in_flight.push_back((id, answer));
+        Ok(())
+    }
+
+    fn call(&self, method: String, request: Request) -> Answer {
+        let (backend, leases) = (self.backend.clone(), self.lessee.leases().clone());
+        Box::pin(async move {
+            let Ok(result) = timeout(CALL_LIMIT, backend.call(request)).await else {
+                let waited = CALL_LIMIT.as_secs();
+                let error = RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"));
+                return Err(error.hint("it may still take effect; ask for `status`"));
+            };
+            result.map(|reply| leases.complete(reply))
         })
+    }
+
+    /// Waits for the answers to all targets that are on their way.
+    async fn settle(&mut self) -> Result<(), Gone> {
+        while !self.in_flight.is_empty() {
+            let done = oldest(&mut self.in_flight).await;
+            self.send_oldest(done).await?;
+        }
+        Ok(())
+    }
+
+    async fn send_oldest(&mut self, result: Result<Reply, RpcError>) -> Result<(), Gone> {
+        match self.in_flight.pop_front() {
+            Some((id, _)) => self.send(wire::reply(&id, result)).await,
+            None => Ok(()),
+        }
+    }
+
+    /// Sends a reply, after those to all requests before.
+    async fn reply<T: Serialize>(&mut self, id: &Value, result: Result<T, RpcError>) -> Result<(), Gone> {
+        self.settle().await?;
+        self.send(wire::reply(id, result)).await
+    }
+
+    fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
+        let arms = self.arms(read_params::<Lease>(params)?.arm)?;
+        self.lessee.take(&arms)?;
+        Ok(LeaseReply { arms })
+    }
+
+    fn release(&self, params: Value) -> Result<LeaseReply, RpcError> {
+        let arms = self.arms(read_params::<Release>(params)?.arm)?;
+        Ok(LeaseReply { arms: self.lessee.release(&arms) })
+    }
+
+    fn arms(&self, wanted: Option<String>) -> Result<Vec<String>, RpcError> {
+        let all = self.backend.arms_of(Subject::All);
+        match wanted {
+            None => Ok(all),
+            Some(arm) if all.contains(&arm) => Ok(vec![arm]),
+            Some(arm) => Err(RpcError::unknown(Code::UnknownArm, "arm", &arm, &all)),
+        }
     }
 
     fn subscribe(&mut self, params: Value) -> Result<(SubscribeReply, Subscription), RpcError> {
@@ -146,61 +257,16 @@ impl Connection {
     }
 
     /// Waits for room in the queue, so a client that does not read is not read from.
-    async fn send(&self, line: String) -> Result<(), Gone> {
+    async fn send(&mut self, line: String) -> Result<(), Gone> {
         self.queue.send(line).await.map_err(|_| Gone)
     }
 }
 
-/// A client's reading of a stream.
-struct Subscription {
-    number: u64,
-    stream: &'static str,
-    from: broadcast::Receiver<Arc<str>>,
-    pace: Pace,
-}
-
-impl Subscription {
-    async fn forward(mut self, queue: mpsc::Sender<String>) {
-        let mut lost = 0;
-        loop {
-            match self.from.recv().await {
-                Ok(data) if self.pace.is_due(Instant::now()) => {
-                    let line = wire::message(self.stream, self.number, lost, &data);
-                    if queue.send(line).await.is_err() {
-                        return;
-                    }
-                    lost = 0;
-                }
-                Ok(_) => {}
-                Err(broadcast::error::RecvError::Lagged(missed)) => lost += missed,
-                Err(broadcast::error::RecvError::Closed) => return,
-            }
-        }
-    }
-}
-
-/// Thins a stream out to a rate.
-struct Pace {
-    period: Option<Duration>,
-    next: Option<Instant>,
-}
-
-impl Pace {
-    fn of(rate: Option<f64>) -> Self {
-        Self { period: rate.map(|hz| Duration::from_secs_f64(1.0 / hz)), next: None }
-    }
-
-    /// Whether a message that came now is to be sent. A quarter of a period early counts as on time, so that asking
-    /// for a stream at its own rate loses nothing to jitter.
-    fn is_due(&mut self, now: Instant) -> bool {
-        let Some(period) = self.period else { return true };
-        let next = self.next.unwrap_or(now);
-        if now + period / 4 < next {
-            return false;
-        }
-        let following = next + period;
-        self.next = Some(if following < now { now + period } else { following });
-        true
+/// The answer to the oldest target that is on its way. Once it has come, the target must be taken out.
+async fn oldest(in_flight: &mut VecDeque<(Value, Answer)>) -> Result<Reply, RpcError> {
+    match in_flight.front_mut() {
+        Some((_, answer)) => answer.await,
+        None => std::future::pending().await,
     }
 }
 

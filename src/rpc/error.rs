@@ -32,6 +32,8 @@ pub enum Code {
     UnknownMotion,
     /// No such subscription on this connection.
     UnknownSubscription,
+    /// Another connection commands the arm; the refusal names it.
+    LeaseHeld,
     /// No trajectory task covers these joints.
     NoTrajectoryTask,
     /// The trajectory is not well-formed: empty, not increasing in time, wrong widths.

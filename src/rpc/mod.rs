@@ -8,6 +8,8 @@
 //! ← {"stream":"coordinator_joint_state","subscription":1,"data":{…}}
 //! ```
 //!
+//! Requests that move an arm need its lease, which one connection has at a time: `lease.rs`.
+//!
 //! [`api`] says what may be asked, [`report`] what comes back, [`error`] how it is refused. [`place`] says where the
 //! sockets are and who lives, [`server`] and [`client`] are the two ends.
 
@@ -16,12 +18,15 @@ mod arm_api;
 pub mod client;
 mod connection;
 pub mod error;
+mod lease;
 mod motion_api;
 pub mod place;
 pub mod report;
 pub mod server;
 pub mod streams;
+mod subscription;
 mod wire;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};
 pub use error::{Code, RpcError};
+pub use lease::Subject;

@@ -119,12 +119,29 @@ pub struct ArmReport {
     pub native_rate_hz: f64,
     /// Recent episodes of trouble, the newest last.
     pub faults: Vec<FaultReport>,
+    /// Who holds its lease and may move it; absent when nobody does.
+    #[serde(default)]
+    pub commander: Option<CommanderReport>,
+    /// How far its gripper closes and opens [m]; absent without a gripper, or where its adapter does not say.
+    #[serde(default)]
+    pub gripper_range: Option<[f64; 2]>,
     /// What happens to it when the run ends: `hold` or `disable`.
     pub on_exit: String,
     /// Whether it keeps its pose when its motors are disabled, or falls.
     pub holds_when_disabled: bool,
     /// What the device thread counted: `reads`, `read_errors`, `writes`, …
     pub counters: BTreeMap<String, u64>,
+}
+
+/// Who commands an arm.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct CommanderReport {
+    /// Its process; absent where the system does not tell.
+    pub pid: Option<i32>,
+    /// What the process calls itself: `python3 policy.py`.
+    pub program: String,
+    /// For how long it holds the lease [s].
+    pub held_for: f64,
 }
 
 /// Why an arm is held.

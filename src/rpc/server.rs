@@ -16,6 +16,7 @@ use tokio::sync::{Semaphore, oneshot};
 use super::api::{Backend, MAX_CONNECTIONS};
 use super::connection;
 use super::error::{Code, RpcError};
+use super::lease::{Leases, Lessee};
 use super::place::Claim;
 use super::wire;
 
@@ -76,6 +77,8 @@ async fn accept(listener: StdListener, backend: Arc<dyn Backend>) {
         Ok(listener) => listener,
         Err(e) => return tracing::error!("rpc: the socket cannot be served: {e}"),
     };
+    let leases = Arc::new(Leases::default());
+    let mut connections = 0;
     let room = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         let stream = match listener.accept().await {
@@ -95,9 +98,12 @@ async fn accept(listener: StdListener, backend: Arc<dyn Backend>) {
             refuse(&stream, error.hint("close one, or ask several things over one connection"));
             continue;
         };
+        connections += 1;
+        let pid = stream.peer_cred().ok().and_then(|peer| peer.pid());
+        let lessee = Lessee::new(leases.clone(), connections, pid);
         let backend = backend.clone();
         tokio::spawn(async move {
-            connection::serve(stream, backend).await;
+            connection::serve(stream, backend, lessee).await;
             drop(seat);
         });
     }

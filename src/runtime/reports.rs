@@ -1,12 +1,14 @@
 //! What a run tells of itself: status, state, motions, streams.
 
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Instant;
 
 use super::dispatch::lock;
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
 use crate::blueprint::OnExit;
 use crate::clock::WallOffset;
+use crate::hardware::device::Connected;
 use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
@@ -58,7 +60,7 @@ impl Service {
     fn arm_report(&self, index: usize) -> Option<ArmReport> {
         let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
         let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
-        let info = &self.parts.connected.get(index)?.info;
+        let Connected { info, gripper_range, .. } = self.parts.connected.get(index)?;
         let faults = health.episodes().into_iter().map(|e| FaultReport {
             since: now.seconds_since(e.since),
             over: e.until.is_some(),
@@ -88,6 +90,8 @@ impl Service {
             measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),
             native_rate_hz: info.native_rate,
             faults: faults.collect(),
+            commander: None, // the connections know
+            gripper_range: gripper_range.map(|(closed, open)| [closed, open]),
             on_exit: match arm.on_exit {
                 OnExit::Hold => "hold".to_owned(),
                 OnExit::Disable => "disable".to_owned(),
@@ -253,13 +257,11 @@ impl Service {
 
     /// Tells an event to the text log and to those who listen.
     pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
-        let admitted = lock(&self.throttle).admit(described.kind, self.now());
-        if let Some(unsaid) = admitted {
-            let more = if unsaid > 0 { format!(" ({unsaid} more like this were not shown)") } else { String::new() };
+        if let Some(line) = self.repeats.line(described, Instant::now()) {
             match described.severity {
-                Severity::Info => tracing::debug!("{}{more}", described.text),
-                Severity::Warn => tracing::warn!("{}{more}", described.text),
-                Severity::Error => tracing::error!("{}{more}", described.text),
+                Severity::Info => tracing::debug!("{line}"),
+                Severity::Warn => tracing::warn!("{line}"),
+                Severity::Error => tracing::error!("{line}"),
             }
         }
         self.parts.streams.publish_event(|| EventReport {

@@ -10,7 +10,7 @@ use dimos::rpc::place::RunFolder;
 use dimos::rpc::report::*;
 use dimos::rpc::server::Server;
 use dimos::rpc::streams::Streams;
-use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError};
+use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError, Subject};
 
 /// Answers like a run with one 2-joint arm named `arm`.
 #[derive(Default)]
@@ -101,6 +101,15 @@ impl Backend for FakeBackend {
                 Request::Shutdown(_) => Reply::Shutdown(Done {}),
             })
         })
+    }
+
+    fn arms_of(&self, subject: Subject<'_>) -> Vec<String> {
+        let is_meant = match subject {
+            Subject::All | Subject::Joints(_) => true,
+            Subject::Arm(name) => name == "arm",
+            Subject::Task(name) => name == "traj_arm" || name == "t",
+        };
+        is_meant.then(|| "arm".to_owned()).into_iter().collect()
     }
 
     fn streams(&self) -> &Streams {

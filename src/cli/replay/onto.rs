@@ -13,7 +13,8 @@ use super::player::Part as Span;
 use crate::blueprint::{Blueprint, Overrides};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::{Signals, show_deviation};
-use crate::cli::{banner, check, output, text_log};
+use crate::cli::text_log::Terminal;
+use crate::cli::{banner, check, output};
 use crate::hardware::registry::Registry;
 use crate::replay::fit::fit;
 use crate::replay::motion::RecordedMotion;
@@ -45,7 +46,8 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     }
     let plan = plan(&blueprint, &fit(&motion).scaled(args.rate)).map_err(split)?;
     refuse_real_arms(&blueprint, args.onto.allow_motion)?;
-    text_log::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the text log: {e}")))?;
+    let terminal =
+        Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the text log: {e}")))?;
     let signals = Signals::watch_with_hangup();
     // The motors come on when the limits are known to allow the motion.
     let wanted: Vec<bool> = blueprint.arms.iter().map(|arm| arm.auto_enable).collect();
@@ -60,6 +62,7 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     let result = driver.drive(&wanted);
     let report = run.status();
     let ended = run.stop();
+    terminal.flush();
     say_goodbye(&result, &ended, args.json);
     for arm in report.arms.iter().filter(|_| !args.json) {
         output::note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));

@@ -222,6 +222,10 @@ impl ManipulatorAdapter for MockArm {
         Ok(self.options.gripper.then_some(self.device.gripper.position))
     }
 
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.options.gripper.then_some((0.0, GRIPPER_MAX))
+    }
+
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         if !self.options.gripper {
             return Err(AdapterError::Unsupported);

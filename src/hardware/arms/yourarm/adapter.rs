@@ -359,6 +359,10 @@ impl ManipulatorAdapter for YourArmAdapter {
         Ok((used && state.gripper_fitted).then_some(state.gripper / MM_PER_M))
     }
 
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.options.gripper.then_some((0.0, super::GRIPPER_MAX))
+    }
+
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         if !self.options.gripper {
             return Err(AdapterError::Unsupported);

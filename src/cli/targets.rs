@@ -1,0 +1,156 @@
+//! Targets of a stream, one per line, from a file or stdin; every mistake is told with its line.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read};
+use std::path::Path;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::time::Duration;
+
+use super::exit::{Failure, Result};
+
+/// Longest line [bytes].
+const MAX_LINE: u64 = 64 * 1024;
+/// Lines that wait to be sent: who writes faster is made to wait.
+const AHEAD: usize = 1;
+
+/// How many numbers a target has.
+#[derive(Debug, Clone, Copy)]
+pub struct Width(pub usize);
+
+/// Where targets come from.
+pub struct Source {
+    lines: Receiver<Result<Vec<f64>>>,
+    over: bool,
+}
+
+impl Source {
+    /// A file. It is read to its end first, so that a mistake in its last line moves nothing.
+    pub fn file(path: &Path, width: Width) -> Result<Self> {
+        let open = || File::open(path).map_err(|e| Failure::usage(format!("{}: {e}", path.display())));
+        Lines::new(open()?, path.display().to_string(), width).try_for_each(|target| target.map(|_| ()))?;
+        Ok(Self::read(Lines::new(open()?, path.display().to_string(), width)))
+    }
+
+    /// stdin, as it comes.
+    pub fn stdin(width: Width) -> Self {
+        Self::read(Lines::new(io::stdin(), "stdin".into(), width))
+    }
+
+    /// Reads on a thread of its own, so that a wait for the next line can be given up.
+    fn read(lines: impl Iterator<Item = Result<Vec<f64>>> + Send + 'static) -> Self {
+        let (sender, receiver) = sync_channel(AHEAD);
+        std::thread::spawn(move || {
+            for line in lines {
+                if sender.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        Self { lines: receiver, over: false }
+    }
+
+    /// The next target; `None` when none came within `patience`, or there are no more.
+    pub fn next(&mut self, patience: Duration) -> Result<Option<Vec<f64>>> {
+        match self.lines.recv_timeout(patience) {
+            Ok(target) => target.map(Some),
+            Err(RecvTimeoutError::Timeout) => Ok(None),
+            Err(RecvTimeoutError::Disconnected) => {
+                self.over = true;
+                Ok(None)
+            }
+        }
+    }
+
+    /// Whether there are no more.
+    pub fn is_over(&self) -> bool {
+        self.over
+    }
+}
+
+/// The targets in a text.
+struct Lines<R> {
+    from: BufReader<R>,
+    name: String,
+    width: Width,
+    line: usize,
+}
+
+impl<R: Read> Lines<R> {
+    fn new(from: R, name: String, width: Width) -> Self {
+        Self { from: BufReader::new(from), name, width, line: 0 }
+    }
+
+    fn mistake(&self, what: impl std::fmt::Display) -> Failure {
+        Failure::usage(format!("{}:{}: {what}", self.name, self.line))
+            .hint("`dimos task stream --help` shows the format")
+    }
+}
+
+impl<R: Read> Iterator for Lines<R> {
+    type Item = Result<Vec<f64>>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            self.line += 1;
+            let mut text = Vec::new();
+            match (&mut self.from).take(MAX_LINE).read_until(b'\n', &mut text) {
+                Ok(0) => return None,
+                Ok(_) if text.len() as u64 == MAX_LINE => return Some(Err(self.mistake("the line is too long"))),
+                Ok(_) => {}
+                Err(e) => return Some(Err(self.mistake(e))),
+            }
+            let Ok(text) = std::str::from_utf8(&text) else { return Some(Err(self.mistake("not a text"))) };
+            let text = text.trim();
+            if text.is_empty() || text.starts_with('#') {
+                continue;
+            }
+            let target = numbers(text).and_then(|numbers| match (numbers.len(), self.width.0) {
+                (given, wanted) if given == wanted => Ok(numbers),
+                (given, wanted) => Err(format!("{given} numbers for {wanted} joints")),
+            });
+            return Some(target.map_err(|what| self.mistake(what)));
+        }
+    }
+}
+
+/// The numbers of a line: a JSON array, or numbers between blanks or commas.
+fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
+    if text.starts_with('[') {
+        return serde_json::from_str(text).map_err(|e| e.to_string());
+    }
+    let cells = text.split([',', ' ', '\t', ';']).filter(|cell| !cell.is_empty());
+    let number = |cell: &str| match cell.parse::<f64>() {
+        Ok(value) if value.is_finite() => Ok(value),
+        _ => Err(format!("{cell:?} is not a finite number")),
+    };
+    cells.map(number).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn all(text: &str, width: usize) -> Vec<std::result::Result<Vec<f64>, String>> {
+        let lines = Lines::new(text.as_bytes(), "t".into(), Width(width));
+        lines.map(|target| target.map_err(|failure| failure.what)).collect()
+    }
+
+    #[test]
+    fn lines_are_json_or_numbers_and_mistakes_have_their_line() {
+        let good = vec![Ok(vec![1.0, -0.5]); 4];
+        assert_eq!(all("[1, -0.5]\n1 -.5\n\n# note\n1,-0.5\n 1;\t-5e-1", 2), good);
+        for (text, expected) in [
+            ("1 2\n3", "t:2: 1 numbers for 2 joints"),
+            ("1 x", "t:1: \"x\" is not a finite number"),
+            ("1 inf", "t:1: \"inf\" is not a finite number"),
+            ("[1, 2", "t:1: EOF"),
+            ("[1, \"2\"]", "t:1: invalid type"),
+            ("[1e999, 1]", "t:1: number out of range"),
+        ] {
+            let last = all(text, 2).pop().unwrap().unwrap_err();
+            assert!(last.starts_with(expected), "{text:?}: {last}");
+        }
+        assert!(all(&"1 ".repeat(40_000), 2)[0].as_ref().unwrap_err().contains("too long"));
+        assert!(all("\u{fffd}", 2)[0].is_err());
+    }
+}

@@ -1,0 +1,196 @@
+//! `dimos task list|invoke|stream`: the tasks of a run, one by one.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use clap::{Subcommand, ValueEnum};
+
+use super::arguments::{Target, rate};
+use super::exit::{Exit, Failure, Result};
+use super::follow::Signals;
+use super::targets::{Source, Width};
+use super::{output, status};
+use crate::rpc::api::{Cancel, Servo, Status, Velocity};
+use crate::rpc::client::Client;
+use crate::rpc::report::TaskReport;
+use crate::rpc::{Code, RpcError};
+
+/// How often a wait for the next target looks for Ctrl-C.
+const LOOK: Duration = Duration::from_millis(50);
+/// Targets per second from a file, when none are given [Hz].
+const FILE_RATE: f64 = 50.0;
+
+/// Arguments of `task`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// List the tasks of a run: what they do just now, and their joints
+    List {
+        #[command(flatten)]
+        target_run: Target,
+    },
+    /// Ask something of one task
+    Invoke {
+        /// The task's name
+        task: String,
+        /// What to ask
+        method: Method,
+        #[command(flatten)]
+        target_run: Target,
+    },
+    /// Stream targets to a servo or velocity task, one per line, from a file or stdin
+    #[command(after_help = "\
+A line is a JSON array or numbers between blanks or commas: one per joint of the task, rad for a servo task, rad/s for a
+velocity task. Empty lines and those that begin with # are skipped. At most one target per tick takes effect.
+At the end of the stream a servo task holds the last target, a velocity task slows down to zero.")]
+    Stream {
+        /// The task's name
+        task: String,
+        /// Where the targets are; without it, or with -, stdin
+        file: Option<PathBuf>,
+        /// Targets per second [Hz]; without it 50 from a file, and from stdin as they come
+        #[arg(long, value_name = "HZ", value_parser = rate)]
+        rate: Option<f64>,
+        #[command(flatten)]
+        target_run: Target,
+    },
+}
+
+/// What can be asked of a task.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Method {
+    /// What it does, and why
+    State,
+    /// End what it does, by decelerating
+    Cancel,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args) -> Result {
+    match &args.action {
+        Action::List { target_run } => {
+            let tasks = target_run.connect()?.call(Status {})?.tasks;
+            if target_run.json {
+                output::json(&tasks)
+            } else {
+                status::print_tasks(&tasks)
+            }
+            Ok(Exit::Ok)
+        }
+        Action::Invoke { task, method, target_run } => invoke(task, *method, target_run),
+        Action::Stream { task, file, rate, target_run } => {
+            let mut client = target_run.connect()?;
+            let report = find(&mut client, task)?;
+            let width = Width(report.joints.len());
+            let (source, rate) = match file.as_deref().filter(|path| path.as_os_str() != "-") {
+                Some(path) => (Source::file(path, width)?, rate.or(Some(FILE_RATE))),
+                None => (Source::stdin(width), *rate),
+            };
+            stream(&mut client, &report, source, rate, target_run.json)
+        }
+    }
+}
+
+fn find(client: &mut Client, name: &str) -> Result<TaskReport> {
+    let mut tasks = client.call(Status {})?.tasks;
+    match tasks.iter().position(|task| task.name == name) {
+        Some(at) => Ok(tasks.swap_remove(at)),
+        None => {
+            let names: Vec<String> = tasks.into_iter().map(|task| task.name).collect();
+            Err(refusal(RpcError::unknown(Code::UnknownTask, "task", name, &names)))
+        }
+    }
+}
+
+fn refusal(error: RpcError) -> Failure {
+    crate::rpc::client::ClientError::Refused(error).into()
+}
+
+fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
+    let mut client = target_run.connect()?;
+    match method {
+        Method::State => {
+            let report = find(&mut client, task)?;
+            if target_run.json { output::json(&report) } else { status::print_tasks(&[report]) }
+        }
+        Method::Cancel => {
+            let reply = client.call(Cancel { task: Some(task.to_owned()), arm: None })?;
+            if target_run.json {
+                output::json(&reply);
+            } else {
+                reply.tasks.iter().for_each(|(task, status)| output::line(format_args!("{task}: {status}")));
+            }
+        }
+    }
+    Ok(Exit::Ok)
+}
+
+/// Sends targets until they end or a signal comes.
+fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Option<f64>, json: bool) -> Result {
+    let positions = match task.kind.as_str() {
+        "servo" => true,
+        "velocity" => false,
+        kind => {
+            let text = format!("{} is a {kind} task, and follows no stream", task.name);
+            return Err(refusal(RpcError::new(Code::WrongTask, text).hint("`dimos task list` shows the types")));
+        }
+    };
+    let signals = Signals::watch();
+    let period = rate.map(|rate| Duration::from_secs_f64(1.0 / rate));
+    let (began, mut sent, mut beat) = (Instant::now(), 0_u64, Instant::now());
+    let ended = loop {
+        if let Some(signal) = signals.last() {
+            break Some(signal);
+        }
+        let wait = beat.saturating_duration_since(Instant::now());
+        if !wait.is_zero() {
+            std::thread::sleep(wait.min(LOOK));
+            continue;
+        }
+        let target = match source.next(LOOK) {
+            Ok(Some(target)) => target,
+            Ok(None) if source.is_over() => break None,
+            Ok(None) => continue,
+            Err(mistake) => {
+                end(client, task)?;
+                return Err(mistake);
+            }
+        };
+        let name = task.name.clone();
+        match positions {
+            true => client.call(Servo { task: name, positions: target })?,
+            false => client.call(Velocity { task: name, velocities: target })?,
+        };
+        sent += 1;
+        if let Some(period) = period {
+            beat = (beat + period).max(Instant::now() - period);
+        }
+    };
+    let now = find(client, &task.name)?;
+    if matches!(now.state.as_str(), "FAULT" | "ABORTED") {
+        let why = now.reason.unwrap_or_else(|| "no reason is known".into());
+        let failure = Failure::new(Exit::Failed, format!("{}: {} after {sent} targets: {why}", now.name, now.state));
+        return Err(failure.hint("`dimos status` shows what the arm waits for"));
+    }
+    if ended.is_some() || !positions {
+        end(client, task)?;
+    }
+    let seconds = began.elapsed().as_secs_f64();
+    if json {
+        output::json(&serde_json::json!({"task": task.name, "targets": sent, "seconds": seconds}));
+    } else {
+        output::line(format_args!("{}: {sent} targets in {seconds:.2} s", task.name));
+    }
+    Ok(ended.map_or(Exit::Ok, Exit::by_signal))
+}
+
+/// Ends the stream's task at once; without that it would go on until its timeout, or keep its joints at zero.
+fn end(client: &mut Client, task: &TaskReport) -> Result<()> {
+    client.call(Cancel { task: Some(task.name.clone()), arm: None })?;
+    Ok(())
+}

@@ -1,0 +1,115 @@
+"""Tries assets/python/dimos_client.py against a live run of tests/python_client.rs; fails at what is not as it says."""
+
+import itertools
+import math
+import os
+
+import dimos_client as dimos
+from dimos_client import Client
+
+READY = [0.1, -0.2, 0.3, 0.0, 0.2, 0.0]
+
+
+def refused(kind, code, act):
+    try:
+        act()
+    except kind as error:
+        assert error.code == code, error
+        return error
+    raise AssertionError(f"{code} was expected")
+
+
+def near(a, b, by):
+    return all(abs(x - y) <= by for x, y in zip(a, b))
+
+
+def reads(robot):
+    state = robot.state("arm")
+    assert state.name == [f"arm_joint{i}" for i in range(1, 7)] and state.lost == 0
+    assert len(state.position) == 6 and None not in state.position and 0 <= state.age < 30
+    refused(dimos.Refused, "UNKNOWN_ARM", lambda: robot.state("rarm"))
+    ticks = [s.tick for s in itertools.islice(robot.joint_states(rate=50), 25)]
+    assert ticks == sorted(set(ticks)), ticks
+    assert robot.status()["arms"][0]["commander"] is None, "readers take no lease"
+
+
+def a_slow_reader_is_told(robot):
+    states = robot.joint_states()
+    first = next(states)
+    (queue,) = robot._queues.values()
+    while len(queue) < dimos.KEPT or not queue[0].get("lost"):
+        robot.status()  # takes in what comes and reads none of it
+    seen = [first, *itertools.islice(states, dimos.KEPT)]
+    assert seen[1].lost > 0
+    for before, after in zip(seen, seen[1:]):
+        assert after.tick - before.tick >= after.lost, (before.tick, after)
+    states.close()
+
+
+def moves(robot):
+    report = robot.move("arm", READY, speed=0.5)
+    assert report["state"] == "COMPLETED" and near(robot.state("arm").position, READY, 0.02)
+    held = refused(dimos.LeaseHeld, "LEASE_HELD", lambda: Client.connect().move("arm", READY))
+    assert held.data["pid"] == os.getpid() and "try_client.py" in held.data["program"], held.data
+    far = refused(dimos.OutOfLimits, "OUT_OF_LIMITS", lambda: robot.move("arm", [99.0] + READY[1:]))
+    assert far.data["joint"] == "arm_joint1" and far.hint
+    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.move("arm", [math.nan] * 6))
+    points = [{"time_from_start": t, "positions": [READY[0] + 0.05 * t], "velocities": [0.0]} for t in (0, 1)]
+    robot.execute({"joint_names": ["arm_joint1"], "points": points})
+    begun = robot.move("arm", READY, wait=False)
+    robot.cancel("arm")
+    failed = refused(dimos.MotionFailed, "ABORTED", lambda: robot.wait(begun["motion"]))
+    assert failed.data["done"]
+
+
+def follows_a_policy(robot, watcher):
+    """50 Hz for 4 s: every target is taken, and the stream never goes stale."""
+    home, asked = [], []
+    seen = watcher._subscribe("events", None, 4096)
+
+    def policy(state, t):
+        if not home:
+            home.extend(state.position)
+        asked.append(t)
+        return [home[0] + 0.1 * (1 - math.cos(2 * t))] + home[1:]
+
+    report = robot.follow("servo_arm", policy, rate=50, duration=4)
+    print(f"50 Hz: {report}")
+    assert report.sent == len(asked) and report.sent + report.missed in range(199, 202), report
+    watcher.status()  # what was told so far is here now
+    told = [m["data"] for m in watcher._queues[seen] if m["data"].get("task") == "servo_arm"]
+    assert [event["text"] for event in told] == ["task servo_arm is EXECUTING"], told
+    refused(dimos.Refused, "UNKNOWN_TASK", lambda: robot.follow("servo", lambda s, t: [0.0], duration=1))
+    robot.servo("servo_arm", [1.0])
+    refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
+    robot.cancel()
+
+
+def grips_and_stops(robot):
+    robot.gripper("arm", "open")
+    while abs(robot.state("arm").gripper - 0.08) > 1e-3:
+        pass
+    robot.gripper("arm", 0.02)
+    while abs(robot.state("arm").gripper - 0.02) > 1e-3:
+        pass
+    robot.velocity("velocity_arm", [0.1, 0, 0, 0, 0, 0])
+    robot.settle()
+    assert robot.stop() == {"arm": "confirmed"}
+    latched = refused(dimos.ArmNotReady, "ARM_LATCHED", lambda: robot.move("arm", READY))
+    assert "dimos arm reset arm" in latched.hint
+    assert robot.reset("arm") == "standby" and robot.enable("arm") == "ready"
+    robot.move("arm", READY, speed=1)
+
+
+refused(dimos.NoRun, "NO_RUN", lambda: Client.connect("another"))
+with Client.connect() as robot, Client.connect("scripts") as watcher:
+    reads(robot)
+    a_slow_reader_is_told(watcher)
+    moves(robot)
+    follows_a_policy(robot, watcher)
+    grips_and_stops(robot)
+    assert robot.call("release")["arms"] == ["arm"]
+    watcher.move("arm", READY)
+    robot.call("shutdown")
+    refused(dimos.ConnectionLost, "NO_CONNECTION", lambda: [robot.status() for _ in range(100_000)])
+print("all is as it says")
