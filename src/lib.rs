@@ -39,5 +39,7 @@ pub mod blueprint;
 
 pub mod runtime;
 
+pub mod replay;
+
 pub mod cli;
 pub mod testing;

@@ -185,10 +185,16 @@ impl Spline {
                 let h = times[s + 1] - times[s];
                 let ends = (a.positions[j], b.positions[j], velocities[s], velocities[s + 1]);
                 let stated = !a.velocities.is_empty() && !b.velocities.is_empty();
-                coefficients[s * joints + j] = match (a.accelerations.get(j), b.accelerations.get(j)) {
+                let curve = match (a.accelerations.get(j), b.accelerations.get(j)) {
                     (Some(&a0), Some(&a1)) if stated => quintic(ends, a0, a1, h),
                     _ => cubic(ends, h),
                 };
+                let reach = curve.iter().rev().fold(0.0, |sum, c| sum * h + c.abs());
+                if !curve.iter().all(|c| c.is_finite()) || !reach.is_finite() {
+                    let problem = "is too close to the point before it for what lies between them";
+                    return Err(TrajectoryError::Time { point: s + 1, time: times[s + 1], problem });
+                }
+                coefficients[s * joints + j] = curve;
             }
         }
         Ok(Self { joints, times, coefficients })

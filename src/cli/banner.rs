@@ -4,11 +4,11 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::output;
+use super::text_log::Terminal;
 use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
 
 /// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout.
-pub fn print(report: &StatusReport, socket: &Path, json: bool) {
+pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, json: bool) {
     #[derive(Serialize)]
     struct Started<'a> {
         event: &'static str,
@@ -17,9 +17,9 @@ pub fn print(report: &StatusReport, socket: &Path, json: bool) {
         report: &'a StatusReport,
     }
     if json {
-        return output::json(&Started { event: "started", socket, report });
+        return terminal.json(&Started { event: "started", socket, report });
     }
-    text(report, socket).iter().for_each(output::note);
+    text(report, socket).iter().for_each(|line| terminal.note(line));
 }
 
 /// The banner's lines.

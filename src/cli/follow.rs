@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::exit::{Exit, Failure, Result};
-use super::output::{self, Table, Tone, toned};
+use super::output::{self, Table, Tone, fixed, toned};
 use crate::rpc::api::{Cancel, Motion};
 use crate::rpc::client::Client;
-use crate::rpc::report::MotionReport;
+use crate::rpc::report::{Deviation, MotionReport};
 
 /// How often the run is asked.
 const INTERVAL: Duration = Duration::from_millis(50);
@@ -75,7 +75,14 @@ impl Signals {
         Self(seen)
     }
 
-    /// The last one.
+    /// The same, and SIGHUP too: for a program whose end would be the end of a run.
+    pub fn watch_with_hangup() -> Self {
+        let signals = Self::watch();
+        let _ = signal_hook::flag::register_usize(libc::SIGHUP, signals.0.clone(), libc::SIGHUP as usize);
+        signals
+    }
+
+    /// The last one received.
     pub fn last(&self) -> Option<i32> {
         Some(self.0.load(Ordering::Relaxed) as i32).filter(|signal| *signal != 0)
     }
@@ -86,15 +93,22 @@ fn print(report: &MotionReport, json: bool) {
         return output::json(report);
     }
     output::line(format_args!("motion {}: {} after {:.2} s", report.motion, report.state, report.elapsed));
-    let Some(deviation) = &report.deviation else { return };
+    show_deviation(report.deviation.as_deref().unwrap_or_default());
+}
+
+/// Shows how far off joints ended.
+pub fn show_deviation(deviation: &[Deviation]) {
+    if deviation.is_empty() {
+        return;
+    }
     let mut table = Table::new(&["JOINT", ">TARGET rad", ">ENDED rad", ">OFF BY rad", ">OFF BY deg"]);
     for joint in deviation {
         let off = joint.error();
         let tone = if off.abs() <= CLOSE { Tone::Good } else { Tone::Warning };
         table.row([
             joint.joint.as_str().into(),
-            output::number(Some(joint.target), 4).into(),
-            output::number(Some(joint.actual), 4).into(),
+            fixed(joint.target, 4).into(),
+            fixed(joint.actual, 4).into(),
             toned(format_args!("{off:+.4}"), tone),
             toned(format_args!("{:+.3}", off.to_degrees()), tone),
         ]);

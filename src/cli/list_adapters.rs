@@ -24,23 +24,25 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         output::json(&registry.rows().iter().map(to_json).collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
-    let mut table =
-        Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "MODES", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS", "ABOUT"]);
+    let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS"]);
     for row in registry.rows() {
         table.row([
             row.name.to_owned(),
             row.level.name().to_owned(),
             row.transport.to_owned(),
             dof(row),
-            modes(row).join(" "),
             row.wire_units.to_owned(),
             format!("{:.0}", row.native_rate),
             row.address.form.to_owned(),
             if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
-            row.about.to_owned(),
         ]);
     }
     table.print();
+    for row in registry.rows() {
+        output::line("");
+        output::line(format_args!("{}: {}", row.name, row.about));
+        output::line(format_args!("  modes: {}", modes(row).join(", ")));
+    }
     Ok(Exit::Ok)
 }
 

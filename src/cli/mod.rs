@@ -87,7 +87,7 @@ enum Command {
     Completions(completions::Args),
     /// Print the manual page, or write one for every verb
     Man(man::Args),
-    #[command(about = "Play a log back to the terminal")]
+    #[command(about = "Play a log back to the terminal, verify it, or let arms follow it")]
     Replay(replay::ReplayArgs),
 }
 
@@ -115,7 +115,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Man(args) => man::run(args),
         Command::Schema(args) => schema::run(args, &registry),
         Command::Replay(args) => {
-            return match replay::run(args) {
+            return match replay::run(args, &registry) {
                 Ok(code) => ExitCode::from(code),
                 Err(e) => {
                     output::failure(&exit::Failure::new(exit::Exit::Failed, e.to_string()));

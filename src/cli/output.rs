@@ -4,7 +4,7 @@ use std::fmt::Display;
 use std::io::{self, IsTerminal, Write};
 
 use comfy_table::presets::NOTHING;
-use comfy_table::{Attribute, Cell, CellAlignment, Color};
+use comfy_table::{Attribute, Cell, CellAlignment, Color, ContentArrangement};
 use serde::Serialize;
 
 use super::exit::Failure;
@@ -68,6 +68,10 @@ impl Table {
     pub fn new(headings: &[&str]) -> Self {
         let mut table = comfy_table::Table::new();
         table.load_style(NOTHING);
+        if io::stdout().is_terminal() {
+            // What does not fit goes on below, in its own column.
+            table.set_content_arrangement(ContentArrangement::Dynamic);
+        }
         if !colour(&io::stdout()) {
             table.force_no_tty();
         }
@@ -100,11 +104,14 @@ impl Table {
 
 /// A number with so many decimals, or `-` where there is none.
 pub fn number(value: Option<f64>, decimals: usize) -> String {
-    let Some(value) = value else { return "-".into() };
+    value.map_or_else(|| "-".into(), |v| fixed(v, decimals))
+}
+
+/// A number with so many decimals; never `-0.00`.
+pub fn fixed(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
-    // A small negative number that rounds to nothing is nothing.
     match text.strip_prefix('-') {
-        Some(digits) if digits.bytes().all(|b| matches!(b, b'0' | b'.')) => digits.to_owned(),
+        Some(rest) if rest.bytes().all(|b| matches!(b, b'0' | b'.')) => rest.to_owned(),
         _ => text,
     }
 }

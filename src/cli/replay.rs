@@ -1,6 +1,8 @@
-//! `dimos replay`: plays a log back to the terminal, in the time it took.
+//! `dimos replay`: plays a log back to the terminal, in the time it took, runs it again and compares, or drives arms by it.
 
+mod onto;
 mod player;
+mod verify;
 mod view;
 
 use std::io::{self, IsTerminal};
@@ -10,20 +12,34 @@ use std::time::Duration;
 use clap::Args;
 use thiserror::Error;
 
+use super::arguments::setting;
+use super::output;
+use crate::hardware::registry::Registry;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
+use crate::replay::recorded::RecordedError;
 use player::{Part, RealTime, play};
 use view::{JsonLines, Live, Plain, View};
 
+/// Exit code: the log comes out differently when it is run again.
+const DIFFERENT: u8 = 1;
 /// Exit code: the log is not there, not a log, or does not have what was asked for.
 const USAGE: u8 = 2;
 /// Exit code: data was lost while recording, or the log was cut.
 const DATA_LOST: u8 = 3;
 
-/// Play a log back to the terminal
+/// Play a log back to the terminal, verify it, or let arms follow it
 ///
 /// In the time it took: a joint table and a progress bar on a terminal, a line a second elsewhere, a JSON object per
 /// message with --json. Exits with 3 if the log was cut, or if the recorder lost data.
+///
+/// With --verify nothing is played: what every tick read and was told goes through the same control code again, and
+/// every command has to come out the same, bit for bit. Exits with 1 and the first difference if not; with 3 if a part
+/// is missing in the log, up to which it came out the same.
+///
+/// With --onto the arms of a blueprint follow the recorded motion, joint by joint of the same name, in a run of their
+/// own: a slow approach to where it begins, then the motion through the blueprint's trajectory tasks, within all limits.
+/// Where one would be broken it is refused before anything moves. It is not collision-checked. Ctrl-C decelerates.
 #[derive(Debug, Clone, Args)]
 pub struct ReplayArgs {
     /// Log file (.mcap)
@@ -32,7 +48,7 @@ pub struct ReplayArgs {
     /// Play the newest log
     #[arg(long)]
     pub last: bool,
-    /// Play faster or slower: 2 is twice as fast
+    /// Play or move faster or slower: 2 is twice as fast
     #[arg(short, long, value_name = "FACTOR", default_value = "1", value_parser = rate)]
     pub rate: f64,
     /// Begin again at the end
@@ -47,9 +63,41 @@ pub struct ReplayArgs {
     /// Play these topics only, separated by commas
     #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
     pub topics: Vec<String>,
-    /// Print a JSON object per message
+    /// Run all of the log through the control code again, and compare its commands bit for bit
+    #[arg(long, conflicts_with_all = ["rate", "looping", "start_offset", "duration", "topics"])]
+    pub verify: bool,
+    /// Where to drive arms by it
+    #[command(flatten)]
+    pub onto: OntoArgs,
+    /// Print JSON
     #[arg(long)]
     pub json: bool,
+}
+
+/// Arguments that drive arms.
+#[derive(Debug, Clone, Args)]
+pub struct OntoArgs {
+    /// Let the arms of this blueprint follow the recorded motion
+    #[arg(long = "onto", value_name = "BLUEPRINT", conflicts_with_all = ["verify", "looping", "topics"])]
+    pub blueprint: Option<String>,
+    /// Let real arms move; without this only simulated ones do
+    #[arg(long, requires = "blueprint")]
+    pub allow_motion: bool,
+    /// Change a field of the blueprint: hardware.arm.address=192.168.1.100 (repeatable)
+    #[arg(long, value_name = "PATH=VALUE", value_parser = setting, requires = "blueprint")]
+    pub set: Vec<(String, String)>,
+    /// Let emulators stand in for all arms of the blueprint
+    #[arg(long, requires = "blueprint")]
+    pub sim: bool,
+    /// Name of the run; without it the blueprint's name
+    #[arg(long, value_name = "RUN", requires = "blueprint")]
+    pub name: Option<String>,
+    /// Write the log of the run to this file
+    #[arg(long, value_name = "FILE", conflicts_with = "no_record", requires = "blueprint")]
+    pub record: Option<PathBuf>,
+    /// Write no log of the run
+    #[arg(long, requires = "blueprint")]
+    pub no_record: bool,
 }
 
 fn rate(text: &str) -> Result<f64, String> {
@@ -84,11 +132,11 @@ fn folder_text(folder: &Option<PathBuf>) -> String {
 }
 
 /// Plays a log as the arguments say. Gives the exit code.
-pub fn run(args: &ReplayArgs) -> anyhow::Result<u8> {
-    match try_run(args) {
+pub fn run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
+    match try_run(args, registry) {
         Ok(code) => Ok(code),
         Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(0),
-        Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() => {
+        Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
             eprintln!("error: {e}");
             Ok(USAGE)
         }
@@ -96,10 +144,20 @@ pub fn run(args: &ReplayArgs) -> anyhow::Result<u8> {
     }
 }
 
-fn try_run(args: &ReplayArgs) -> anyhow::Result<u8> {
+fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
     let path = log_path(args)?;
+    if args.verify {
+        return Ok(verify::run(&path, args.json)?);
+    }
     let mut log = LogReader::open(&path)?;
     let part = choose(args, log.info(), &path)?;
+    if let Some(blueprint) = &args.onto.blueprint {
+        let exit = onto::run(args, blueprint, &path, &part, registry).unwrap_or_else(|failure| {
+            output::failure(&failure);
+            failure.exit
+        });
+        return Ok(exit as u8);
+    }
     let out = io::stdout();
     let tty = out.is_terminal();
     let mut view: Box<dyn View> = if args.json {

@@ -9,9 +9,11 @@ use signal_hook::iterator::Signals;
 
 use super::arguments::{duration, setting};
 use super::exit::{Exit, Failure, Result};
-use super::{banner, check, output, text_log};
+use super::text_log::Terminal;
+use super::{banner, check};
 use crate::blueprint::Overrides;
 use crate::hardware::registry::Registry;
+use crate::rpc::report::StatusReport;
 use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
 
 /// Arguments of `run`.
@@ -70,24 +72,43 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     let loaded = check::load(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
-    text_log::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the text log: {e}")))?;
     // Taken before anything is connected: a signal during the start ends the run as soon as it is up, controlled.
-    let signals = Signals::new([SIGINT, SIGTERM, SIGHUP])
-        .map_err(|e| Failure::new(Exit::Failed, format!("signals cannot be watched: {e}")))?;
-    let run = Run::start(blueprint, args.options()).map_err(|error| Failure {
-        exit: if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed },
-        what: error.to_string(),
-        hint: Some(error.hint().to_owned()),
+    let signals = signals()?;
+    let terminal = terminal()?;
+    let run = Run::start(blueprint, args.options()).map_err(|error| {
+        terminal.flush();
+        let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
+        Failure::new(exit, error.to_string()).hint(error.hint())
     })?;
+    keep_up(run, signals, &terminal, args.duration, args.json)
+}
+
+/// Keeps a run up until a signal, its time, `dimos down` or a fault ends it, and stops it: what `dimos run` does with
+/// a run that has started. Tells about it on the terminal.
+pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result {
+    keep_up(run, signals()?, &terminal()?, duration, json)
+}
+
+fn signals() -> Result<Signals> {
+    Signals::new([SIGINT, SIGTERM, SIGHUP])
+        .map_err(|e| Failure::new(Exit::Failed, format!("signals cannot be watched: {e}")))
+}
+
+fn terminal() -> Result<Terminal> {
+    Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the terminal: {e}")))
+}
+
+fn keep_up(run: Run, signals: Signals, terminal: &Terminal, duration: Option<Duration>, json: bool) -> Result {
     watch(signals, &run)?;
     let report = run.status();
-    banner::print(&report, run.socket().unwrap_or_else(|| std::path::Path::new("none")), args.json);
-    let ending = run.wait(args.duration);
-    if !args.json {
-        output::note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
+    banner::print(terminal, &report, run.socket().unwrap_or_else(|| std::path::Path::new("none")), json);
+    let ending = run.wait(duration);
+    if !json {
+        terminal.note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
     }
     let ended = run.stop();
-    say_goodbye(&report, &ending, &ended, args.json);
+    say_goodbye(terminal, &report, &ending, &ended, json);
+    terminal.flush();
     Ok(match ending {
         Ending::Fault(_) => Exit::Fault,
         Ending::Signal(signal) => Exit::by_signal(signal),
@@ -120,7 +141,7 @@ fn why(ending: &Ending) -> String {
     }
 }
 
-fn say_goodbye(report: &crate::rpc::report::StatusReport, ending: &Ending, ended: &Ended, json: bool) {
+fn say_goodbye(terminal: &Terminal, report: &StatusReport, ending: &Ending, ended: &Ended, json: bool) {
     #[derive(Serialize)]
     struct Line<'a> {
         event: &'static str,
@@ -132,16 +153,16 @@ fn say_goodbye(report: &crate::rpc::report::StatusReport, ending: &Ending, ended
     if json {
         let log = ended.log.as_ref();
         let (run, troubles) = (report.run.as_str(), ended.troubles.as_slice());
-        return output::json(&Line { event: "ended", run, why: why(ending), troubles, log });
+        return terminal.json(&Line { event: "ended", run, why: why(ending), troubles, log });
     }
     for trouble in &ended.troubles {
-        output::note(format_args!("warning: {trouble}"));
+        terminal.note(format_args!("warning: {trouble}"));
     }
     for arm in &report.arms {
-        output::note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
+        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
     }
     match &ended.log {
-        Some(log) => output::note(format_args!("run {} ended; its log: {}", report.run, log.display())),
-        None => output::note(format_args!("run {} ended; no log was written", report.run)),
+        Some(log) => terminal.note(format_args!("run {} ended; its log: {}", report.run, log.display())),
+        None => terminal.note(format_args!("run {} ended; no log was written", report.run)),
     }
 }

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::arguments::Target;
+use super::banner::at_exit;
 use super::exit::{Exit, Result};
 use super::output::{self, Table, Tone, number, span, toned};
 use crate::rpc::api::Status;
@@ -85,7 +86,8 @@ fn print(r: &StatusReport) {
         (Some(log), Some(recorder)) => {
             let cut = recorder.error.as_ref().map(|e| format!("; ENDED: {e}")).unwrap_or_default();
             let (messages, dropped) = (recorder.messages, recorder.dropped);
-            output::line(format_args!("  log {log}: {messages} messages, {dropped} dropped{cut}"));
+            output::line(format_args!("  log {log}"));
+            output::line(format_args!("  {messages} messages logged, {dropped} dropped{cut}"));
         }
         _ => output::line("  no log is written"),
     }
@@ -98,19 +100,13 @@ fn print(r: &StatusReport) {
 }
 
 fn print_arms(arms: &[ArmReport]) {
-    let mut table = Table::new(&[
-        "ARM", "PHASE", "LINK", "MOTORS", "MODE", ">AGE ms", ">RATE Hz", ">NATIVE", "ADAPTER", "ADDRESS", "ON EXIT",
-    ]);
+    let mut table = Table::new(&["ARM", "PHASE", "LINK", "MOTORS", "MODE", ">AGE ms", ">RATE Hz", ">NATIVE Hz"]);
     for arm in arms {
         let good = |well: bool| if well { Tone::Good } else { Tone::Bad };
         let phase_tone = match arm.phase.as_str() {
             "ready" => Tone::Good,
             "held" => Tone::Bad,
             _ => Tone::Warning,
-        };
-        let address = match arm.simulated {
-            true => format!("{} SIMULATED", arm.address),
-            false => arm.address.clone(),
         };
         table.row([
             arm.hardware_id.as_str().into(),
@@ -121,14 +117,14 @@ fn print_arms(arms: &[ArmReport]) {
             number(arm.state_age_ms, 1).into(),
             number(arm.measured_rate_hz, 1).into(),
             format!("{:.0}", arm.native_rate_hz).into(),
-            arm.adapter.as_str().into(),
-            address.trim().into(),
-            arm.on_exit.as_str().into(),
         ]);
     }
     table.print();
     for arm in arms {
         let name = &arm.hardware_id;
+        let simulated = if arm.simulated { "SIMULATED, " } else { "" };
+        let address = if arm.address.is_empty() { String::new() } else { format!(" at {}", arm.address) };
+        output::line(format_args!("  {name}: {simulated}{}{address}; at exit: {}", arm.adapter, at_exit(arm)));
         if let Some(cause) = &arm.cause {
             output::line(format_args!("  {name} is {}: {}", arm.phase, cause.text));
         }
@@ -145,7 +141,12 @@ fn print_arms(arms: &[ArmReport]) {
             let held = span(c.held_for);
             output::line(format_args!("  {name} is commanded by {}{process}, since {held}", c.program));
         }
-        let counted: Vec<String> = arm.counters.iter().map(|(what, n)| format!("{what} {n}")).collect();
+        let counted: Vec<String> = arm
+            .counters
+            .iter()
+            .filter(|(_, n)| **n > 0)
+            .map(|(what, n)| format!("{n} {}", what.replace('_', " ")))
+            .collect();
         if !counted.is_empty() {
             output::line(format_args!("  {name} counted {}", counted.join(", ")));
         }
@@ -154,7 +155,7 @@ fn print_arms(arms: &[ArmReport]) {
 
 /// The tasks in a table.
 pub(super) fn print_tasks(tasks: &[TaskReport]) {
-    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS", "REASON"]);
+    let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS"]);
     for task in tasks {
         let tone = match task.state.as_str() {
             "ABORTED" | "FAULT" => Tone::Bad,
@@ -168,16 +169,23 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
             toned(&task.state, tone),
             task.progress.map_or_else(|| "-".into(), |p| format!("{:.0} %", p * 100.0)).into(),
             joints(&task.joints).into(),
-            task.reason.clone().unwrap_or_default().into(),
         ]);
     }
     table.print();
+    for task in tasks {
+        if let Some(reason) = &task.reason {
+            output::line(format_args!("  {} is {}: {reason}", task.name, task.state));
+        }
+    }
 }
 
-/// The first and the last joint stand for all between.
+/// The first and the end of the last joint's name stand for all between.
 fn joints(names: &[String]) -> String {
     match names {
-        [first, _, .., last] => format!("{first} … {last} ({})", names.len()),
+        [first, _, .., last] => {
+            let same = first.chars().zip(last.chars()).take_while(|(a, b)| a == b).count();
+            format!("{first} … {} ({})", last.chars().skip(same).collect::<String>(), names.len())
+        }
         few => few.join(" "),
     }
 }
@@ -193,7 +201,7 @@ fn print_timing(r: &StatusReport) {
     row("lateness", &t.lateness_us);
     row("compute", &t.compute_us);
     table.print();
-    output::line(format_args!("  {} ticks, {} overruns, {} periods skipped", t.count, t.overruns, t.skipped));
+    output::line(format_args!("  ticks: {}, overruns: {}, periods skipped: {}", t.count, t.overruns, t.skipped));
     for text in r.realtime.iter().flat_map(super::banner::realtime) {
         output::line(format_args!("  {text}"));
     }

@@ -1,64 +1,115 @@
-//! The text log of a run, on stderr: written by a thread of its own, so that a terminal that stands still holds up
-//! nobody. Lines that find the queue full are dropped and counted.
+//! What a run says on its terminal: its own words and its text log, written by a thread of its own, so that a terminal
+//! that stands still (Ctrl-S, a pipe that nobody reads) holds up nobody, least of all the stop. Lines that find the
+//! queue full are dropped and counted.
 
+use std::fmt::Display;
 use std::io::{self, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::time::Duration;
 
+use serde::Serialize;
 use tracing_subscriber::filter::LevelFilter;
 use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::layer::SubscriberExt;
 
 /// Lines on their way to the terminal.
 const QUEUE: usize = 1024;
+/// How long the last lines are waited for.
+const LAST_LINES: Duration = Duration::from_millis(500);
 
+enum Item {
+    Note(Vec<u8>),
+    Data(Vec<u8>),
+    /// Answered when all before it is written.
+    Flush(SyncSender<()>),
+}
+
+/// The way to the terminal. Nothing here waits for it.
 #[derive(Clone)]
-struct Queue {
-    lines: SyncSender<Vec<u8>>,
+pub struct Terminal {
+    items: SyncSender<Item>,
     dropped: Arc<AtomicU64>,
 }
 
-/// Starts the text log. `DIMOS_LOG` sets its level: error, warn (without it), info, debug.
-pub fn start() -> io::Result<()> {
-    let level = std::env::var("DIMOS_LOG").ok().and_then(|l| l.parse::<LevelFilter>().ok());
-    let (lines, received) = sync_channel::<Vec<u8>>(QUEUE);
-    let dropped = Arc::new(AtomicU64::new(0));
-    let lost = dropped.clone();
-    std::thread::Builder::new().name("text-log".into()).spawn(move || {
-        for line in received {
-            let mut stderr = io::stderr().lock();
-            let _ = stderr.write_all(&line);
-            let missing = lost.swap(0, Ordering::Relaxed);
-            if missing > 0 {
-                let _ = writeln!(stderr, "({missing} lines were dropped: the terminal was too slow)");
-            }
+impl Terminal {
+    /// Starts the thread and the text log. `DIMOS_LOG` sets its level: error, warn (without it), info, debug.
+    pub fn start() -> io::Result<Self> {
+        let level = std::env::var("DIMOS_LOG").ok().and_then(|l| l.parse::<LevelFilter>().ok());
+        let (items, received) = sync_channel(QUEUE);
+        let dropped = Arc::new(AtomicU64::new(0));
+        let lost = dropped.clone();
+        std::thread::Builder::new().name("terminal".into()).spawn(move || write(&received, &lost))?;
+        let terminal = Self { items, dropped };
+        let layer = tracing_subscriber::fmt::layer()
+            .with_ansi(super::output::colour(&io::stderr()))
+            .with_target(false)
+            .with_writer(terminal.clone());
+        let subscriber = tracing_subscriber::registry().with(level.unwrap_or(LevelFilter::WARN)).with(layer);
+        // A program that embeds this one may have a log of its own; then that one is used.
+        let _ = tracing::subscriber::set_global_default(subscriber);
+        Ok(terminal)
+    }
+
+    /// A line for people, to stderr.
+    pub fn note(&self, text: impl Display) {
+        self.send(Item::Note(format!("{text}\n").into_bytes()));
+    }
+
+    /// A line of JSON, to stdout.
+    pub fn json(&self, value: &impl Serialize) {
+        // The types printed have string keys only, so encoding cannot fail.
+        let mut line = serde_json::to_vec(value).unwrap_or_default();
+        line.push(b'\n');
+        self.send(Item::Data(line));
+    }
+
+    /// Waits a moment for what was said to be written.
+    pub fn flush(&self) {
+        let (done, written) = sync_channel(1);
+        if self.items.try_send(Item::Flush(done)).is_ok() {
+            // Who has not read by then does not look.
+            let _ = written.recv_timeout(LAST_LINES);
         }
-    })?;
-    let writer = Queue { lines, dropped };
-    let layer = tracing_subscriber::fmt::layer()
-        .with_ansi(super::output::colour(&io::stderr()))
-        .with_target(false)
-        .with_writer(writer);
-    let subscriber = tracing_subscriber::registry().with(level.unwrap_or(LevelFilter::WARN)).with(layer);
-    // A program that embeds this one may have a log of its own; then that one is used.
-    let _ = tracing::subscriber::set_global_default(subscriber);
-    Ok(())
+    }
+
+    fn send(&self, item: Item) {
+        if self.items.try_send(item).is_err() {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
 }
 
-impl<'a> MakeWriter<'a> for Queue {
-    type Writer = Queue;
+fn write(items: &Receiver<Item>, lost: &AtomicU64) {
+    for item in items {
+        // That nobody reads any more is no error.
+        let _ = match item {
+            Item::Note(line) => io::stderr().write_all(&line),
+            Item::Data(line) => io::stdout().write_all(&line),
+            Item::Flush(done) => {
+                let _ = done.send(());
+                Ok(())
+            }
+        };
+        let missing = lost.swap(0, Ordering::Relaxed);
+        if missing > 0 {
+            let _ = writeln!(io::stderr(), "({missing} lines were dropped: the terminal was too slow)");
+        }
+    }
+}
 
-    fn make_writer(&'a self) -> Queue {
+impl<'a> MakeWriter<'a> for Terminal {
+    type Writer = Terminal;
+
+    fn make_writer(&'a self) -> Terminal {
         self.clone()
     }
 }
 
-impl Write for Queue {
+impl Write for Terminal {
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
-        if self.lines.try_send(line.to_vec()).is_err() {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-        }
+        self.send(Item::Note(line.to_vec()));
         Ok(line.len())
     }
 

@@ -6,13 +6,15 @@ use super::estimate::VelocityEstimator;
 use super::failsafe::Failsafe;
 use super::limit::{Bounds, Limiter, Refusal};
 use super::task::Demand;
-use crate::arm::{ArmCommand, ArmState, Link};
+use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
 use crate::clock::Mono;
-use crate::joint::{ControlMode, MAX_DOF};
+use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::telemetry::{Cause, LimitKind, Phase};
 
 /// A joint that measures no more than this is at a standstill for a change of mode [rad/s].
 const STANDSTILL: f64 = 0.05;
+/// How long an arm that lags gets to come to where its last command is, before it is asked to stop [s].
+const SETTLING_LIMIT: f64 = 0.5;
 /// Further than this from the last command, a re-activated arm is taken to have been moved by hand [rad].
 const CARRIED_BY_POSITION_ERROR: f64 = 0.05;
 
@@ -33,7 +35,11 @@ pub struct ArmControl {
     command: ArmCommand,
     /// The last command still stands at the arm: it has been under power since.
     command_stands: bool,
-    stopped: bool,
+    /// The arm is to be asked to stop by its own means, once it is at rest.
+    stop_owed: bool,
+    was_held: bool,
+    /// How long its commands have been at rest [s].
+    settling: f64,
 }
 
 /// What one joint is asked to do in this tick.
@@ -82,7 +88,9 @@ impl ArmControl {
             failsafe: Failsafe::default(),
             command: ArmCommand::default(),
             command_stands: false,
-            stopped: false,
+            stop_owed: false,
+            was_held: false,
+            settling: 0.0,
         }
     }
 
@@ -113,15 +121,18 @@ impl ArmControl {
 
     /// Takes in the latest state. `true`: its phase changed.
     pub fn read(&mut self, state: &ArmState, now: Mono) -> bool {
-        let finite = state.position.iter().take(self.config.dof).all(|q| q.is_finite());
-        if finite {
-            self.state = *state;
-            self.estimator.fill(&mut self.state);
-        } else {
-            // Positions that are not numbers are no state: the last one stays, and ages.
-            self.state.link = state.link;
-            self.state.error = state.error;
+        let dof = self.config.dof;
+        let finite = |values: &Joints| values.iter().take(dof).all(|v| v.is_finite());
+        let before = std::mem::replace(&mut self.state, *state);
+        if !finite(&state.position) {
+            // Positions that are not numbers are no measurement: the last one stays, and ages.
+            (self.state.seq, self.state.stamp) = (before.seq, before.stamp);
+            (self.state.position, self.state.velocity) = (before.position, before.velocity);
+            (self.state.velocity_source, self.state.effort) = (before.velocity_source, before.effort);
+        } else if !finite(&state.velocity) {
+            self.state.velocity_source = VelocitySource::Absent;
         }
+        self.estimator.fill(&mut self.state);
         self.fresh = self.state.seq != 0
             && self.state.link == Link::Up
             && now.since(self.state.stamp) <= self.config.state_timeout;
@@ -132,15 +143,18 @@ impl ArmControl {
     }
 
     /// The arm was enabled: starts the hold. Where the arm has been under power since the last command and is
-    /// still near it, that command stays: starting from the measured pose would sink a little at every enable.
+    /// still near it, that command stays: starting from the measured pose would sink a little at every enable. An
+    /// arm that is still being brought to rest goes on with that.
     pub fn seed(&mut self) {
+        if self.command.mode.is_some() {
+            return;
+        }
         for (limiter, q) in self.limiters.iter_mut().zip(&self.state.position) {
             let near = (limiter.position() - q).abs() <= CARRIED_BY_POSITION_ERROR;
             let start = if self.command_stands && near { limiter.position() } else { *q };
             limiter.seed(start);
         }
-        self.command.mode = None;
-        self.stopped = false;
+        self.stop_owed = false;
     }
 
     /// A new gripper opening [m].
@@ -166,13 +180,24 @@ impl ArmControl {
     ) -> Routed {
         self.command.seq += 1;
         self.command.next_tick = next_tick;
-        let routed = match self.failsafe.phase() {
+        let phase = self.failsafe.phase();
+        let held = phase == Phase::Held;
+        self.stop_owed |= held && !self.was_held;
+        self.was_held = held;
+        let routed = match phase {
             Phase::Unknown | Phase::Disabled => {
                 self.command.mode = None;
                 Routed::NotReady
             }
-            _ if self.state.link != Link::Up || !self.state.enabled => {
+            _ if !self.state.enabled => {
                 self.command.mode = None;
+                Routed::NotReady
+            }
+            _ if matches!(self.state.link, Link::Down | Link::Faulted) => {
+                // It may still follow the last command: the device thread stops it as soon as it gets through.
+                if self.command.mode.take().is_some() {
+                    self.stop();
+                }
                 Routed::NotReady
             }
             Phase::Held | Phase::Standby => {
@@ -194,15 +219,32 @@ impl ArmControl {
     /// Slows down by commands; when at rest, asks the arm to stop by its own means and leaves it alone.
     fn come_to_rest(&mut self, dt: f64) {
         if let Some(mode) = self.command.mode {
-            if !self.at_rest() {
+            if !self.settled(dt) {
                 return self.hold(mode, dt);
             }
             self.command.mode = None;
+            self.stop_owed = true;
         }
-        if !self.stopped {
-            self.stopped = true;
-            self.command.stop_seq = self.command.stop_seq.wrapping_add(1);
+        if self.stop_owed {
+            self.stop();
         }
+    }
+
+    fn stop(&mut self) {
+        self.stop_owed = false;
+        self.settling = 0.0;
+        self.command.stop_seq = self.command.stop_seq.wrapping_add(1);
+    }
+
+    /// Whether the arm has come to where its commands rest. A stop before that would make it hold short of the last
+    /// command, and taking it up again would move it by the difference.
+    fn settled(&mut self, dt: f64) -> bool {
+        if !self.at_rest() {
+            self.settling = 0.0;
+            return false;
+        }
+        self.settling += dt;
+        self.at_standstill() || !self.fresh || self.settling > SETTLING_LIMIT
     }
 
     fn follow(
@@ -212,7 +254,13 @@ impl ArmControl {
         dt: f64,
         mut tell: impl FnMut(usize, LimitKind, f64),
     ) -> Routed {
-        let Some(mode) = self.mode_for(demand) else { return Routed::NotReady };
+        let Some(mode) = self.mode_for(demand) else {
+            // It lacks the mode: what it does now must not stand.
+            if let Some(present) = self.command.mode {
+                self.hold(present, dt);
+            }
+            return Routed::NotReady;
+        };
         if let Some(present) = self.command.mode.filter(|present| *present != mode) {
             if !self.at_standstill() {
                 self.hold(present, dt);
@@ -275,12 +323,11 @@ impl ArmControl {
     }
 
     fn mode_for(&self, demand: Demand) -> Option<ControlMode> {
+        let velocity = self.config.modes.contains(&ControlMode::Velocity).then_some(ControlMode::Velocity);
         match demand {
-            Demand::Velocities => Some(ControlMode::Velocity),
+            Demand::Velocities => velocity,
             Demand::Positions => self.config.position_mode(),
-            Demand::Nothing => {
-                self.command.mode.or_else(|| self.config.position_mode()).or(Some(ControlMode::Velocity))
-            }
+            Demand::Nothing => self.command.mode.or_else(|| self.config.position_mode()).or(velocity),
         }
     }
 

@@ -13,10 +13,9 @@ use crate::clock::Mono;
 use crate::joint::Joints;
 use crate::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, TaskState, TaskView};
 
-/// At most this many requests are handled in one tick; the rest wait for the next.
-const REQUESTS_PER_TICK: usize = 32;
-/// Room for the events of one tick.
-const EVENTS_PER_TICK: usize = 256;
+/// At most this many requests are handled in one tick: as many as can wait, so that a stop is never kept waiting
+/// by a flood of targets.
+const REQUESTS_PER_TICK: usize = 256;
 /// So much lost time makes all arms hold [s].
 const LOST_TIME: f64 = 0.1;
 /// So many overruns in a row are told as degraded.
@@ -31,7 +30,7 @@ pub struct TickTime {
     pub next: Mono,
     /// Whole periods skipped before it.
     pub skipped: u32,
-    /// How late it woke up [ns].
+    /// The lateness that cost them [ns].
     pub late_ns: u64,
 }
 
@@ -54,7 +53,8 @@ pub struct TickOutput {
 
 impl TickOutput {
     fn tell(&mut self, event: Event) {
-        if self.events.len() < EVENTS_PER_TICK {
+        // As many as there was room for at the start: the tick allocates nothing.
+        if self.events.len() < self.events.capacity() {
             self.events.push(event);
         } else {
             self.events_lost = self.events_lost.saturating_add(1);
@@ -76,7 +76,6 @@ pub struct Coordinator {
     shutting_down: bool,
     started: bool,
     auto_start: Vec<bool>,
-    /// Motions to give back when a request is refused or a task ends outside `compute`.
     output: TickOutput,
 }
 
@@ -93,6 +92,8 @@ impl Coordinator {
             .collect();
         let tasks: Vec<Task> = config.tasks.iter().map(Task::new).collect();
         let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
+        // Each request has its outcome and may change a task; the rest tells of itself a few times at most.
+        let events = 2 * REQUESTS_PER_TICK + 4 * (arms.len() + tasks.len()) + arm_of.len();
         Self {
             period: 1.0 / config.rate,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
@@ -101,7 +102,7 @@ impl Coordinator {
                 commands: vec![ArmCommand::default(); arms.len()],
                 arms: Vec::with_capacity(arms.len()),
                 tasks: vec![TaskView::default(); tasks.len()],
-                events: Vec::with_capacity(EVENTS_PER_TICK),
+                events: Vec::with_capacity(events),
                 retired: Vec::with_capacity(2 * tasks.len() + REQUESTS_PER_TICK),
                 events_lost: 0,
             },
@@ -276,6 +277,7 @@ impl Coordinator {
 
     fn stop(&mut self, arm: Option<u16>, now: Mono) -> Outcome {
         match arm {
+            Some(arm) if arm as usize >= self.arms.len() => return Outcome::StartStateUnavailable(arm),
             Some(arm) => self.hold(arm as usize, Cause::Operator, now),
             None => (0..self.arms.len()).for_each(|i| self.hold(i, Cause::Operator, now)),
         }
@@ -283,6 +285,9 @@ impl Coordinator {
     }
 
     fn cancel(&mut self, which: Option<u16>) -> Outcome {
+        if let Some(task) = which.filter(|&t| t as usize >= self.tasks.len()) {
+            return Outcome::WrongTask(task);
+        }
         let mut outcome = Outcome::AlreadyStopped;
         for t in 0..self.tasks.len() {
             if which.is_some_and(|w| w as usize != t) {
@@ -347,7 +352,7 @@ impl Coordinator {
         }
         let Some(t) = self.tasks.get_mut(task as usize) else { return Outcome::WrongTask(task) };
         match (&mut t.body, positions) {
-            (Body::Servo(body), true) => body.set_target(&cx, target),
+            (Body::Servo(body), true) => body.set_target(&cx, &t.joints, target),
             (Body::Velocity(body), false) => body.set_target(&cx, target),
             _ => return Outcome::WrongTask(task),
         }

@@ -8,6 +8,10 @@ use crate::telemetry::LimitKind;
 /// Slack for rounding: a command at its limit is not "limited".
 const ROUNDING: f64 = 1e-9;
 
+/// How far an arm may lag behind its velocity commands and still stop inside its position range [s]: its own
+/// delay and the age of its state.
+const VELOCITY_LAG: f64 = 0.03;
+
 /// Limits of one joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
@@ -164,7 +168,8 @@ impl Limiter {
         self.hand_over();
         let b = self.bounds;
         let change = b.acceleration * dt;
-        let (slowest, fastest) = self.speeds_inside(b.lower, b.upper, at, dt);
+        let ahead = at + self.velocity * VELOCITY_LAG;
+        let (slowest, fastest) = self.speeds_inside(b.lower, b.upper, ahead, dt);
         let capped = target.clamp(-b.velocity, b.velocity);
         let inside = capped.clamp(slowest, fastest);
         self.velocity = inside.clamp(self.velocity - change, self.velocity + change);

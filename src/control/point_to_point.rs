@@ -14,6 +14,10 @@ const SAME_TIME: f64 = 1e-6;
 /// The shortest motion [s]; also that of an arm that is there already.
 const SHORTEST: f64 = 0.05;
 
+/// How much less jerk is tried where the generator finds nothing, and how often.
+const LESS_JERK: f64 = 0.999;
+const LESS_JERK_TRIES: usize = 3;
+
 /// Why there is no such motion.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NoMotion {
@@ -67,7 +71,19 @@ pub fn point_to_point(
     }
     let mut generator = Ruckig::<0, ThrowErrorHandler>::new(Some(n), 0.01);
     let mut found = Trajectory::<0>::new(Some(n));
-    generator.calculate(&input, &mut found).map_err(|e| NoMotion::NotFound(format!("{e:?}")))?;
+    // The generator finds nothing where a distance is exactly at the border between two shapes of profile, such as
+    // 2 a³/j². A little less jerk is on one side of it.
+    let mut result = generator.calculate(&input, &mut found);
+    for _ in 0..LESS_JERK_TRIES {
+        if result.is_ok() {
+            break;
+        }
+        (0..n).for_each(|j| input.max_jerk[j] *= LESS_JERK);
+        result = generator.calculate(&input, &mut found);
+    }
+    // Its own words are a page of numbers; the first line says what it is.
+    let first_line = |e: String| e.split("\\n").next().unwrap_or_default().to_owned();
+    result.map_err(|e| NoMotion::NotFound(first_line(format!("{e:?}"))))?;
     let duration = found.get_duration();
     if duration < SHORTEST {
         return Ok(stay(joints, start, target));
@@ -164,6 +180,22 @@ mod tests {
         let said = point_to_point(&names, &[0.0, 0.0], &[0.0, 3.2], &limits(2), 1.0).unwrap_err().to_string();
         assert!(said.contains("arm_joint2") && said.contains("by 0.2100 rad"), "{said}");
         assert!(point_to_point(&names, &[0.0, 0.0], &[0.0, f64::NAN], &limits(2), 1.0).is_err());
+    }
+
+    /// At 2 a³/j² the acceleration is reached for an instant.
+    #[test]
+    fn a_distance_between_two_shapes_of_profile_is_found() {
+        let names = crate::joint::make_joints("arm", 1);
+        for (a, j) in [(10.0, 100.0), (2.0, 20.0), (3.0, 30.0)] {
+            let l = JointLimits { acceleration_max: vec![a], jerk_max: vec![j], ..JointLimits::uniform(1, 3.0, 3.0) };
+            for speed in [0.1, 0.2, 0.5, 0.8, 1.0] {
+                let target = 2.0 * a * a * a / (j * j);
+                let motion = point_to_point(&names, &[0.0], &[target], &l, speed).unwrap();
+                assert_eq!(motion.points.last().unwrap().positions, [target]);
+                let e = Spline::new(&motion).unwrap().extremes(0);
+                assert!(e.steepest <= a * speed * speed * (1.0 + 1e-4), "{e:?}");
+            }
+        }
     }
 
     #[test]

@@ -38,8 +38,6 @@ pub struct Pulse {
     pub stop: AtomicBool,
     /// Samples that found the ring full.
     pub dropped: AtomicU64,
-    /// Processor time of the thread [ns].
-    pub cpu_ns: AtomicU64,
     /// Commands that replaced one that the device thread had not taken.
     pub overwritten: AtomicU32,
     /// Wake-up after the deadline.
@@ -130,9 +128,9 @@ pub fn run(
         for (slot, command) in ports.commands.iter_mut().zip(&output.commands) {
             overwritten += u32::from(slot.write(command));
         }
+        let done = clock.now();
         // All wakes after all computing: a woken thread must not push the tick aside half-way.
         ports.wakes.iter().for_each(Wake::raise);
-        let done = clock.now();
         let compute_ns = done.0.saturating_sub(woke.0);
         pulse.beat.beat(done);
 
@@ -151,14 +149,13 @@ pub fn run(
                 std::mem::forget(motion);
             }
         }
-        let timing = TickSample { tick, deadline, late_ns, compute_ns, skipped, dropped };
+        let timing =
+            TickSample { tick, deadline, next, late_ns, compute_ns, skipped, overrun_ns: time.late_ns, dropped };
         let wanted = output.arms.len() + output.events.len() + 1;
-        if ports.samples.slots() >= wanted {
+        if let Ok(chunk) = ports.samples.write_chunk_uninit(wanted) {
             let arms = output.arms.iter().map(|a| Sample::Arm(*a));
             let events = output.events.iter().map(|e| Sample::Event(tick, *e));
-            for sample in arms.chain(events).chain([Sample::Tick(timing)]) {
-                let _ = ports.samples.push(sample);
-            }
+            chunk.fill_from_iter(arms.chain(events).chain([Sample::Tick(timing)]));
             dropped = 0;
         } else {
             // A tick is logged whole or not at all, and what is missing is counted.
@@ -178,7 +175,6 @@ pub fn run(
         pulse.overruns.fetch_add(u64::from(skipped > 0), Ordering::Relaxed);
         pulse.skipped.fetch_add(skipped as u64, Ordering::Relaxed);
         pulse.ticks.store(tick + 1, Ordering::Release);
-        pulse.cpu_ns.store(host::thread_cpu_time().as_nanos() as u64, Ordering::Relaxed);
         tick += 1;
         (skips_before, late_before) = (skips_after, late_ns);
         deadline = next;

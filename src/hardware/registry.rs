@@ -37,8 +37,9 @@ pub struct AddressForm {
     pub form: &'static str,
     /// Whether a blueprint must give one.
     pub required: bool,
-    /// Says what is wrong with an address, in a sentence without full stop. Never asks the network.
-    pub check: fn(&str) -> Result<(), String>,
+    /// The address in full, with whatever it leaves to defaults; or what is wrong with it, in a sentence without full
+    /// stop. Never asks the network.
+    pub check: fn(&str) -> Result<String, String>,
 }
 
 /// The adapter's own options: how to check them in a blueprint, and their JSON Schema.

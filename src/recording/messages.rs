@@ -123,6 +123,10 @@ message! {
         compute_ns: u64,
         /// Whole periods skipped before this tick.
         skipped: u32,
+        /// The lateness that cost them, of this tick or of the one before [ns].
+        overrun_ns: u64,
+        /// When the tick took the next one to be due, in monotonic time [ns].
+        next_ns: u64,
         /// Samples lost since the last tick in this log because the ring to the recorder was full.
         dropped: u32,
     }

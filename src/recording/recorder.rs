@@ -19,8 +19,8 @@ use crate::clock::{Clock, Mono, MonotonicClock, WallOffset};
 use crate::telemetry::describe::{Described, Names, Severity};
 use crate::telemetry::{Event, Sample};
 
-/// How often the ring is emptied.
-const DRAIN_EVERY: Duration = Duration::from_millis(20);
+/// How often the ring is emptied: half as often as the log is flushed, because each time costs a wake-up.
+const DRAIN_EVERY: Duration = Duration::from_millis(50);
 /// The same in the first second, so that a run's first state is on disk soon.
 const DRAIN_EVERY_AT_FIRST: Duration = Duration::from_millis(2);
 /// Room for the write buffer: more than what a run logs between two flushes.
@@ -158,7 +158,7 @@ impl Recorder {
         let stats = Arc::new(RecorderStats::default());
         let file = config.path.as_deref().map(create_file).transpose()?;
         let disk = file.as_ref().and_then(|f| f.try_clone().ok());
-        let sink = file.map(|f| Counted { inner: BufWriter::with_capacity(BUFFER, f), stats: stats.clone() });
+        let sink = file.map(|f| Counted { inner: BufWriter::with_capacity(BUFFER, f), stats: stats.clone(), at: 0 });
         let mut worker = Worker::new(&config, sink, disk, ring, notes, on_notice, stats.clone())?;
         let stop = Arc::new(AtomicBool::new(false));
         let stopping = stop.clone();
@@ -219,16 +219,19 @@ fn create_file(path: &Path) -> Result<File, RecordError> {
     make().map_err(|source| RecordError::Create { path: path.to_owned(), source })
 }
 
-/// A sink that counts what goes through it.
+/// A sink that counts what goes through it, and so knows where it is: a buffered file that is asked writes first what
+/// it has, and asks the kernel.
 struct Counted<W> {
     inner: W,
     stats: Arc<RecorderStats>,
+    at: u64,
 }
 
 impl<W: Write> Write for Counted<W> {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let written = self.inner.write(bytes)?;
         self.stats.bytes.fetch_add(written as u64, Ordering::Relaxed);
+        self.at += written as u64;
         Ok(written)
     }
     fn flush(&mut self) -> std::io::Result<()> {
@@ -238,6 +241,9 @@ impl<W: Write> Write for Counted<W> {
 
 impl<W: Seek> Seek for Counted<W> {
     fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
-        self.inner.seek(to)
+        if to != SeekFrom::Current(0) {
+            self.at = self.inner.seek(to)?;
+        }
+        Ok(self.at)
     }
 }

@@ -65,6 +65,7 @@ pub struct RecordReader {
     length: u64,
     at: u64,
     ended: bool,
+    attachments: bool,
 }
 
 impl RecordReader {
@@ -79,7 +80,13 @@ impl RecordReader {
         if magic != MAGIC {
             return Err(ReplayError::NotMcap { path: path.to_owned() });
         }
-        Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false })
+        Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false, attachments: false })
+    }
+
+    /// Reads attachments as well, up to [`LIMIT`]; without this they are passed over.
+    pub fn with_attachments(mut self) -> Self {
+        self.attachments = true;
+        self
     }
 
     /// Where the summary begins; `None` if the file was cut, or has none.
@@ -133,22 +140,25 @@ impl RecordReader {
         }
         self.at = at + PREFIX as u64 + length;
         let body = match opcode {
+            op::ATTACHMENT if self.attachments && length <= LIMIT as u64 => self.body(length)?,
             op::ATTACHMENT | op::MESSAGE_INDEX | op::ATTACHMENT_INDEX | op::METADATA_INDEX | op::SUMMARY_OFFSET => {
                 self.file.seek_relative(length as i64).map_err(|e| self.io(e))?;
                 Vec::new()
             }
             _ if length > LIMIT as u64 => return Err(self.cut(at, "a record is longer than 16 MiB")),
-            _ => {
-                let mut body = vec![0; length as usize];
-                self.file.read_exact(&mut body).map_err(|e| self.io(e))?;
-                body
-            }
+            _ => self.body(length)?,
         };
         let closed = || self.length - self.at >= MAGIC.len() as u64;
         if opcode == op::FOOTER && !(closed() && self.read::<{ MAGIC.len() }>()? == *MAGIC) {
             return Err(self.cut(at, "it has no proper end"));
         }
         Ok(RawRecord { opcode, at, body })
+    }
+
+    fn body(&mut self, length: u64) -> Result<Vec<u8>, ReplayError> {
+        let mut body = vec![0; length as usize];
+        self.file.read_exact(&mut body).map_err(|e| self.io(e))?;
+        Ok(body)
     }
 
     fn read<const N: usize>(&mut self) -> Result<[u8; N], ReplayError> {

@@ -132,6 +132,23 @@ impl LogReader {
     }
 }
 
+/// A file that goes along with a log, by its name; `None` if there is none before the first message.
+pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReplayError> {
+    let mut records = RecordReader::open(path)?.with_attachments();
+    loop {
+        let record = match records.next_record() {
+            Ok(Some(record)) if !matches!(record.opcode, op::CHUNK | op::MESSAGE) => record,
+            Ok(_) | Err(ReplayError::Cut { .. }) => return Ok(None),
+            Err(e) => return Err(e),
+        };
+        if let Ok(Record::Attachment { header, data, .. }) = parse_record(record.opcode, &record.body)
+            && header.name == name
+        {
+            return Ok(Some(data.into_owned()));
+        }
+    }
+}
+
 /// Time span and channels from the summary of a closed log; `None` if it does not say.
 fn summary(records: &mut RecordReader, start: u64, channels: &mut Channels) -> Result<Option<LogInfo>, ReplayError> {
     records.go_to(start)?;

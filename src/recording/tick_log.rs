@@ -270,6 +270,8 @@ impl TickLog {
             late_ns: tick.late_ns,
             compute_ns: tick.compute_ns,
             skipped: tick.skipped,
+            overrun_ns: tick.overrun_ns,
+            next_ns: tick.next.0,
             dropped: tick.dropped,
         };
         log.publish("/dimos/tick", self.wall.wall(tick.deadline), &message)

@@ -15,11 +15,16 @@ impl Beat {
         self.0.store(now.0, Ordering::Release);
     }
 
-    /// How long ago the last sign was; `None` before the first.
-    pub fn silence(&self, now: Mono) -> Option<Duration> {
+    /// When the last sign was; `None` before the first.
+    pub fn last(&self) -> Option<Mono> {
         match self.0.load(Ordering::Acquire) {
             0 => None,
-            last => Some(now.since(Mono(last))),
+            last => Some(Mono(last)),
         }
+    }
+
+    /// How long ago the last sign was; `None` before the first.
+    pub fn silence(&self, now: Mono) -> Option<Duration> {
+        self.last().map(|last| now.since(last))
     }
 }

@@ -6,7 +6,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::time::Duration;
 
-use crate::clock::Mono;
+use crate::clock::{Clock, Mono, MonotonicClock};
 
 /// FIFO priority of the watchdog: above everything it watches.
 pub const WATCHDOG_PRIORITY: i32 = 82;
@@ -14,6 +14,10 @@ pub const WATCHDOG_PRIORITY: i32 = 82;
 pub const DEVICE_PRIORITY: i32 = 81;
 /// FIFO priority of the tick.
 pub const TICK_PRIORITY: i32 = 80;
+/// FIFO priority of emulators: they stand for controllers, which do not wait for this host's other work.
+pub const EMULATOR_PRIORITY: i32 = 79;
+/// What the grant of real-time scheduling is called.
+pub const SCHEDULING: &str = "real-time scheduling";
 /// Stack of a timed thread [bytes].
 pub const STACK: usize = 256 * 1024;
 
@@ -33,8 +37,7 @@ pub struct Grant {
 const FIFO_REMEDY: &str = "allow it: add `@realtime - rtprio 95` to /etc/security/limits.d/ and yourself to that group, or `setcap cap_sys_nice,cap_ipc_lock+ep` on the binary";
 const MEMLOCK_REMEDY: &str =
     "allow it: `@realtime - memlock unlimited` in /etc/security/limits.d/ (LimitMEMLOCK=infinity under systemd)";
-const LATENCY_REMEDY: &str =
-    "allow it: run as root or let your group write /dev/cpu_dma_latency by a udev rule; or give `realtime: false`";
+const LATENCY_REMEDY: &str = "allow it: let your group write /dev/cpu_dma_latency by a udev rule, or run as root";
 
 /// Holds idle states off for as long as it lives.
 #[derive(Debug)]
@@ -70,11 +73,11 @@ fn probe_fifo() -> Grant {
         Ok(()) => {
             set_other();
             let detail = format!("SCHED_FIFO {TICK_PRIORITY}–{WATCHDOG_PRIORITY}");
-            Grant { what: "real-time scheduling", granted: true, detail, remedy: "" }
+            Grant { what: SCHEDULING, granted: true, detail, remedy: "" }
         }
         Err(e) => {
             let detail = format!("SCHED_FIFO refused: {e}");
-            Grant { what: "real-time scheduling", granted: false, detail, remedy: FIFO_REMEDY }
+            Grant { what: SCHEDULING, granted: false, detail, remedy: FIFO_REMEDY }
         }
     }
 }
@@ -99,7 +102,7 @@ fn set_other() {
 }
 
 /// Makes the calling thread fit for timed work: FIFO when permitted, otherwise the shortest timer slack; its stack
-/// is touched so that no page fault comes later. Returns whether it runs under FIFO.
+/// is touched, and locked as far as the limit allows, so that no page fault comes later. Returns whether it runs under FIFO.
 pub fn enter_realtime(priority: i32) -> bool {
     let fifo = set_fifo(priority).is_ok();
     // SAFETY: PR_SET_TIMERSLACK takes one integer and concerns the calling thread only.
@@ -114,6 +117,7 @@ fn touch_stack() {
     for byte in pages.iter_mut().step_by(4096) {
         *byte = 1;
     }
+    lock_pages(&pages);
     std::hint::black_box(&mut pages);
 }
 
@@ -122,7 +126,7 @@ fn touch_stack() {
 fn lock_memory() -> Grant {
     let what = "memory locked";
     if !may_lock_all() {
-        let detail = "only slots, rings and stacks, as far as the limit allows".to_owned();
+        let detail = "only rings and stacks, as far as the limit allows".to_owned();
         return Grant { what, granted: false, detail, remedy: MEMLOCK_REMEDY };
     }
     // SAFETY: takes flags only; concerns the whole process and moves nothing.
@@ -159,6 +163,10 @@ fn hold_cpu_latency() -> io::Result<LatencyHold> {
 
 /// Sleeps until a point of the monotonic clock; returns at once when it is past.
 pub fn sleep_until(deadline: Mono) {
+    // To the kernel a timer that is due already is a timer like any other, and costs as much.
+    if MonotonicClock.now() >= deadline {
+        return;
+    }
     let at = rustix::time::Timespec {
         tv_sec: (deadline.0 / 1_000_000_000) as i64,
         tv_nsec: (deadline.0 % 1_000_000_000) as i64,

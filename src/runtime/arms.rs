@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use super::StartError;
 use super::device_lock::{self, DeviceLock};
-use super::{Options, StartError};
 use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
 use crate::clock::{Clock, Mono, MonotonicClock};
@@ -55,7 +55,7 @@ pub struct BroughtUp {
 /// Connects all arms at once, or none: on the first that fails, all others are let go again.
 pub fn bring_up(
     blueprint: &Blueprint,
-    options: &Options,
+    realtime: bool,
     beat: &Arc<Beat>,
     note: impl Fn(usize, Note) + Clone + Send + 'static,
 ) -> Result<BroughtUp, StartError> {
@@ -64,7 +64,7 @@ pub fn bring_up(
     let mut slots = Slots::default();
     let mut state_timeouts = Vec::new();
     for (index, arm) in blueprint.arms.iter().enumerate() {
-        let config = configure(arm, &mut arms, options)?;
+        let config = configure(arm, &mut arms)?;
         let adapter = (arm.adapter.create)(&config).map_err(|e| hardware(arm, &e))?;
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
@@ -75,6 +75,7 @@ pub fn bring_up(
             tick_period: period,
             native_rate: arm.adapter.native_rate,
             velocity_max: (arm.adapter.limits)(arm.joints.len()).velocity_max.iter().copied().fold(0.1, f64::max),
+            realtime,
             beat: beat.clone(),
             clock: Arc::new(MonotonicClock),
             notes: Box::new(move |what| note(index, what)),
@@ -108,7 +109,7 @@ pub fn bring_up(
 }
 
 /// Locks the device or starts its emulator; answers what the adapter is made from.
-fn configure(arm: &Arm, arms: &mut Arms, options: &Options) -> Result<AdapterConfig, StartError> {
+fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     let mut config = AdapterConfig {
         hardware_id: arm.hardware_id.clone(),
         address: arm.address.clone(),
@@ -123,12 +124,12 @@ fn configure(arm: &Arm, arms: &mut Arms, options: &Options) -> Result<AdapterCon
         }
         _ if arm.address.is_empty() || arm.address == SIM => {}
         _ => {
-            let lock = device_lock::take(options.folder.path(), &arm.adapter_type, &arm.address).map_err(|e| {
-                StartError::Hardware {
-                    arm: arm.hardware_id.clone(),
-                    what: e.to_string(),
-                    hint: "end the other run first: `dimos status` shows it, `dimos down` ends it".to_owned(),
-                }
+            // The blueprint was checked; an address that is not in full is as good as it gets.
+            let address = (arm.adapter.address.check)(&arm.address).unwrap_or_else(|_| arm.address.clone());
+            let lock = device_lock::take(&arm.adapter_type, &address).map_err(|e| StartError::Hardware {
+                arm: arm.hardware_id.clone(),
+                what: e.to_string(),
+                hint: "end the other run first: `dimos status` shows it, `dimos down` ends it".to_owned(),
             })?;
             arms._locks.push(lock);
         }

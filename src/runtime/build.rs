@@ -5,7 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
@@ -13,7 +13,7 @@ use super::service::{Service, ServiceParts};
 use super::watchdog::Watchdog;
 use super::{Ending, Options, Record, Run, StartError};
 use crate::arm::ArmState;
-use crate::blueprint::{Blueprint, TaskKind as Typed};
+use crate::blueprint::{Arm, Blueprint, TaskKind as Typed};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::control::config::{
     ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
@@ -36,6 +36,8 @@ use crate::telemetry::{ArmSample, Cause, Phase, Sample, TaskView, TickSample};
 
 /// So many seconds of samples fit into the recorder's ring.
 const RING_SECONDS: f64 = 5.0;
+/// How often an enabled arm is asked for again that is not ready yet.
+const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// How long enabled arms get until they are ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
 
@@ -55,8 +57,9 @@ impl Run {
             let (notes, names) = (notes.clone(), names.clone());
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
+        let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
         let BroughtUp { mut arms, slots, connected, state_timeouts } =
-            arms::bring_up(blueprint, &options, &pulse.beat, device_notes)?;
+            arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
         let config = coordinator_config(blueprint, &connected, &state_timeouts);
 
         let samples = ring_size(&config);
@@ -178,16 +181,27 @@ impl Run {
     fn enable(&self, blueprint: &Blueprint) -> Result<(), StartError> {
         let which = || blueprint.arms.iter().enumerate().filter(|(_, a)| a.auto_enable).map(|(i, _)| i);
         self.arms.enable(blueprint, which())?;
-        for arm in which() {
-            let request = Request::Ready { arm: arm as u16 };
-            let log = log_of(&request);
-            // Whether it was taken shows in the arm's phase.
-            let _ = self.dispatcher.send(request, log);
-        }
-        let limit = std::time::Instant::now() + READY_LIMIT;
-        while !which().all(|arm| self.service.phase(arm) == Phase::Ready) {
-            if std::time::Instant::now() >= limit {
+        let limit = Instant::now() + READY_LIMIT;
+        let mut ask = Instant::now();
+        let settled = |arm: usize, a: &Arm| match self.service.phase(arm) {
+            Phase::Ready => true,
+            phase => !a.auto_enable && phase != Phase::Unknown,
+        };
+        while !blueprint.arms.iter().enumerate().all(|(i, a)| settled(i, a)) {
+            let now = Instant::now();
+            if now >= limit {
                 break; // The banner and `status` say how far it came.
+            }
+            if now >= ask {
+                ask = now + ASK_AGAIN;
+                let waiting =
+                    |&arm: &usize| !matches!(self.service.phase(arm), Phase::Activating | Phase::Ready | Phase::Held);
+                for arm in which().filter(waiting) {
+                    let request = Request::Ready { arm: arm as u16 };
+                    let log = log_of(&request);
+                    // Whether it was taken shows in the arm's phase. On a busy host the state may not be fresh just now.
+                    let _ = self.dispatcher.send(request, log);
+                }
             }
             std::thread::sleep(Duration::from_millis(5));
         }
@@ -361,6 +375,7 @@ fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: devic
         device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),
         device::Note::Over(text) => (Severity::Info, format!("{id}: over: {text}")),
     };
+    // One line per episode, without DIMOS_LOG=info.
     match severity {
         Severity::Info => tracing::info!("{text}"),
         _ => tracing::warn!("{text}"),

@@ -1,14 +1,19 @@
-//! One program per device: a lock file by the device's canonical address, taken before a byte is sent, which dies
-//! with the process.
+//! One program per device: a name in the kernel by the device's canonical address, taken before a byte is sent. It
+//! belongs to the machine, not to a user or a folder, and dies with the process.
 
-use std::fs::{DirBuilder, File, OpenOptions, TryLockError};
-use std::io::{Read, Write};
-use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
-use std::path::Path;
+use std::io;
+use std::os::fd::AsFd;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
+
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with, sockopt};
+
+/// Longest name of a socket in the kernel, without its leading zero [bytes].
+const MAX_NAME: usize = 107;
 
 /// A device that is ours for as long as this lives.
 #[derive(Debug)]
-pub struct DeviceLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
+pub struct DeviceLock(#[expect(dead_code, reason = "the name is ours while the socket is open")] UnixListener);
 
 /// Why a device is not ours.
 #[derive(Debug, thiserror::Error)]
@@ -23,7 +28,7 @@ pub enum DeviceTaken {
         /// The process.
         pid: String,
     },
-    /// The lock file cannot be made.
+    /// The name cannot be taken.
     #[error("cannot lock {adapter} at {address}: {error}")]
     Io {
         /// The adapter.
@@ -31,45 +36,43 @@ pub enum DeviceTaken {
         /// The device's address.
         address: String,
         /// Why.
-        error: std::io::Error,
+        error: io::Error,
     },
 }
 
-/// Takes a device, or says who has it. `folder` is the folder of the runs' sockets.
-pub fn take(folder: &Path, adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
-    let io = |error| DeviceTaken::Io { adapter: adapter.into(), address: address.into(), error };
-    DirBuilder::new().recursive(true).mode(0o700).create(folder).map_err(io)?;
-    let plain = |c: char| if c.is_ascii_alphanumeric() || matches!(c, '.' | '-') { c } else { '_' };
-    let name: String = canonical(address).chars().map(plain).collect();
-    let path = folder.join(format!("device-{adapter}-{name}.held"));
-    let mut file =
-        OpenOptions::new().read(true).write(true).create(true).truncate(false).mode(0o600).open(path).map_err(io)?;
-    match file.try_lock() {
-        Ok(()) => {
-            // The file stays when the lock is gone: removing it would let two processes lock two files.
-            file.set_len(0).map_err(io)?;
-            write!(file, "{}", std::process::id()).map_err(io)?;
-            Ok(DeviceLock(file))
+/// Takes the device at an address, which is given in full, or says who has it.
+pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
+    let name = name(adapter, address);
+    let bound = SocketAddr::from_abstract_name(&name).and_then(|at| UnixListener::bind_addr(&at));
+    let (adapter, address) = (adapter.to_owned(), address.to_owned());
+    bound.map(DeviceLock).map_err(|error| match error.kind() {
+        io::ErrorKind::AddrInUse => {
+            let pid = holder(&name).map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
+            DeviceTaken::By { adapter, address, pid }
         }
-        Err(TryLockError::WouldBlock) => {
-            let mut pid = String::new();
-            let _ = file.read_to_string(&mut pid);
-            let pid = if pid.trim().is_empty() { "unknown".to_owned() } else { pid.trim().to_owned() };
-            Err(DeviceTaken::By { adapter: adapter.into(), address: address.into(), pid })
-        }
-        Err(TryLockError::Error(error)) => Err(io(error)),
-    }
+        _ => DeviceTaken::Io { adapter, address, error },
+    })
 }
 
-/// The same device under another spelling: case, a name for the loopback, a leading zero in the port.
-fn canonical(address: &str) -> String {
+/// Who has a name: the kernel tells whoever connects. Waits for nobody.
+fn holder(name: &str) -> Option<i32> {
+    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).ok()?;
+    connect(socket.as_fd(), &SocketAddrUnix::new_abstract_name(name.as_bytes()).ok()?).ok()?;
+    Some(sockopt::socket_peercred(&socket).ok()?.pid.as_raw_nonzero().get())
+}
+
+/// The same for every spelling of a device's address: case, a name for the loopback.
+fn name(adapter: &str, address: &str) -> String {
     let address = address.trim().to_ascii_lowercase().replace("localhost", "127.0.0.1");
-    match address.rsplit_once(':') {
-        Some((host, port)) => match port.parse::<u16>() {
-            Ok(port) => format!("{host}:{port}"),
-            Err(_) => address,
-        },
-        None => address,
+    let name = format!("dimos/device/{adapter}/{address}");
+    // Hosts may have names longer than that; they differ at their beginning, ports at their end.
+    match name.char_indices().nth(MAX_NAME / 2) {
+        Some((half, _)) if name.len() > MAX_NAME => {
+            let tail = name.char_indices().rev().nth(MAX_NAME / 4).map_or(half, |(at, _)| at);
+            format!("{}{}", &name[..half], &name[tail..]).chars().filter(char::is_ascii).collect()
+        }
+        _ => name,
     }
 }
 
@@ -79,12 +82,25 @@ mod tests {
 
     #[test]
     fn f29_a_device_is_taken_once_and_names_the_holder() {
-        let folder = tempfile::tempdir().unwrap();
-        let held = take(folder.path(), "yourarm", "LOCALHOST:9760").unwrap();
-        let refused = take(folder.path(), "yourarm", "127.0.0.1:9760").unwrap_err().to_string();
-        assert!(refused.contains(&std::process::id().to_string()), "{refused}");
-        assert!(take(folder.path(), "yourarm", "127.0.0.2:9760").is_ok());
+        let port = std::process::id();
+        let at = |host: &str| format!("{host}:{port}");
+        let held = take("test", &at("LOCALHOST")).unwrap();
+        for _ in 0..200 {
+            let refused = take("test", &at("127.0.0.1")).unwrap_err().to_string();
+            // A queue of those who ask is full some time: then nobody is named, and nobody waits.
+            assert!(refused.contains(&format!("process {port}")) || refused.contains("unknown"), "{refused}");
+        }
+        assert!(take("test", &at("127.0.0.2")).is_ok());
+        assert!(take("other", &at("127.0.0.1")).is_ok());
         drop(held);
-        assert!(take(folder.path(), "yourarm", "127.0.0.1:9760").is_ok());
+        assert!(take("test", &at("127.0.0.1")).is_ok());
+    }
+
+    #[test]
+    fn names_fit_and_differ_by_host_and_port() {
+        let long = |end: &str| name("adapter", &format!("{}{end}", "h".repeat(300)));
+        assert!(long(":1").len() <= MAX_NAME && long("ä").len() <= MAX_NAME);
+        assert_ne!(long(":1"), long(":2"));
+        assert_eq!(name("a", "Host:1"), name("a", " host:1"));
     }
 }

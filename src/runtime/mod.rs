@@ -10,10 +10,11 @@ mod arms;
 mod build;
 mod device_lock;
 mod dispatch;
+mod in_process;
 mod motions;
+mod repeats;
 mod reports;
 mod service;
-mod throttle;
 mod watchdog;
 
 use std::path::PathBuf;
@@ -24,10 +25,14 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 pub use device_lock::DeviceTaken;
+pub use dispatch::log_of;
 
+use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
 use crate::recording::recorder::Recorder;
+use crate::rpc::RpcError;
+use crate::rpc::api::Method;
 use crate::rpc::place::RunFolder;
 use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
@@ -39,6 +44,8 @@ use watchdog::Watchdog;
 
 /// How long moving arms get to come to rest.
 const REST_LIMIT: Duration = Duration::from_secs(2);
+/// How long an arm stands still before it is taken to be at rest: an instant is also where it turns round.
+const STILL_FOR: Duration = Duration::from_millis(50);
 /// How long the tick gets to end.
 const TICK_END_LIMIT: Duration = Duration::from_millis(300);
 
@@ -60,7 +67,7 @@ pub struct Options {
     pub name: Option<String>,
     /// Where it is logged.
     pub record: Record,
-    /// Where the socket and the locks are.
+    /// Where the socket is.
     pub folder: RunFolder,
     /// Called at each tick; for tests and benchmarks.
     pub probe: Option<Probe>,
@@ -164,6 +171,22 @@ impl Run {
         self.service.status()
     }
 
+    /// What its coordinator was made from: effective limits among others.
+    pub fn config(&self) -> &CoordinatorConfig {
+        &self.service.parts.config
+    }
+
+    /// Asks it what others ask over rpc, and waits for the answer. Not for a thread that runs async code.
+    pub fn call<M: Method>(&self, request: &M) -> Result<M::Reply, RpcError> {
+        let answers = self.call_together(std::slice::from_ref(request));
+        answers.into_iter().next().unwrap_or_else(|| Err(in_process::defect("no answer")))
+    }
+
+    /// Asks it several things at once: they reach the tick together, but for a tick now and then.
+    pub fn call_together<M: Method>(&self, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
+        in_process::call(&self.service, requests)
+    }
+
     /// Lets other threads end it.
     pub fn endings(&self) -> Sender<Ending> {
         self.endings.0.clone()
@@ -186,17 +209,24 @@ impl Run {
         self.watchdog.stand_down();
         self.end_tick(&mut ended);
         ended.troubles.extend(self.arms.release());
-        drop(self.server.take());
-        drop(self.courier);
-        if let Err(e) = self.recorder.finish() {
+        let Self { arms, server, courier, recorder, .. } = self;
+        drop(courier);
+        if let Err(e) = recorder.finish() {
             ended.troubles.push(e.to_string());
         }
+        // Last of all: who sees that the run is gone finds its log closed and its devices free.
+        drop(arms);
+        drop(server);
         ended
     }
 
     fn tick_lives(&self) -> bool {
         self.tick.as_ref().is_some_and(|t| !t.is_finished())
-            && self.pulse.beat.silence(self.arms.now()).is_none_or(|s| s < Duration::from_millis(300))
+            && self
+                .pulse
+                .beat
+                .silence(self.arms.now())
+                .is_none_or(|s| s < watchdog::silence_limit(self.service.period()))
     }
 
     fn come_to_rest(&self, ended: &mut Ended) {
@@ -204,6 +234,7 @@ impl Run {
         let told = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
         let Ok(answer) = told else { return ended.troubles.push("the coordinator takes no requests".to_owned()) };
         let mut answer = Some(answer);
+        let mut still_since = Instant::now();
         while self.tick_lives() && Instant::now() < limit {
             std::thread::sleep(Duration::from_millis(2));
             if let Some(waiting) = &mut answer {
@@ -212,7 +243,10 @@ impl Run {
                 }
                 answer = None;
             }
-            if self.pulse.at_rest.load(Ordering::Acquire) {
+            // That nothing is commanded to move is half of it: an arm that lags, or that was let go of, still moves.
+            if !self.pulse.at_rest.load(Ordering::Acquire) || !self.service.at_standstill() {
+                still_since = Instant::now();
+            } else if still_since.elapsed() >= STILL_FOR.max(2 * self.service.period()) {
                 return;
             }
         }
@@ -223,8 +257,10 @@ impl Run {
 
     fn end_tick(&mut self, ended: &mut Ended) {
         self.pulse.stop.store(true, Ordering::Release);
+        let hangs = !self.tick_lives();
         let Some(tick) = self.tick.take() else { return };
-        let limit = Instant::now() + TICK_END_LIMIT.max(2 * self.service.period());
+        let patience = if hangs { Duration::ZERO } else { TICK_END_LIMIT.max(2 * self.service.period()) };
+        let limit = Instant::now() + patience;
         while !tick.is_finished() && Instant::now() < limit {
             std::thread::sleep(Duration::from_millis(1));
         }

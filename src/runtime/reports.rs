@@ -1,6 +1,7 @@
 //! What a run tells of itself: status, state, motions, streams.
 
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Instant;
 
 use super::dispatch::lock;
 use super::service::Service;
@@ -256,13 +257,11 @@ impl Service {
 
     /// Tells an event to the text log and to those who listen.
     pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
-        let admitted = lock(&self.throttle).admit(described.kind, self.now());
-        if let Some(unsaid) = admitted {
-            let more = if unsaid > 0 { format!(" ({unsaid} more like this were not shown)") } else { String::new() };
+        if let Some(line) = self.repeats.line(described, Instant::now()) {
             match described.severity {
-                Severity::Info => tracing::debug!("{}{more}", described.text),
-                Severity::Warn => tracing::warn!("{}{more}", described.text),
-                Severity::Error => tracing::error!("{}{more}", described.text),
+                Severity::Info => tracing::debug!("{line}"),
+                Severity::Warn => tracing::warn!("{line}"),
+                Severity::Error => tracing::error!("{line}"),
             }
         }
         self.parts.streams.publish_event(|| EventReport {

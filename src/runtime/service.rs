@@ -13,7 +13,8 @@ use serde_json::{Value, json};
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::{Motions, Planned};
-use super::throttle::Throttle;
+use super::repeats::Repeats;
+use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
 use crate::clock::{Mono, WallOffset};
 use crate::control::config::{CoordinatorConfig, TaskKind};
@@ -41,8 +42,12 @@ const STOP_LIMIT: Duration = Duration::from_secs(3);
 const ORDER_LIMIT: Duration = Duration::from_secs(5);
 /// How long an enabled arm gets to be ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
+/// How long a device takes to refuse an opening of its gripper.
+const GRIPPER_REPLY: Duration = Duration::from_millis(20);
 /// Trajectories may exceed a velocity or acceleration by this factor: rounding in files.
 const SLACK: f64 = 1.001;
+/// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
+const STANDSTILL: f64 = 0.02;
 
 /// What a service is made from.
 pub struct ServiceParts {
@@ -69,7 +74,7 @@ pub struct Service {
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
-    pub(super) throttle: Mutex<Throttle>,
+    pub(super) repeats: Repeats,
     closed: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
@@ -81,7 +86,7 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
-            throttle: Mutex::default(),
+            repeats: Repeats::default(),
             closed: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
@@ -115,6 +120,13 @@ impl Service {
     /// The latest sample of an arm.
     pub(super) fn arm_view(&self, arm: usize) -> Option<ArmSample> {
         lock(&self.parts.arm_views).get_mut(arm).map(SlotReader::read)
+    }
+
+    /// Whether every arm that can be seen is measured to stand still.
+    pub fn at_standstill(&self) -> bool {
+        let still = |state: &ArmState| state.velocity.iter().take(state.dof).all(|v| v.abs() <= STANDSTILL);
+        let mut views = lock(&self.parts.arm_views);
+        views.iter_mut().map(SlotReader::read).all(|view| view.state.link != Link::Up || still(&view.state))
     }
 
     pub(super) fn task_view(&self, task: usize) -> TaskView {
@@ -357,7 +369,7 @@ impl Service {
     /// How far an arm's stop has come; `None`: not yet known.
     fn confirmation(&self, arm: usize) -> Option<api::Confirmation> {
         let (view, device) = (self.arm_view(arm)?, self.parts.devices.get(arm)?);
-        if view.state.link != crate::arm::Link::Up {
+        if view.state.link != Link::Up {
             return Some(api::Confirmation::NotSent);
         }
         if !view.state.enabled {
@@ -438,7 +450,16 @@ impl Service {
         if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
             return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
         }
+        let device = self.device(arm)?;
+        let refusals = device.health().write_errors.load(Ordering::Relaxed);
         self.ask(Request::Gripper { arm, opening: call.position }).await?;
+        // The tick hands the opening over without knowing what the gripper can do; the arm says so at once.
+        tokio::time::sleep(self.period() + GRIPPER_REPLY).await;
+        if device.health().write_errors.load(Ordering::Relaxed) > refusals {
+            let why = device.health().episodes().pop().map_or_else(String::new, |e| e.text);
+            let error = RpcError::new(Code::DeviceRefused, format!("{}: {why}", call.arm));
+            return Err(error.hint("`dimos state` shows the gripper's opening now, in metres"));
+        }
         Ok(Reply::Gripper(Done {}))
     }
 

@@ -12,8 +12,8 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::rt::beat::Beat;
 use crate::rt::host;
 
-/// How often it looks.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// How often it looks: each look costs a wake-up of the processor.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
 
 /// A tick silent for this long is taken to hang: long enough for a machine that stalls, short enough to end a run
 /// within a second.
@@ -35,11 +35,18 @@ impl Watchdog {
         let thread = std::thread::Builder::new().name("watchdog".into()).stack_size(host::STACK).spawn(move || {
             host::enter_realtime(host::WATCHDOG_PRIORITY);
             let limit = silence_limit(period);
+            let (mut last, mut silent_for, mut looked) = (None, Duration::ZERO, MonotonicClock.now());
             while !stopping.load(Ordering::Acquire) {
-                std::thread::sleep(LOOK_EVERY);
-                let silence = beat.silence(MonotonicClock.now()).unwrap_or_default();
-                if silence > limit && !stopping.load(Ordering::Acquire) {
-                    let what = format!("the tick has been silent for {} ms", silence.as_millis());
+                std::thread::park_timeout(LOOK_EVERY);
+                let now = MonotonicClock.now();
+                let beat = beat.last();
+                // A process that was stopped and goes on finds its tick silent, but the tick has had no chance to beat:
+                // only time counts in which this thread could look.
+                let passed = now.since(looked).min(2 * LOOK_EVERY);
+                silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };
+                (last, looked) = (beat, now);
+                if beat.is_some() && silent_for > limit && !stopping.load(Ordering::Acquire) {
+                    let what = format!("the tick has been silent for {} ms", silent_for.as_millis());
                     let _ = endings.send(Ending::Fault(what));
                     return;
                 }
@@ -58,6 +65,7 @@ impl Drop for Watchdog {
     fn drop(&mut self) {
         self.stand_down();
         if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
             let _ = thread.join();
         }
     }

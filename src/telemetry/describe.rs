@@ -119,7 +119,8 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             Described { joint: Some(joint), values: vec![asked], ..d }
         }
         Event::Overrun(skipped, late_ns) => {
-            let text = format!("overrun: {skipped} periods skipped, {:.3} ms late", late_ns as f64 * 1e-6);
+            let periods = if skipped == 1 { "period" } else { "periods" };
+            let text = format!("overrun: {skipped} {periods} skipped, {:.3} ms late", late_ns as f64 * 1e-6);
             let d = plain("overrun", Severity::Warn, "skipped", text);
             Described { values: vec![f64::from(skipped), late_ns as f64], ..d }
         }
@@ -185,9 +186,10 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
 }
 
 fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> Described {
-    let severity = match state {
-        TaskState::Aborted | TaskState::Fault => Severity::Error,
-        _ if matches!(reason, Reason::None | Reason::Cancelled) => Severity::Info,
+    let severity = match (state, reason) {
+        (_, Reason::None | Reason::Cancelled) => Severity::Info,
+        (_, Reason::ArmHeld(_, Cause::Operator | Cause::Shutdown)) => Severity::Warn,
+        (TaskState::Aborted | TaskState::Fault, _) => Severity::Error,
         _ => Severity::Warn,
     };
     let name = names.task(task);

@@ -41,12 +41,16 @@ pub struct TickSample {
     pub tick: u64,
     /// The tick's deadline: the time it works with.
     pub deadline: Mono,
+    /// When it took the next tick to be due.
+    pub next: Mono,
     /// Wake-up after the deadline [ns].
     pub late_ns: u64,
     /// Time from wake-up to the last command handed over [ns].
     pub compute_ns: u64,
     /// Whole periods skipped before this tick.
     pub skipped: u32,
+    /// The lateness that cost them [ns]: of this tick or of the one before.
+    pub overrun_ns: u64,
     /// Samples that found the ring full since the last tick that got through.
     pub dropped: u32,
 }

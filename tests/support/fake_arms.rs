@@ -30,13 +30,13 @@ enum Tool {
 #[serde(default, deny_unknown_fields)]
 struct NoOptions {}
 
-fn host(address: &str) -> Result<(), String> {
-    let (host, port) = address.split_once(':').unwrap_or((address, "1"));
+fn host(text: &str) -> Result<String, String> {
+    let (host, port) = text.split_once(':').unwrap_or((text, "1"));
     match port.parse::<u16>() {
         _ if host.is_empty() => Err("the host is missing".to_owned()),
         _ if host.contains(char::is_whitespace) => Err("a host has no spaces".to_owned()),
         Err(_) => Err(format!("{port:?} is no port number")),
-        Ok(_) => Ok(()),
+        Ok(port) => Ok(format!("{host}:{port}")),
     }
 }
 
@@ -67,7 +67,7 @@ pub const MOCK: AdapterSpec = AdapterSpec {
     about: "an arm in memory",
     transport: "memory",
     dof: (1, 16),
-    address: AddressForm { form: "none", required: false, check: |_| Ok(()) },
+    address: AddressForm { form: "none", required: false, check: |address| Ok(address.to_owned()) },
     options: OptionsSpec::of::<NoOptions>(),
     emulate: None,
     ..YOURARM
@@ -84,7 +84,7 @@ pub const SERVOBOT: AdapterSpec = AdapterSpec {
         form: "/dev/ttyX",
         required: true,
         check: |address| match address.starts_with("/dev/") {
-            true => Ok(()),
+            true => Ok(address.to_owned()),
             false => Err("a serial port starts with /dev/".to_owned()),
         },
     },

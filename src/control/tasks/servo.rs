@@ -3,7 +3,7 @@
 //! joints.
 
 use crate::clock::Mono;
-use crate::control::config::ServoParams;
+use crate::control::config::{JUMP, ServoParams};
 use crate::control::task::{Claim, Context};
 use crate::joint::{Joints, MAX_DOF};
 
@@ -29,9 +29,10 @@ struct Target {
 
 impl Target {
     fn reached(&self, cx: &Context<'_>) -> Joints {
-        // A target counts from its tick on, so the first step is made at once.
+        // A target counts from its tick on, so the first step is made at once. The line is a tick longer than the
+        // stream's period: the next target may come so much later without a halt in between.
         let done = if self.period > 1.5 * cx.dt {
-            ((cx.now.seconds_since(self.at) + cx.dt) / self.period).clamp(0.0, 1.0)
+            ((cx.now.seconds_since(self.at) + cx.dt) / (self.period + cx.dt)).clamp(0.0, 1.0)
         } else {
             1.0
         };
@@ -57,7 +58,7 @@ impl ServoTask {
     }
 
     /// A new target [rad], in the order of the task's joints.
-    pub fn set_target(&mut self, cx: &Context<'_>, to: &Joints) {
+    pub fn set_target(&mut self, cx: &Context<'_>, joints: &[u16], to: &Joints) {
         self.muted = [false; MAX_DOF];
         let (from, period) = match &self.target {
             None => (*to, 0.0),
@@ -69,7 +70,14 @@ impl ServoTask {
                     _ => pause,
                 };
                 let before = Context { now: cx.now.before(std::time::Duration::from_secs_f64(cx.dt)), ..*cx };
-                (last.reached(&before), period)
+                let from = last.reached(&before);
+                // What no joint could do in that time is a jump: passed on whole, so that it is refused.
+                let reachable = |(k, joint): (usize, &u16)| {
+                    let step = to.get(k).zip(last.to.get(k)).map_or(0.0, |(to, last)| (to - last).abs());
+                    step <= JUMP.max(cx.joint(*joint).velocity_limit * pause * 1.5)
+                };
+                let possible = joints.iter().enumerate().all(reachable);
+                (from, if possible { period } else { 0.0 })
             }
         };
         self.target = Some(Target { from, to: *to, at: cx.now, period });

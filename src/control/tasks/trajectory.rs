@@ -22,6 +22,8 @@ pub struct TrajectoryTask {
     /// Speed along the trajectory: 1, or less on the way to a stop.
     rate: f64,
     slowing: bool,
+    /// The arm has taken it up.
+    begun: bool,
     /// Time since the trajectory's end [s].
     settling: f64,
     /// What the last commands were ahead of the first point, joint by joint [rad].
@@ -43,6 +45,7 @@ impl TrajectoryTask {
             elapsed: 0.0,
             rate: 1.0,
             slowing: false,
+            begun: false,
             settling: 0.0,
             offsets: Vec::with_capacity(width),
             fade: SHORTEST_FADE,
@@ -54,37 +57,50 @@ impl TrajectoryTask {
 
     /// Whether a motion may start from the present state.
     pub fn check_start(&self, cx: &Context<'_>, motion: &Motion) -> Result<(), Outcome> {
-        for (k, &joint) in motion.joints.iter().enumerate() {
-            let distance = (motion.spline.start(k) - cx.joint(joint).position).abs();
-            if distance.is_nan() || distance > self.params.start_position_tolerance {
-                return Err(Outcome::StartStateMismatch(joint, distance));
-            }
+        match self.away_from_start(cx, motion) {
+            Some((joint, error)) => Err(Outcome::StartStateMismatch(joint, error.abs())),
+            None => Ok(()),
         }
-        Ok(())
+    }
+
+    /// The first joint that is too far from the start, and how far it is ahead of it [rad].
+    fn away_from_start(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
+        motion.joints.iter().enumerate().find_map(|(k, &joint)| {
+            let error = cx.joint(joint).position - motion.spline.start(k);
+            let away = error.is_nan() || error.abs() > self.params.start_position_tolerance;
+            away.then_some((joint, error))
+        })
     }
 
     /// Takes on a motion. Answers the one before, if any.
     pub fn start(&mut self, cx: &Context<'_>, motion: Box<Motion>) -> Option<Box<Motion>> {
         self.cursor = Cursor::default();
-        (self.elapsed, self.rate, self.slowing, self.settling) = (0.0, 1.0, false, 0.0);
+        (self.elapsed, self.rate, self.slowing, self.begun, self.settling) = (0.0, 1.0, false, false, 0.0);
+        self.samples.clear();
+        self.samples.resize(motion.joints.len(), Sample::default());
+        self.last = TaskView { motion: motion.id, remaining: motion.spline.duration(), ..TaskView::default() };
+        let before = self.motion.replace(motion);
+        self.set_out(cx);
+        before
+    }
+
+    /// Notes what the last commands are ahead of the first point, and over which time that is faded out.
+    fn set_out(&mut self, cx: &Context<'_>) {
+        let Some(motion) = self.motion.as_deref() else { return };
         self.fade = SHORTEST_FADE;
         self.offsets.clear();
         self.asked.clear();
-        self.samples.clear();
         for (k, &joint) in motion.joints.iter().enumerate() {
             let view = cx.joint(joint);
             let offset = view.commanded - motion.spline.start(k);
             self.offsets.push(offset);
             self.asked.push(view.commanded);
-            self.samples.push(Sample::default());
             // The fade may use a quarter of the joint's speed and acceleration: peaks of a quintic step are
             // 1.875 offset / T and 5.774 offset / T².
             let by_speed = 1.875 * offset.abs() / (0.25 * view.velocity_limit);
             let by_acceleration = (5.774 * offset.abs() / (0.25 * view.acceleration)).sqrt();
             self.fade = self.fade.max(by_speed).max(by_acceleration);
         }
-        self.last = TaskView { motion: motion.id, remaining: motion.spline.duration(), ..TaskView::default() };
-        self.motion.replace(motion)
     }
 
     /// From now on slow down along the path.
@@ -99,6 +115,20 @@ impl TrajectoryTask {
 
     /// Fills in the claims of this tick, or says how it ended. `granted`: the claims of the last tick went out.
     pub fn compute(&mut self, cx: &Context<'_>, granted: bool, claims: &mut Vec<Claim>) -> Option<(TaskState, Reason)> {
+        if !granted {
+            if self.slowing {
+                return Some((TaskState::Aborted, Reason::Cancelled));
+            }
+            if !self.begun {
+                // While the arm slows down and changes its mode for it, the way to the start changes.
+                self.set_out(cx);
+                let away = self.motion.as_deref().and_then(|motion| self.away_from_start(cx, motion));
+                if let Some((joint, error)) = away {
+                    return Some((TaskState::Aborted, Reason::PathTolerance(joint, error)));
+                }
+            }
+        }
+        self.begun |= granted;
         let motion = self.motion.as_deref()?;
         if granted {
             if let Some(reason) = self.off_path(cx, motion) {
@@ -108,7 +138,7 @@ impl TrajectoryTask {
         }
         let duration = motion.spline.duration();
         motion.spline.sample(self.elapsed, &mut self.cursor, &mut self.samples);
-        if self.slowing && granted {
+        if self.slowing {
             self.rate -= cx.dt * steepest_slowdown(cx, motion, &self.samples, self.rate);
             if self.rate <= 0.0 || self.elapsed >= duration {
                 note_progress(&mut self.last, self.elapsed, duration);

@@ -68,7 +68,8 @@ fn addresses_are_checked(context: &mut Context) -> Result<(), String> {
         return context.skip("it needs no address");
     }
     require((address.check)("").is_err(), || "an empty address is accepted".into())?;
-    (address.check)(&context.config.address).map_err(|e| format!("the emulator's own address is refused: {e}"))
+    let own = (address.check)(&context.config.address);
+    own.map(drop).map_err(|e| format!("the emulator's own address is refused: {e}"))
 }
 
 fn options_are_strict(context: &mut Context) -> Result<(), String> {

@@ -8,6 +8,8 @@ use crate::clock::Mono;
 
 /// Episodes that are remembered.
 const EPISODES: usize = 16;
+/// Most lines about one stretch of trouble.
+const TOLD: usize = 8;
 
 /// A stretch of trouble of one kind.
 #[derive(Debug, Clone, PartialEq)]
@@ -48,7 +50,8 @@ pub struct Health {
     pub stop_confirmed: AtomicU32,
     /// `ArmCommand::stop_seq` of the last stop that was sent.
     pub stop_sent: AtomicU32,
-    rate_mhz: AtomicU64,
+    /// Mean time between states [ns]; a mean of rates would count short pauses for too much.
+    interval_ns: AtomicU64,
     text: Mutex<Text>,
 }
 
@@ -56,21 +59,26 @@ pub struct Health {
 struct Text {
     error: String,
     episodes: VecDeque<Episode>,
+    /// What was told since all was well.
+    told: Vec<String>,
 }
 
 impl Health {
     /// How often states come [Hz].
     pub fn rate(&self) -> f64 {
-        self.rate_mhz.load(Ordering::Relaxed) as f64 * 1e-3
+        match self.interval_ns.load(Ordering::Relaxed) {
+            0 => 0.0,
+            ns => 1e9 / ns as f64,
+        }
     }
 
     /// A state came, so long after the one before [s].
     pub(super) fn state_came(&self, interval: f64) {
         self.reads.fetch_add(1, Ordering::Relaxed);
         if interval > 0.0 {
-            let old = self.rate();
-            let new = if old > 0.0 { old + 0.05 * (1.0 / interval - old) } else { 1.0 / interval };
-            self.rate_mhz.store((new * 1e3) as u64, Ordering::Relaxed);
+            let (old, new) = (self.interval_ns.load(Ordering::Relaxed) as f64, interval * 1e9);
+            let mean = if old > 0.0 { old + 0.05 * (new - old) } else { new };
+            self.interval_ns.store(mean.max(1.0) as u64, Ordering::Relaxed);
         }
     }
 
@@ -88,15 +96,20 @@ impl Health {
         self.lock().episodes.iter().cloned().collect()
     }
 
-    /// Trouble was seen. `true`: it is new, and worth a line.
+    /// Trouble was seen. `true`: it is new, and worth a line. What comes again before all is well is not new, also
+    /// when other trouble came between: an arm that is gone fails at reads and writes in turn.
     pub(super) fn trouble(&self, now: Mono, text: &str) -> bool {
         let mut all = self.lock();
-        if let Some(same) = all.episodes.back_mut().filter(|e| e.until.is_none()) {
-            same.count += 1;
-            if same.text == text {
+        let open = all.episodes.back_mut().filter(|e| e.until.is_none());
+        if let Some(open) = open {
+            open.count += 1;
+            if all.told.iter().any(|told| told == text) || all.told.len() == TOLD {
                 return false;
             }
-            same.until = Some(now);
+        }
+        all.told.push(text.to_owned());
+        if let Some(before) = all.episodes.back_mut().filter(|e| e.until.is_none()) {
+            before.until = Some(now);
         }
         if all.episodes.len() == EPISODES {
             all.episodes.pop_front();
@@ -110,10 +123,31 @@ impl Health {
         let mut all = self.lock();
         let last = all.episodes.back_mut().filter(|e| e.until.is_none())?;
         last.until = Some(now);
-        Some(last.text.clone())
+        let text = last.text.clone();
+        all.told.clear();
+        Some(text)
     }
 
     fn lock(&self) -> std::sync::MutexGuard<'_, Text> {
         self.text.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn trouble_is_told_once_until_it_is_over() {
+        let health = Health::default();
+        let told = |text: &str| health.trouble(Mono(1), text);
+        assert!(told("no state") && told("no command"));
+        assert!((0..9).all(|_| !told("no state") && !told("no command")), "in turn is not new");
+        let counts: Vec<u64> = health.episodes().iter().map(|e| e.count).collect();
+        assert_eq!(counts, [2, 19], "the first, and the second that took its place");
+        assert_eq!(health.over(Mono(2)).as_deref(), Some("no command"));
+        assert_eq!(health.over(Mono(3)), None);
+        assert!(told("no state"), "the next time it is new");
+        assert_eq!((0..99).filter(|n| told(&format!("trouble {n}"))).count(), TOLD - 1);
     }
 }

@@ -24,6 +24,9 @@ use crate::rt::beat::Beat;
 use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
 
+/// Without real-time scheduling the computer itself stalls this long when it is busy; nothing is to be read into that.
+const STALLS: Duration = Duration::from_millis(100);
+
 /// What a device thread is made from.
 pub struct DeviceConfig {
     /// The arm's name in the blueprint.
@@ -36,6 +39,8 @@ pub struct DeviceConfig {
     pub native_rate: f64,
     /// The fastest any joint may move [rad/s], to tell a plausible pose from an impossible one.
     pub velocity_max: f64,
+    /// Whether the process may schedule in real time: silence is then noticed sooner.
+    pub realtime: bool,
     /// The tick's heartbeat.
     pub beat: Arc<Beat>,
     /// Time.
@@ -53,12 +58,12 @@ impl DeviceConfig {
 
     /// A state older than this is stale.
     pub fn state_timeout(&self) -> Duration {
-        (3 * self.read_period()).max(Duration::from_millis(30))
+        (3 * self.read_period()).max(if self.realtime { Duration::from_millis(30) } else { STALLS })
     }
 
     /// Without the tick's heartbeat for this long, the device thread holds the arm by itself.
     pub fn beat_timeout(&self) -> Duration {
-        (3 * self.tick_period).max(Duration::from_millis(40))
+        (3 * self.tick_period).max(if self.realtime { Duration::from_millis(40) } else { STALLS })
     }
 }
 

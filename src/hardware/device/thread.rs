@@ -23,6 +23,10 @@ const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::fr
 const PLAUSIBLE_AFTER: u32 = 3;
 /// How long `activate` waits for plausible states, and for the motors.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
+/// How long a stopped arm gets to stand still before its motors are disabled, and what counts as standing [rad/s, s].
+const REST_LIMIT: Duration = Duration::from_secs(1);
+const STANDSTILL: f64 = 0.02;
+const STILL_FOR: f64 = 0.03;
 
 pub(super) struct Worker {
     config: DeviceConfig,
@@ -33,6 +37,8 @@ pub(super) struct Worker {
     state: ArmState,
     reading: JointReading,
     last: ArmCommand,
+    /// A stop that the arm has not taken yet. Kept until it does, also over a new connection.
+    stop_owed: bool,
     /// It was connected once and should be again.
     wanted: bool,
     connected: bool,
@@ -65,6 +71,7 @@ impl Worker {
             state,
             reading: JointReading::default(),
             last: ArmCommand::default(),
+            stop_owed: false,
             wanted: false,
             connected: false,
             whole_state_at_once: false,
@@ -100,7 +107,7 @@ impl Worker {
         let due = if self.connected { self.next_read } else { self.reconnect.0 };
         let now = self.config.clock.now();
         let idle = if self.wanted { due.since(now) } else { Duration::from_secs(1) };
-        self.wake.wait(idle.min(Duration::from_secs(1)));
+        self.wake.wait(idle.min(Duration::from_secs(1)).min(self.until_silent(now)));
         loop {
             match orders.try_recv() {
                 Ok(order) => {
@@ -117,7 +124,8 @@ impl Worker {
         }
         if self.connected {
             self.pass_on_command(adapter);
-            self.watch_the_tick(adapter);
+            self.watch_the_tick();
+            self.stop(adapter);
             if self.config.clock.now() >= self.next_read {
                 self.read(adapter);
             }
@@ -177,16 +185,16 @@ impl Worker {
         self.connected = true;
         self.reconnect.1 = BACK_OFF.0;
         self.plausible = 0;
-        self.last = self.commands.read();
+        self.take_command();
         self.read(adapter);
         Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range() })
     }
 
     fn connect_again(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        self.state.self_held = true; // Whoever held it before, only `enable` lets it move again.
         match self.connect(adapter) {
             Ok(_) => {
                 self.health.reconnects.fetch_add(1, Relaxed);
-                self.state.self_held = true; // Whoever held it before, only `enable` lets it move again.
                 self.well_again();
             }
             Err(_) => {
@@ -224,6 +232,7 @@ impl Worker {
             self.read(adapter);
         }
         self.state.self_held = false;
+        self.stop_owed = false;
         self.write_errors = 0;
         self.turn = 0;
         for _ in 0..6 {
@@ -237,6 +246,7 @@ impl Worker {
         if self.connected {
             result = adapter.deactivate();
             if disable {
+                self.wait_for_standstill(adapter);
                 result = result.and(adapter.write_enable(false));
             }
         }
@@ -248,27 +258,53 @@ impl Worker {
         result
     }
 
-    fn pass_on_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+    /// Motors are not switched off, and brakes not closed, under an arm that still moves; but not for ever either.
+    fn wait_for_standstill(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let limit = self.config.clock.now().after(REST_LIMIT);
+        let mut still_for = 0.0;
+        loop {
+            let before = (self.state.position, self.state.stamp);
+            std::thread::sleep(self.config.read_period());
+            self.read(adapter);
+            let past = self.state.stamp.seconds_since(before.1).max(1e-3);
+            let moved = self.state.position.iter().zip(before.0).take(self.config.dof);
+            let still = moved.map(|(now, then)| (now - then).abs() / past).all(|v| v <= STANDSTILL);
+            // One instant is not enough: it is also where a joint turns round.
+            still_for = if still { still_for + self.state.stamp.seconds_since(before.1) } else { 0.0 };
+            if !self.connected || still_for >= STILL_FOR || self.config.clock.now() >= limit {
+                return;
+            }
+        }
+    }
+
+    /// Takes the newest command. Answers the one before it.
+    fn take_command(&mut self) -> ArmCommand {
         let command = self.commands.read();
-        if command.seq == self.last.seq {
+        self.stop_owed |= command.stop_seq != self.last.stop_seq;
+        std::mem::replace(&mut self.last, command)
+    }
+
+    /// Whether the arm is being moved by commands, as far as this thread lets them through.
+    fn moving(&self) -> bool {
+        self.connected && self.last.mode.is_some() && !self.state.self_held
+    }
+
+    fn pass_on_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let before = self.take_command();
+        let command = self.last;
+        if command.seq == before.seq {
             return;
         }
-        let before = std::mem::replace(&mut self.last, command);
         let lead = Duration::from_secs_f64((3.0 * self.read_time).max(1e-3)).min(self.config.tick_period / 2);
         let earliest = self.last_read.after(self.config.read_period().mul_f64(0.8));
         self.next_read = self.next_read.min(command.next_tick.before(lead)).max(earliest);
         if self.state.self_held {
             return;
         }
-        let result = self.write(adapter, &before, &command);
-        match result {
+        match self.write(adapter, &before, &command) {
+            Ok(()) if self.stop_owed => {}
             Ok(()) => self.write_errors = 0,
-            Err(error) => {
-                self.health.write_errors.fetch_add(1, Relaxed);
-                self.write_errors += 1;
-                self.trouble(&format!("a command was not taken: {error}"));
-                self.after_error(adapter, &error);
-            }
+            Err(error) => self.not_taken(adapter, "a command was not taken", &error),
         }
     }
 
@@ -278,17 +314,12 @@ impl Worker {
         before: &ArmCommand,
         command: &ArmCommand,
     ) -> AdapterResult<()> {
-        if command.stop_seq != before.stop_seq {
-            let stop = adapter.write_stop()?;
-            self.health.stop_sent.store(command.stop_seq, Relaxed);
-            if stop == Stop::Confirmed {
-                self.health.stop_confirmed.store(command.stop_seq, Relaxed);
-            }
-        }
-        if command.gripper_seq != before.gripper_seq {
-            adapter.write_gripper_position(command.gripper)?;
-        }
-        let Some(mode) = command.mode else { return Ok(()) };
+        // A refused gripper costs the joints nothing.
+        let gripper = match command.gripper_seq == before.gripper_seq {
+            true => Ok(()),
+            false => adapter.write_gripper_position(command.gripper),
+        };
+        let Some(mode) = command.mode else { return gripper };
         if adapter.get_control_mode() != mode {
             adapter.set_control_mode(mode)?;
         }
@@ -299,23 +330,45 @@ impl Worker {
         }
         self.state.written = command.seq;
         self.health.writes.fetch_add(1, Relaxed);
-        Ok(())
+        gripper
+    }
+
+    /// Asks the arm to stop by its own means, again and again until it has taken it.
+    fn stop(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        if !self.stop_owed || !self.connected {
+            return;
+        }
+        match adapter.write_stop() {
+            Ok(stop) => {
+                self.stop_owed = false;
+                self.health.stop_sent.store(self.last.stop_seq, Relaxed);
+                if stop == Stop::Confirmed {
+                    self.health.stop_confirmed.store(self.last.stop_seq, Relaxed);
+                }
+            }
+            Err(error) => self.not_taken(adapter, "the arm did not take the stop", &error),
+        }
+    }
+
+    fn not_taken(&mut self, adapter: &mut dyn ManipulatorAdapter, what: &str, error: &AdapterError) {
+        self.health.write_errors.fetch_add(1, Relaxed);
+        self.write_errors += 1;
+        self.trouble(&format!("{what}: {error}"));
+        self.after_error(adapter, error);
+    }
+
+    /// How long the tick may still be silent, where its silence would matter.
+    fn until_silent(&self, now: Mono) -> Duration {
+        let silence = self.config.beat.silence(now).filter(|_| self.moving());
+        silence.map_or(Duration::MAX, |silence| self.config.beat_timeout().saturating_sub(silence))
     }
 
     /// The checker is not the checked: when the tick falls silent, this thread holds the arm.
-    fn watch_the_tick(&mut self, adapter: &mut dyn ManipulatorAdapter) {
-        if self.last.mode.is_none() || self.state.self_held {
-            return;
-        }
-        let silence = self.config.beat.silence(self.config.clock.now());
-        if silence.is_some_and(|s| s > self.config.beat_timeout()) {
+    fn watch_the_tick(&mut self) {
+        if self.until_silent(self.config.clock.now()).is_zero() {
             self.state.self_held = true;
-            let stopped = adapter.write_stop();
+            self.stop_owed = true;
             self.trouble("the tick fell silent: held by the device thread");
-            if let Err(error) = stopped {
-                self.trouble(&format!("the tick fell silent, and the arm did not take the stop: {error}"));
-                self.after_error(adapter, &error);
-            }
             self.states.write(&self.state);
         }
     }

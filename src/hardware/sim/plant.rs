@@ -15,6 +15,9 @@ const SAG_SPEED: f64 = 0.25;
 const BRAKING: f64 = 0.85;
 /// Viscous friction [Nm·s/rad].
 const FRICTION: f64 = 0.5;
+/// How much more than the acceleration limit the drives can do when they follow set points: one that could do no more
+/// than it is asked would never make up for starting late.
+const HEADROOM: f64 = 2.0;
 /// Below these a joint that follows a target has arrived [rad, rad/s].
 const ARRIVED: (f64, f64) = (1e-7, 1e-4);
 
@@ -23,7 +26,7 @@ const ARRIVED: (f64, f64) = (1e-7, 1e-4);
 pub enum Tracking {
     /// At once, as far as the velocity limit allows.
     Ideal,
-    /// First-order with this time constant [s], within the acceleration limit.
+    /// First-order with this time constant [s]; set points within the acceleration limit, with some headroom.
     Lag(f64),
 }
 
@@ -48,6 +51,8 @@ struct Joint {
     velocity: f64,
     /// Target position [rad] or velocity [rad/s].
     target: f64,
+    /// How fast the set points move, by the last two of them [rad/s].
+    pace: f64,
     lower: f64,
     upper: f64,
     velocity_max: f64,
@@ -164,13 +169,18 @@ impl Plant {
 
     /// Follows a set point [rad].
     pub fn servo(&mut self, target: &[f64]) {
+        let following = self.drive == Drive::Servo;
+        let before = self.joints.map(|joint| joint.target);
         if !self.drive_to(Drive::Servo, target) {
             return;
         }
         self.interval = (self.since_set_point - self.ahead).clamp(1e-3, CREDIT);
         self.since_set_point = self.ahead;
+        let (interval, ahead) = (self.interval, self.ahead);
+        for (joint, before) in self.active_mut().iter_mut().zip(before) {
+            joint.pace = if following { (joint.target - before) / interval } else { 0.0 };
+        }
         if self.tracking == Tracking::Ideal {
-            let (interval, ahead) = (self.interval, self.ahead);
             for joint in self.active_mut().iter_mut().filter(|joint| !joint.blocked) {
                 let reach = joint.velocity_max * (joint.credit - ahead).max(0.0);
                 let step = (joint.target - joint.position).clamp(-reach, reach);
@@ -264,14 +274,17 @@ impl Plant {
             }
             match (drive, tracking) {
                 (Drive::Disabled, _) => joint.fall(fall, h),
-                (Drive::Stop, _) => joint.accelerate(0.0, h),
-                (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, h),
-                (Drive::Servo, Tracking::Lag(lag)) => joint.approach(joint.velocity_max, lag, h),
+                (Drive::Stop, _) => joint.accelerate(0.0, joint.acceleration, h),
+                (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, 0.0, joint.acceleration, h),
+                (Drive::Servo, Tracking::Lag(lag)) => {
+                    let pace = if pause { 0.0 } else { joint.pace };
+                    joint.approach(joint.velocity_max, lag, pace, HEADROOM * joint.acceleration, h);
+                }
                 (Drive::Servo, Tracking::Ideal) => joint.follow(pause, h),
                 (Drive::Velocity, Tracking::Lag(_)) => {
                     let room = if joint.target > 0.0 { joint.upper } else { joint.lower } - joint.position;
                     let brake = braking_speed(room.abs(), joint.acceleration, h);
-                    joint.accelerate(joint.target.clamp(-brake, brake), h);
+                    joint.accelerate(joint.target.clamp(-brake, brake), joint.acceleration, h);
                 }
                 (Drive::Velocity, Tracking::Ideal) => {
                     joint.velocity = joint.target;
@@ -307,22 +320,24 @@ impl Joint {
         }
     }
 
-    fn accelerate(&mut self, velocity: f64, h: f64) {
-        let dv = self.acceleration * h;
+    fn accelerate(&mut self, velocity: f64, acceleration: f64, h: f64) {
+        let dv = acceleration * h;
         self.velocity += (velocity - self.velocity).clamp(-dv, dv);
         self.travel(h);
     }
 
-    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time.
-    fn approach(&mut self, top: f64, lag: f64, h: f64) {
+    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time: not before a
+    /// target that moves on at `pace` [rad/s], only relative to it.
+    fn approach(&mut self, top: f64, lag: f64, pace: f64, acceleration: f64, h: f64) {
         let error = self.target - self.position;
-        if error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(self.acceleration * h) {
+        let arrived = error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(acceleration * h);
+        if arrived && pace == 0.0 {
             (self.position, self.velocity) = (self.target, 0.0);
             return;
         }
         let wanted = error.abs() / lag.max(h);
-        let brake = braking_speed(error.abs(), self.acceleration, h);
-        self.accelerate(wanted.min(brake).min(top).copysign(error), h);
+        let brake = braking_speed(error.abs(), acceleration, h) + (pace * error.signum()).max(0.0);
+        self.accelerate(wanted.min(brake).min(top).copysign(error), acceleration, h);
     }
 
     /// An ideal joint between set points: makes the rest of its way at top speed, then stands.

@@ -29,7 +29,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
-    address: AddressForm { form: "none", required: false, check: |_| Ok(()) },
+    address: AddressForm { form: "none", required: false, check: |address| Ok(address.to_owned()) },
     holds_when_disabled: true,
     gripper: true,
     options: OptionsSpec::of::<Options>(),

@@ -43,7 +43,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     address: AddressForm {
         form: "HOST[:PORT]",
         required: true,
-        check: |address| Endpoint::parse(address, protocol::PORT).map(|_| ()),
+        check: |address| Endpoint::parse(address, protocol::PORT).map(|endpoint| endpoint.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,

@@ -62,7 +62,9 @@ fn units_go_both_ways_and_the_arm_gets_there() {
     arm.write_joint_positions(&target, 0.5).unwrap();
     until("arrival", || close(&read(&mut *arm).unwrap().position, &target));
     let there = emulator.joints();
-    assert!(close(&there.0, &target), "it stays there: {there:?}");
+    // It may still be settling by less than the wire can tell.
+    let off = there.0.iter().zip(target).map(|(q, t)| (q - t).abs()).fold(0.0, f64::max);
+    assert!(off < 1e-3, "it stays there: {there:?}");
     let [first, ..] = emulator.trace()[..] else { panic!("nothing recorded") };
     let degrees = target.map(|v: f64| v.to_degrees() as f32);
     assert_eq!(first.request, Request::MoveJoints(50.0, degrees), "deg and % on the wire");
@@ -266,6 +268,13 @@ fn sag_and_zero_state_and_blocked_joints_can_be_played() {
     until("joint 6", || (read(&mut *arm).unwrap().position[5] - 0.1).abs() < 1e-6);
     assert!(emulator.joints().0[0].abs() < 1e-9);
     assert!(emulator.inject(Fault::new(FaultKind::Panic)).is_err());
+}
+
+#[test]
+fn an_address_in_full_has_its_port() {
+    let full = |address| (super::SPEC.address.check)(address).unwrap();
+    assert_eq!(full("arm.local"), format!("arm.local:{}", super::protocol::PORT));
+    assert_eq!(full("[::1]:7"), "[::1]:7");
 }
 
 #[test]

@@ -14,7 +14,7 @@ use crate::joint::{JointLimits, Joints};
 /// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
 const INITIAL: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// How far joints are behind their set points [s].
-const LAG: f64 = 0.02;
+const LAG: f64 = 0.01;
 /// In velocity mode the arm stops when no velocity arrives for this long [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
 /// Speed of the gripper [m/s].

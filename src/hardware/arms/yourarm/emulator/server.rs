@@ -11,6 +11,7 @@ use super::controller::{Controller, Delivery};
 use super::wire::{self, status};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::transport::tcp::Scan;
+use crate::rt::host;
 
 /// How long a new client waits for the end of one that has just gone.
 const GRACE: Duration = Duration::from_millis(200);
@@ -164,6 +165,7 @@ fn listen(shared: &Arc<Shared>, mut listener: TcpListener) {
         drop(line);
         let for_thread = shared.clone();
         let spawned = std::thread::Builder::new().name("yourarm-sim-client".into()).spawn(move || {
+            host::enter_realtime(host::EMULATOR_PRIORITY);
             serve(&for_thread, stream);
             lock(&for_thread.controller).client_gone(MonotonicClock.now());
             lock(&for_thread.line).client = None;

@@ -1,0 +1,179 @@
+//! A test bed for the coordinator: arms that do what they are told, and somebody who keeps their tasks busy.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use dimos::clock::Mono;
+use dimos::control::config::{
+    ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
+};
+use dimos::control::request::{Envelope, Motion, Request};
+use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos::telemetry::{TaskState, TaskView};
+use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+
+/// Joints of each arm.
+pub const DOF: usize = 7;
+/// After so many ticks all tasks are under way.
+pub const SETTLED: u64 = 200;
+
+/// What the tasks do; there is one per arm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Load {
+    /// All arms hold.
+    Hold,
+    /// All follow trajectories.
+    Trajectory,
+    /// All follow streams of positions, with a new target in every tick.
+    Servo,
+    /// All follow streams of velocities, with a new target in every tick.
+    Velocity,
+    /// One after the other: trajectory, servo, velocity.
+    EveryType,
+}
+
+/// Arms, and what keeps them busy.
+pub struct Bed {
+    config: CoordinatorConfig,
+    motion: Spline,
+    holds: bool,
+    sent: u64,
+}
+
+impl Bed {
+    /// So many arms under a load, ticking at 100 Hz.
+    pub fn new(arms: usize, load: Load) -> Self {
+        let limits = JointLimits::uniform(DOF, 3.0, 3.0).with_defaults();
+        let arm = |i| ArmConfig {
+            name: format!("arm{i}"),
+            dof: DOF,
+            limits: limits.clone(),
+            modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
+            gripper: true,
+            state_timeout: Duration::from_millis(30),
+        };
+        let kinds = [
+            TaskKind::Trajectory(TrajectoryParams::default()),
+            TaskKind::Servo(ServoParams::default()),
+            TaskKind::Velocity(VelocityParams::default()),
+        ];
+        let task = |i: usize| TaskConfig {
+            name: format!("task{i}"),
+            kind: kinds[match load {
+                Load::Hold | Load::Trajectory => 0,
+                Load::Servo => 1,
+                Load::Velocity => 2,
+                Load::EveryType => i % 3,
+            }]
+            .clone(),
+            joints: (i * DOF..(i + 1) * DOF).map(|j| j as u16).collect(),
+            priority: 10,
+            auto_start: false,
+        };
+        let config =
+            CoordinatorConfig { rate: 100.0, arms: (0..arms).map(arm).collect(), tasks: (0..arms).map(task).collect() };
+        Self { config, motion: motion(), holds: load == Load::Hold, sent: 0 }
+    }
+
+    /// What the coordinator is made from.
+    pub fn config(&self) -> &CoordinatorConfig {
+        &self.config
+    }
+
+    /// What the tasks are told in a tick, for the views they showed after the one before.
+    pub fn requests(&mut self, tick: u64, tasks: &[TaskView], queue: &mut VecDeque<Envelope>) {
+        if tick == 10 {
+            for arm in 0..self.config.arms.len() {
+                self.send(Request::Ready { arm: arm as u16 }, queue);
+            }
+        }
+        // By then the arms are ready.
+        if self.holds || tick < SETTLED / 2 {
+            return;
+        }
+        for t in 0..self.config.tasks.len() {
+            let task = t as u16;
+            let request = match self.config.tasks[t].kind {
+                TaskKind::Trajectory(_) if tasks.get(t).is_some_and(|v| v.state == TaskState::Executing) => continue,
+                TaskKind::Trajectory(_) => {
+                    let joints = self.config.tasks[t].joints.clone();
+                    let motion = Motion { id: self.sent + 1, joints, spline: self.motion.clone() };
+                    Request::Execute { task, motion: Box::new(motion) }
+                }
+                TaskKind::Servo(_) => Request::Servo { task, target: swing(tick as f64 / 100.0).0 },
+                TaskKind::Velocity(_) => Request::Velocity { task, target: swing(tick as f64 / 100.0).1 },
+            };
+            self.send(request, queue);
+        }
+    }
+
+    fn send(&mut self, request: Request, queue: &mut VecDeque<Envelope>) {
+        self.sent += 1;
+        queue.push_back(Envelope { id: self.sent, request });
+    }
+
+    /// Whether the load is what it should be.
+    pub fn is_busy(&self, tasks: &[TaskView]) -> bool {
+        self.holds || tasks.iter().all(|t| t.state == TaskState::Executing)
+    }
+}
+
+/// Positions and velocities of a swing of 0.2 rad that takes 4 s.
+fn swing(time: f64) -> (Joints, Joints) {
+    let turn = std::f64::consts::TAU / 4.0;
+    let values = |v| joints_of(&[v; DOF]);
+    (values(0.1 * (1.0 - (turn * time).cos())), values(0.1 * turn * (turn * time).sin()))
+}
+
+/// A motion of 40 s that ends where it began, with a point every 0.25 s.
+fn motion() -> Spline {
+    let points = (0..=160).map(|i| f64::from(i) * 0.25).map(|time| {
+        let (positions, velocities) = swing(time);
+        TrajectoryPoint {
+            time_from_start: time,
+            positions: positions[..DOF].to_vec(),
+            velocities: velocities[..DOF].to_vec(),
+            accelerations: Vec::new(),
+        }
+    });
+    let joint_names = (0..DOF).map(|j| j.to_string()).collect();
+    Spline::new(&JointTrajectory { joint_names, points: points.collect() }).expect("a valid trajectory")
+}
+
+/// An arm before its first tick: connected, enabled, at zero.
+pub fn fresh_arm() -> ArmState {
+    ArmState {
+        seq: 1,
+        dof: DOF,
+        velocity_source: VelocitySource::Measured,
+        mode: ControlMode::ServoPosition,
+        enabled: true,
+        link: Link::Up,
+        ..ArmState::default()
+    }
+}
+
+/// Lets an arm be where it was told to be.
+pub fn follow(state: &mut ArmState, command: &ArmCommand, now: Mono) {
+    let dt = now.seconds_since(state.stamp).clamp(1e-6, 0.1);
+    match command.mode {
+        Some(ControlMode::Velocity) => {
+            for (p, v) in state.position.iter_mut().zip(&command.values) {
+                *p += v * dt;
+            }
+            state.velocity = command.values;
+        }
+        Some(_) => {
+            for ((v, p), to) in state.velocity.iter_mut().zip(&state.position).zip(&command.values) {
+                *v = (to - p) / dt;
+            }
+            state.position = command.values;
+        }
+        None => {}
+    }
+    state.mode = command.mode.unwrap_or(state.mode);
+    state.written = command.seq;
+    state.seq += 1;
+    state.stamp = now;
+}

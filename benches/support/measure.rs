@@ -1,0 +1,92 @@
+//! Repeated figures, their goals, and the table that shows both.
+
+/// What a figure should come to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Goal {
+    /// This or less.
+    AtMost(f64),
+    /// This or more.
+    AtLeast(f64),
+}
+
+/// One figure, measured several times.
+#[derive(Debug, Clone)]
+pub struct Measure {
+    what: String,
+    unit: &'static str,
+    repeats: Vec<f64>,
+    goal: Option<Goal>,
+}
+
+impl Measure {
+    /// What was measured, in which unit, and what came out each time.
+    pub fn new(what: impl Into<String>, unit: &'static str, repeats: Vec<f64>) -> Self {
+        Self { what: what.into(), unit, repeats, goal: None }
+    }
+
+    /// The same with a goal for its median.
+    pub fn goal(mut self, goal: Goal) -> Self {
+        self.goal = Some(goal);
+        self
+    }
+
+    fn row(&self) -> [String; 8] {
+        let at = |q| figure(quantile(&self.repeats, q));
+        let (goal, verdict) = match self.goal {
+            None => (String::new(), ""),
+            Some(Goal::AtMost(most)) => (format!("≤ {}", figure(most)), verdict(self.median() <= most)),
+            Some(Goal::AtLeast(least)) => (format!("≥ {}", figure(least)), verdict(self.median() >= least)),
+        };
+        let n = self.repeats.len().to_string();
+        [self.what.clone(), at(0.5), at(0.95), at(0.99), self.unit.into(), n, goal, verdict.into()]
+    }
+
+    fn median(&self) -> f64 {
+        quantile(&self.repeats, 0.5)
+    }
+}
+
+/// The word beside a goal.
+pub fn verdict(met: bool) -> &'static str {
+    if met { "met" } else { "missed" }
+}
+
+/// The value that a part `q` of the values does not exceed; NaN of nothing.
+pub fn quantile(values: &[f64], q: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let rank = ((sorted.len() as f64 * q).ceil() as usize).clamp(1, sorted.len().max(1));
+    sorted.get(rank - 1).copied().unwrap_or(f64::NAN)
+}
+
+/// Prints figures under a title: median, p95 and p99 over the repeats, beside the goal.
+pub fn print(title: &str, measures: &[Measure]) {
+    let head = ["", "median", "p95", "p99", "", "n", "goal", ""].map(str::to_owned);
+    let rows = std::iter::once(head).chain(measures.iter().map(Measure::row)).map(Vec::from).collect();
+    print_rows(title, rows);
+}
+
+/// Prints rows under a title, aligned: the first column to the left, the others to the right.
+pub fn print_rows(title: &str, rows: Vec<Vec<String>>) {
+    println!("{title}");
+    let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
+    let width = |c: usize| rows.iter().filter_map(|r| r.get(c)).map(|v| v.chars().count()).max().unwrap_or_default();
+    let widths: Vec<usize> = (0..columns).map(width).collect();
+    for row in &rows {
+        let mut line = String::from(" ");
+        for (c, (cell, &width)) in row.iter().zip(&widths).enumerate() {
+            line += &if c == 0 { format!(" {cell:<width$}") } else { format!("  {cell:>width$}") };
+        }
+        println!("{}", line.trim_end());
+    }
+    println!();
+}
+
+/// A figure with three digits that count.
+pub fn figure(value: f64) -> String {
+    match value.abs() {
+        v if v >= 100.0 => format!("{value:.0}"),
+        v if v >= 10.0 => format!("{value:.1}"),
+        _ => format!("{value:.2}"),
+    }
+}

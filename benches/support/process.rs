@@ -1,0 +1,36 @@
+//! What the kernel says about another process: its memory, and the processor time of each of its threads.
+
+use std::collections::BTreeMap;
+use std::fs;
+
+/// Resident memory [MiB].
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Memory {
+    /// Now.
+    pub now: f64,
+    /// The most so far.
+    pub most: f64,
+}
+
+/// Resident memory of a process.
+pub fn memory(pid: u32) -> Memory {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let field = |name: &str| {
+        let kib = status.lines().find_map(|l| l.strip_prefix(name))?.split_whitespace().next()?.parse::<f64>().ok()?;
+        Some(kib / 1024.0)
+    };
+    Memory { now: field("VmRSS:").unwrap_or(f64::NAN), most: field("VmHWM:").unwrap_or(f64::NAN) }
+}
+
+/// Processor time that each thread of a process has used [ns], by thread name.
+pub fn threads(pid: u32) -> BTreeMap<String, u64> {
+    let mut times = BTreeMap::new();
+    for task in fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten() {
+        let read = |file: &str| fs::read_to_string(task.path().join(file)).unwrap_or_default();
+        let used = read("schedstat").split_whitespace().next().and_then(|ns| ns.parse::<u64>().ok());
+        if let Some(ns) = used {
+            *times.entry(read("comm").trim().to_owned()).or_default() += ns;
+        }
+    }
+    times
+}

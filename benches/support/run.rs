@@ -1,0 +1,111 @@
+//! A live run of the real binary, in a folder of its own.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use dimos::rpc::api::{Execute, Point, Shutdown, State, Trajectory};
+use dimos::rpc::client::Client;
+use dimos::rpc::place::RunFolder;
+
+/// How long a run gets to come up.
+const UP_LIMIT: Duration = Duration::from_secs(10);
+/// How long it gets to end.
+const END_LIMIT: Duration = Duration::from_secs(10);
+/// Name of each run; its folder tells them apart.
+const NAME: &str = "bench";
+
+/// A run that is being started, or is up. Ends when it is dropped.
+pub struct LiveRun {
+    home: tempfile::TempDir,
+    child: Child,
+    /// When the process was started.
+    pub started: Instant,
+}
+
+impl LiveRun {
+    /// Starts `dimos run BLUEPRINT` with more arguments, and does not wait.
+    pub fn start(blueprint: &str, arguments: &[&str]) -> std::io::Result<Self> {
+        let home = tempfile::tempdir()?;
+        let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
+        command.args(["run", blueprint, "--name", NAME, "--record"]).arg(home.path().join("log.mcap")).args(arguments);
+        command.env("XDG_RUNTIME_DIR", home.path()).env("XDG_STATE_HOME", home.path());
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let started = Instant::now();
+        let child = command.spawn()?;
+        Ok(Self { home, child, started })
+    }
+
+    /// Its process.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Its log.
+    pub fn log(&self) -> PathBuf {
+        self.home.path().join("log.mcap")
+    }
+
+    /// Connects to it as soon as it is up.
+    pub fn client(&mut self) -> Result<Client, String> {
+        let folder = RunFolder::at(self.home.path().join("dimos"));
+        loop {
+            if let Some(status) = self.child.try_wait().map_err(|e| e.to_string())? {
+                return Err(format!("the run ended at once: {status}"));
+            }
+            match Client::find(&folder, Some(NAME)) {
+                Ok(client) => return Ok(client),
+                Err(e) if self.started.elapsed() > UP_LIMIT => return Err(e.to_string()),
+                Err(_) => std::thread::sleep(Duration::from_millis(5)),
+            }
+        }
+    }
+
+    /// Ends it, controlled, and hands on its log.
+    pub fn end<T>(mut self, read: impl FnOnce(&Path) -> T) -> Result<T, String> {
+        self.client()?.call(Shutdown {}).map_err(|e| e.to_string())?;
+        let limit = Instant::now() + END_LIMIT;
+        while self.child.try_wait().map_err(|e| e.to_string())?.is_none() {
+            if Instant::now() > limit {
+                return Err("the run does not end".into());
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        Ok(read(&self.log()))
+    }
+}
+
+impl Drop for LiveRun {
+    fn drop(&mut self) {
+        // Only a run that was not ended is still there; its arm is emulated.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Lets every arm of a run swing for so long [s], each by a trajectory task of its own.
+pub fn keep_moving(client: &mut Client, seconds: f64) -> Result<(), String> {
+    let state = client.call(State {}).map_err(|e| e.to_string())?;
+    for arm in &state.arms {
+        let joint_names = arm.joints.iter().map(|j| j.name.clone()).collect();
+        let start: Vec<f64> = arm.joints.iter().map(|j| j.command.or(j.position).unwrap_or_default()).collect();
+        let points = (0..=(seconds / SWING_STEP) as usize).map(|i| swing(&start, i as f64 * SWING_STEP)).collect();
+        let trajectory = Trajectory { joint_names, points };
+        client.call(Execute { trajectory, task: None }).map_err(|e| e.to_string())?;
+    }
+    Ok(())
+}
+
+/// Time between two points of a swing [s].
+const SWING_STEP: f64 = 0.25;
+
+/// Where joints are that swing out from `start` by 0.2 rad and back every 4 s.
+fn swing(start: &[f64], time: f64) -> Point {
+    let turn = std::f64::consts::TAU / 4.0;
+    Point {
+        time_from_start: time,
+        positions: start.iter().map(|p| p + 0.1 * (1.0 - (turn * time).cos())).collect(),
+        velocities: Some(vec![0.1 * turn * (turn * time).sin(); start.len()]),
+        accelerations: None,
+    }
+}

@@ -1,0 +1,316 @@
+//! `dimos replay LOG --onto BLUEPRINT`: the arms of a blueprint follow the motion of a log.
+
+use std::collections::BTreeMap;
+use std::io::{self, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
+
+use super::ReplayArgs;
+use super::player::Part as Span;
+use crate::blueprint::{Blueprint, Overrides};
+use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::follow::{Signals, show_deviation};
+use crate::cli::text_log::Terminal;
+use crate::cli::{banner, check, output};
+use crate::hardware::registry::Registry;
+use crate::replay::fit::fit;
+use crate::replay::motion::RecordedMotion;
+use crate::replay::onto::{Approach, Plan, check as check_limits, is_real, plan};
+use crate::rpc::RpcError;
+use crate::rpc::api::{self, ArmEnable, Cancel, Execute, Move, Point, State, Trajectory};
+use crate::rpc::report::{Deviation, MotionReport, StateReport};
+use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
+use crate::trajectory::JointTrajectory;
+
+/// Fraction of the limits with which arms go to where the motion begins.
+const APPROACH_SPEED: f64 = 0.2;
+/// How often the run is asked.
+const INTERVAL: Duration = Duration::from_millis(50);
+/// How long arms get to send their first state.
+const FIRST_STATE: Duration = Duration::from_secs(2);
+/// How long a cancelled motion may take to come to rest.
+const REST: Duration = Duration::from_secs(10);
+
+/// Drives the arms of a blueprint along a part of a log.
+pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Registry) -> Result {
+    let set = args.onto.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+    let loaded = check::load(onto, &Overrides { set, sim: args.onto.sim }, registry)?;
+    let Some(mut blueprint) = loaded.blueprint.clone() else { return Err(check::refuse(&loaded)) };
+    check::print_warnings(&loaded);
+    let motion = RecordedMotion::read(log, span.from, span.to).map_err(split)?;
+    if motion.lost > 0 {
+        output::note(format_args!("warning: {} ticks are missing in the log: straight lines bridge them", motion.lost));
+    }
+    let plan = plan(&blueprint, &fit(&motion).scaled(args.rate)).map_err(split)?;
+    refuse_real_arms(&blueprint, args.onto.allow_motion)?;
+    let terminal =
+        Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the text log: {e}")))?;
+    let signals = Signals::watch_with_hangup();
+    // The motors come on when the limits are known to allow the motion.
+    let wanted: Vec<bool> = blueprint.arms.iter().map(|arm| arm.auto_enable).collect();
+    blueprint.arms.iter_mut().for_each(|arm| arm.auto_enable = false);
+    let run = Run::start(&blueprint, options(args)).map_err(|error| Failure {
+        exit: if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed },
+        what: error.to_string(),
+        hint: Some(error.hint().to_owned()),
+    })?;
+    let show = Show { bars: !args.json && io::stderr().is_terminal(), quiet: args.json };
+    let driver = Driver { run: &run, blueprint: &blueprint, plan: &plan, signals: &signals, show, rate: args.rate };
+    let result = driver.drive(&wanted);
+    let report = run.status();
+    let ended = run.stop();
+    terminal.flush();
+    say_goodbye(&result, &ended, args.json);
+    for arm in report.arms.iter().filter(|_| !args.json) {
+        output::note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
+    }
+    result.map(|_| Exit::Ok).or_else(|end| match end {
+        End::Failed(failure) => Err(failure),
+        End::Signal(signal) => Ok(Exit::by_signal(signal)),
+    })
+}
+
+fn options(args: &ReplayArgs) -> Options {
+    let record = match &args.onto.record {
+        Some(path) => Record::To(path.clone()),
+        None if args.onto.no_record => Record::Off,
+        None => Record::AsBlueprint,
+    };
+    Options { name: args.onto.name.clone(), record, ..Options::default() }
+}
+
+fn refuse_real_arms(blueprint: &Blueprint, allowed: bool) -> Result<()> {
+    let real: Vec<&str> = blueprint.arms.iter().filter(|a| is_real(a)).map(|a| a.hardware_id.as_str()).collect();
+    if real.is_empty() || allowed {
+        return Ok(());
+    }
+    let what = format!("{} of {} would move for real", real.join(", "), blueprint.name);
+    Err(Failure::usage(what).hint("clear the space around it and add --allow-motion; or try without it: --sim"))
+}
+
+/// An error whose text ends with a hint in a line of its own: something is wrong with what was typed.
+fn split(error: impl std::fmt::Display) -> Failure {
+    let text = error.to_string();
+    match text.split_once("\nhint: ") {
+        Some((what, hint)) => Failure::usage(what).hint(hint),
+        None => Failure::usage(text),
+    }
+}
+
+/// Why it ended before its end.
+enum End {
+    Failed(Failure),
+    Signal(i32),
+}
+
+impl From<Failure> for End {
+    fn from(failure: Failure) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+impl From<RpcError> for End {
+    fn from(error: RpcError) -> Self {
+        let what = format!("{} [{}]", error.message, error.code.name());
+        Self::Failed(Failure { exit: Exit::Failed, what, hint: error.hint })
+    }
+}
+
+struct Show {
+    bars: bool,
+    quiet: bool,
+}
+
+impl Show {
+    fn say(&self, text: std::fmt::Arguments<'_>) {
+        if !self.quiet {
+            output::note(text);
+        }
+    }
+}
+
+struct Driver<'a> {
+    run: &'a Run,
+    blueprint: &'a Blueprint,
+    plan: &'a Plan,
+    signals: &'a Signals,
+    show: Show,
+    rate: f64,
+}
+
+impl Driver<'_> {
+    fn drive(&self, wanted: &[bool]) -> std::result::Result<Vec<Deviation>, End> {
+        let state = self.first_states()?;
+        self.refuse_broken_limits()?;
+        for (arm, wanted) in self.blueprint.arms.iter().zip(wanted) {
+            if *wanted || self.plan.approaches.iter().any(|a| a.arm == arm.hardware_id) {
+                self.run.call(&ArmEnable { arm: arm.hardware_id.clone() })?;
+            }
+        }
+        for approach in &self.plan.approaches {
+            let target = target(approach, &state);
+            let go = Move { arm: approach.arm.clone(), target, speed: APPROACH_SPEED };
+            let begun = self.run.call(&go)?;
+            let (arm, duration) = (&approach.arm, begun.duration);
+            self.show.say(format_args!("approach: {arm} goes to where the motion begins, {duration:.1} s, directly"));
+            self.follow(&[begun.motion], "approach")?;
+        }
+        let parts = self.plan.parts.iter();
+        let requests: Vec<Execute> =
+            parts.map(|p| Execute { trajectory: sent(&p.trajectory), task: Some(p.task.clone()) }).collect();
+        let mut motions = Vec::new();
+        let mut refused = None;
+        for begun in self.run.call_together(&requests) {
+            match begun {
+                Ok(begun) => motions.push(begun.motion),
+                Err(e) => refused = Some(e),
+            }
+        }
+        if let Some(e) = refused {
+            self.cancel(&motions)?;
+            return Err(e.into());
+        }
+        let duration = self.plan.parts.first().map_or(0.0, |p| p.trajectory.duration());
+        let (joints, rate) = (self.plan.parts.iter().map(|p| p.trajectory.joint_names.len()).sum::<usize>(), self.rate);
+        self.show.say(format_args!("motion: {joints} joints, {duration:.1} s at rate {rate}, not collision-checked"));
+        let reports = self.follow(&motions, "motion")?;
+        Ok(reports.into_iter().flat_map(|report| report.deviation.unwrap_or_default()).collect())
+    }
+
+    /// Waits until every arm has told where it is.
+    fn first_states(&self) -> std::result::Result<StateReport, End> {
+        let limit = Instant::now() + FIRST_STATE;
+        loop {
+            let state = self.run.call(&State {})?;
+            let unknown = state.arms.iter().find(|arm| arm.joints.iter().any(|j| j.position.is_none()));
+            match unknown {
+                None => return Ok(state),
+                Some(arm) if Instant::now() >= limit => {
+                    let what = format!("{} does not say where it is", arm.hardware_id);
+                    let hint = "`dimos run` with this blueprint, and `dimos status`, show what it says";
+                    return Err(Failure::new(Exit::Hardware, what).hint(hint).into());
+                }
+                Some(_) => std::thread::sleep(Duration::from_millis(5)),
+            }
+        }
+    }
+
+    fn refuse_broken_limits(&self) -> std::result::Result<(), End> {
+        let joints: Vec<String> = self.blueprint.arms.iter().flat_map(|arm| arm.joints.clone()).collect();
+        let verdict = check_limits(self.plan, self.run.config(), &joints).map_err(|e| split(e.to_string()))?;
+        let Some(worst) = verdict.broken.first() else { return Ok(()) };
+        let more = verdict.broken.len() - 1;
+        let others = if more > 0 { format!(" ({more} more limits would be broken)") } else { String::new() };
+        let hint = if worst.limit == "position" {
+            "limits are the arm's own, narrowed by `limits` in the blueprint; choose another part of the log".to_owned()
+        } else {
+            // Rounded down, or it would be refused once more.
+            let possible = (self.rate * verdict.possible_rate * 1000.0).floor() / 1000.0;
+            format!("slow it down: --rate {possible}; a part that begins or ends in mid-motion needs other ends")
+        };
+        let what = format!("{worst}{others}; nothing has moved");
+        Err(Failure::new(Exit::Failed, what).hint(hint).into())
+    }
+
+    /// Waits for the end of all motions. Whatever goes wrong with one, or a signal, ends the others as well.
+    fn follow(&self, motions: &[u64], what: &'static str) -> std::result::Result<Vec<MotionReport>, End> {
+        let bar = if self.show.bars { ProgressBar::new(1000) } else { ProgressBar::hidden() };
+        if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        bar.set_prefix(what);
+        let result = loop {
+            let reports = self.reports(motions)?;
+            let slowest = reports.iter().map(|r| r.progress).fold(1.0, f64::min);
+            bar.set_position((slowest.clamp(0.0, 1.0) * 1000.0) as u64);
+            bar.set_message(format!("{:.1} s left", reports.iter().map(|r| r.remaining).fold(0.0, f64::max)));
+            if let Some(failed) = reports.iter().find(|r| r.done && r.state != "COMPLETED") {
+                let why = failed.error.clone().unwrap_or_else(|| "it ended before its goal".to_owned());
+                let failure =
+                    Failure::new(Exit::Failed, format!("the {what} on {}: {}: {why}", failed.task, failed.state));
+                break Err(End::Failed(failure.hint("the log of this run tells what happened before")));
+            }
+            if reports.iter().all(|r| r.done) {
+                break Ok(reports);
+            }
+            if let Some(signal) = self.signals.last() {
+                break Err(End::Signal(signal));
+            }
+            match self.run.wait(Some(INTERVAL)) {
+                Ending::Duration => {}
+                Ending::Fault(fault) => break Err(End::Failed(Failure::new(Exit::Fault, fault))),
+                _ => break Err(End::Failed(Failure::new(Exit::Failed, "the run was asked to end".to_owned()))),
+            }
+        };
+        bar.finish_and_clear();
+        if let Err(End::Signal(_)) = &result {
+            self.show.say(format_args!("cancelling: the arms decelerate"));
+        }
+        if result.is_err() {
+            self.cancel(motions)?;
+        }
+        result
+    }
+
+    fn reports(&self, motions: &[u64]) -> std::result::Result<Vec<MotionReport>, End> {
+        motions.iter().map(|&motion| Ok(self.run.call(&api::Motion { motion })?)).collect()
+    }
+
+    /// Ends motions and waits until they have. What cannot be ended here is ended by the stop of the run.
+    fn cancel(&self, motions: &[u64]) -> std::result::Result<(), End> {
+        let limit = Instant::now() + REST;
+        if self.run.call(&Cancel { task: None, arm: None }).is_ok() {
+            while Instant::now() < limit && !self.reports(motions)?.iter().all(|r| r.done) {
+                std::thread::sleep(INTERVAL);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A whole target: joints that the motion does not move stay where they are.
+fn target(approach: &Approach, state: &StateReport) -> Vec<f64> {
+    let arm = state.arms.iter().find(|arm| arm.hardware_id == approach.arm);
+    let present = |j: usize| arm.and_then(|arm| arm.joints.get(j)?.position).unwrap_or(f64::NAN);
+    approach.target.iter().enumerate().map(|(j, target)| target.unwrap_or_else(|| present(j))).collect()
+}
+
+fn sent(trajectory: &JointTrajectory) -> Trajectory {
+    let points = trajectory.points.iter().map(|p| Point {
+        time_from_start: p.time_from_start,
+        positions: p.positions.clone(),
+        velocities: Some(p.velocities.clone()),
+        accelerations: None,
+    });
+    Trajectory { joint_names: trajectory.joint_names.clone(), points: points.collect() }
+}
+
+fn say_goodbye(result: &std::result::Result<Vec<Deviation>, End>, ended: &Ended, json: bool) {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        event: &'static str,
+        completed: bool,
+        deviation: BTreeMap<&'a str, f64>,
+        troubles: &'a [String],
+        log: Option<&'a PathBuf>,
+    }
+    let deviation = result.as_ref().map(Vec::as_slice).unwrap_or_default();
+    if json {
+        let deviation = deviation.iter().map(|d| (d.joint.as_str(), d.error())).collect();
+        let (troubles, log, completed) = (ended.troubles.as_slice(), ended.log.as_ref(), result.is_ok());
+        return output::json(&Line { event: "replayed", completed, deviation, troubles, log });
+    }
+    if result.is_ok() {
+        output::line("motion: COMPLETED");
+        show_deviation(deviation);
+    }
+    for trouble in &ended.troubles {
+        output::note(format_args!("warning: {trouble}"));
+    }
+    if let Some(log) = &ended.log {
+        output::note(format_args!("its log: {}", log.display()));
+    }
+}

@@ -1,0 +1,186 @@
+//! Compares what came out of a tick that was run again with what the log says came out then.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::inputs::{LoggedTick, values};
+use super::recorded::Recorded;
+use crate::arm::VelocitySource;
+use crate::control::coordinator::TickOutput;
+use crate::joint::ControlMode;
+use crate::recording::messages::Event;
+use crate::telemetry::describe::{Described, Names, describe};
+
+/// A value that differs.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Value {
+    /// A number, and its bits.
+    Number {
+        /// The number; null in JSON where it is not finite.
+        value: f64,
+        /// Its bits as an IEEE 754 double, in hexadecimal.
+        bits: String,
+    },
+    /// Anything else.
+    Text(String),
+}
+
+impl Value {
+    fn number(value: f64) -> Self {
+        Self::Number { value, bits: format!("{:016x}", value.to_bits()) }
+    }
+
+    fn text(value: impl fmt::Display) -> Self {
+        Self::Text(value.to_string())
+    }
+}
+
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Number { value, bits } => write!(f, "{value:?} (bits {bits})"),
+            Self::Text(text) if text.is_empty() => write!(f, "nothing"),
+            Self::Text(text) => write!(f, "{text}"),
+        }
+    }
+}
+
+/// The first thing that came out differently.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Difference {
+    /// The tick.
+    pub tick: u64,
+    /// When it was [s after the first tick].
+    pub time: f64,
+    /// What differs, e.g. `position command`.
+    pub what: &'static str,
+    /// The arm concerned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub arm: Option<String>,
+    /// The joint concerned.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub joint: Option<String>,
+    /// What the log says.
+    pub logged: Value,
+    /// What came out now.
+    pub rerun: Value,
+}
+
+/// Something that differs, of which arm and of which of its joints.
+type Found = (&'static str, Option<(usize, Option<usize>)>, Value, Value);
+
+/// What to compare with.
+#[derive(Debug)]
+pub(super) struct Comparison<'a> {
+    names: &'a Names,
+}
+
+impl<'a> Comparison<'a> {
+    pub fn new(recorded: &'a Recorded) -> Self {
+        Self { names: &recorded.names }
+    }
+
+    /// The first difference, if there is one; `time` is the tick's time after the first tick [ns].
+    pub fn compare(&self, logged: &LoggedTick, output: &TickOutput, time: u64) -> Option<Difference> {
+        let (what, place, then, now) = self.arms(logged, output).or_else(|| self.events(&logged.events, output))?;
+        let arm = place.and_then(|(arm, joint)| Some((self.names.arms.get(arm)?, joint)));
+        Some(Difference {
+            tick: logged.tick.tick,
+            time: time as f64 * 1e-9,
+            what,
+            arm: arm.map(|(names, _)| names.hardware_id.clone()),
+            joint: arm.and_then(|(names, joint)| names.joints.get(joint?).cloned()),
+            logged: then,
+            rerun: now,
+        })
+    }
+
+    fn arms(&self, logged: &LoggedTick, output: &TickOutput) -> Option<Found> {
+        let mut first = 0;
+        let arms = logged.arms.iter().zip(&output.arms).zip(&self.names.arms).enumerate();
+        for (i, ((then, now), names)) in arms {
+            let dof = names.joints.len();
+            let joint = |what, then: f64, now: f64, j| {
+                (then.to_bits() != now.to_bits())
+                    .then(|| (what, Some((i, Some(j))), Value::number(then), Value::number(now)))
+            };
+            if now.state.velocity_source == VelocitySource::Estimated {
+                let mut pairs = then.velocity.iter().zip(&now.state.velocity).take(dof).enumerate();
+                let found = pairs.find_map(|(j, (then, now))| joint("estimated velocity", *then, *now, j));
+                if found.is_some() {
+                    return found;
+                }
+            }
+            let (command, wanted) = (&now.command, &then.output);
+            if let Some(mode) = command.mode {
+                let (what, column) = match mode {
+                    ControlMode::Velocity => ("velocity command", &logged.commands.velocity),
+                    ControlMode::Torque => ("torque command", &logged.commands.effort),
+                    _ => ("position command", &logged.commands.position),
+                };
+                let absent = [f64::NAN; crate::joint::MAX_DOF];
+                let then = values(column, first, dof).unwrap_or(absent);
+                let mut pairs = then.iter().zip(&command.values).take(dof).enumerate();
+                if let Some(found) = pairs.find_map(|(j, (then, now))| joint(what, *then, *now, j)) {
+                    return Some(found);
+                }
+            }
+            first += dof;
+            let name = command.mode.map_or("", ControlMode::name);
+            let arm = |what, then: Value, now: Value| Some((what, Some((i, None)), then, now));
+            if wanted.mode != name {
+                return arm("mode of the command", Value::text(&wanted.mode), Value::text(name));
+            }
+            if wanted.gripper_seq != command.gripper_seq {
+                let (then, now) = (wanted.gripper_seq, command.gripper_seq);
+                return arm("number of gripper commands", Value::text(then), Value::text(now));
+            }
+            if command.gripper_seq > 0 && wanted.gripper.to_bits() != command.gripper.to_bits() {
+                let (then, now) = (Value::number(wanted.gripper), Value::number(command.gripper));
+                return arm("gripper command", then, now);
+            }
+            if wanted.stop_seq != command.stop_seq {
+                return arm("number of stops", Value::text(wanted.stop_seq), Value::text(command.stop_seq));
+            }
+            let numbers = (wanted.seq, wanted.next_tick_ns) == (command.seq, command.next_tick.0);
+            if then.output_is_new && !numbers {
+                let text = |seq, next| Value::Text(format!("command {seq}, next tick at {next} ns"));
+                return arm(
+                    "count of commands",
+                    text(wanted.seq, wanted.next_tick_ns),
+                    text(command.seq, command.next_tick.0),
+                );
+            }
+        }
+        None
+    }
+
+    fn events(&self, logged: &[Event], output: &TickOutput) -> Option<Found> {
+        if logged.is_empty() && output.events.is_empty() {
+            return None;
+        }
+        let count = logged.len().max(output.events.len());
+        (0..count).find_map(|k| {
+            let (then, now) = (logged.get(k), output.events.get(k).map(|event| describe(event, self.names)));
+            let same = then.zip(now.as_ref()).is_some_and(|(then, now)| is_told_by(now, then));
+            (!same).then(|| {
+                let then = then.map_or(Value::text(""), |e| Value::text(&e.text));
+                ("event", None, then, now.map_or(Value::text(""), |d| Value::Text(d.text)))
+            })
+        })
+    }
+}
+
+/// Whether a message tells this event. The sentence may be another one: other versions have other words.
+fn is_told_by(now: &Described, then: &Event) -> bool {
+    let name = |name: &Option<String>| name.clone().unwrap_or_default();
+    let bits = |values: &[f64]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+    now.kind == then.kind
+        && now.status == then.status
+        && now.request.as_slice() == then.request
+        && (name(&now.arm), name(&now.task), name(&now.joint))
+            == (then.arm.clone(), then.task.clone(), then.joint.clone())
+        && bits(&now.values) == bits(&then.values)
+}

@@ -1,0 +1,271 @@
+//! A log, tick by tick: what each tick read, what it was told, and what came of it, put together again from the
+//! messages of the log.
+
+use std::collections::BTreeMap;
+
+use super::recorded::Recorded;
+use super::requests;
+use crate::arm::{ArmState, Link, VelocitySource};
+use crate::clock::Mono;
+use crate::control::coordinator::TickTime;
+use crate::control::request::{Envelope, Request};
+use crate::joint::{ControlMode, Joints, MAX_DOF};
+use crate::recording::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
+use crate::recording::wire::Message;
+
+/// What a message is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Topic {
+    /// Joint values read.
+    States,
+    /// Joint values commanded.
+    Commands,
+    /// Whatever else was read of an arm.
+    Input(usize),
+    /// Whatever else was wanted of an arm.
+    Output(usize),
+    /// The end of a tick.
+    Tick,
+    /// Something happened.
+    Event,
+    /// Something was asked.
+    Request,
+}
+
+impl Topic {
+    /// What a topic of the log is about; `None`: nothing that a tick read or made.
+    pub fn of(topic: &str, recorded: &Recorded) -> Option<Self> {
+        let arm = |id: &str| recorded.names.arms.iter().position(|arm| arm.hardware_id == id);
+        Some(match topic {
+            "/joint_states" => Self::States,
+            "/joint_commands" => Self::Commands,
+            "/dimos/tick" => Self::Tick,
+            "/dimos/events" => Self::Event,
+            "/dimos/requests" => Self::Request,
+            _ => match topic.strip_prefix("/dimos/inputs/") {
+                Some(id) => Self::Input(arm(id)?),
+                None => Self::Output(arm(topic.strip_prefix("/dimos/outputs/")?)?),
+            },
+        })
+    }
+}
+
+/// One arm of a tick.
+#[derive(Debug, Clone, Default)]
+pub(super) struct LoggedArm {
+    /// The state as the tick read it. Where the tick estimated the velocities, it says that it has none …
+    pub state: ArmState,
+    /// … and they are here [rad/s].
+    pub velocity: Joints,
+    /// What it wants of the arm, besides joint values: as of the last message.
+    pub output: ArmOutput,
+    /// Whether that message is of this tick.
+    pub output_is_new: bool,
+}
+
+/// A tick of a log.
+#[derive(Debug, Default)]
+pub(super) struct LoggedTick {
+    /// Its message.
+    pub tick: Tick,
+    /// Its arms.
+    pub arms: Vec<LoggedArm>,
+    /// Commanded joint values.
+    pub commands: JointState,
+    /// What happened in it.
+    pub events: Vec<Event>,
+}
+
+impl LoggedTick {
+    /// The times it worked with.
+    pub fn time(&self) -> TickTime {
+        TickTime {
+            now: Mono(self.tick.deadline_ns),
+            next: Mono(self.tick.next_ns),
+            skipped: self.tick.skipped,
+            late_ns: self.tick.overrun_ns,
+        }
+    }
+}
+
+/// Puts ticks together.
+#[derive(Debug)]
+pub(super) struct Assembler {
+    joints: Vec<String>,
+    /// First joint and number of joints of each arm.
+    spans: Vec<(usize, usize)>,
+    /// The tick that is being put together, or is complete but for its events.
+    pub logged: LoggedTick,
+    closed: bool,
+    /// Joint values read, until the tick is closed.
+    states: JointState,
+    waiting: BTreeMap<u64, Result<Request, String>>,
+}
+
+impl Assembler {
+    pub fn new(recorded: &Recorded) -> Self {
+        let mut first = 0;
+        let spans = (recorded.config.arms.iter())
+            .map(|arm| {
+                first += arm.dof;
+                (first - arm.dof, arm.dof)
+            })
+            .collect();
+        let arms = vec![LoggedArm::default(); recorded.config.arms.len()];
+        Self {
+            joints: recorded.joints(),
+            spans,
+            logged: LoggedTick { arms, ..LoggedTick::default() },
+            closed: false,
+            states: JointState::default(),
+            waiting: BTreeMap::new(),
+        }
+    }
+
+    /// Whether a message on this topic belongs to a later tick, so that the present one is complete.
+    pub fn completes(&self, topic: Topic) -> bool {
+        self.closed && !matches!(topic, Topic::Event | Topic::Request)
+    }
+
+    /// Whether there is a tick that misses nothing but, perhaps, events.
+    pub fn is_closed(&self) -> bool {
+        self.closed
+    }
+
+    /// Makes room for the next tick.
+    pub fn next(&mut self) {
+        self.closed = false;
+        self.logged.events.clear();
+        self.logged.commands = JointState::default();
+        self.logged.arms.iter_mut().for_each(|arm| arm.output_is_new = false);
+        self.states = JointState::default();
+    }
+
+    /// Takes a message. An error says what is wrong with it.
+    pub fn take(&mut self, topic: Topic, bytes: &[u8]) -> Result<(), String> {
+        self.decode(topic, bytes).map_err(|e| format!("{topic:?}: {e}"))
+    }
+
+    fn decode(&mut self, topic: Topic, bytes: &[u8]) -> Result<(), String> {
+        match topic {
+            Topic::States => self.states = self.joint_values(bytes)?,
+            Topic::Commands => self.logged.commands = self.joint_values(bytes)?,
+            Topic::Input(arm) => {
+                let input: ArmInput = message(bytes)?;
+                let arm = self.logged.arms.get_mut(arm).ok_or("no such arm")?;
+                read_input(&input, &mut arm.state)?;
+            }
+            Topic::Output(arm) => {
+                let arm = self.logged.arms.get_mut(arm).ok_or("no such arm")?;
+                (arm.output, arm.output_is_new) = (message(bytes)?, true);
+            }
+            Topic::Tick => {
+                self.logged.tick = message(bytes)?;
+                self.fill_in_values();
+                self.closed = true;
+            }
+            Topic::Event => self.logged.events.push(message(bytes)?),
+            Topic::Request => {
+                let line: Text = message(bytes)?;
+                let (id, request) = requests::read(&line.data, &self.joints)?;
+                self.waiting.insert(id, request);
+            }
+        }
+        Ok(())
+    }
+
+    fn joint_values(&self, bytes: &[u8]) -> Result<JointState, String> {
+        let values: JointState = message(bytes)?;
+        let fits = |list: &[f64]| list.is_empty() || list.len() == self.joints.len();
+        if values.name != self.joints {
+            return Err("its joints are not those of the run".to_owned());
+        }
+        if ![&values.position, &values.velocity, &values.effort].into_iter().all(|list| fits(list)) {
+            return Err("it has not one value for each joint".to_owned());
+        }
+        Ok(values)
+    }
+
+    /// The joint values of a state stand in another message than the rest of it.
+    fn fill_in_values(&mut self) {
+        for (arm, &(first, dof)) in self.logged.arms.iter_mut().zip(&self.spans) {
+            let state = &mut arm.state;
+            let known = state.seq > 0;
+            state.dof = if known { dof } else { 0 };
+            let column = |list: &[f64]| values(list, first, dof).filter(|_| known).unwrap_or([0.0; MAX_DOF]);
+            state.position = column(&self.states.position);
+            arm.velocity = column(&self.states.velocity);
+            if state.velocity_source == VelocitySource::Measured {
+                state.velocity = arm.velocity;
+            }
+        }
+    }
+
+    /// The requests that the tick was told, in their order. An error names one that cannot be told again.
+    pub fn requests(&mut self, told: &mut Vec<Envelope>) -> Result<(), String> {
+        told.clear();
+        // What the tick starts by itself is answered with the number 0.
+        for id in self.logged.events.iter().flat_map(|e| &e.request).copied().filter(|id| *id != 0) {
+            let request = match self.waiting.remove(&id) {
+                Some(request) => request.map_err(|e| format!("request {id} cannot be read: {e}"))?,
+                None => return Err(format!("request {id} is missing")),
+            };
+            told.push(Envelope { id, request });
+        }
+        Ok(())
+    }
+}
+
+fn message<M: Message>(bytes: &[u8]) -> Result<M, String> {
+    M::decode(bytes).map_err(|e| e.to_string())
+}
+
+/// The values of an arm's joints out of those of all.
+pub(super) fn values(list: &[f64], first: usize, dof: usize) -> Option<Joints> {
+    list.get(first..first + dof).map(crate::joint::joints_of)
+}
+
+/// What a state says besides joint values. Efforts, gripper, pose and wrench are left out: no tick uses them.
+fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
+    *state = ArmState {
+        seq: input.seq,
+        stamp: Mono(input.stamp_ns),
+        // The tick is to estimate again what it estimated then.
+        velocity_source: match source(&input.velocity_source)? {
+            VelocitySource::Estimated => VelocitySource::Absent,
+            other => other,
+        },
+        mode: mode(&input.mode)?,
+        enabled: input.enabled,
+        error: input.error,
+        link: link(&input.link)?,
+        self_held: input.self_held,
+        written: input.written,
+        ..ArmState::default()
+    };
+    Ok(())
+}
+
+fn source(name: &str) -> Result<VelocitySource, String> {
+    let all = [VelocitySource::Absent, VelocitySource::Measured, VelocitySource::Estimated];
+    all.into_iter().find(|s| s.name() == name).ok_or_else(|| format!("{name:?} is no source of velocities"))
+}
+
+fn link(name: &str) -> Result<Link, String> {
+    let all = [Link::Down, Link::Up, Link::Stale, Link::Faulted];
+    all.into_iter().find(|l| l.name() == name).ok_or_else(|| format!("{name:?} is no state of a connection"))
+}
+
+/// A control mode by its name.
+fn mode(name: &str) -> Result<ControlMode, String> {
+    let all = [
+        ControlMode::Position,
+        ControlMode::ServoPosition,
+        ControlMode::Velocity,
+        ControlMode::Torque,
+        ControlMode::Cartesian,
+        ControlMode::CartesianVelocity,
+        ControlMode::Impedance,
+    ];
+    all.into_iter().find(|m| m.name() == name).ok_or_else(|| format!("{name:?} is no control mode"))
+}

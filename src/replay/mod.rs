@@ -1,0 +1,15 @@
+//! Logs put to use again: run once more through the coordinator and compared, or as a motion for arms.
+//!
+//! ```text
+//! log ─▶ recorded (who ran) ─▶ inputs (tick by tick) ─▶ verify: Coordinator::tick ─▶ the same commands?
+//!                           └▶ motion (what was commanded) ─▶ onto: a run of a blueprint that follows it
+//! ```
+
+pub mod compare;
+pub mod fit;
+mod inputs;
+pub mod motion;
+pub mod onto;
+pub mod recorded;
+mod requests;
+pub mod verify;

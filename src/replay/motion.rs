@@ -1,0 +1,185 @@
+//! The motion in a log: where its joints were commanded to be, tick by tick, else where they were.
+//!
+//! Time is control time: tick number times period, as for every trajectory. Where a joint is commanded by velocity or
+//! not at all, its measured positions are taken, averaged over ±0.1 s (which makes no motion faster or steeper), and
+//! the step between measured and commanded positions is faded out over a second.
+
+use std::path::Path;
+
+use super::recorded::{Recorded, RecordedError};
+use crate::recording::messages::JointState;
+use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
+
+/// Measured positions are averaged over so much time before and after [s].
+const AVERAGED: f64 = 0.1;
+/// The step between two sources is faded out over this time [s].
+const FADE: f64 = 1.0;
+
+/// The motion of a log's joints.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordedMotion {
+    /// The joints that there is anything of.
+    pub joints: Vec<String>,
+    /// Time between two rows [s].
+    pub period: f64,
+    /// Positions [rad], one row per tick, one value per joint.
+    pub rows: Vec<Vec<f64>>,
+    /// Ticks that are missing in the log; they are bridged in a straight line.
+    pub lost: u64,
+}
+
+/// What a tick says of each joint.
+struct Row {
+    tick: u64,
+    measured: Vec<f64>,
+    commanded: Vec<f64>,
+}
+
+impl RecordedMotion {
+    /// Reads the motion between two Unix times [ns]. Where anything is commanded by position, it begins and ends with
+    /// that.
+    pub fn read(path: &Path, from: u64, to: u64) -> Result<Self, RecordedError> {
+        let recorded = Recorded::open(path)?;
+        let names = recorded.joints();
+        let rows = rows(path, names.len(), from, to)?;
+        let is_commanded = |row: &Row| row.commanded.iter().any(|q| q.is_finite());
+        let whole = (0, rows.len().saturating_sub(1));
+        let first = rows.iter().position(is_commanded).unwrap_or(whole.0);
+        let last = rows.iter().rposition(is_commanded).unwrap_or(whole.1);
+        let rows = rows.get(first..=last).unwrap_or_default();
+        let ticks: u64 = rows.windows(2).map(|w| w[1].tick.saturating_sub(w[0].tick).saturating_sub(1)).sum();
+        let period = 1.0 / recorded.config.rate;
+        let columns: Vec<Option<Vec<f64>>> = (0..names.len()).map(|j| column(rows, j, period)).collect();
+        let known = |j: &usize| columns[*j].is_some();
+        let joints = (0..names.len()).filter(known).map(|j| names[j].clone()).collect();
+        let columns: Vec<Vec<f64>> = columns.into_iter().flatten().collect();
+        let at = |k: usize| columns.iter().map(|c| c[k]).collect();
+        let length = columns.first().map_or(0, Vec::len);
+        Ok(Self { joints, period, rows: (0..length).map(at).collect(), lost: ticks })
+    }
+}
+
+fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, RecordedError> {
+    let topics = ["/joint_states", "/joint_commands", "/dimos/tick"].map(str::to_owned).to_vec();
+    let mut log = LogReader::open(path)?;
+    log.select(Selection { topics, from, to })?;
+    let nothing = || vec![f64::NAN; joints];
+    let positions = |m: &JointState| if m.position.len() == joints { m.position.clone() } else { nothing() };
+    let (mut measured, mut commanded) = (nothing(), nothing());
+    let mut rows: Vec<Row> = Vec::new();
+    loop {
+        match log.next_entry() {
+            Ok(Some(entry)) => match &entry.data {
+                Payload::JointState(m) if entry.topic == "/joint_states" => measured = positions(m),
+                Payload::JointState(m) => commanded = positions(m),
+                Payload::Tick(t) if rows.last().is_none_or(|row| t.tick > row.tick) => {
+                    let now =
+                        (std::mem::replace(&mut measured, nothing()), std::mem::replace(&mut commanded, nothing()));
+                    rows.push(Row { tick: t.tick, measured: now.0, commanded: now.1 });
+                }
+                _ => {}
+            },
+            // What stands before a cut can be followed all the same.
+            Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(rows),
+            Err(e) => return Err(e.into()),
+        }
+    }
+}
+
+/// One joint's positions, tick by tick without gaps; `None` if it has any tick without a position.
+fn column(rows: &[Row], joint: usize, period: f64) -> Option<Vec<f64>> {
+    let commanded = bridged(rows, |row| row.commanded[joint]);
+    let measured = averaged(&bridged(rows, |row| row.measured[joint]), (AVERAGED / period).round() as usize);
+    let steps = (FADE / period).max(1.0);
+    let mut out: Vec<f64> = Vec::with_capacity(commanded.len());
+    let (mut offset, mut age, mut by_command) = (0.0, 0.0, None);
+    for (k, (c, m)) in commanded.iter().zip(&measured).enumerate() {
+        let is_commanded = c.is_finite();
+        let source = if is_commanded { c } else { m };
+        if let (Some(last), true) = (out.last(), by_command.is_some_and(|before| before != is_commanded)) {
+            // Measured positions are known before they are needed, so a joint that moves goes on moving.
+            let before = if is_commanded { *c } else { measured[k - 1] };
+            (offset, age) = (last - before, 0.0);
+        }
+        by_command = Some(is_commanded);
+        age += 1.0;
+        let x: f64 = (age / steps).min(1.0);
+        let left = 1.0 - x * x * x * (10.0 + x * (6.0 * x - 15.0));
+        let value = source + offset * left;
+        if !value.is_finite() {
+            return None;
+        }
+        out.push(value);
+    }
+    (!out.is_empty()).then_some(out)
+}
+
+/// Values tick by tick; ticks that are missing lie on a straight line.
+fn bridged(rows: &[Row], value: impl Fn(&Row) -> f64) -> Vec<f64> {
+    let mut out: Vec<f64> = Vec::with_capacity(rows.len());
+    for pair in rows.windows(2) {
+        let (a, b) = (value(&pair[0]), value(&pair[1]));
+        let steps = pair[1].tick - pair[0].tick;
+        out.push(a);
+        out.extend((1..steps).map(|k| a + (b - a) * k as f64 / steps as f64));
+    }
+    out.extend(rows.last().map(value));
+    out
+}
+
+/// Weighted averages: the weight falls in a straight line to both sides.
+fn averaged(values: &[f64], width: usize) -> Vec<f64> {
+    let last = values.len().saturating_sub(1) as isize;
+    let box_once = |values: &[f64], ahead: usize, behind: usize| -> Vec<f64> {
+        let at = |k: isize| values[k.clamp(0, last) as usize];
+        let mean = |k: isize| -> f64 {
+            let sum: f64 = (k - behind as isize..=k + ahead as isize).map(at).sum();
+            sum / (ahead + behind + 1) as f64
+        };
+        (0..values.len() as isize).map(mean).collect()
+    };
+    let once = box_once(values, width / 2, width / 2);
+    box_once(&once, width / 2, width / 2)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(tick: u64, measured: f64, commanded: f64) -> Row {
+        Row { tick, measured: vec![measured], commanded: vec![commanded] }
+    }
+
+    #[test]
+    fn commanded_positions_are_taken_as_they_are() {
+        let rows: Vec<Row> = (0..50).map(|k| row(k, 7.0, 0.01 * (k as f64).sin())).collect();
+        let c = column(&rows, 0, 0.01).unwrap();
+        assert!(c.iter().zip(&rows).all(|(c, row)| *c == row.commanded[0]));
+    }
+
+    #[test]
+    fn the_step_to_measured_positions_is_faded_out() {
+        let command = |k: u64| if k < 50 { 0.5 } else { f64::NAN };
+        let rows: Vec<Row> = (0..300).map(|k| row(k, 0.49, command(k))).collect();
+        let c = column(&rows, 0, 0.01).unwrap();
+        let steepest = c.windows(3).map(|w| (w[2] - 2.0 * w[1] + w[0]).abs() / 1e-4).fold(0.0, f64::max);
+        assert!(steepest < 6.0 * 0.01, "{steepest}");
+        assert!((c[0] - 0.5).abs() < 1e-12 && (c[299] - 0.49).abs() < 1e-12);
+    }
+
+    #[test]
+    fn averaging_makes_nothing_steeper_and_takes_noise_away() {
+        let noise = |k: usize| if k.is_multiple_of(2) { 1e-4 } else { -1e-4 };
+        let smooth = averaged(&(0..200).map(|k| 0.001 * k as f64 + noise(k)).collect::<Vec<_>>(), 10);
+        let inner = &smooth[12..188];
+        assert!(inner.windows(2).all(|w| (w[1] - w[0] - 0.001).abs() < 1e-5));
+    }
+
+    #[test]
+    fn missing_ticks_lie_on_a_straight_line_and_missing_positions_leave_the_joint_out() {
+        let rows = [row(3, 0.0, 0.1), row(6, 0.0, 0.4)];
+        let c = column(&rows, 0, 0.01).unwrap();
+        assert!(c.iter().zip([0.1, 0.2, 0.3, 0.4]).all(|(a, b)| (a - b).abs() < 1e-12) && c.len() == 4);
+        assert!(column(&[row(0, f64::NAN, 0.1), row(1, f64::NAN, f64::NAN)], 0, 0.01).is_none());
+    }
+}

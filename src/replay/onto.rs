@@ -1,0 +1,228 @@
+//! A recorded motion made ready for the arms of a blueprint: which task follows which part of it, where each arm
+//! begins, and whether the limits allow it. What happens then: `cli::replay::onto`.
+
+use serde::Serialize;
+use thiserror::Error;
+
+use crate::blueprint::{Arm, Blueprint, TaskKind};
+use crate::control::config::CoordinatorConfig;
+use crate::control::limit::Bounds;
+use crate::trajectory::{JointTrajectory, Spline, TrajectoryError, TrajectoryPoint};
+
+/// Most values in one trajectory: it is checked, logged and kept in memory as a whole.
+const MOST_VALUES: usize = 300_000;
+/// By this part limits may be exceeded: rounding.
+const SLACK: f64 = 1.001;
+
+/// Why a motion cannot be followed by the arms of a blueprint.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum OntoError {
+    /// There is no motion.
+    #[error("the log has no motion to follow: no joint has a position in every tick\nhint: choose another part of it")]
+    Nothing,
+    /// A joint is in the log and not in the blueprint.
+    #[error(
+        "the log moves {joint}, which the blueprint {blueprint} does not have\nhint: joints are matched by name; it has {has}"
+    )]
+    NoSuchJoint {
+        /// The joint.
+        joint: String,
+        /// The blueprint.
+        blueprint: String,
+        /// The joints that it has.
+        has: String,
+    },
+    /// No task can follow it.
+    #[error(
+        "no trajectory task of the blueprint covers the joints of {arm}\n\
+         hint: add one: `tasks: [{{name: traj_{arm}, type: trajectory, joint_names: {{hardware: {arm}}}}}]`"
+    )]
+    NoTask {
+        /// The arm.
+        arm: String,
+    },
+    /// It is too long.
+    #[error(
+        "the motion has {0} values, and may have {MOST_VALUES}\nhint: choose a part of it with --start-offset and --duration"
+    )]
+    TooLong(usize),
+    /// It is no trajectory.
+    #[error("the motion cannot be followed: {0}\nhint: choose another part of the log")]
+    Trajectory(#[from] TrajectoryError),
+}
+
+/// A limit that the motion would break.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Broken {
+    /// The joint.
+    pub joint: String,
+    /// `position`, `velocity` or `acceleration`.
+    pub limit: &'static str,
+    /// How far the motion goes, at its worst [rad, rad/s or rad/s²].
+    pub reaches: f64,
+    /// How far it may go.
+    pub allowed: f64,
+    /// By how much that is too far.
+    pub by: f64,
+}
+
+impl Broken {
+    fn unit(&self) -> &'static str {
+        match self.limit {
+            "position" => "rad",
+            "velocity" => "rad/s",
+            _ => "rad/s²",
+        }
+    }
+}
+
+impl std::fmt::Display for Broken {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { joint, limit, reaches, allowed, by } = self;
+        let unit = self.unit();
+        write!(f, "{joint} would break its {limit} limit by {by:.4} {unit}: {reaches:.4} of {allowed:.4} {unit}")
+    }
+}
+
+/// A part of the motion, for one task.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    /// The task.
+    pub task: String,
+    /// The motion.
+    pub trajectory: JointTrajectory,
+}
+
+/// An arm on its way to where the motion begins.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Approach {
+    /// The arm.
+    pub arm: String,
+    /// Where each of its joints goes [rad]; `None`: it stays where it is.
+    pub target: Vec<Option<f64>>,
+}
+
+/// A motion for the arms of a blueprint.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// First, one arm after the other goes to where it begins.
+    pub approaches: Vec<Approach>,
+    /// Then all parts begin together.
+    pub parts: Vec<Part>,
+}
+
+/// Whether an arm of a blueprint is a real one: neither emulated nor a plant in memory.
+pub fn is_real(arm: &Arm) -> bool {
+    !arm.simulated && arm.adapter.transport != "memory"
+}
+
+/// Finds the arms and tasks of a blueprint that follow a motion, joint by joint of the same name.
+pub fn plan(blueprint: &Blueprint, motion: &JointTrajectory) -> Result<Plan, OntoError> {
+    let Some(first) = motion.points.first().filter(|_| !motion.joint_names.is_empty()) else {
+        return Err(OntoError::Nothing);
+    };
+    let size = motion.points.len() * motion.joint_names.len();
+    if size > MOST_VALUES {
+        return Err(OntoError::TooLong(size));
+    }
+    let all: Vec<&String> = blueprint.arms.iter().flat_map(|arm| &arm.joints).collect();
+    if let Some(joint) = motion.joint_names.iter().find(|joint| !all.contains(joint)) {
+        let has = all.iter().map(|j| j.as_str()).collect::<Vec<_>>().join(", ");
+        return Err(OntoError::NoSuchJoint { joint: joint.clone(), blueprint: blueprint.name.clone(), has });
+    }
+    let value = |joint: &String| motion.joint_names.iter().position(|j| j == joint).map(|k| first.positions[k]);
+    let driven = |arm: &&Arm| arm.joints.iter().any(|j| value(j).is_some());
+    let approaches = (blueprint.arms.iter().filter(driven))
+        .map(|arm| Approach { arm: arm.hardware_id.clone(), target: arm.joints.iter().map(value).collect() })
+        .collect();
+    // One task for all of it, so that nothing can fall apart; else one for each arm.
+    let parts = match task_for(blueprint, &motion.joint_names, &all) {
+        Some(task) => vec![Part { task, trajectory: motion.clone() }],
+        None => (blueprint.arms.iter().filter(driven))
+            .map(|arm| {
+                let own = only(motion, |joint| arm.joints.contains(joint));
+                let task = task_for(blueprint, &own.joint_names, &all);
+                let task = task.ok_or_else(|| OntoError::NoTask { arm: arm.hardware_id.clone() })?;
+                Ok(Part { task, trajectory: own })
+            })
+            .collect::<Result<_, OntoError>>()?,
+    };
+    for part in &parts {
+        part.trajectory.validate()?;
+    }
+    Ok(Plan { approaches, parts })
+}
+
+fn task_for(blueprint: &Blueprint, joints: &[String], all: &[&String]) -> Option<String> {
+    let covers = |task: &&crate::blueprint::Task| {
+        let has = |name: &String| task.joints.iter().any(|&j| all.get(j).is_some_and(|joint| *joint == name));
+        matches!(task.kind, TaskKind::Trajectory(_)) && joints.iter().all(has)
+    };
+    blueprint.tasks.iter().find(covers).map(|task| task.name.clone())
+}
+
+/// The motion of some of its joints.
+fn only(motion: &JointTrajectory, wanted: impl Fn(&String) -> bool) -> JointTrajectory {
+    let chosen: Vec<usize> = (0..motion.joint_names.len()).filter(|&k| wanted(&motion.joint_names[k])).collect();
+    let pick = |values: &[f64]| chosen.iter().filter_map(|&k| values.get(k).copied()).collect();
+    let points = motion.points.iter().map(|p| TrajectoryPoint {
+        time_from_start: p.time_from_start,
+        positions: pick(&p.positions),
+        velocities: pick(&p.velocities),
+        accelerations: pick(&p.accelerations),
+    });
+    let points = points.collect();
+    JointTrajectory { joint_names: chosen.iter().map(|&k| motion.joint_names[k].clone()).collect(), points }
+}
+
+/// What the limits of the arms say to a motion.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Verdict {
+    /// Limits that it would break: positions first, then the worst of the others.
+    pub broken: Vec<Broken>,
+    /// So much of its speed would be within velocities and accelerations; 1 if it is already.
+    pub possible_rate: f64,
+}
+
+/// Compares a motion with the limits of all arms. `joints` are the names of all joints, arm by arm.
+pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Result<Verdict, TrajectoryError> {
+    let limits = config.arms.iter().flat_map(|arm| (0..arm.dof).map(move |j| (&arm.limits, j)));
+    let bounds: Vec<Bounds> = limits
+        .map(|(l, j)| {
+            Bounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j])
+        })
+        .collect();
+    let mut positions = Vec::new();
+    let mut others: Vec<(f64, Broken)> = Vec::new();
+    let mut possible_rate = 1.0f64;
+    for part in &plan.parts {
+        let spline = Spline::new(&part.trajectory)?;
+        for (k, joint) in part.trajectory.joint_names.iter().enumerate() {
+            let found = joints.iter().position(|j| j == joint).and_then(|j| bounds.get(j));
+            let (Some(b), e) = (found, spline.extremes(k)) else { continue };
+            let broken = |limit, reaches: f64, allowed: f64| {
+                let by = (reaches - allowed).abs();
+                Broken { joint: joint.clone(), limit, reaches, allowed, by }
+            };
+            if e.lowest < b.lower - 1e-6 {
+                positions.push(broken("position", e.lowest, b.lower));
+            }
+            if e.highest > b.upper + 1e-6 {
+                positions.push(broken("position", e.highest, b.upper));
+            }
+            for (limit, reaches, allowed, rate) in [
+                ("velocity", e.fastest, b.velocity, b.velocity / e.fastest),
+                ("acceleration", e.steepest, b.acceleration, (b.acceleration / e.steepest).sqrt()),
+            ] {
+                if reaches > allowed * SLACK + 1e-9 {
+                    others.push((rate, broken(limit, reaches, allowed)));
+                    possible_rate = possible_rate.min(rate);
+                }
+            }
+        }
+    }
+    positions.sort_by(|a, b| b.by.total_cmp(&a.by));
+    others.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let broken = positions.into_iter().chain(others.into_iter().map(|(_, broken)| broken)).collect();
+    Ok(Verdict { broken, possible_rate })
+}

@@ -1,0 +1,106 @@
+//! What a log says about its run: which arms and tasks there were, and what their coordinator was made from.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+use crate::control::config::{ArmConfig, CoordinatorConfig};
+use crate::joint::MAX_DOF;
+use crate::recording::replay::{LogInfo, LogReader, ReplayError, attachment};
+use crate::telemetry::describe::{ArmNames, Names};
+
+/// Name of the attachment that a coordinator can be made from.
+pub const COORDINATOR: &str = "coordinator.json";
+
+/// Why a log cannot be run again.
+#[derive(Debug, Error)]
+pub enum RecordedError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
+    /// It does not say what its coordinator was made from.
+    #[error(
+        "the log {path} has no {COORDINATOR}: what its coordinator was made from is not known\n\
+         hint: only logs that `dimos run` wrote can be run again; `dimos replay` plays any"
+    )]
+    NoCoordinator {
+        /// The log.
+        path: PathBuf,
+    },
+    /// What it says does not fit together.
+    #[error("the log {path} cannot be run again: {what}\nhint: a program of another version may have written it")]
+    Unfit {
+        /// The log.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+}
+
+/// The run behind a log.
+#[derive(Debug, Clone)]
+pub struct Recorded {
+    /// The log.
+    pub path: PathBuf,
+    /// What its coordinator was made from.
+    pub config: CoordinatorConfig,
+    /// Names of arms, joints and tasks, in the order of the coordinator's indices.
+    pub names: Names,
+    /// What the log says about itself.
+    pub info: LogInfo,
+}
+
+impl Recorded {
+    /// Reads what a log says about its run.
+    pub fn open(path: &Path) -> Result<Self, RecordedError> {
+        let info = LogReader::open(path)?.info().clone();
+        let path = path.to_owned();
+        let Some(json) = attachment(&path, COORDINATOR)? else { return Err(RecordedError::NoCoordinator { path }) };
+        let read = serde_json::from_slice(&json).map_err(|e| format!("{COORDINATOR}: {e}"));
+        let names = read.and_then(|config| Ok((names(&config, &info.metadata)?, config)));
+        match names {
+            Ok((names, config)) => Ok(Self { path, config, names, info }),
+            Err(what) => Err(RecordedError::Unfit { path, what }),
+        }
+    }
+
+    /// Names of all joints, arm by arm.
+    pub fn joints(&self) -> Vec<String> {
+        self.names.arms.iter().flat_map(|arm| arm.joints.clone()).collect()
+    }
+}
+
+fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Result<Names, String> {
+    if !(config.rate.is_finite() && config.rate > 0.0) {
+        return Err(format!("its tick rate is {} Hz", config.rate));
+    }
+    let joints: BTreeMap<String, Vec<String>> = metadata
+        .get("arms")
+        .and_then(|text| serde_json::from_str(text).ok())
+        .ok_or("its metadata does not name the joints")?;
+    let mut arms = Vec::new();
+    for arm in &config.arms {
+        check_limits(arm)?;
+        let joints = joints.get(&arm.name).filter(|j| j.len() == arm.dof);
+        let joints =
+            joints.ok_or_else(|| format!("its metadata does not name the {} joints of {}", arm.dof, arm.name))?;
+        arms.push(ArmNames { hardware_id: arm.name.clone(), joints: joints.clone() });
+    }
+    let all: usize = config.arms.iter().map(|a| a.dof).sum();
+    if let Some(task) = config.tasks.iter().find(|t| t.joints.iter().any(|&j| usize::from(j) >= all)) {
+        return Err(format!("task {} has joints that do not exist", task.name));
+    }
+    Ok(Names { arms, tasks: config.tasks.iter().map(|t| t.name.clone()).collect() })
+}
+
+/// A file may say anything; the coordinator relies on limits that leave room to move.
+fn check_limits(arm: &ArmConfig) -> Result<(), String> {
+    let l = &arm.limits;
+    let lists = [&l.position_lower, &l.position_upper, &l.velocity_max, &l.acceleration_max];
+    let whole =
+        arm.dof <= MAX_DOF && lists.iter().all(|list| list.len() == arm.dof && list.iter().all(|v| v.is_finite()));
+    let room = || l.position_lower.iter().zip(&l.position_upper).all(|(lower, upper)| lower < upper);
+    let speed = || l.velocity_max.iter().chain(&l.acceleration_max).all(|v| *v > 0.0);
+    if whole && room() && speed() { Ok(()) } else { Err(format!("the limits of {} leave no room to move", arm.name)) }
+}

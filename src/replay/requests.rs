@@ -1,0 +1,134 @@
+//! Requests as a log tells them, made into requests again: the other way round than `runtime::dispatch`.
+
+use serde::Deserialize;
+
+use crate::control::request::{Motion, Request};
+use crate::joint::{Joints, joints_of};
+use crate::trajectory::{JointTrajectory, Spline};
+
+/// A message of `/dimos/requests`.
+#[derive(Debug, Deserialize)]
+struct Line {
+    id: u64,
+    request: Told,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Told {
+    Execute { task: u16, motion: u64, trajectory: JointTrajectory },
+    Cancel { task: Option<u16> },
+    Servo { task: u16, target: Vec<Option<f64>> },
+    Velocity { task: u16, target: Vec<Option<f64>> },
+    Stop { arm: Option<u16> },
+    Reset { arm: u16 },
+    Ready { arm: u16 },
+    Park { arm: u16 },
+    Gripper { arm: u16, opening: Option<f64> },
+    Shutdown {},
+}
+
+/// The id of a request, whatever it asks.
+#[derive(Debug, Deserialize)]
+struct Id {
+    id: u64,
+}
+
+/// Reads a request. `joints` are the names of all joints, arm by arm. Where only its contents cannot be read, the
+/// inner result says why.
+pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<Request, String>), String> {
+    match serde_json::from_str::<Line>(json) {
+        Ok(line) => Ok((line.id, request(line.request, joints))),
+        Err(e) => match serde_json::from_str::<Id>(json) {
+            Ok(Id { id }) => Ok((id, Err(e.to_string()))),
+            Err(e) => Err(e.to_string()),
+        },
+    }
+}
+
+fn request(told: Told, joints: &[String]) -> Result<Request, String> {
+    Ok(match told {
+        Told::Execute { task, motion, trajectory } => {
+            let spline = Spline::new(&trajectory).map_err(|e| e.to_string())?;
+            let index = |name: &String| joints.iter().position(|j| j == name).map(|j| j as u16);
+            let found: Option<Vec<u16>> = trajectory.joint_names.iter().map(index).collect();
+            let joints = found.ok_or("its trajectory has a joint that no arm has")?;
+            Request::Execute { task, motion: Box::new(Motion { id: motion, joints, spline }) }
+        }
+        Told::Cancel { task } => Request::Cancel { task },
+        Told::Servo { task, target } => Request::Servo { task, target: values(&target) },
+        Told::Velocity { task, target } => Request::Velocity { task, target: values(&target) },
+        Told::Stop { arm } => Request::Stop { arm },
+        Told::Reset { arm } => Request::Reset { arm },
+        Told::Ready { arm } => Request::Ready { arm },
+        Told::Park { arm } => Request::Park { arm },
+        Told::Gripper { arm, opening } => Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN) },
+        Told::Shutdown {} => Request::Shutdown,
+    })
+}
+
+/// JSON has no infinities and no NaN: what was not finite is null. It is refused all the same.
+fn values(told: &[Option<f64>]) -> Joints {
+    let values: Vec<f64> = told.iter().map(|v| v.unwrap_or(f64::NAN)).collect();
+    joints_of(&values)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::runtime::log_of;
+    use crate::trajectory::TrajectoryPoint;
+
+    /// What is read is told in the same words again.
+    #[test]
+    fn every_request_is_read_as_it_was_told() {
+        let target = joints_of(&[0.1 + 0.2, -0.0, f64::MIN_POSITIVE, 1e300, std::f64::consts::PI]);
+        for request in [
+            Request::Cancel { task: None },
+            Request::Cancel { task: Some(3) },
+            Request::Servo { task: 1, target },
+            Request::Velocity { task: 2, target },
+            Request::Stop { arm: None },
+            Request::Stop { arm: Some(1) },
+            Request::Reset { arm: 1 },
+            Request::Ready { arm: 0 },
+            Request::Park { arm: 2 },
+            Request::Gripper { arm: 1, opening: 0.1 + 0.2 },
+            Request::Shutdown,
+        ] {
+            let told = log_of(&request);
+            let line = json!({"id": 7, "request": told}).to_string();
+            let (id, again) = read(&line, &[]).unwrap();
+            // Debug output shows every bit of a number, and the sign of zero.
+            assert_eq!((id, format!("{:?}", again.unwrap())), (7, format!("{request:?}")));
+        }
+    }
+
+    #[test]
+    fn a_trajectory_makes_the_same_curve_again() {
+        let point = |t: f64, q: f64, v: f64| TrajectoryPoint {
+            time_from_start: t,
+            positions: vec![q, -q / 3.0],
+            velocities: vec![v, 0.1 + v],
+            accelerations: Vec::new(),
+        };
+        let points = vec![point(0.0, 0.1, 0.0), point(1.0 / 3.0, 0.2, 0.7), point(0.7, 0.3, 0.0)];
+        let trajectory = JointTrajectory { joint_names: vec!["b".into(), "a".into()], points };
+        let told = json!({"id": 9, "request": {"execute": {"task": 1, "motion": 5, "trajectory": trajectory}}});
+        let names = ["a".to_owned(), "b".to_owned()];
+        let (_, request) = read(&told.to_string(), &names).unwrap();
+        let Ok(Request::Execute { task: 1, motion }) = request else { panic!("{request:?}") };
+        assert_eq!(*motion, Motion { id: 5, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
+        let (_, unknown) = read(&told.to_string(), &names[..1]).unwrap();
+        assert!(unknown.unwrap_err().contains("joint"));
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_said() {
+        assert!(read("{", &[]).is_err());
+        let (id, unknown) = read(r#"{"id":4,"request":{"dance":{}}}"#, &[]).unwrap();
+        assert!(id == 4 && unknown.unwrap_err().contains("dance"));
+    }
+}

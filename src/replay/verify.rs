@@ -1,0 +1,203 @@
+//! Runs a log once more: what every tick read and was told goes through [`Coordinator::tick`] again, and what comes
+//! out is compared with what came out then, bit for bit.
+
+use std::path::Path;
+
+use mcap::parse_record;
+use mcap::records::{Record, op};
+use serde::Serialize;
+
+use super::compare::{Comparison, Difference};
+use super::inputs::{Assembler, Topic};
+use super::recorded::{Recorded, RecordedError};
+use crate::arm::ArmState;
+use crate::control::coordinator::Coordinator;
+use crate::control::request::Envelope;
+use crate::recording::records::{RawRecord, RecordReader, unpack_chunk};
+use crate::recording::replay::ReplayError;
+
+/// How far a log could be verified.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "result", rename_all = "snake_case")]
+pub enum Finding {
+    /// All of it came out the same.
+    Reproducible,
+    /// Something came out differently; the first such thing.
+    Different(Difference),
+    /// From some tick on, what a tick read or was told is not in the log. All before came out the same.
+    Incomplete {
+        /// The first tick that cannot be verified.
+        tick: u64,
+        /// Why.
+        why: String,
+    },
+}
+
+/// What came of verifying a log.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Verification {
+    /// What was found.
+    #[serde(flatten)]
+    pub finding: Finding,
+    /// Ticks that came out the same.
+    pub ticks: u64,
+    /// Requests that they were told.
+    pub requests: u64,
+    /// Events that they told.
+    pub events: u64,
+    /// Time from the first to the last of these ticks [s].
+    pub length: f64,
+}
+
+/// Runs a log once more and compares.
+pub fn verify(path: &Path) -> Result<Verification, RecordedError> {
+    let recorded = Recorded::open(path)?;
+    let mut records = RecordReader::open(path)?;
+    let mut run = Rerun::new(&recorded);
+    let end = loop {
+        match records.next_record() {
+            Ok(Some(record)) => {
+                if let Err(damage) = run.record(&record) {
+                    break Some(records.cut(record.at, damage));
+                }
+            }
+            Ok(None) => break None,
+            Err(cut @ ReplayError::Cut { .. }) => break Some(cut),
+            Err(e) => return Err(e.into()),
+        }
+        if run.found.is_some() {
+            break None;
+        }
+    };
+    Ok(run.finish(end))
+}
+
+/// A log on its way through a coordinator.
+struct Rerun<'a> {
+    recorded: &'a Recorded,
+    channels: Vec<Option<Topic>>,
+    ticks: Assembler,
+    coordinator: Coordinator,
+    comparison: Comparison<'a>,
+    states: Vec<ArmState>,
+    told: Vec<Envelope>,
+    /// The first tick's deadline and the last's [ns].
+    span: Option<(u64, u64)>,
+    counts: Verification,
+    found: Option<Finding>,
+}
+
+impl<'a> Rerun<'a> {
+    fn new(recorded: &'a Recorded) -> Self {
+        Self {
+            recorded,
+            channels: Vec::new(),
+            ticks: Assembler::new(recorded),
+            coordinator: Coordinator::new(&recorded.config),
+            comparison: Comparison::new(recorded),
+            states: vec![ArmState::default(); recorded.config.arms.len()],
+            told: Vec::new(),
+            span: None,
+            counts: Verification { finding: Finding::Reproducible, ticks: 0, requests: 0, events: 0, length: 0.0 },
+            found: None,
+        }
+    }
+
+    fn record(&mut self, record: &RawRecord) -> Result<(), mcap::McapError> {
+        match record.opcode {
+            op::CHUNK => unpack_chunk(&record.body, |opcode, body| self.contents(opcode, body)),
+            opcode => {
+                self.contents(opcode, &record.body);
+                Ok(())
+            }
+        }
+    }
+
+    /// A record of a chunk, or one that stands by itself.
+    fn contents(&mut self, opcode: u8, body: &[u8]) {
+        match opcode {
+            _ if self.found.is_some() => {}
+            op::CHANNEL => {
+                if let Ok(Record::Channel(channel)) = parse_record(opcode, body) {
+                    let id = usize::from(channel.id);
+                    self.channels.resize(self.channels.len().max(id + 1), None);
+                    self.channels[id] = Topic::of(&channel.topic, self.recorded);
+                }
+            }
+            op::MESSAGE => {
+                // Channel, sequence and two times come before the message itself.
+                let Some((header, bytes)) = body.split_at_checked(22) else { return };
+                let channel = usize::from(u16::from_le_bytes([header[0], header[1]]));
+                if let Some(topic) = self.channels.get(channel).copied().flatten() {
+                    self.message(topic, bytes);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn message(&mut self, topic: Topic, bytes: &[u8]) {
+        if self.ticks.completes(topic) {
+            self.run_tick();
+        }
+        if self.found.is_some() {
+            return;
+        }
+        if let Err(why) = self.ticks.take(topic, bytes) {
+            self.stop_at(self.counts.ticks, why);
+        }
+    }
+
+    fn stop_at(&mut self, tick: u64, why: String) {
+        self.found = Some(Finding::Incomplete { tick, why });
+    }
+
+    /// Runs the tick that is complete.
+    fn run_tick(&mut self) {
+        let (index, dropped) = (self.ticks.logged.tick.tick, self.ticks.logged.tick.dropped);
+        let expected = self.counts.ticks;
+        if index != expected || dropped > 0 {
+            return self.stop_at(expected, format!("{dropped} samples were lost up to tick {index}"));
+        }
+        if let Err(why) = self.ticks.requests(&mut self.told) {
+            return self.stop_at(index, why);
+        }
+        let logged = &self.ticks.logged;
+        for (state, arm) in self.states.iter_mut().zip(&logged.arms) {
+            *state = arm.state;
+        }
+        self.counts.requests += self.told.len() as u64;
+        let mut requests = self.told.drain(..);
+        let output = self.coordinator.tick(logged.time(), &self.states, || requests.next());
+        drop(requests);
+        let deadline = logged.tick.deadline_ns;
+        let (first, _) = *self.span.get_or_insert((deadline, deadline));
+        if let Some(difference) = self.comparison.compare(logged, output, deadline.saturating_sub(first)) {
+            self.found = Some(Finding::Different(difference));
+            return;
+        }
+        self.span = Some((first, deadline));
+        self.counts.events += logged.events.len() as u64;
+        self.counts.ticks += 1;
+        self.ticks.next();
+    }
+
+    fn finish(mut self, cut: Option<ReplayError>) -> Verification {
+        match cut {
+            // The last tick's requests and events may be among what was cut off.
+            Some(cut) if self.found.is_none() => self.stop_at(self.counts.ticks, first_line(&cut.to_string())),
+            None if self.found.is_none() && self.ticks.is_closed() => self.run_tick(),
+            _ => {}
+        }
+        let (first, last) = self.span.unwrap_or_default();
+        Verification {
+            finding: self.found.unwrap_or(Finding::Reproducible),
+            length: last.saturating_sub(first) as f64 * 1e-9,
+            ..self.counts
+        }
+    }
+}
+
+fn first_line(text: &str) -> String {
+    text.lines().next().unwrap_or_default().to_owned()
+}

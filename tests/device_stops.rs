@@ -1,0 +1,130 @@
+//! A stop that an arm does not take at once is asked for again, whoever wants it: the tick, or the device thread
+//! by itself because the tick fell silent.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::{Duration, Instant};
+
+use dimos::arm::{ArmCommand, ArmState, Link};
+use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::device::{Device, DeviceConfig};
+use dimos::hardware::spec::AdapterError;
+use dimos::joint::ControlMode;
+use dimos::rt::beat::Beat;
+use dimos::rt::slot::{SlotReader, SlotWriter, slot};
+use dimos::testing::{Call, MockAdapter};
+
+const LIMIT: Duration = Duration::from_secs(20);
+
+struct Bench {
+    device: Device,
+    beat: Arc<Beat>,
+    states: SlotReader<ArmState>,
+    commands: SlotWriter<ArmCommand>,
+    command: ArmCommand,
+    mock: MockAdapter,
+}
+
+fn bench(native_rate: f64) -> Bench {
+    let mock = MockAdapter::new(6);
+    let beat = Arc::new(Beat::default());
+    let (state_writer, states) = slot(ArmState::default());
+    let (commands, command_reader) = slot(ArmCommand::default());
+    let config = DeviceConfig {
+        realtime: true,
+        hardware_id: "arm".into(),
+        dof: 6,
+        tick_period: Duration::from_millis(10),
+        native_rate,
+        velocity_max: 2.0,
+        beat: beat.clone(),
+        clock: Arc::new(MonotonicClock),
+        notes: Box::new(|_| {}),
+    };
+    let device = Device::spawn(config, Box::new(mock.clone()), state_writer, command_reader).unwrap();
+    device.connect().wait(LIMIT).unwrap();
+    device.activate().wait(LIMIT).unwrap();
+    Bench { device, beat, states, commands, command: ArmCommand::default(), mock }
+}
+
+impl Bench {
+    /// What a tick does: a heartbeat, and the next command.
+    fn tick(&mut self, change: impl FnOnce(&mut ArmCommand)) {
+        let now = MonotonicClock.now();
+        self.beat.beat(now);
+        self.command.seq += 1;
+        self.command.next_tick = now.after(Duration::from_millis(10));
+        change(&mut self.command);
+        self.commands.write(&self.command);
+        self.device.wake().raise();
+    }
+
+    fn stops(&self) -> usize {
+        self.mock.calls().iter().filter(|c| **c == Call::Method("write_stop")).count()
+    }
+
+    fn until(&mut self, what: &str, mut done: impl FnMut(&mut Self) -> bool) {
+        let began = Instant::now();
+        while !done(self) {
+            assert!(began.elapsed() < LIMIT, "not within {LIMIT:?}: {what}");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    fn end(self) {
+        self.device.finish(false).wait(LIMIT).unwrap();
+        self.device.join();
+    }
+}
+
+#[test]
+fn a_stop_that_fails_is_sent_again_and_confirmed() {
+    let mut bench = bench(100.0);
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.5));
+    bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    bench.mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
+    bench.mock.fail("write_stop", AdapterError::Rejected("busy".into()));
+    bench.tick(|c| (c.mode, c.stop_seq) = (None, 1));
+    // No tick comes any more: the thread goes on by itself.
+    bench.until("the stop", |b| b.device.health().stop_confirmed.load(Relaxed) == 1);
+    assert_eq!(bench.stops(), 3);
+    bench.end();
+}
+
+#[test]
+fn a_stop_that_was_asked_for_while_the_link_was_down_is_sent_when_it_is_back() {
+    let mut bench = bench(100.0);
+    bench.tick(|c| c.mode = Some(ControlMode::Velocity));
+    bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    bench.mock.fail("read_joint_positions", AdapterError::NotConnected);
+    bench.until("the loss", |b| b.states.read().link == Link::Faulted);
+    bench.tick(|c| (c.mode, c.stop_seq) = (None, 1));
+    bench.until("the stop", |b| b.device.health().stop_confirmed.load(Relaxed) == 1);
+    let calls = bench.mock.calls();
+    let at = |name: &str| calls.iter().rposition(|c| c.name() == name).unwrap();
+    assert!(at("connect") < at("write_stop"), "after the new connection");
+    bench.until("the link", |b| b.states.read().link == Link::Up);
+    assert!(bench.states.read().self_held, "it must be enabled before it moves again");
+    bench.end();
+}
+
+#[test]
+fn a_slow_arm_is_held_too_when_the_tick_falls_silent() {
+    // It is read once a second, and must be stopped long before the next time.
+    let mut bench = bench(1.0);
+    bench.mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.5));
+    bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    bench.mock.clear_calls();
+    bench.until("the stops", |b| b.stops() == 2);
+    assert!(bench.states.read().self_held);
+    let reads = bench.mock.calls().iter().filter(|c| c.name() == "read_joint_positions").count();
+    assert!(reads <= 1, "held between two readings, not after {reads} of them");
+    let written = |b: &Bench| b.mock.calls().iter().filter(|c| c.name() == "write_joint_velocities").count();
+    let before = written(&bench);
+    bench.tick(|_| {});
+    bench.until("the command", |b| b.states.read().seq > 0);
+    std::thread::sleep(Duration::from_millis(30));
+    assert_eq!(written(&bench), before, "a tick that comes back does not move it again");
+    bench.end();
+}

@@ -1,0 +1,280 @@
+//! The house rules that a machine can check: who may use whom, where `unsafe` may stand, how long a file may be,
+//! and what may not stand on a path that runs with hardware.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Every module of `src/`, with the modules that it may use besides itself. `ALL`: everything above it.
+const ALL: &[&str] = &["*"];
+const VOCABULARY: &[&str] = &["joint", "arm", "trajectory", "clock", "telemetry", "yaml"];
+const LAYERS: &[(&str, &[&str])] = &[
+    ("joint", &[]),
+    ("arm", &[]),
+    ("trajectory", &[]),
+    ("clock", &[]),
+    ("telemetry", &[]),
+    ("yaml", &[]),
+    ("rt", &[]),
+    ("robot", &[]),
+    ("collision", &["robot"]),
+    ("hardware", &["rt"]),
+    // The public test doubles belong to the hardware layer.
+    ("testing", &["rt", "hardware"]),
+    ("control", &["rt", "robot", "collision"]),
+    ("planning", &["robot", "collision"]),
+    ("rpc", &["robot", "collision"]),
+    ("recording", &["rt", "robot"]),
+    ("view", &["robot", "collision", "rpc"]),
+    ("blueprint", &["robot", "collision", "hardware"]),
+    ("runtime", ALL),
+    ("cli", ALL),
+];
+/// Modules of which others may use one part only: `(user, used, part)`.
+const PARTS: &[(&str, &str, &str)] =
+    &[("blueprint", "control", "config"), ("blueprint", "planning", "config"), ("blueprint", "recording", "config")];
+
+/// The mock arm panics when a test's script of faults says so.
+const SCRIPTED_PANIC: &str = "src/hardware/arms/mock/device.rs";
+
+/// A source file: its path below the checkout, its text, its code without comments and strings, and the part of
+/// that before the unit tests.
+struct Source {
+    path: String,
+    text: String,
+    code: String,
+    shipped: String,
+    for_tests: bool,
+}
+
+fn sources(folder: &str) -> Vec<Source> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut paths = Vec::new();
+    collect(&root.join(folder), &mut paths);
+    paths.sort();
+    assert!(paths.len() > 5, "no sources in {folder}");
+    let texts: Vec<String> = paths.iter().map(|path| fs::read_to_string(path).unwrap()).collect();
+    let for_tests = |path: &Path| {
+        let name = path.file_stem().unwrap().to_string_lossy().into_owned();
+        let ways = [format!("#[cfg(test)]\nmod {name};"), format!("#[cfg(test)]\n#[path = \"{name}.rs\"]")];
+        let folder = path.parent().unwrap();
+        let beside = |other: &Path| other.parent() == Some(folder) || other == folder.with_extension("rs");
+        let mut others = paths.iter().zip(&texts).filter(|(other, _)| beside(other));
+        others.any(|(_, text)| ways.iter().any(|way| text.contains(way)))
+    };
+    let source = |(path, text): (&PathBuf, &String)| {
+        let code = code(text);
+        Source {
+            path: path.strip_prefix(root).unwrap().to_string_lossy().into_owned(),
+            shipped: code.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default().to_owned(),
+            for_tests: path.ancestors().take(3).any(for_tests),
+            text: text.clone(),
+            code,
+        }
+    };
+    paths.iter().zip(&texts).map(source).collect()
+}
+
+fn collect(folder: &Path, paths: &mut Vec<PathBuf>) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            collect(&path, paths);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            paths.push(path);
+        }
+    }
+}
+
+/// The text with comments, strings and characters blanked out. Lines stay where they are.
+fn code(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(c) = rest.chars().next() {
+        let raw = rest.strip_prefix('r').map(|r| r.chars().take_while(|c| *c == '#').count());
+        let is_raw = raw.is_some_and(|n| rest[1 + n..].starts_with('"'))
+            && !out.ends_with(|c: char| c.is_alphanumeric() || c == '_');
+        let length = if rest.starts_with("//") {
+            rest.find('\n').unwrap_or(rest.len())
+        } else if is_raw {
+            let n = raw.unwrap_or(0);
+            let end = format!("\"{}", "#".repeat(n));
+            rest[n + 2..].find(&end).map_or(rest.len(), |at| n + 2 + at + end.len())
+        } else if c == '"' {
+            let mut escaped = false;
+            let end = rest[1..].find(|c| {
+                let ends = c == '"' && !escaped;
+                escaped = c == '\\' && !escaped;
+                ends
+            });
+            end.map_or(rest.len(), |at| at + 2)
+        } else if let Some(escape) = rest.strip_prefix("'\\") {
+            escape.find('\'').map_or(1, |at| at + 3)
+        } else if c == '\'' && rest.chars().nth(2) == Some('\'') {
+            rest.char_indices().nth(3).map_or(rest.len(), |(at, _)| at)
+        } else {
+            out.push(c);
+            rest = &rest[c.len_utf8()..];
+            continue;
+        };
+        out.extend(rest[..length].chars().map(|c| if c == '\n' { '\n' } else { ' ' }));
+        rest = &rest[length..];
+    }
+    out
+}
+
+/// The paths below the crate that a file names: `(line, module, part)`.
+fn used(code: &str) -> Vec<(usize, String, String)> {
+    let mut all = Vec::new();
+    let word = |s: &str| s.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>();
+    for (at, _) in code.match_indices("crate::") {
+        if code[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_' || c == '$') {
+            continue;
+        }
+        let line = code[..at].matches('\n').count() + 1;
+        let after = &code[at + "crate::".len()..];
+        let Some(group) = after.strip_prefix('{') else {
+            let module = word(after);
+            let part = after[module.len()..].strip_prefix("::").map(word).unwrap_or_default();
+            all.push((line, module, part));
+            continue;
+        };
+        let (mut depth, mut fresh) = (0, true);
+        for (i, c) in group.char_indices() {
+            match c {
+                '{' => depth += 1,
+                '}' if depth == 0 => break,
+                '}' => depth -= 1,
+                ',' if depth == 0 => fresh = true,
+                c if fresh && c.is_alphabetic() => {
+                    let module = word(&group[i..]);
+                    let part = group[i + module.len()..].strip_prefix("::").map(word).unwrap_or_default();
+                    all.push((line, module, part));
+                    fresh = false;
+                }
+                _ => {}
+            }
+        }
+    }
+    // `crate::VERSION` is no module.
+    all.retain(|(_, module, _)| module.starts_with(char::is_lowercase));
+    all
+}
+
+fn module_of(path: &str) -> &str {
+    let below = path.strip_prefix("src/").unwrap();
+    below.split(['/', '.']).next().unwrap()
+}
+
+fn fail_on(found: &[String], rule: &str) {
+    assert!(found.is_empty(), "{rule}:\n  {}", found.join("\n  "));
+}
+
+#[test]
+fn a_module_uses_only_what_stands_above_it() {
+    let mut found = Vec::new();
+    for source in sources("src") {
+        let module = module_of(&source.path);
+        if matches!(module, "lib" | "main") {
+            continue;
+        }
+        let Some(place) = LAYERS.iter().position(|(name, _)| *name == module) else {
+            found.push(format!("{}: `{module}` has no layer; give it one here and in src/lib.rs", source.path));
+            continue;
+        };
+        let above = LAYERS[..place].iter().any(|_| true);
+        for (line, target, part) in used(&source.code) {
+            let (_, allowed) = LAYERS[place];
+            let known = LAYERS.iter().position(|(name, _)| *name == target);
+            let fine = target == module
+                || VOCABULARY.contains(&target.as_str())
+                || allowed.contains(&target.as_str())
+                || (allowed == ALL && above && known.is_some_and(|k| k < place))
+                || PARTS.contains(&(module, target.as_str(), part.as_str()));
+            if !fine {
+                found.push(format!("{}:{line}: `{module}` may not use `{target}`", source.path));
+            }
+        }
+    }
+    fail_on(&found, "layers (architecture, section 2)");
+}
+
+#[test]
+fn one_arm_does_not_use_another() {
+    let mut found = Vec::new();
+    for source in sources("src") {
+        let Some(arm) = source.path.strip_prefix("src/hardware/arms/").and_then(|p| p.split_once('/')) else {
+            continue;
+        };
+        for (at, start) in source.code.match_indices("hardware::arms::") {
+            if !source.code[at + start.len()..].starts_with(arm.0) {
+                found.push(format!("{}: {}", source.path, source.code[at..].lines().next().unwrap_or_default()));
+            }
+        }
+    }
+    fail_on(&found, "each arm stands alone");
+}
+
+/// Words of a line of code.
+fn words(line: &str) -> impl Iterator<Item = &str> {
+    line.split(|c: char| !(c.is_alphanumeric() || c == '_'))
+}
+
+#[test]
+fn unsafe_stands_only_in_rt_and_says_why() {
+    let mut found = Vec::new();
+    for source in sources("src") {
+        let lines: Vec<&str> = source.text.lines().collect();
+        for (i, line) in source.code.lines().enumerate().filter(|(_, l)| words(l).any(|w| w == "unsafe")) {
+            if module_of(&source.path) != "rt" {
+                found.push(format!("{}:{}: {}", source.path, i + 1, line.trim()));
+            } else if !lines[i.saturating_sub(3)..i].iter().any(|l| l.contains("// SAFETY:")) {
+                found.push(format!("{}:{}: without `// SAFETY:`", source.path, i + 1));
+            }
+        }
+    }
+    fail_on(&found, "`unsafe` only in src/rt, each with `// SAFETY:`");
+}
+
+#[test]
+fn no_file_is_too_long_and_no_test_is_skipped_for_good() {
+    let mut found = Vec::new();
+    for source in sources("src").into_iter().chain(sources("tests")) {
+        let lines = source.text.lines().count();
+        if lines > 800 {
+            found.push(format!("{}: {lines} lines", source.path));
+        }
+        if source.code.contains("#[ignore") {
+            found.push(format!("{}: an ignored test", source.path));
+        }
+    }
+    fail_on(&found, "no file over 800 lines, no ignored test");
+}
+
+#[test]
+fn nothing_panics_on_purpose_where_hardware_runs() {
+    let mut found = Vec::new();
+    for source in sources("src") {
+        if source.for_tests || !matches!(module_of(&source.path), "control" | "hardware" | "rt" | "runtime") {
+            continue;
+        }
+        for (i, line) in source.shipped.lines().enumerate() {
+            for bad in [".unwrap()", ".expect(", "panic!(", "unreachable!(", "todo!(", "unimplemented!("] {
+                let scripted = source.path == SCRIPTED_PANIC && bad == "panic!(";
+                if line.contains(bad) && !scripted {
+                    found.push(format!("{}:{}: {bad} {}", source.path, i + 1, line.trim()));
+                }
+            }
+        }
+    }
+    fail_on(&found, "no unwrap, expect or panic on a path that runs with hardware");
+}
+
+#[test]
+fn the_checks_see_what_they_should() {
+    let text = "use crate::{rt::slot, clock};\n// crate::cli\nlet s = \"crate::cli // unsafe\";\nlet c = '\"';\ncrate::rpc::x();\nr#\"a \"crate::cli\"#;\n";
+    let seen: Vec<(usize, String)> = used(&code(text)).into_iter().map(|(line, module, _)| (line, module)).collect();
+    let expected = [(1, "rt"), (1, "clock"), (5, "rpc")].map(|(line, module)| (line, module.to_owned()));
+    assert_eq!(seen, expected);
+    assert!(!code(text).contains("unsafe"));
+    assert_eq!(module_of("src/hardware/arms/mock/mod.rs"), "hardware");
+}

@@ -1,0 +1,457 @@
+//! The coordinator on a virtual clock, between arms in memory and a list of requests. Every command that goes out
+//! is checked here against what no command may ever do; the tests look at the rest.
+
+// Each test binary uses its own part of this file.
+#![allow(dead_code)]
+// The check compares several lists joint by joint.
+#![allow(clippy::needless_range_loop)]
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use dimos::clock::Mono;
+use dimos::control::config::*;
+use dimos::control::coordinator::{Coordinator, TickTime};
+use dimos::control::request::{Envelope, Motion, Request};
+use dimos::joint::{ControlMode, JointLimits, joints_of};
+use dimos::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
+use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+
+pub const V_MAX: f64 = 1.5;
+pub const A_MAX: f64 = 4.0;
+pub const RANGE: f64 = 2.0;
+/// Commands stay inside the range by the margin.
+pub const SOFT: f64 = RANGE - POSITION_MARGIN;
+
+/// An arm in memory: follows what it is commanded, with the imperfections it is given.
+#[derive(Debug, Clone)]
+pub struct SimArm {
+    pub dof: usize,
+    /// Joint positions [rad].
+    pub q: Vec<f64>,
+    /// Joint velocities [rad/s].
+    pub v: Vec<f64>,
+    /// Time constant of a first-order lag behind the command [s]; 0 = none.
+    pub lag: f64,
+    /// How far gravity pulls each joint below its setpoint [rad].
+    pub sag: f64,
+    /// Whether it reports velocities.
+    pub reports_velocity: bool,
+    /// Ticks until a commanded mode is in effect.
+    pub mode_delay: u32,
+    /// Whether its stop makes the place where it is its setpoint.
+    pub stop_takes_hold: bool,
+    /// Joints stand still, whatever is commanded.
+    pub blocked: bool,
+    /// No new states come.
+    pub silent: bool,
+    /// How old a state is when the tick reads it.
+    pub age: Duration,
+    pub enabled: bool,
+    pub error: i32,
+    pub link: Link,
+    pub self_held: bool,
+    pub mode: ControlMode,
+    /// What its joints are told [rad or rad/s]; `None`: never told anything.
+    pub setpoint: Option<Vec<f64>>,
+    pub state: ArmState,
+    pub stops: u32,
+    pub gripper: f64,
+    switching: u32,
+    last: ArmCommand,
+}
+
+impl SimArm {
+    pub fn new(dof: usize) -> Self {
+        Self {
+            dof,
+            q: vec![0.0; dof],
+            v: vec![0.0; dof],
+            lag: 0.0,
+            sag: 0.0,
+            reports_velocity: true,
+            mode_delay: 0,
+            stop_takes_hold: false,
+            blocked: false,
+            silent: false,
+            age: Duration::from_millis(1),
+            enabled: true,
+            error: 0,
+            link: Link::Up,
+            self_held: false,
+            mode: ControlMode::Position,
+            setpoint: None,
+            state: ArmState::default(),
+            stops: 0,
+            gripper: 0.0,
+            switching: 0,
+            last: ArmCommand::default(),
+        }
+    }
+
+    fn observe(&mut self, now: Mono) -> ArmState {
+        if !self.silent {
+            self.state.seq += 1;
+            self.state.stamp = now.before(self.age);
+            self.state.position = joints_of(&self.q);
+            self.state.velocity = if self.reports_velocity { joints_of(&self.v) } else { joints_of(&[]) };
+            self.state.velocity_source =
+                if self.reports_velocity { VelocitySource::Measured } else { VelocitySource::Absent };
+        }
+        self.state.dof = self.dof;
+        self.state.mode = self.mode;
+        self.state.enabled = self.enabled;
+        self.state.error = self.error;
+        self.state.link = self.link;
+        self.state.self_held = self.self_held;
+        self.state
+    }
+
+    /// Obeys a command for one period.
+    fn obey(&mut self, command: &ArmCommand, dt: f64) {
+        if command.stop_seq != self.last.stop_seq {
+            self.stops += 1;
+            if self.stop_takes_hold {
+                self.setpoint = Some(self.q.clone());
+            }
+            if self.mode == ControlMode::Velocity {
+                self.setpoint = None;
+            }
+        }
+        if command.gripper_seq != self.last.gripper_seq {
+            self.gripper = command.gripper;
+        }
+        self.last = *command;
+        if let Some(mode) = command.mode.filter(|_| self.enabled && self.link == Link::Up) {
+            if mode != self.mode {
+                self.switching += 1;
+                if self.switching > self.mode_delay {
+                    (self.mode, self.switching) = (mode, 0);
+                }
+            }
+            if mode == self.mode {
+                self.setpoint = Some(command.values[..self.dof].to_vec());
+            }
+        }
+        for j in 0..self.dof {
+            let told = self.setpoint.as_ref().map(|s| s[j]);
+            let share = if self.lag > 0.0 { 1.0 - (-dt / self.lag).exp() } else { 1.0 };
+            let next = match (self.mode, told) {
+                _ if self.blocked || !self.enabled => self.q[j],
+                (_, None) => self.q[j],
+                (ControlMode::Velocity, Some(v)) => {
+                    let v = self.v[j] + share * (v - self.v[j]);
+                    self.q[j] + v * dt
+                }
+                (_, Some(q)) => self.q[j] + share * (q - self.sag - self.q[j]),
+            };
+            self.v[j] = (next - self.q[j]) / dt;
+            self.q[j] = next;
+        }
+    }
+}
+
+pub struct Rig {
+    pub config: CoordinatorConfig,
+    pub coordinator: Coordinator,
+    pub arms: Vec<SimArm>,
+    pub now: Mono,
+    pub ticks: u64,
+    pub inbox: VecDeque<Envelope>,
+    /// Everything that was told, with the tick's number.
+    pub events: Vec<(u64, Event)>,
+    /// The commands of the last tick.
+    pub commands: Vec<ArmCommand>,
+    pub samples: Vec<ArmSample>,
+    pub tasks: Vec<TaskView>,
+    /// Ids of the motions that were given back.
+    pub retired: Vec<u64>,
+    /// Called with `true` before and `false` after the coordinator's tick.
+    pub around: fn(bool),
+    wire: Vec<Wire>,
+    next_id: u64,
+}
+
+/// What was last on an arm's wire.
+#[derive(Debug, Clone)]
+struct Wire {
+    mode: Option<ControlMode>,
+    values: Vec<f64>,
+    velocity: Vec<f64>,
+    /// How far out it may be: the range, or where it was seeded.
+    lowest: Vec<f64>,
+    highest: Vec<f64>,
+}
+
+pub fn arm(name: &str, dof: usize) -> ArmConfig {
+    let mut limits = JointLimits::uniform(dof, RANGE, V_MAX).with_defaults();
+    limits.acceleration_max = vec![A_MAX; dof];
+    ArmConfig {
+        name: name.to_owned(),
+        dof,
+        limits,
+        modes: vec![ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity],
+        gripper: true,
+        state_timeout: Duration::from_millis(30),
+    }
+}
+
+pub fn task(name: &str, kind: TaskKind, joints: impl IntoIterator<Item = u16>, priority: i32) -> TaskConfig {
+    TaskConfig { name: name.to_owned(), kind, joints: joints.into_iter().collect(), priority, auto_start: false }
+}
+
+pub fn trajectory() -> TaskKind {
+    TaskKind::Trajectory(TrajectoryParams::default())
+}
+
+pub fn servo() -> TaskKind {
+    TaskKind::Servo(ServoParams::default())
+}
+
+pub fn velocity() -> TaskKind {
+    TaskKind::Velocity(VelocityParams::default())
+}
+
+/// A motion through the given points `(time, positions)`, at rest at both ends.
+pub fn motion(id: u64, joints: &[u16], points: &[(f64, &[f64])]) -> Box<Motion> {
+    let points = points.iter().map(|(t, p)| TrajectoryPoint {
+        time_from_start: *t,
+        positions: p.to_vec(),
+        velocities: vec![],
+        accelerations: vec![],
+    });
+    let names = joints.iter().map(|j| format!("j{j}")).collect();
+    let given = JointTrajectory { joint_names: names, points: points.collect() };
+    Box::new(Motion { id, joints: joints.to_vec(), spline: Spline::new(&given).unwrap() })
+}
+
+/// All of an arm's joints from one place to another.
+pub fn sweep(id: u64, joints: std::ops::Range<u16>, from: f64, to: f64, seconds: f64) -> Box<Motion> {
+    let joints: Vec<u16> = joints.collect();
+    let n = joints.len();
+    motion(id, &joints, &[(0.0, &vec![from; n]), (seconds, &vec![to; n])])
+}
+
+impl Rig {
+    pub fn new(rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
+        let config = CoordinatorConfig { rate, arms, tasks };
+        let wire = |a: &ArmConfig| Wire {
+            mode: None,
+            values: vec![0.0; a.dof],
+            velocity: vec![0.0; a.dof],
+            lowest: vec![-SOFT; a.dof],
+            highest: vec![SOFT; a.dof],
+        };
+        Self {
+            coordinator: Coordinator::new(&config),
+            arms: config.arms.iter().map(|a| SimArm::new(a.dof)).collect(),
+            now: Mono(1_000_000_000),
+            ticks: 0,
+            inbox: VecDeque::new(),
+            events: Vec::new(),
+            commands: vec![ArmCommand::default(); config.arms.len()],
+            samples: Vec::new(),
+            tasks: Vec::new(),
+            retired: Vec::new(),
+            around: |_| {},
+            wire: config.arms.iter().map(wire).collect(),
+            next_id: 1,
+            config,
+        }
+    }
+
+    /// One 6-joint arm and these tasks at 100 Hz, ready.
+    pub fn one_arm(tasks: Vec<TaskConfig>) -> Self {
+        let mut rig = Self::new(100.0, vec![arm("arm", 6)], tasks);
+        rig.make_ready();
+        rig
+    }
+
+    /// A 7-joint and a 6-joint arm and these tasks at 100 Hz, ready.
+    pub fn two_arms(tasks: Vec<TaskConfig>) -> Self {
+        let mut rig = Self::new(100.0, vec![arm("left", 7), arm("right", 6)], tasks);
+        rig.make_ready();
+        rig
+    }
+
+    pub fn dt(&self) -> f64 {
+        1.0 / self.config.rate
+    }
+
+    pub fn send(&mut self, request: Request) -> u64 {
+        let id = self.next_id;
+        self.next_id += 1;
+        self.inbox.push_back(Envelope { id, request });
+        id
+    }
+
+    /// Sends a request, makes one tick, and answers what came of it.
+    pub fn ask(&mut self, request: Request) -> Outcome {
+        let id = self.send(request);
+        self.tick();
+        self.outcome(id)
+    }
+
+    pub fn outcome(&self, id: u64) -> Outcome {
+        let of = |(_, e): &(u64, Event)| match e {
+            Event::Request(i, outcome) if *i == id => Some(*outcome),
+            _ => None,
+        };
+        self.events.iter().rev().find_map(of).expect("every request is answered")
+    }
+
+    pub fn execute(&mut self, task: u16, motion: Box<Motion>) -> Outcome {
+        self.ask(Request::Execute { task, motion })
+    }
+
+    pub fn servo(&mut self, task: u16, target: &[f64]) -> u64 {
+        self.send(Request::Servo { task, target: joints_of(target) })
+    }
+
+    pub fn velocity(&mut self, task: u16, target: &[f64]) -> u64 {
+        self.send(Request::Velocity { task, target: joints_of(target) })
+    }
+
+    /// Enables all arms and waits until they are ready.
+    pub fn make_ready(&mut self) {
+        self.run(2);
+        for i in 0..self.arms.len() {
+            assert_eq!(self.ask(Request::Ready { arm: i as u16 }), Outcome::Accepted);
+        }
+        self.run_for(0.3);
+        assert!((0..self.arms.len()).all(|i| self.phase(i) == Phase::Ready));
+        self.events.clear();
+    }
+
+    pub fn phase(&self, arm: usize) -> Phase {
+        self.samples[arm].phase
+    }
+
+    pub fn tick(&mut self) {
+        self.tick_after(0);
+    }
+
+    /// A tick after so many skipped periods.
+    pub fn tick_after(&mut self, skipped: u32) {
+        let period = self.config.period();
+        self.now = self.now.after(period * (skipped + 1));
+        let states: Vec<ArmState> = self.arms.iter_mut().map(|a| a.observe(self.now)).collect();
+        self.tick_with(&states, skipped);
+        let dt = self.dt();
+        for (arm, command) in self.arms.iter_mut().zip(&self.commands) {
+            arm.obey(command, dt);
+        }
+    }
+
+    /// A tick that reads these states; no arm obeys its commands.
+    pub fn tick_with(&mut self, states: &[ArmState], skipped: u32) {
+        let late_ns = skipped as u64 * self.config.period().as_nanos() as u64;
+        let time = TickTime { now: self.now, next: self.now.after(self.config.period()), skipped, late_ns };
+        let inbox = &mut self.inbox;
+        (self.around)(true);
+        let output = self.coordinator.tick(time, states, || inbox.pop_front());
+        (self.around)(false);
+        assert_eq!(output.events_lost, 0);
+        self.ticks += 1;
+        self.events.extend(output.events.iter().map(|e| (self.ticks, *e)));
+        self.commands.clone_from(&output.commands);
+        self.samples.clone_from(&output.arms);
+        self.tasks.clone_from(&output.tasks);
+        self.retired.extend(output.retired.drain(..).map(|m| m.id));
+        self.check_wire();
+    }
+
+    pub fn run(&mut self, ticks: u64) {
+        (0..ticks).for_each(|_| self.tick());
+    }
+
+    pub fn run_for(&mut self, seconds: f64) {
+        self.run((seconds * self.config.rate).round() as u64);
+    }
+
+    /// Runs until `done`, for so many seconds at most. Answers the time it took [s].
+    pub fn run_until(&mut self, limit: f64, mut done: impl FnMut(&Self) -> bool) -> f64 {
+        for k in 0..=(limit * self.config.rate) as u64 {
+            if done(self) {
+                return k as f64 * self.dt();
+            }
+            self.tick();
+        }
+        panic!("not within {limit} s; tasks: {:?}; events: {:?}", self.tasks, self.events);
+    }
+
+    pub fn count(&self, wanted: impl Fn(&Event) -> bool) -> usize {
+        self.events.iter().filter(|(_, e)| wanted(e)).count()
+    }
+
+    pub fn told(&self, event: Event) -> bool {
+        self.events.iter().any(|(_, e)| *e == event)
+    }
+
+    /// The position commands of an arm in the last tick.
+    pub fn commanded(&self, arm: usize) -> Vec<f64> {
+        self.commands[arm].values[..self.arms[arm].dof].to_vec()
+    }
+
+    /// The largest speed that an arm's commands of the last tick stand for [rad/s].
+    pub fn speed(&self, arm: usize) -> f64 {
+        self.wire[arm].velocity.iter().fold(0.0, |s: f64, v| s.max(v.abs()))
+    }
+
+    /// What no command may ever do.
+    fn check_wire(&mut self) {
+        let dt = self.dt();
+        for (i, (wire, command)) in self.wire.iter_mut().zip(&self.commands).enumerate() {
+            let (sample, arm, limits) = (&self.samples[i], &self.arms[i], &self.config.arms[i].limits);
+            let was = wire.clone();
+            let at = |what: &str| format!("tick {}: arm {i}: {what}: {command:?} after {was:?}", self.ticks);
+            assert!(command.values.iter().all(|v| v.is_finite()) && command.gripper.is_finite(), "{}", at("F07"));
+            let values = command.values[..arm.dof].to_vec();
+            let resting = wire.velocity.iter().all(|v| v.abs() < 1e-9);
+            let Some(mode) = command.mode else {
+                let reachable = arm.link == Link::Up && arm.enabled;
+                assert!(wire.mode.is_none() || resting || !reachable, "{}", at("let go while it moves"));
+                wire.mode = None;
+                wire.velocity.fill(0.0);
+                continue;
+            };
+            let may_move = matches!(sample.phase, Phase::Activating | Phase::Ready | Phase::Held | Phase::Standby);
+            assert!(may_move && arm.enabled, "{}", at("commanded without power"));
+            let switched = wire.mode != Some(mode);
+            if switched {
+                let still = arm.state.velocity[..arm.dof].iter().all(|v| v.abs() <= 0.05);
+                assert!(resting, "{}", at("F11: mode switched while commands move"));
+                assert!(wire.mode.is_none() || still || !arm.reports_velocity, "{}", at("F11: switched in motion"));
+                wire.velocity.fill(0.0);
+                for j in 0..arm.dof {
+                    let q = arm.state.position[j];
+                    (wire.lowest[j], wire.highest[j]) = (q.min(-SOFT), q.max(SOFT));
+                }
+            }
+            for j in 0..arm.dof {
+                let velocity = match (mode == ControlMode::Velocity, switched) {
+                    (true, _) => values[j],
+                    (false, false) => (values[j] - wire.values[j]) / dt,
+                    (false, true) => {
+                        let from_here = (values[j] - arm.state.position[j]).abs();
+                        let stands = wire.mode.is_none() && (values[j] - wire.values[j]).abs() < 1e-12;
+                        assert!(from_here <= 0.005 || stands, "{}", at("F12: first step"));
+                        0.0
+                    }
+                };
+                let change = velocity - wire.velocity[j];
+                assert!(velocity.abs() <= limits.velocity_max[j] * (1.0 + 1e-9) + 1e-12, "{}", at("F08 velocity"));
+                let most = limits.acceleration_max[j] * dt * (1.0 + 1e-6) + 1e-8;
+                assert!(change.abs() <= most, "{} joint {j} by {}", at("F08 acceleration"), change / dt);
+                wire.velocity[j] = velocity;
+                if mode != ControlMode::Velocity {
+                    let inside = (wire.lowest[j] - 1e-9..=wire.highest[j] + 1e-9).contains(&values[j]);
+                    assert!(inside, "{} joint {j}", at("F09"));
+                }
+            }
+            wire.mode = Some(mode);
+            wire.values = values;
+        }
+    }
+}

@@ -1,0 +1,191 @@
+//! Runs without threads or time: ideal arms, the coordinator on a clock that is set forward, and the real recorder.
+//! Ten minutes take seconds.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+use std::sync::mpsc::{Sender, channel};
+use std::time::Duration;
+
+use dimos::arm::{ArmState, Link, VelocitySource};
+use dimos::clock::{Mono, WallOffset};
+use dimos::control::config::{ArmConfig, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::coordinator::{Coordinator, TickTime};
+use dimos::control::request::{Envelope, Motion, Request};
+use dimos::joint::{ControlMode, JointLimits, make_joints};
+use dimos::recording::log_writer::LogAttachment;
+use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
+use dimos::runtime::log_of;
+use dimos::telemetry::describe::{ArmNames, Names};
+use dimos::telemetry::{Sample, TaskView, TickSample};
+use dimos::trajectory::{JointTrajectory, Spline};
+use serde_json::json;
+
+/// Ticks are this long.
+pub const PERIOD: Duration = Duration::from_millis(10);
+/// The first tick's deadline, in monotonic and in Unix time.
+const START: (Mono, u64) = (Mono(1_000_000_000), 1_795_270_590_000_000_000);
+
+/// One arm `arm` with a trajectory task `traj_arm`.
+pub fn one_arm(dof: usize) -> CoordinatorConfig {
+    let arm = ArmConfig {
+        name: "arm".into(),
+        dof,
+        limits: JointLimits::uniform(dof, 3.0, 2.0).with_defaults(),
+        modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
+        gripper: true,
+        state_timeout: Duration::from_millis(50),
+    };
+    let task = TaskConfig {
+        name: "traj_arm".into(),
+        kind: TaskKind::Trajectory(TrajectoryParams::default()),
+        joints: (0..dof as u16).collect(),
+        priority: 10,
+        auto_start: false,
+    };
+    CoordinatorConfig { rate: 100.0, arms: vec![arm], tasks: vec![task] }
+}
+
+/// A run on a clock that is set forward.
+pub struct VirtualRun {
+    pub coordinator: Coordinator,
+    /// What the next tick reads. An arm that is enabled does what it is told, one period later.
+    pub states: Vec<ArmState>,
+    /// What the tasks showed after the last tick.
+    pub tasks: Vec<TaskView>,
+    /// The next tick.
+    pub tick: u64,
+    /// Samples that the recorder will be told to have been lost with the next tick.
+    pub dropped: u32,
+    config: CoordinatorConfig,
+    names: Names,
+    now: Mono,
+    ring: rtrb::Producer<Sample>,
+    notes: Sender<Note>,
+    inbox: VecDeque<Envelope>,
+    next_id: u64,
+    recorder: Recorder,
+}
+
+impl VirtualRun {
+    /// Begins a run and its log.
+    pub fn start(config: &CoordinatorConfig, log: &Path) -> Self {
+        let arm = |a: &ArmConfig| ArmNames { hardware_id: a.name.clone(), joints: make_joints(&a.name, a.dof) };
+        let names = Names {
+            arms: config.arms.iter().map(arm).collect(),
+            tasks: config.tasks.iter().map(|t| t.name.clone()).collect(),
+        };
+        let attachment = LogAttachment {
+            name: "coordinator.json".into(),
+            media_type: "application/json".into(),
+            data: serde_json::to_vec(config).unwrap(),
+        };
+        let record = RecorderConfig {
+            path: Some(log.to_owned()),
+            run: "virtual".into(),
+            names: names.clone(),
+            frame_id: "coordinator".into(),
+            attachments: vec![attachment],
+            metadata: BTreeMap::new(),
+            wall: WallOffset::of(START.0, START.1),
+        };
+        let (ring, samples) = rtrb::RingBuffer::new(64 * 1024);
+        let (notes, noted) = channel();
+        let recorder = Recorder::start(record, samples, noted, |_| {}).unwrap();
+        let state = |arm: &ArmConfig| ArmState {
+            dof: arm.dof,
+            velocity_source: VelocitySource::Measured,
+            mode: ControlMode::ServoPosition,
+            enabled: true,
+            link: Link::Up,
+            ..ArmState::default()
+        };
+        Self {
+            coordinator: Coordinator::new(config),
+            states: config.arms.iter().map(state).collect(),
+            tasks: vec![TaskView::default(); config.tasks.len()],
+            tick: 0,
+            dropped: 0,
+            config: config.clone(),
+            names,
+            now: START.0,
+            ring,
+            notes,
+            inbox: VecDeque::new(),
+            next_id: 1,
+            recorder,
+        }
+    }
+
+    /// Asks something of the next tick.
+    pub fn ask(&mut self, request: Request) {
+        let told = log_of(&request);
+        self.told(request, told);
+    }
+
+    /// Asks for a trajectory.
+    pub fn execute(&mut self, task: u16, trajectory: &JointTrajectory) {
+        let all: Vec<&String> = self.names.arms.iter().flat_map(|a| &a.joints).collect();
+        let index = |name| all.iter().position(|j| *j == name).unwrap() as u16;
+        let joints = trajectory.joint_names.iter().map(index).collect();
+        let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap() };
+        let told = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
+        self.told(Request::Execute { task, motion: Box::new(motion) }, told);
+    }
+
+    fn told(&mut self, request: Request, told: serde_json::Value) {
+        let (id, stamp) = (self.next_id, self.now);
+        self.next_id += 1;
+        self.notes.send(Note::Request { id, stamp, json: told.to_string() }).unwrap();
+        self.inbox.push_back(Envelope { id, request });
+    }
+
+    /// One tick.
+    pub fn step(&mut self) {
+        self.overrun(0);
+    }
+
+    /// One tick, after so many that were skipped.
+    pub fn overrun(&mut self, skipped: u32) {
+        self.now = self.now.after(PERIOD * skipped);
+        let next = self.now.after(PERIOD);
+        for state in &mut self.states {
+            state.seq += 1;
+            state.stamp = self.now.before(Duration::from_micros(1500));
+        }
+        let late_ns = 20_000 + u64::from(skipped) * PERIOD.as_nanos() as u64;
+        let time = TickTime { now: self.now, next, skipped, late_ns };
+        let output = self.coordinator.tick(time, &self.states, || self.inbox.pop_front());
+        let (tick, dropped) = (self.tick, std::mem::take(&mut self.dropped));
+        let (deadline, overrun_ns) = (self.now, late_ns);
+        let timing = TickSample { tick, deadline, next, late_ns, compute_ns: 5_000, skipped, overrun_ns, dropped };
+        let arms = output.arms.iter().map(|a| Sample::Arm(*a));
+        let events = output.events.iter().map(|e| Sample::Event(tick, *e));
+        for sample in arms.chain(events).chain([Sample::Tick(timing)]) {
+            while self.ring.is_full() {
+                std::thread::yield_now();
+            }
+            self.ring.push(sample).unwrap();
+        }
+        let period = PERIOD.as_secs_f64();
+        for ((state, command), arm) in self.states.iter_mut().zip(&output.commands).zip(&self.config.arms) {
+            let Some(mode) = command.mode.filter(|_| state.enabled) else { continue };
+            state.mode = mode;
+            for j in 0..arm.dof {
+                let before = state.position[j];
+                state.position[j] = match mode {
+                    ControlMode::Velocity => before + command.values[j] * period,
+                    _ => command.values[j],
+                };
+                state.velocity[j] = (state.position[j] - before) / period;
+            }
+        }
+        self.tasks.clone_from(&output.tasks);
+        self.now = next;
+        self.tick += 1;
+    }
+
+    /// Closes the log.
+    pub fn finish(self) {
+        self.recorder.finish().unwrap();
+    }
+}
