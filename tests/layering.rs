@@ -27,6 +27,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("view", &["robot", "collision", "rpc"]),
     ("blueprint", &["robot", "collision", "hardware"]),
     ("runtime", ALL),
+    ("replay", ALL),
     ("cli", ALL),
 ];
 /// Modules of which others may use one part only: `(user, used, part)`.
