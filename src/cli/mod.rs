@@ -5,16 +5,19 @@ pub mod arm;
 pub mod banner;
 pub mod cancel;
 pub mod check;
+pub mod daemon;
 pub mod down;
 pub mod execute;
 pub mod exit;
 mod follow;
 pub mod list_adapters;
 pub mod list_blueprints;
+pub mod logs;
 pub mod move_to;
 pub mod output;
 pub mod replay;
 pub mod run;
+pub mod run_record;
 pub mod schema;
 pub mod state;
 pub mod status;
@@ -66,6 +69,8 @@ enum Command {
     Arm(arm::Args),
     /// End a run, controlled: decelerate, release the arms, close the log
     Down(down::Args),
+    /// Show the text log of a run that was started with --daemon, live or dead
+    Logs(logs::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),
     /// List the blueprints that `run` finds by name
@@ -93,6 +98,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Stop(args) => stop::run(args),
         Command::Arm(args) => arm::run(args),
         Command::Down(args) => down::run(args),
+        Command::Logs(args) => logs::run(args),
         Command::ListAdapters(args) => list_adapters::run(args, &registry),
         Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
         Command::Check(args) => check::run(args, &registry),
