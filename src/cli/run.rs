@@ -17,7 +17,7 @@ use super::{banner, check, daemon};
 use crate::blueprint::Overrides;
 use crate::hardware::registry::Registry;
 use crate::rpc::report::StatusReport;
-use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
+use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager, StartError};
 
 /// Arguments of `run`.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
@@ -69,7 +69,7 @@ impl Args {
             None if self.no_record => Record::Off,
             None => Record::AsBlueprint,
         };
-        Options { name: self.name.clone(), record, ..Options::default() }
+        Options { name: self.name.clone(), record, service_manager: ServiceManager::from_env(), ..Options::default() }
     }
 }
 
@@ -116,6 +116,9 @@ fn bring_up(args: &Args, registry: &Registry) -> Result<(Run, Signals, Terminal)
     let terminal = terminal()?;
     let run = Run::start(blueprint, args.options()).map_err(|error| {
         terminal.flush();
+        if let Some(manager) = ServiceManager::from_env() {
+            manager.status(&error.to_string());
+        }
         let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
         Failure::new(exit, error.to_string()).hint(error.hint())
     })?;
@@ -150,7 +153,7 @@ fn keep_up(
     let in_terminal = record.as_ref().is_none_or(|record| record.text_log.is_none());
     let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
     banner::print(terminal, &report, run.socket().unwrap_or_else(|| Path::new("none")), how_to_end, json);
-    let ending = run.wait(duration);
+    let ending = run.wait_for_end(duration);
     if !json {
         terminal.note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
     }

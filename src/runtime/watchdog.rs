@@ -28,8 +28,13 @@ pub struct Watchdog {
 }
 
 impl Watchdog {
-    /// Starts the thread `watchdog`.
-    pub fn start(beat: Arc<Beat>, period: Duration, endings: Sender<Ending>) -> std::io::Result<Self> {
+    /// Starts the thread `watchdog`. `alive` is called at each look that finds a new beat, and must not wait.
+    pub fn start(
+        beat: Arc<Beat>,
+        period: Duration,
+        endings: Sender<Ending>,
+        mut alive: impl FnMut() + Send + 'static,
+    ) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let stopping = stop.clone();
         let thread = std::thread::Builder::new().name("watchdog".into()).stack_size(host::STACK).spawn(move || {
@@ -44,6 +49,9 @@ impl Watchdog {
                 // only time counts in which this thread could look.
                 let passed = now.since(looked).min(2 * LOOK_EVERY);
                 silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };
+                if beat != last {
+                    alive();
+                }
                 (last, looked) = (beat, now);
                 if beat.is_some() && silent_for > limit && !stopping.load(Ordering::Acquire) {
                     let what = format!("the tick has been silent for {} ms", silent_for.as_millis());
