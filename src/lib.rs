@@ -12,6 +12,19 @@
 //! ```
 //!
 //! A module may use only those above it in this list; `tests/layering.rs` checks that.
+//!
+//! As a library: [`runtime::Run`] builds a run from a blueprint, [`hardware::registry`] makes adapters,
+//! [`hardware::spec::ManipulatorAdapter`] is what a new arm implements, [`testing`] stands in for one in unit tests,
+//! [`cli::main_with`] is the whole program with more arms. `docs/library.md` shows each.
+//!
+//! ```
+//! use dimos::runtime::{Record, Run};
+//!
+//! let run = Run::from_name("coordinator-mock")?.name("doc-crate").record(Record::Off).start()?;
+//! println!("{} is up at {} Hz", run.name(), run.status().tick_rate);
+//! run.stop();
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 #![allow(rustdoc::broken_intra_doc_links, reason = "units stand in brackets: [rad]")]
 
@@ -43,3 +56,8 @@ pub mod replay;
 
 pub mod cli;
 pub mod testing;
+
+/// The examples of `docs/library.md`, as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../docs/library.md")]
+pub struct LibraryPage;

@@ -25,7 +25,8 @@ impl Home {
 
     fn command(&self, arguments: &str) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
-        command.args(arguments.split_whitespace()).env("XDG_RUNTIME_DIR", self.0.path()).current_dir(self.0.path());
+        command.args(arguments.split_whitespace()).env("XDG_RUNTIME_DIR", self.0.path());
+        command.env("XDG_STATE_HOME", self.0.path()).current_dir(self.0.path());
         command
     }
 

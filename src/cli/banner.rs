@@ -7,8 +7,12 @@ use serde::Serialize;
 use super::text_log::Terminal;
 use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
 
+/// The last line of a banner: how to end a run that has a terminal.
+pub const IN_A_TERMINAL: &str = "Ctrl-C ends it, controlled. In a second terminal: dimos status";
+
 /// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout.
-pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, json: bool) {
+/// `end` says how to end it.
+pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, end: &str, json: bool) {
     #[derive(Serialize)]
     struct Started<'a> {
         event: &'static str,
@@ -19,11 +23,11 @@ pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, j
     if json {
         return terminal.json(&Started { event: "started", socket, report });
     }
-    text(report, socket).iter().for_each(|line| terminal.note(line));
+    text(report, socket, end).iter().for_each(|line| terminal.note(line));
 }
 
 /// The banner's lines.
-pub fn text(report: &StatusReport, socket: &Path) -> Vec<String> {
+pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
     let simulated = if report.simulated { "  SIMULATED" } else { "" };
     let mut lines = vec![format!("run {}{simulated}  (pid {}, dimos {})", report.run, report.pid, report.version)];
     let mut row = |what: &str, text: String| lines.push(format!("  {what:<10} {text}"));
@@ -40,7 +44,7 @@ pub fn text(report: &StatusReport, socket: &Path) -> Vec<String> {
     }
     row("log", report.log.clone().unwrap_or_else(|| "none is written".into()));
     row("socket", socket.display().to_string());
-    lines.push("Ctrl-C ends it, controlled. In a second terminal: dimos status".into());
+    lines.push(end.into());
     lines
 }
 
@@ -103,6 +107,6 @@ run coordinator-yourarm  SIMULATED  (pid 42, dimos 0.1.0)
   log        none is written
   socket     /run/dimos.sock
 Ctrl-C ends it, controlled. In a second terminal: dimos status";
-        assert_eq!(text(&report, Path::new("/run/dimos.sock")).join("\n"), expected);
+        assert_eq!(text(&report, Path::new("/run/dimos.sock"), IN_A_TERMINAL).join("\n"), expected);
     }
 }

@@ -4,9 +4,10 @@ use std::time::{Duration, Instant};
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
+use super::run_record::{Fate, RunRecord};
 use crate::rpc::api::Shutdown;
 use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::place::RunFolder;
+use crate::rpc::place::{LiveRun, RunFolder};
 
 /// How long a controlled end may take, and a little.
 const PATIENCE: Duration = Duration::from_secs(6);
@@ -23,19 +24,44 @@ pub struct Args {
     pub run: Option<String>,
 }
 
-/// Runs the verb: asks, and waits until the run is gone.
+/// Runs the verb: asks, waits until the run is gone, and says what became of it.
 pub fn run(args: &Args) -> Result {
     let folder = RunFolder::standard();
-    let found = client::find(&folder, args.name.as_deref().or(args.run.as_deref()))?;
+    let found = find(&folder, args.name.as_deref().or(args.run.as_deref()))?;
     Client::connect(&found.name, &found.socket)?.call(Shutdown {})?;
     let asked = Instant::now();
-    while folder.runs().map_err(ClientError::from)?.contains(&found) {
+    // The name is free before the process has written its last words.
+    let noted = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
+    let lives = || noted().is_some_and(|record| record.fate() == Fate::Lives);
+    while folder.runs().map_err(ClientError::from)?.contains(&found) || lives() {
         if asked.elapsed() > PATIENCE {
             let what = format!("{} was asked to end, but pid {} still lives", found.name, found.pid);
-            return Err(Failure::new(Exit::Failed, what).hint("its own terminal or log says what it waits for"));
+            return Err(
+                Failure::new(Exit::Failed, what).hint("its own terminal or `dimos logs` says what it waits for")
+            );
         }
         std::thread::sleep(INTERVAL);
     }
-    output::note(format_args!("{} ended", found.name));
-    Ok(Exit::Ok)
+    match noted() {
+        Some(record) if record.fell() => {
+            let exit = if record.fate() == Fate::Crashed { Exit::Failed } else { Exit::Fault };
+            Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it fell")) })
+        }
+        Some(RunRecord { log: Some(log), .. }) => {
+            output::note(format_args!("{} ended; its log: {}", found.name, log.display()));
+            Ok(Exit::Ok)
+        }
+        _ => {
+            output::note(format_args!("{} ended", found.name));
+            Ok(Exit::Ok)
+        }
+    }
+}
+
+/// The run that is meant. One that is named, but dead: what became of it.
+fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun> {
+    client::find(folder, name).map_err(|error| {
+        let dead = name.and_then(RunRecord::of).and_then(|record| record.failure());
+        dead.unwrap_or_else(|| error.into())
+    })
 }

@@ -24,6 +24,12 @@ pub enum Exit {
 }
 
 impl Exit {
+    /// The exit code of a number; one that is not in the contract (a crash) counts as failed.
+    pub fn of(code: u8) -> Self {
+        let all = [Self::Ok, Self::Usage, Self::Hardware, Self::Fault, Self::Interrupted, Self::Terminated];
+        all.into_iter().find(|exit| *exit as u8 == code).unwrap_or(Self::Failed)
+    }
+
     /// The code of a run or a wait that a signal ended.
     pub fn by_signal(signal: i32) -> Self {
         if signal == libc::SIGTERM { Self::Terminated } else { Self::Interrupted }

@@ -6,6 +6,7 @@ pub mod banner;
 pub mod cancel;
 pub mod check;
 pub mod completions;
+pub mod daemon;
 pub mod doctor;
 pub mod down;
 pub mod execute;
@@ -13,11 +14,13 @@ pub mod exit;
 mod follow;
 pub mod list_adapters;
 pub mod list_blueprints;
+pub mod logs;
 pub mod man;
 pub mod move_to;
 pub mod output;
 pub mod replay;
 pub mod run;
+pub mod run_record;
 pub mod schema;
 pub mod state;
 pub mod status;
@@ -73,6 +76,8 @@ enum Command {
     Task(task::Args),
     /// End a run, controlled: decelerate, release the arms, close the log
     Down(down::Args),
+    /// Show the text log of a run that was started with --daemon, live or dead
+    Logs(logs::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),
     /// List the blueprints that `run` finds by name
@@ -107,6 +112,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Arm(args) => arm::run(args),
         Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),
+        Command::Logs(args) => logs::run(args),
         Command::ListAdapters(args) => list_adapters::run(args, &registry),
         Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
         Command::Check(args) => check::run(args, &registry),

@@ -1,6 +1,7 @@
 //! `dimos run NAME|PATH`: starts a run and keeps it up until a signal, its time, `dimos down` or a fault ends it.
+//! With `--daemon` a process of its own does that ([`daemon`]).
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::Serialize;
@@ -8,13 +9,15 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
 use super::arguments::{duration, setting};
+use super::daemon::Starter;
 use super::exit::{Exit, Failure, Result};
+use super::run_record::RunRecord;
 use super::text_log::Terminal;
-use super::{banner, check};
+use super::{banner, check, daemon};
 use crate::blueprint::Overrides;
 use crate::hardware::registry::Registry;
 use crate::rpc::report::StatusReport;
-use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
+use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager, StartError};
 
 /// Arguments of `run`.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
@@ -40,6 +43,12 @@ pub struct Args {
     /// Name of the run; without it the blueprint's name
     #[arg(long, value_name = "RUN")]
     pub name: Option<String>,
+    /// Start the run in the background, without this terminal; return when the arms are up
+    #[arg(short, long)]
+    pub daemon: bool,
+    /// What the process in the background is started with
+    #[arg(long, value_name = "FILE", hide = true)]
+    pub text_log: Option<PathBuf>,
     /// Only check the blueprint; connect to nothing
     #[arg(long)]
     pub check: bool,
@@ -60,7 +69,7 @@ impl Args {
             None if self.no_record => Record::Off,
             None => Record::AsBlueprint,
         };
-        Options { name: self.name.clone(), record, ..Options::default() }
+        Options { name: self.name.clone(), record, service_manager: ServiceManager::from_env(), ..Options::default() }
     }
 }
 
@@ -69,6 +78,36 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     if args.check {
         return check::report(&args.blueprint, &args.overrides(), registry, args.json);
     }
+    match &args.text_log {
+        None if args.daemon => daemon::start(args, registry),
+        None => {
+            let (run, signals, terminal) = bring_up(args, registry)?;
+            let record = RunRecord::begin(&run.status(), None);
+            keep_up(run, signals, &terminal, args.duration, args.json, Some(record))
+        }
+        Some(text_log) => in_background(args, registry, text_log),
+    }
+}
+
+/// What a run in the background does: it tells whoever started it that it is up, or why not.
+fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
+    let starter = Starter::detach(text_log)?;
+    let (run, signals, terminal) = match bring_up(args, registry) {
+        Ok(up) => up,
+        Err(failure) => {
+            starter.failed(&failure);
+            return Err(failure);
+        }
+    };
+    let record = RunRecord::begin(&run.status(), Some(text_log));
+    if !starter.up(&run.status(), run.socket()) {
+        terminal.note("whoever started this run has gone before it was up");
+        let _ = run.endings().send(Ending::Asked);
+    }
+    keep_up(run, signals, &terminal, args.duration, false, Some(record))
+}
+
+fn bring_up(args: &Args, registry: &Registry) -> Result<(Run, Signals, Terminal)> {
     let loaded = check::load(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
@@ -77,16 +116,19 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     let terminal = terminal()?;
     let run = Run::start(blueprint, args.options()).map_err(|error| {
         terminal.flush();
+        if let Some(manager) = ServiceManager::from_env() {
+            manager.status(&error.to_string());
+        }
         let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
         Failure::new(exit, error.to_string()).hint(error.hint())
     })?;
-    keep_up(run, signals, &terminal, args.duration, args.json)
+    Ok((run, signals, terminal))
 }
 
 /// Keeps a run up until a signal, its time, `dimos down` or a fault ends it, and stops it: what `dimos run` does with
 /// a run that has started. Tells about it on the terminal.
 pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result {
-    keep_up(run, signals()?, &terminal()?, duration, json)
+    keep_up(run, signals()?, &terminal()?, duration, json, None)
 }
 
 fn signals() -> Result<Signals> {
@@ -98,22 +140,35 @@ fn terminal() -> Result<Terminal> {
     Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the terminal: {e}")))
 }
 
-fn keep_up(run: Run, signals: Signals, terminal: &Terminal, duration: Option<Duration>, json: bool) -> Result {
+fn keep_up(
+    run: Run,
+    signals: Signals,
+    terminal: &Terminal,
+    duration: Option<Duration>,
+    json: bool,
+    record: Option<RunRecord>,
+) -> Result {
     watch(signals, &run)?;
     let report = run.status();
-    banner::print(terminal, &report, run.socket().unwrap_or_else(|| std::path::Path::new("none")), json);
-    let ending = run.wait(duration);
+    let in_terminal = record.as_ref().is_none_or(|record| record.text_log.is_none());
+    let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
+    banner::print(terminal, &report, run.socket().unwrap_or_else(|| Path::new("none")), how_to_end, json);
+    let ending = run.wait_for_end(duration);
     if !json {
         terminal.note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
     }
     let ended = run.stop();
     say_goodbye(terminal, &report, &ending, &ended, json);
-    terminal.flush();
-    Ok(match ending {
+    let exit = match &ending {
         Ending::Fault(_) => Exit::Fault,
-        Ending::Signal(signal) => Exit::by_signal(signal),
+        Ending::Signal(signal) => Exit::by_signal(*signal),
         Ending::Duration | Ending::Asked => Exit::Ok,
-    })
+    };
+    if let Some(record) = record {
+        record.end(exit, why(&ending));
+    }
+    terminal.flush();
+    Ok(exit)
 }
 
 /// Hands signals to the run for as long as the process lives: a second one is taken note of and changes nothing.

@@ -6,6 +6,7 @@ use super::arguments::Target;
 use super::banner::at_exit;
 use super::exit::{Exit, Result};
 use super::output::{self, Table, Tone, number, span, toned};
+use super::run_record::{Fate, RunRecord};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::LiveRun;
@@ -25,33 +26,68 @@ pub struct Args {
 enum Found {
     Answered(Box<StatusReport>),
     Silent { run: String, pid: u32, error: String },
+    Fallen(Fallen),
+}
+
+/// A run that crashed or that a fault ended, and that nobody has started again since.
+#[derive(Serialize)]
+struct Fallen {
+    /// What it was, and how it ended.
+    #[serde(flatten)]
+    record: RunRecord,
+    /// Whether it left no word of its end.
+    crashed: bool,
+    /// The last lines of its text log.
+    last_words: Vec<String>,
 }
 
 /// Runs the verb: the run named, or the only one, in full; several as a list. `--json` without `--run` is a list always.
 pub fn run(args: &Args) -> Result {
-    let mut runs = args.target_run.named_or_all()?;
-    let only = (runs.len() == 1).then(|| runs.pop()).flatten();
-    match only {
-        Some(run) if args.target_run.run.is_some() || !args.target_run.json => {
-            let report = ask(&run)?;
-            if args.target_run.json { output::json(&report) } else { print(&report) }
+    let mut runs = args.target_run.named_or_all().map_err(|failure| {
+        let dead = args.target_run.run.as_deref().and_then(RunRecord::of).and_then(|record| record.failure());
+        dead.unwrap_or(failure)
+    })?;
+    if args.target_run.run.is_some() || (runs.len() == 1 && !args.target_run.json) {
+        let Some(run) = runs.pop() else { return Ok(Exit::Ok) };
+        let report = ask(&run)?;
+        if args.target_run.json {
+            output::json(&report);
+            return Ok(Exit::Ok);
         }
-        only => overview(only.into_iter().chain(runs), args.target_run.json),
+        print(&report);
+        if args.target_run.run.is_none() {
+            fallen(&[run]).iter().for_each(print_fallen);
+        }
+    } else {
+        overview(runs, args.target_run.json);
     }
     Ok(Exit::Ok)
+}
+
+/// The runs that fell since they were started last.
+fn fallen(live: &[LiveRun]) -> Vec<Fallen> {
+    let dead = RunRecord::all().into_iter().filter(|r| !live.iter().any(|l| l.name == r.run) && r.fell());
+    dead.map(|record| Fallen { crashed: record.fate() == Fate::Crashed, last_words: record.last_words(), record })
+        .collect()
+}
+
+fn print_fallen(fallen: &Fallen) {
+    output::line("");
+    output::line(fallen.record.obituary().unwrap_or_default());
+    fallen.last_words.iter().for_each(|words| output::line(format_args!("  {words}")));
 }
 
 fn ask(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
     Client::connect(&run.name, &run.socket)?.call(Status {})
 }
 
-fn overview(runs: impl Iterator<Item = LiveRun>, json: bool) {
-    let found: Vec<Found> = runs
-        .map(|run| match ask(&run) {
-            Ok(report) => Found::Answered(Box::new(report)),
-            Err(error) => Found::Silent { run: run.name, pid: run.pid, error: error.to_string() },
-        })
-        .collect();
+fn overview(runs: Vec<LiveRun>, json: bool) {
+    let fallen = fallen(&runs);
+    let answers = runs.into_iter().map(|run| match ask(&run) {
+        Ok(report) => Found::Answered(Box::new(report)),
+        Err(error) => Found::Silent { run: run.name, pid: run.pid, error: error.to_string() },
+    });
+    let found: Vec<Found> = answers.chain(fallen.into_iter().map(Found::Fallen)).collect();
     if json {
         return output::json(&found);
     }
@@ -72,9 +108,20 @@ fn overview(runs: impl Iterator<Item = LiveRun>, json: bool) {
                 let [pid, error] = [pid.to_string(), error.clone()];
                 table.row([run.as_str(), &pid, "-", "-", &error, "-"]);
             }
+            Found::Fallen(Fallen { record, crashed, .. }) => {
+                let how = toned(if *crashed { "CRASHED" } else { "FAULT" }, Tone::Bad);
+                let log = record.log.as_ref().map_or_else(|| "-".into(), |log| log.display().to_string());
+                let [run, pid, blueprint] = [record.run.clone(), record.pid.to_string(), record.blueprint.clone()];
+                table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how, log.into()]);
+            }
         }
     }
     table.print();
+    for found in &found {
+        if let Found::Fallen(fallen) = found {
+            print_fallen(fallen);
+        }
+    }
 }
 
 fn print(r: &StatusReport) {

@@ -167,20 +167,58 @@ impl Registry {
 }
 
 /// Names of the built-in adapters.
+///
+/// ```
+/// assert!(dimos::hardware::registry::available().contains(&"yourarm"));
+/// ```
 pub fn available() -> Vec<&'static str> {
     Registry::builtin().names()
 }
 
-/// Makes a built-in adapter by name; it is not connected yet.
-pub fn create(name: &str, address: &str, dof: usize) -> Result<Box<dyn ManipulatorAdapter>, AdapterError> {
-    let registry = Registry::builtin();
-    let row = registry.get(name).ok_or_else(|| {
-        AdapterError::Rejected(format!("no adapter named {name:?}; there are {}", registry.names().join(", ")))
-    })?;
-    (row.create)(&AdapterConfig {
-        hardware_id: name.to_owned(),
-        address: address.to_owned(),
-        dof,
-        options: serde_json::Value::Null,
+/// Makes a built-in adapter by name, the way a run does; it is not connected yet. The address is in the adapter's own
+/// form (`dimos list-adapters` shows it). An error names the adapters that there are, or what is wrong with the address.
+///
+/// ```
+/// use dimos::hardware::registry;
+///
+/// let adapter = registry::create("yourarm", "192.168.1.100", 6)?;
+/// assert_eq!(adapter.get_dof(), 6);
+/// assert!(!adapter.is_connected());
+/// assert!(registry::create("yuorarm", "192.168.1.100", 6).is_err());
+/// # Ok::<(), dimos::hardware::spec::AdapterError>(())
+/// ```
+pub fn create(name: &str, address: &str, dof: usize) -> AdapterResult<Box<dyn ManipulatorAdapter>> {
+    (builtin(name)?.create)(&plain(name, address, dof))
+}
+
+/// Starts the emulator of a built-in adapter, which then reaches it at [`Emulator::address`]. `Unsupported` where the
+/// adapter has none because it is its own plant.
+///
+/// ```
+/// use dimos::hardware::registry;
+///
+/// let emulator = registry::emulate("yourarm", 6)?;
+/// let mut adapter = registry::create("yourarm", &emulator.address(), 6)?;
+/// adapter.connect()?;
+/// assert!(adapter.is_connected());
+/// let mut positions = [0.0; 6]; // [rad]
+/// adapter.read_joint_positions(&mut positions)?;
+/// adapter.disconnect();
+/// # Ok::<(), dimos::hardware::spec::AdapterError>(())
+/// ```
+pub fn emulate(name: &str, dof: usize) -> AdapterResult<Box<dyn Emulator>> {
+    let start = builtin(name)?.emulate.ok_or(AdapterError::Unsupported)?;
+    start(&plain(name, SIM, dof))
+}
+
+fn builtin(name: &str) -> AdapterResult<&'static AdapterSpec> {
+    let table = crate::hardware::arms::TABLE;
+    table.iter().find(|row| row.name == name).ok_or_else(|| {
+        AdapterError::Rejected(format!("no adapter named {name:?}; there are {}", available().join(", ")))
     })
+}
+
+/// A configuration without options, for an arm named like its adapter.
+fn plain(name: &str, address: &str, dof: usize) -> AdapterConfig {
+    AdapterConfig { hardware_id: name.to_owned(), address: address.to_owned(), dof, options: serde_json::Value::Null }
 }

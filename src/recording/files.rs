@@ -8,6 +8,10 @@ use jiff::fmt::strtime;
 
 /// How the time in a log's file name is written: `20261121T141630Z`.
 const STAMP: &str = "%Y%m%dT%H%M%SZ";
+/// The ending of a log's name.
+const LOG: &str = "mcap";
+/// The ending of the name of a text log, which is kept beside it.
+const TEXT_LOG: &str = "log";
 /// Logs kept by default.
 pub const KEPT_LOGS: usize = 20;
 
@@ -20,35 +24,57 @@ pub fn log_folder() -> Option<PathBuf> {
 
 /// The file name of a log that begins at a Unix time [ns]: `<run>-20261121T141630Z.mcap`.
 pub fn log_file_name(run: &str, wall_ns: u64) -> String {
+    file_name(run, wall_ns, LOG)
+}
+
+fn file_name(run: &str, wall_ns: u64, ending: &str) -> String {
     let time = Timestamp::from_nanosecond(i128::from(wall_ns)).unwrap_or(Timestamp::UNIX_EPOCH);
-    format!("{run}-{}.mcap", time.strftime(STAMP))
+    format!("{run}-{}.{ending}", time.strftime(STAMP))
 }
 
 /// A path in `folder` for a log that begins at a Unix time [ns]. A second log of the same run within a second gets
 /// `-2` after its time, and so on.
 pub fn new_log_path(folder: &Path, run: &str, wall_ns: u64) -> PathBuf {
-    let name = log_file_name(run, wall_ns);
+    new_path(folder, run, wall_ns, LOG)
+}
+
+/// The same for a text log: `<run>-20261121T141630Z.log`.
+pub fn new_text_log_path(folder: &Path, run: &str, wall_ns: u64) -> PathBuf {
+    new_path(folder, run, wall_ns, TEXT_LOG)
+}
+
+fn new_path(folder: &Path, run: &str, wall_ns: u64, ending: &str) -> PathBuf {
+    let name = file_name(run, wall_ns, ending);
     let first = folder.join(&name);
-    let others = (2..).map(|n| folder.join(name.replace(".mcap", &format!("-{n}.mcap"))));
+    let others = (2..).map(|n| folder.join(name.replace(&format!(".{ending}"), &format!("-{n}.{ending}"))));
     std::iter::once(first.clone()).chain(others).find(|path| !path.exists()).unwrap_or(first)
 }
 
 /// The newest log in `folder`, by the time in its name.
 pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
-    Ok(logs(folder)?.pop())
+    Ok(logs(folder, LOG)?.pop())
 }
 
 /// Removes all but the newest `keep` logs from `folder`, and nothing that is not named like a log. A log that cannot
 /// be removed is left. Gives the paths it removed.
 pub fn retain(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
-    let mut old = logs(folder)?;
+    retain_newest(folder, LOG, keep)
+}
+
+/// The same for text logs.
+pub fn retain_text_logs(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
+    retain_newest(folder, TEXT_LOG, keep)
+}
+
+fn retain_newest(folder: &Path, ending: &str, keep: usize) -> io::Result<Vec<PathBuf>> {
+    let mut old = logs(folder, ending)?;
     old.truncate(old.len().saturating_sub(keep));
     old.retain(|path| std::fs::remove_file(path).is_ok());
     Ok(old)
 }
 
-/// All logs in `folder`, oldest first.
-fn logs(folder: &Path) -> io::Result<Vec<PathBuf>> {
+/// All logs in `folder` with that ending, oldest first.
+fn logs(folder: &Path, ending: &str) -> io::Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -57,7 +83,7 @@ fn logs(folder: &Path) -> io::Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     for entry in entries {
         let entry = entry?;
-        let key = entry.file_name().to_str().and_then(log_time);
+        let key = entry.file_name().to_str().and_then(|name| log_time(name, ending));
         if let Some(key) = key.filter(|_| entry.file_type().is_ok_and(|kind| kind.is_file())) {
             found.push((key, entry.path()));
         }
@@ -67,8 +93,8 @@ fn logs(folder: &Path) -> io::Result<Vec<PathBuf>> {
 }
 
 /// Time in the name of a log, and its number within that second; `None` if it is not named like a log.
-fn log_time(name: &str) -> Option<(jiff::civil::DateTime, u32)> {
-    let stem = name.strip_suffix(".mcap")?;
+fn log_time(name: &str, ending: &str) -> Option<(jiff::civil::DateTime, u32)> {
+    let stem = name.strip_suffix(ending)?.strip_suffix('.')?;
     let (run_and_time, last) = stem.rsplit_once('-')?;
     let (run, time, number) = match last.parse() {
         Ok(number) if last.len() < 8 => {
@@ -96,7 +122,7 @@ mod tests {
     #[test]
     fn a_log_is_named_after_its_run_and_utc_time() {
         assert_eq!(log_file_name("coordinator-yourarm", NOON), "coordinator-yourarm-20261121T141630Z.mcap");
-        assert!(log_time("coordinator-yourarm-20261121T141630Z.mcap").is_some());
+        assert!(log_time("coordinator-yourarm-20261121T141630Z.mcap", LOG).is_some());
     }
 
     #[test]

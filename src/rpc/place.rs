@@ -109,10 +109,7 @@ impl RunFolder {
 
     /// Takes a run's name, or says who has it. Removes what a dead run of that name left.
     pub fn claim(&self, run: &str) -> Result<Claim, PlaceError> {
-        let good = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'-' | b'_' | b'.');
-        if run.is_empty() || run.len() > MAX_NAME || run.starts_with('.') || !run.bytes().all(good) {
-            return Err(PlaceError::BadName(run.to_owned()));
-        }
+        check_name(run)?;
         let socket = self.0.join(format!("{run}.sock"));
         if socket.as_os_str().len() > MAX_SOCKET_PATH {
             return Err(PlaceError::PathTooLong(socket));
@@ -220,6 +217,15 @@ impl Drop for Claim {
         let _ = remove(&self.socket);
         let _ = remove(&self.lock_path);
     }
+}
+
+/// Whether a name may be that of a run: it is part of names of files.
+pub fn check_name(run: &str) -> Result<(), PlaceError> {
+    let good = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'-' | b'_' | b'.');
+    if run.is_empty() || run.len() > MAX_NAME || run.starts_with('.') || !run.bytes().all(good) {
+        return Err(PlaceError::BadName(run.to_owned()));
+    }
+    Ok(())
 }
 
 fn remove(path: &Path) -> Result<(), PlaceError> {

@@ -10,8 +10,9 @@ use std::time::{Duration, Instant};
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
 use super::service::{Service, ServiceParts};
+use super::service_manager::ServiceManager;
 use super::watchdog::Watchdog;
-use super::{Ending, Options, Record, Run, StartError};
+use super::{Ending, Handle, Options, Record, Run, StartError};
 use crate::arm::ArmState;
 use crate::blueprint::{Arm, Blueprint, TaskKind as Typed};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
@@ -26,6 +27,7 @@ use crate::joint::MAX_DOF;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
+use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
 use crate::rpc::streams::Streams;
 use crate::rt::host;
@@ -143,20 +145,22 @@ impl Run {
             .map_err(|e| fail(&mut arms, io("courier", e)))?;
         let tick = spawn_tick(&config, ports, options.probe.take(), endings.clone())
             .map_err(|e| fail(&mut arms, io("tick", e)))?;
-        let watchdog = Watchdog::start(pulse.beat.clone(), config.period(), endings.clone())
+        let manager = options.service_manager.take();
+        let alive = signs_of_life(manager.as_ref());
+        let watchdog = Watchdog::start(pulse.beat.clone(), config.period(), endings.clone(), alive)
             .map_err(|e| fail(&mut arms, io("watchdog", e)))?;
         let mut run = Self {
-            name,
             arms,
             pulse,
             tick: Some(tick),
             watchdog,
             dispatcher,
-            courier,
-            recorder,
+            courier: Some(courier),
+            recorder: Some(recorder),
             server: None,
-            service,
+            handle: Handle { service },
             endings: (endings, ended),
+            manager,
             _latency: latency,
         };
         if let Err(error) = run.enable(blueprint) {
@@ -164,7 +168,7 @@ impl Run {
             return Err(error);
         }
         if blueprint.rpc.enabled {
-            match Server::start(claim, run.service.clone()) {
+            match Server::start(claim, run.handle.service.clone()) {
                 Ok(server) => run.server = Some(server),
                 Err(e) => {
                     let what = format!("the socket cannot be opened: {e}");
@@ -173,7 +177,10 @@ impl Run {
                 }
             }
         } else {
-            run.service.keep(claim);
+            run.handle.service.keep(claim);
+        }
+        if let Some(manager) = &run.manager {
+            manager.ready(&in_short(&run.status()));
         }
         Ok(run)
     }
@@ -183,7 +190,7 @@ impl Run {
         self.arms.enable(blueprint, which())?;
         let limit = Instant::now() + READY_LIMIT;
         let mut ask = Instant::now();
-        let settled = |arm: usize, a: &Arm| match self.service.phase(arm) {
+        let settled = |arm: usize, a: &Arm| match self.handle.service.phase(arm) {
             Phase::Ready => true,
             phase => !a.auto_enable && phase != Phase::Unknown,
         };
@@ -207,6 +214,25 @@ impl Run {
         }
         Ok(())
     }
+}
+
+/// What the watchdog does at each look that finds the tick alive.
+fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
+    match manager.map(ServiceManager::signs_of_life) {
+        Some(Ok(alive)) => Box::new(alive),
+        Some(Err(e)) => {
+            tracing::warn!("the service manager's watchdog is not fed: {e}");
+            Box::new(|| {})
+        }
+        None => Box::new(|| {}),
+    }
+}
+
+/// A run in a line.
+fn in_short(report: &StatusReport) -> String {
+    let arms: Vec<String> = report.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
+    let simulated = if report.simulated { ", SIMULATED" } else { "" };
+    format!("{}: {}{simulated}", report.run, arms.join(", "))
 }
 
 fn wake() -> Result<Wake, StartError> {

@@ -8,13 +8,16 @@
 
 mod arms;
 mod build;
+mod builder;
 mod device_lock;
 mod dispatch;
+mod handle;
 mod in_process;
 mod motions;
 mod repeats;
 mod reports;
 mod service;
+mod service_manager;
 mod watchdog;
 
 use std::path::PathBuf;
@@ -24,22 +27,21 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+pub use builder::Builder;
 pub use device_lock::DeviceTaken;
 pub use dispatch::log_of;
+pub use handle::Handle;
+pub use service_manager::ServiceManager;
 
 use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
 use crate::recording::recorder::Recorder;
-use crate::rpc::RpcError;
-use crate::rpc::api::Method;
 use crate::rpc::place::RunFolder;
-use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
 use arms::Arms;
 use dispatch::{Courier, Dispatcher};
-use service::Service;
 use watchdog::Watchdog;
 
 /// How long moving arms get to come to rest.
@@ -73,11 +75,20 @@ pub struct Options {
     pub probe: Option<Probe>,
     /// Whether idle states of the processor are held off.
     pub hold_latency: bool,
+    /// Who is told when the run is up, beats and ends: systemd, for a run that is a service.
+    pub service_manager: Option<ServiceManager>,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { name: None, record: Record::AsBlueprint, folder: RunFolder::standard(), probe: None, hold_latency: true }
+        Self {
+            name: None,
+            record: Record::AsBlueprint,
+            folder: RunFolder::standard(),
+            probe: None,
+            hold_latency: true,
+            service_manager: None,
+        }
     }
 }
 
@@ -90,6 +101,14 @@ pub enum StartError {
         /// The arm.
         arm: String,
         /// What is wrong.
+        what: String,
+        /// What to do.
+        hint: String,
+    },
+    /// The blueprint has mistakes.
+    #[error("{what}")]
+    Blueprint {
+        /// All of them, each at its place, for people.
         what: String,
         /// What to do.
         hint: String,
@@ -108,7 +127,7 @@ impl StartError {
     /// What to do about it.
     pub fn hint(&self) -> &str {
         match self {
-            Self::Hardware { hint, .. } | Self::Other { hint, .. } => hint,
+            Self::Hardware { hint, .. } | Self::Blueprint { hint, .. } | Self::Other { hint, .. } => hint,
         }
     }
 
@@ -139,52 +158,63 @@ pub struct Ended {
     pub log: Option<PathBuf>,
 }
 
-/// A run that is up.
+/// A run that is up. Everything it can be asked is a method of its [`Handle`], and thereby of the run itself.
+///
+/// ```
+/// use dimos::runtime::{Record, Run};
+///
+/// let run = Run::from_name("coordinator-mock")?.name("doc-run").record(Record::Off).start()?;
+/// let motion = run.move_arm("arm", &[0.1, -0.2, 0.3, 0.0, 0.2, 0.0, 0.0], 1.0)?;
+/// assert_eq!(run.wait(motion.motion)?.state, "COMPLETED");
+/// let ended = run.stop();
+/// assert!(ended.troubles.is_empty());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Run {
-    name: String,
     arms: Arms,
     pulse: Arc<Pulse>,
     tick: Option<JoinHandle<()>>,
     watchdog: Watchdog,
     dispatcher: Arc<Dispatcher>,
-    courier: Courier,
-    recorder: Recorder,
+    courier: Option<Courier>,
+    recorder: Option<Recorder>,
     server: Option<Server>,
-    service: Arc<Service>,
+    handle: Handle,
     endings: (Sender<Ending>, Receiver<Ending>),
+    manager: Option<ServiceManager>,
     _latency: Option<LatencyHold>,
 }
 
-impl Run {
-    /// Its name.
-    pub fn name(&self) -> &str {
-        &self.name
-    }
+impl std::ops::Deref for Run {
+    type Target = Handle;
 
+    fn deref(&self) -> &Handle {
+        &self.handle
+    }
+}
+
+impl Drop for Run {
+    fn drop(&mut self) {
+        for trouble in self.stop_in_order().troubles {
+            tracing::warn!("{trouble}");
+        }
+    }
+}
+
+impl Run {
     /// Its socket, if it has one.
     pub fn socket(&self) -> Option<&std::path::Path> {
         self.server.as_ref().map(Server::socket)
     }
 
-    /// What it tells of itself.
-    pub fn status(&self) -> StatusReport {
-        self.service.status()
+    /// A way to talk to it, for other threads.
+    pub fn handle(&self) -> Handle {
+        self.handle.clone()
     }
 
     /// What its coordinator was made from: effective limits among others.
     pub fn config(&self) -> &CoordinatorConfig {
-        &self.service.parts.config
-    }
-
-    /// Asks it what others ask over rpc, and waits for the answer. Not for a thread that runs async code.
-    pub fn call<M: Method>(&self, request: &M) -> Result<M::Reply, RpcError> {
-        let answers = self.call_together(std::slice::from_ref(request));
-        answers.into_iter().next().unwrap_or_else(|| Err(in_process::defect("no answer")))
-    }
-
-    /// Asks it several things at once: they reach the tick together, but for a tick now and then.
-    pub fn call_together<M: Method>(&self, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
-        in_process::call(&self.service, requests)
+        &self.handle.service.parts.config
     }
 
     /// Lets other threads end it.
@@ -192,8 +222,9 @@ impl Run {
         self.endings.0.clone()
     }
 
-    /// Waits for its end, so long at most.
-    pub fn wait(&self, limit: Option<Duration>) -> Ending {
+    /// Waits until someone or something ends it ([`endings`](Self::endings), `dimos down`, a fault), so long at most.
+    /// It is still up then, until it is stopped.
+    pub fn wait_for_end(&self, limit: Option<Duration>) -> Ending {
         let received = match limit {
             Some(limit) => self.endings.1.recv_timeout(limit),
             None => self.endings.1.recv().map_err(|_| RecvTimeoutError::Disconnected),
@@ -201,22 +232,28 @@ impl Run {
         received.unwrap_or(Ending::Duration)
     }
 
-    /// Stops it, in order: nothing is skipped, whatever breaks on the way.
+    /// Stops it, in order: nothing is skipped, whatever breaks on the way. A run that is dropped is stopped as well.
     pub fn stop(mut self) -> Ended {
-        let mut ended = Ended { log: self.recorder.path().map(PathBuf::from), ..Ended::default() };
-        self.service.close();
+        self.stop_in_order()
+    }
+
+    fn stop_in_order(&mut self) -> Ended {
+        // What is left in the fields goes when the run is dropped, the arms before the server: who sees that the run is
+        // gone finds its log closed and its devices free.
+        let Some(recorder) = self.recorder.take() else { return Ended::default() };
+        let mut ended = Ended { log: recorder.path().map(PathBuf::from), ..Ended::default() };
+        if let Some(manager) = &self.manager {
+            manager.stopping();
+        }
+        self.handle.service.close();
         self.come_to_rest(&mut ended);
         self.watchdog.stand_down();
         self.end_tick(&mut ended);
         ended.troubles.extend(self.arms.release());
-        let Self { arms, server, courier, recorder, .. } = self;
-        drop(courier);
+        self.courier = None;
         if let Err(e) = recorder.finish() {
             ended.troubles.push(e.to_string());
         }
-        // Last of all: who sees that the run is gone finds its log closed and its devices free.
-        drop(arms);
-        drop(server);
         ended
     }
 
@@ -226,7 +263,7 @@ impl Run {
                 .pulse
                 .beat
                 .silence(self.arms.now())
-                .is_none_or(|s| s < watchdog::silence_limit(self.service.period()))
+                .is_none_or(|s| s < watchdog::silence_limit(self.handle.service.period()))
     }
 
     fn come_to_rest(&self, ended: &mut Ended) {
@@ -244,9 +281,9 @@ impl Run {
                 answer = None;
             }
             // That nothing is commanded to move is half of it: an arm that lags, or that was let go of, still moves.
-            if !self.pulse.at_rest.load(Ordering::Acquire) || !self.service.at_standstill() {
+            if !self.pulse.at_rest.load(Ordering::Acquire) || !self.handle.service.at_standstill() {
                 still_since = Instant::now();
-            } else if still_since.elapsed() >= STILL_FOR.max(2 * self.service.period()) {
+            } else if still_since.elapsed() >= STILL_FOR.max(2 * self.handle.service.period()) {
                 return;
             }
         }
@@ -259,7 +296,7 @@ impl Run {
         self.pulse.stop.store(true, Ordering::Release);
         let hangs = !self.tick_lives();
         let Some(tick) = self.tick.take() else { return };
-        let patience = if hangs { Duration::ZERO } else { TICK_END_LIMIT.max(2 * self.service.period()) };
+        let patience = if hangs { Duration::ZERO } else { TICK_END_LIMIT.max(2 * self.handle.service.period()) };
         let limit = Instant::now() + patience;
         while !tick.is_finished() && Instant::now() < limit {
             std::thread::sleep(Duration::from_millis(1));

@@ -107,6 +107,11 @@ impl Service {
         self.closed.store(true, Ordering::Release);
     }
 
+    /// Whether the run is ending.
+    pub fn is_closed(&self) -> bool {
+        self.closed.load(Ordering::Acquire)
+    }
+
     /// Length of a tick's period.
     pub fn period(&self) -> Duration {
         self.parts.config.period()

@@ -28,8 +28,13 @@ pub struct Watchdog {
 }
 
 impl Watchdog {
-    /// Starts the thread `watchdog`.
-    pub fn start(beat: Arc<Beat>, period: Duration, endings: Sender<Ending>) -> std::io::Result<Self> {
+    /// Starts the thread `watchdog`. `alive` is called at each look that finds a new beat, and must not wait.
+    pub fn start(
+        beat: Arc<Beat>,
+        period: Duration,
+        endings: Sender<Ending>,
+        mut alive: impl FnMut() + Send + 'static,
+    ) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let stopping = stop.clone();
         let thread = std::thread::Builder::new().name("watchdog".into()).stack_size(host::STACK).spawn(move || {
@@ -44,6 +49,9 @@ impl Watchdog {
                 // only time counts in which this thread could look.
                 let passed = now.since(looked).min(2 * LOOK_EVERY);
                 silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };
+                if beat != last {
+                    alive();
+                }
                 (last, looked) = (beat, now);
                 if beat.is_some() && silent_for > limit && !stopping.load(Ordering::Acquire) {
                     let what = format!("the tick has been silent for {} ms", silent_for.as_millis());
@@ -68,5 +76,26 @@ impl Drop for Watchdog {
             thread.thread().unpark();
             let _ = thread.join();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicUsize;
+    use std::sync::mpsc::channel;
+
+    use super::*;
+
+    #[test]
+    fn a_sign_of_life_is_given_for_a_beat_and_for_nothing_else() {
+        let (beat, signs, (endings, ended)) = (Arc::new(Beat::default()), Arc::new(AtomicUsize::new(0)), channel());
+        let given = signs.clone();
+        let alive = move || drop(given.fetch_add(1, Ordering::Relaxed));
+        let _watchdog = Watchdog::start(beat.clone(), Duration::from_millis(10), endings, alive).unwrap();
+        assert!(ended.recv_timeout(3 * LOOK_EVERY).is_err(), "before the first beat nothing is silent");
+        assert_eq!(signs.load(Ordering::Relaxed), 0);
+        beat.beat(MonotonicClock.now());
+        assert!(matches!(ended.recv().unwrap(), Ending::Fault(what) if what.contains("silent")));
+        assert_eq!(signs.load(Ordering::Relaxed), 1);
     }
 }

@@ -88,6 +88,7 @@ impl Home {
         let mut logs: Vec<_> = std::fs::read_dir(self.path().join("state/dimos"))
             .map(|all| all.map(|e| e.unwrap().path()).collect())
             .unwrap_or_default();
+        logs.retain(|path| path.extension().is_some_and(|e| e == "mcap"));
         logs.sort();
         logs
     }

@@ -147,13 +147,13 @@ impl Driver<'_> {
         self.refuse_broken_limits()?;
         for (arm, wanted) in self.blueprint.arms.iter().zip(wanted) {
             if *wanted || self.plan.approaches.iter().any(|a| a.arm == arm.hardware_id) {
-                self.run.call(&ArmEnable { arm: arm.hardware_id.clone() })?;
+                self.run.call(ArmEnable { arm: arm.hardware_id.clone() })?;
             }
         }
         for approach in &self.plan.approaches {
             let target = target(approach, &state);
             let go = Move { arm: approach.arm.clone(), target, speed: APPROACH_SPEED };
-            let begun = self.run.call(&go)?;
+            let begun = self.run.call(go)?;
             let (arm, duration) = (&approach.arm, begun.duration);
             self.show.say(format_args!("approach: {arm} goes to where the motion begins, {duration:.1} s, directly"));
             self.follow(&[begun.motion], "approach")?;
@@ -184,7 +184,7 @@ impl Driver<'_> {
     fn first_states(&self) -> std::result::Result<StateReport, End> {
         let limit = Instant::now() + FIRST_STATE;
         loop {
-            let state = self.run.call(&State {})?;
+            let state = self.run.call(State {})?;
             let unknown = state.arms.iter().find(|arm| arm.joints.iter().any(|j| j.position.is_none()));
             match unknown {
                 None => return Ok(state),
@@ -239,7 +239,7 @@ impl Driver<'_> {
             if let Some(signal) = self.signals.last() {
                 break Err(End::Signal(signal));
             }
-            match self.run.wait(Some(INTERVAL)) {
+            match self.run.wait_for_end(Some(INTERVAL)) {
                 Ending::Duration => {}
                 Ending::Fault(fault) => break Err(End::Failed(Failure::new(Exit::Fault, fault))),
                 _ => break Err(End::Failed(Failure::new(Exit::Failed, "the run was asked to end".to_owned()))),
@@ -256,13 +256,13 @@ impl Driver<'_> {
     }
 
     fn reports(&self, motions: &[u64]) -> std::result::Result<Vec<MotionReport>, End> {
-        motions.iter().map(|&motion| Ok(self.run.call(&api::Motion { motion })?)).collect()
+        motions.iter().map(|&motion| Ok(self.run.call(api::Motion { motion })?)).collect()
     }
 
     /// Ends motions and waits until they have. What cannot be ended here is ended by the stop of the run.
     fn cancel(&self, motions: &[u64]) -> std::result::Result<(), End> {
         let limit = Instant::now() + REST;
-        if self.run.call(&Cancel { task: None, arm: None }).is_ok() {
+        if self.run.call(Cancel { task: None, arm: None }).is_ok() {
             while Instant::now() < limit && !self.reports(motions)?.iter().all(|r| r.done) {
                 std::thread::sleep(INTERVAL);
             }

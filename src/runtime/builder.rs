@@ -1,0 +1,114 @@
+//! A run from a blueprint's name or text, for programs: what `dimos run` does with its arguments.
+
+use super::{Options, Record, Run, StartError};
+use crate::blueprint::{self, FindError, Found, Loaded, Overrides, Source};
+use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::rpc::place::RunFolder;
+
+/// A run that is not up yet. What is not said is as the blueprint says.
+///
+/// ```
+/// use dimos::runtime::{Record, Run};
+///
+/// let run = Run::from_name("coordinator-yourarm")?
+///     .sim() // its emulator, whatever address the blueprint gives
+///     .set("coordinator.tick_rate", "250")
+///     .name("doc-builder")
+///     .record(Record::Off)
+///     .start()?;
+/// assert_eq!(run.status().tick_rate, 250.0);
+/// run.stop();
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub struct Builder {
+    found: Found,
+    overrides: Overrides,
+    adapters: Registry,
+    options: Options,
+}
+
+impl Run {
+    /// A run of a blueprint that `dimos list-blueprints` shows, or of a file. Fails where there is none.
+    pub fn from_name(name_or_path: &str) -> Result<Builder, FindError> {
+        blueprint::find(name_or_path).map(Builder::of)
+    }
+
+    /// A run of a blueprint given as YAML text; `name` is the run's, unless the text gives another.
+    ///
+    /// ```
+    /// use dimos::runtime::{Record, Run};
+    ///
+    /// let blueprint = "
+    /// hardware:
+    ///   - {hardware_id: left, adapter_type: mock, joints: {prefix: left, count: 6}}
+    /// tasks:
+    ///   - {name: traj_left, type: trajectory, joint_names: {hardware: left}}
+    /// ";
+    /// let run = Run::from_yaml("doc-yaml", blueprint).record(Record::Off).start()?;
+    /// assert_eq!(run.state().arms[0].joints[0].name, "left_joint1");
+    /// # Ok::<(), dimos::runtime::StartError>(())
+    /// ```
+    pub fn from_yaml(name: &str, text: &str) -> Builder {
+        Builder::of(Found { name: name.to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() })
+    }
+}
+
+impl Builder {
+    fn of(found: Found) -> Self {
+        Self { found, overrides: Overrides::default(), adapters: Registry::builtin(), options: Options::default() }
+    }
+
+    /// Changes a field of the blueprint, like `--set`: `.set("hardware.arm.address", "192.168.1.100")`.
+    pub fn set(mut self, path: &str, value: impl std::fmt::Display) -> Self {
+        self.overrides.set.push(format!("{path}={value}"));
+        self
+    }
+
+    /// Lets emulators stand in for all arms, like `--sim`.
+    pub fn sim(mut self) -> Self {
+        self.overrides.sim = true;
+        self
+    }
+
+    /// Names the run; live runs have different names.
+    pub fn name(mut self, name: &str) -> Self {
+        self.options.name = Some(name.to_owned());
+        self
+    }
+
+    /// Says where it is logged.
+    pub fn record(mut self, record: Record) -> Self {
+        self.options.record = record;
+        self
+    }
+
+    /// Adapters besides those in the box, which win over those of the same name.
+    pub fn adapters(mut self, more: &[AdapterSpec]) -> Self {
+        self.adapters = Registry::with(more);
+        self
+    }
+
+    /// Where its socket and lock are; the command line looks in [`RunFolder::standard`] only.
+    pub fn folder(mut self, folder: RunFolder) -> Self {
+        self.options.folder = folder;
+        self
+    }
+
+    /// Reads and checks the blueprint; connects to nothing.
+    pub fn check(&self) -> Loaded {
+        blueprint::load(&self.found, &self.overrides, &self.adapters)
+    }
+
+    /// Starts the run; its arms are up then. When this fails nothing has moved, and all that was connected is
+    /// disconnected again.
+    pub fn start(self) -> Result<Run, StartError> {
+        let loaded = self.check();
+        match &loaded.blueprint {
+            Some(blueprint) => Run::start(blueprint, self.options),
+            None => {
+                let what = loaded.render(false).trim_end().to_owned();
+                Err(StartError::Blueprint { what, hint: "nothing was connected".to_owned() })
+            }
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! The service manager (systemd), where there is one: told when the run is up and when it ends, and kept content only
+//! while the tick beats.
+//!
+//! It is told by datagrams to the socket that `NOTIFY_SOCKET` names: `READY=1`, `WATCHDOG=1` and the like.
+
+use std::ffi::OsString;
+use std::io;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::time::{Duration, Instant};
+
+/// The way to the service manager. What cannot be delivered is dropped: nothing here waits or fails.
+#[derive(Debug)]
+pub struct ServiceManager {
+    socket: UnixDatagram,
+    address: SocketAddr,
+    watchdog: Option<Duration>,
+}
+
+impl ServiceManager {
+    /// The one that started this process, as `NOTIFY_SOCKET` says; `None` where there is none.
+    pub fn from_env() -> Option<Self> {
+        let variable = |name| std::env::var(name).ok().and_then(|value| value.parse::<u64>().ok());
+        let ours = variable("WATCHDOG_PID").is_none_or(|pid| pid == u64::from(std::process::id()));
+        let watchdog = variable("WATCHDOG_USEC").filter(|usec| ours && *usec > 0).map(Duration::from_micros);
+        Self::at(std::env::var_os("NOTIFY_SOCKET")?, watchdog).ok()
+    }
+
+    /// One that listens at an address (a path, or `@` and an abstract name), and that wants a sign of life so often.
+    pub fn at(address: OsString, watchdog: Option<Duration>) -> io::Result<Self> {
+        let address = match address.as_bytes().strip_prefix(b"@") {
+            Some(name) => SocketAddr::from_abstract_name(name)?,
+            None => SocketAddr::from_pathname(&address)?,
+        };
+        let socket = UnixDatagram::unbound()?;
+        socket.set_nonblocking(true)?;
+        Ok(Self { socket, address, watchdog })
+    }
+
+    /// The run is up; `status` is for people.
+    pub fn ready(&self, status: &str) {
+        self.tell(&format!("READY=1\nSTATUS={}", one_line(status)));
+    }
+
+    /// What the run is about, for people.
+    pub fn status(&self, status: &str) {
+        self.tell(&format!("STATUS={}", one_line(status)));
+    }
+
+    /// The run ends.
+    pub fn stopping(&self) {
+        self.tell("STOPPING=1\nSTATUS=coming to rest, then releasing the arms");
+    }
+
+    /// What the watchdog does each time it found that the tick beats: a sign of life, twice as often as asked for.
+    pub fn signs_of_life(&self) -> io::Result<impl FnMut() + Send + 'static> {
+        let of_its_own =
+            Self { socket: self.socket.try_clone()?, address: self.address.clone(), watchdog: self.watchdog };
+        let mut last: Option<Instant> = None;
+        Ok(move || {
+            let due = of_its_own.watchdog.filter(|every| last.is_none_or(|last| last.elapsed() >= *every / 2));
+            if due.is_some() {
+                last = Some(Instant::now());
+                of_its_own.tell("WATCHDOG=1");
+            }
+        })
+    }
+
+    fn tell(&self, message: &str) {
+        let _ = self.socket.send_to_addr(message.as_bytes(), &self.address);
+    }
+}
+
+fn one_line(text: &str) -> String {
+    text.replace('\n', "; ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn heard(socket: &UnixDatagram) -> Vec<String> {
+        socket.set_nonblocking(true).unwrap();
+        let mut buffer = [0; 256];
+        let next = || socket.recv(&mut buffer).ok().map(|n| String::from_utf8_lossy(&buffer[..n]).into_owned());
+        std::iter::from_fn(next).collect()
+    }
+
+    #[test]
+    fn it_is_told_at_a_path_and_at_an_abstract_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notify");
+        let name = format!("@dimos-test-{}", std::process::id());
+        let of_name = SocketAddr::from_abstract_name(&name[1..]).unwrap();
+        let sockets = [UnixDatagram::bind(&path).unwrap(), UnixDatagram::bind_addr(&of_name).unwrap()];
+        for (socket, address) in sockets.iter().zip([path.into_os_string(), name.into()]) {
+            let manager = ServiceManager::at(address, None).unwrap();
+            manager.ready("one\ntwo");
+            manager.stopping();
+            let told = heard(socket);
+            assert_eq!(told[0], "READY=1\nSTATUS=one; two");
+            assert!(told[1].starts_with("STOPPING=1\n") && told.len() == 2);
+        }
+    }
+
+    #[test]
+    fn signs_of_life_come_only_where_they_are_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notify");
+        let socket = UnixDatagram::bind(&path).unwrap();
+        for (watchdog, expected) in [(None, 0), (Some(Duration::from_secs(3600)), 1), (Some(Duration::ZERO), 3)] {
+            let manager = ServiceManager::at(path.clone().into_os_string(), watchdog).unwrap();
+            let mut alive = manager.signs_of_life().unwrap();
+            (0..3).for_each(|_| alive());
+            assert_eq!(heard(&socket).len(), expected, "{watchdog:?}");
+        }
+    }
+
+    #[test]
+    fn that_nobody_listens_is_no_trouble() {
+        ServiceManager::at("/nonexistent/notify".into(), None).unwrap().ready("x");
+        assert!(ServiceManager::at("/".repeat(200).into(), None).is_err());
+    }
+}

@@ -1,0 +1,87 @@
+//! Runs inside of a program, where the examples of docs/library.md say nothing.
+
+use std::path::Path;
+
+use dimos::rpc::Code;
+use dimos::rpc::api::Move;
+use dimos::rpc::place::RunFolder;
+use dimos::rpc::streams::{Stream, Subscribe};
+use dimos::runtime::{Builder, Ending, Record, Run, StartError};
+
+fn mock(folder: &Path) -> Builder {
+    Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunFolder::at(folder))
+}
+
+#[test]
+fn a_run_that_is_dropped_is_stopped() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = mock(folder.path()).start().unwrap();
+    assert!(run.socket().unwrap().exists());
+    let handle = run.handle();
+    let motion = handle.move_arm("arm", &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).unwrap().motion;
+    drop(run);
+    assert!(RunFolder::at(folder.path()).runs().unwrap().is_empty());
+    // Who still has a handle is refused, and does not wait for ever.
+    assert_eq!(handle.move_arm("arm", &[0.0; 7], 0.5).unwrap_err().code, Code::ShuttingDown);
+    assert!(handle.wait(motion).map_or_else(|e| e.code == Code::ShuttingDown, |report| report.state == "ABORTED"));
+    assert!(handle.stop_arms().is_err());
+    // And its name is free.
+    mock(folder.path()).start().unwrap().stop();
+}
+
+#[test]
+fn what_is_wrong_is_told_before_anything_is_connected() {
+    let Err(error) = Run::from_name("coordinator-mokc") else { panic!("there is none") };
+    assert!(error.hint.contains("coordinator-mock"), "{error}");
+    let folder = tempfile::tempdir().unwrap();
+    let wrong = mock(folder.path()).set("coordinator.tick_rate", -5);
+    assert_eq!(wrong.check().errors(), 1);
+    match wrong.start() {
+        Err(StartError::Blueprint { what, .. }) => assert!(what.contains("tick_rate"), "{what}"),
+        other => panic!("{:?}", other.map(|_| ()).err()),
+    }
+    let first = mock(folder.path()).start().unwrap();
+    match mock(folder.path()).start() {
+        Err(error @ StartError::Other { .. }) => assert!(error.to_string().contains("live already"), "{error}"),
+        other => panic!("{:?}", other.map(|_| ()).err()),
+    }
+    first.stop();
+}
+
+#[test]
+fn calls_are_checked_as_over_the_socket() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = mock(folder.path()).start().unwrap();
+    let code = |target: &[f64], speed| run.move_arm("arm", target, speed).unwrap_err().code;
+    assert_eq!(code(&[f64::NAN; 7], 0.5), Code::InvalidParams);
+    assert_eq!(code(&[], 0.5), Code::InvalidParams);
+    assert_eq!(code(&[0.0; 7], 7.0), Code::InvalidParams);
+    let unknown = run.reset("amr").unwrap_err();
+    assert_eq!((unknown.code, unknown.hint.as_deref()), (Code::UnknownArm, Some("did you mean `arm`?")));
+    assert_eq!(run.servo("traj_arm", &[0.0; 7]).unwrap_err().code, Code::WrongTask);
+    let stream = Subscribe { stream: Stream::Events, rate: None };
+    assert_eq!(run.call(stream).unwrap_err().code, Code::UnknownMethod, "streams are on the socket");
+}
+
+#[test]
+fn a_handle_may_be_used_on_a_thread_of_an_async_program() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = mock(folder.path()).start().unwrap();
+    let handle = run.handle();
+    let asynchronous = tokio::runtime::Builder::new_current_thread().build().unwrap();
+    let moved = asynchronous.block_on(async move {
+        let target = vec![0.05; 7];
+        handle.call(Move { arm: "arm".into(), target, speed: 1.0 })
+    });
+    assert_eq!(run.wait(moved.unwrap().motion).unwrap().state, "COMPLETED");
+}
+
+#[test]
+fn another_thread_can_end_a_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = mock(folder.path()).start().unwrap();
+    let endings = run.endings();
+    std::thread::spawn(move || endings.send(Ending::Asked));
+    assert_eq!(run.wait_for_end(None), Ending::Asked);
+    assert!(run.stop().troubles.is_empty());
+}
