@@ -132,10 +132,10 @@ impl Home {
 
 /// Whether a move ended where it should.
 fn moved(run: &Run, target: &[f64]) -> bool {
-    let Ok(begun) = run.call(&Move { arm: "arm".into(), target: target.to_vec(), speed: 0.7 }) else { return false };
+    let Ok(begun) = run.call(Move { arm: "arm".into(), target: target.to_vec(), speed: 0.7 }) else { return false };
     let limit = Instant::now() + Duration::from_secs(30);
     loop {
-        let report = run.call(&Motion { motion: begun.motion }).unwrap();
+        let report = run.call(Motion { motion: begun.motion }).unwrap();
         if report.done {
             return report.state == "COMPLETED";
         }

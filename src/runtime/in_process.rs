@@ -27,7 +27,9 @@ fn wait_for(service: &Arc<Service>, requests: Vec<Result<Request, RpcError>>) ->
     runtime.block_on(async {
         let begin = |request: Result<Request, RpcError>| {
             let service = service.clone();
-            tokio::spawn(async move { tokio::time::timeout(CALL_LIMIT, service.call(request?)).await.unwrap_or_else(late) })
+            tokio::spawn(
+                async move { tokio::time::timeout(CALL_LIMIT, service.call(request?)).await.unwrap_or_else(late) },
+            )
         };
         let begun: Vec<_> = requests.into_iter().map(begin).collect();
         let mut answers = Vec::with_capacity(begun.len());

@@ -6,6 +6,7 @@
 //! stop:  come to rest ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
 //! ```
 
+mod arm_requests;
 mod arms;
 mod build;
 mod builder;
@@ -13,6 +14,7 @@ mod device_lock;
 mod dispatch;
 mod handle;
 mod in_process;
+mod motion_requests;
 mod motions;
 mod repeats;
 mod reports;

@@ -4,6 +4,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
 use super::dispatch::lock;
+use super::motions::End;
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
 use crate::blueprint::OnExit;
@@ -170,30 +171,36 @@ impl Service {
         if view.motion == number {
             (report.progress, report.elapsed, report.remaining) = (view.progress, view.elapsed, view.remaining);
         }
-        match end {
-            None => {
-                report.state = if view.motion == number { view.state } else { TaskState::Executing }.name().to_owned();
-                // The task may be done a moment before it is known where the arm ended.
-                if !matches!(view.state, TaskState::Executing | TaskState::Cancelling) {
-                    report.state = TaskState::Executing.name().to_owned();
-                }
+        let over = !matches!(view.state, TaskState::Executing | TaskState::Cancelling);
+        let end = match end {
+            Some(end) => Some(end.clone()),
+            // The task is done; that it is known where the arm ended takes the recorder a moment, or, if the recorder
+            // fell behind, does not come at all. Where the arm is now is where it ended.
+            None if view.motion == number && over => {
+                let at = self.positions();
+                let actual = planned.joints.iter().map(|j| at.get(*j as usize).copied().unwrap_or(f64::NAN)).collect();
+                Some(End { state: view.state, reason: view.reason, actual })
             }
-            Some(end) => {
-                report.state = end.state.name().to_owned();
-                report.done = true;
-                report.error = self.reason(&end.reason);
-                if end.state == TaskState::Completed {
-                    (report.progress, report.remaining) = (1.0, 0.0);
-                }
-                let all = planned.joints.iter().zip(&planned.goal).zip(&end.actual);
-                let deviation = all.map(|((joint, target), actual)| Deviation {
-                    joint: self.parts.names.joint(*joint),
-                    target: *target,
-                    actual: *actual,
-                });
-                report.deviation = Some(deviation.collect());
-            }
+            None => None,
+        };
+        let Some(end) = end else {
+            let state = if view.motion == number { view.state } else { TaskState::Executing };
+            report.state = state.name().to_owned();
+            return Ok(report);
+        };
+        report.state = end.state.name().to_owned();
+        report.done = true;
+        report.error = self.reason(&end.reason);
+        if end.state == TaskState::Completed {
+            (report.progress, report.remaining) = (1.0, 0.0);
         }
+        let all = planned.joints.iter().zip(&planned.goal).zip(&end.actual);
+        let deviation = all.map(|((joint, target), actual)| Deviation {
+            joint: self.parts.names.joint(*joint),
+            target: *target,
+            actual: *actual,
+        });
+        report.deviation = Some(deviation.collect());
         Ok(report)
     }
 

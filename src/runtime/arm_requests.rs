@@ -1,0 +1,135 @@
+//! What is asked of an arm as a whole: stop, reset, enable, disable.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use super::service::{Service, internal};
+use crate::arm::Link;
+use crate::control::request::Request;
+use crate::hardware::device::{Answer, Device};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::rpc::api::{self, Reply};
+use crate::rpc::{Code, RpcError};
+use crate::telemetry::{Outcome, Phase};
+
+/// How long a stopped arm gets to come to rest and confirm.
+const STOP_LIMIT: Duration = Duration::from_secs(3);
+/// How long an order to a device may take.
+const ORDER_LIMIT: Duration = Duration::from_secs(5);
+/// How long an enabled arm gets to be ready.
+const READY_LIMIT: Duration = Duration::from_secs(2);
+
+impl Service {
+    pub(super) async fn stop(&self, call: api::Stop) -> Result<Reply, RpcError> {
+        let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
+        self.ask(Request::Stop { arm }).await?;
+        let limit = Instant::now() + STOP_LIMIT;
+        let mut arms = BTreeMap::new();
+        for (i, config) in self.parts.config.arms.iter().enumerate() {
+            if arm.is_some_and(|a| a as usize != i) {
+                continue;
+            }
+            let confirmation = loop {
+                match self.confirmation(i) {
+                    Some(c) => break c,
+                    None if Instant::now() >= limit => break api::Confirmation::SentNotConfirmed,
+                    None => tokio::time::sleep(Duration::from_millis(5)).await,
+                }
+            };
+            arms.insert(config.name.clone(), confirmation);
+        }
+        Ok(Reply::Stop(api::StopReply { arms }))
+    }
+
+    /// How far an arm's stop has come; `None`: not yet known.
+    pub(super) fn confirmation(&self, arm: usize) -> Option<api::Confirmation> {
+        let (view, device) = (self.arm_view(arm)?, self.parts.devices.get(arm)?);
+        if view.state.link != Link::Up {
+            return Some(api::Confirmation::NotSent);
+        }
+        if !view.state.enabled {
+            return Some(api::Confirmation::Confirmed); // Its motors are off: the arm itself says so.
+        }
+        let (asked, health) = (view.command.stop_seq, device.health());
+        let is_asked = view.phase == Phase::Held && view.command.mode.is_none() && asked > 0;
+        if !is_asked {
+            return None;
+        }
+        if health.stop_confirmed.load(Ordering::Relaxed) == asked {
+            return Some(api::Confirmation::Confirmed);
+        }
+        (health.stop_sent.load(Ordering::Relaxed) == asked).then_some(api::Confirmation::SentNotConfirmed)
+    }
+
+    pub(super) async fn reset(&self, id: String) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&id)?;
+        let device = self.device(arm)?;
+        let view = self.arm_view(arm as usize);
+        if view.is_some_and(|v| v.phase == Phase::Held) {
+            let cleared = order(device.clear_errors()).await;
+            match cleared {
+                Ok(()) | Err(AdapterError::NotConnected) => {}
+                Err(e) => return Err(refused(&id, "did not clear its error", &e)),
+            }
+            // The next tick must see the state after the clearing.
+            tokio::time::sleep(self.period() * 2).await;
+        }
+        self.ask(Request::Reset { arm }).await?;
+        self.phase_reply(id, arm).await
+    }
+
+    pub(super) async fn enable(&self, id: String) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&id)?;
+        let view = self.arm_view(arm as usize).ok_or_else(internal)?;
+        match view.phase {
+            Phase::Held => {
+                let outcome = Outcome::ArmLatched(arm, view.cause);
+                return self.refusal(&outcome).map_or_else(|| Err(internal()), Err);
+            }
+            Phase::Ready | Phase::Activating => {}
+            _ => {
+                order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
+                self.ask(Request::Ready { arm }).await?;
+            }
+        }
+        let limit = Instant::now() + READY_LIMIT;
+        while self.phase(arm as usize) != Phase::Ready && Instant::now() < limit {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        self.phase_reply(id, arm).await
+    }
+
+    pub(super) async fn disable(&self, id: String) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&id)?;
+        self.ask(Request::Park { arm }).await?;
+        let limit = Instant::now() + STOP_LIMIT;
+        while self.arm_view(arm as usize).is_some_and(|v| v.command.mode.is_some()) && Instant::now() < limit {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+        order(self.device(arm)?.disable()).await.map_err(|e| refused(&id, "was not disabled", &e))?;
+        tokio::time::sleep(self.period() * 2).await;
+        self.phase_reply(id, arm).await
+    }
+
+    pub(super) async fn phase_reply(&self, arm: String, index: u16) -> Result<Reply, RpcError> {
+        tokio::time::sleep(self.period()).await;
+        Ok(Reply::ArmReset(api::ArmReply { arm, phase: self.phase(index as usize).name().to_owned() }))
+    }
+
+    pub(super) fn device(&self, arm: u16) -> Result<Arc<Device>, RpcError> {
+        self.parts.devices.get(arm as usize).cloned().ok_or_else(internal)
+    }
+}
+
+/// Waits for a device without holding up the others who talk to the run.
+async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
+    let waited = tokio::task::spawn_blocking(move || answer.wait(ORDER_LIMIT)).await;
+    waited.unwrap_or_else(|e| Err(AdapterError::Io(e.to_string())))
+}
+
+fn refused(arm: &str, what: &str, error: &AdapterError) -> RpcError {
+    RpcError::new(Code::DeviceRefused, format!("{arm} {what}: {error}"))
+        .hint("see the arm's own panel or manual; `dimos status` shows its link and error")
+}

@@ -1,0 +1,178 @@
+//! Motions that are asked for: found their task, checked against every limit, handed to the tick.
+
+use serde_json::json;
+
+use super::dispatch::lock;
+use super::motions::Planned;
+use super::service::{Service, internal};
+use crate::control::config::TaskKind;
+use crate::control::limit::Bounds;
+use crate::control::point_to_point::{NoMotion, point_to_point};
+use crate::control::request::{Motion, Request};
+use crate::rpc::api::{self, Reply};
+use crate::rpc::{Code, RpcError};
+use crate::telemetry::Outcome;
+use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+
+/// Trajectories may exceed a velocity or acceleration by this factor: rounding in files.
+const SLACK: f64 = 1.001;
+/// A trajectory begins and ends at rest: slower than this [rad/s].
+const REST: f64 = 1e-3;
+
+impl Service {
+    /// A trajectory task that covers these joints.
+    pub(super) fn trajectory_task(&self, joints: &[u16]) -> Result<u16, RpcError> {
+        let tasks = self.parts.config.tasks.iter().enumerate();
+        let fitting = |(_, t): &(usize, &crate::control::config::TaskConfig)| {
+            matches!(t.kind, TaskKind::Trajectory(_)) && joints.iter().all(|j| t.joints.contains(j))
+        };
+        match { tasks }.find(fitting) {
+            Some((i, _)) => Ok(i as u16),
+            None => Err(RpcError::new(Code::NoTrajectoryTask, "no trajectory task covers these joints")
+                .hint("add one to the blueprint: `tasks: [{name: traj_arm, type: trajectory, …}]`")),
+        }
+    }
+
+    pub(super) async fn move_arm(&self, call: api::Move) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&call.arm)?;
+        let joints: Vec<u16> = self.joints_of_arm(arm).collect();
+        let config = &self.parts.config.arms[arm as usize];
+        if call.target.len() != joints.len() {
+            let what = format!("{} has {} joints, the target {} values", call.arm, joints.len(), call.target.len());
+            return Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"));
+        }
+        let task = self.trajectory_task(&joints)?;
+        let Some(view) = self.arm_view(arm as usize).filter(|v| v.state.seq > 0) else {
+            return self.refusal(&Outcome::StartStateUnavailable(arm)).map_or_else(|| Err(internal()), Err);
+        };
+        // Where positions are being commanded, the motion continues from the command, not from the sag below it.
+        let from_command = view.command.mode.is_some_and(|m| m.is_position());
+        let start = if from_command { view.command.values } else { view.state.position };
+        let start = start.get(..config.dof).unwrap_or_default().to_vec();
+        let names = self.parts.names.arms[arm as usize].joints.clone();
+        let motion = point_to_point(&names, &start, &call.target, &config.limits, call.speed).map_err(|e| match e {
+            NoMotion::OutOfLimits { ref joint, excess, .. } => {
+                let data = json!({"joint": joint, "by": excess});
+                RpcError::new(Code::OutOfLimits, e.to_string())
+                    .hint("limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
+                    .data(data)
+            }
+            NoMotion::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string()),
+        })?;
+        let duration = motion.duration();
+        let number = self.begin(task, joints, &motion).await?;
+        Ok(Reply::Move(api::MoveReply {
+            motion: number,
+            task: self.parts.names.task(task),
+            duration,
+            joints: names,
+            start,
+            target: call.target,
+        }))
+    }
+
+    pub(super) async fn execute(&self, call: api::Execute) -> Result<Reply, RpcError> {
+        let trajectory = trajectory_of(call.trajectory);
+        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
+        let mut joints = Vec::new();
+        for name in &trajectory.joint_names {
+            match all.iter().position(|j| *j == name) {
+                Some(j) => joints.push(j as u16),
+                None => return Err(RpcError::unknown(Code::InvalidTrajectory, "joint", name, &all)),
+            }
+        }
+        let task = match &call.task {
+            Some(name) => self.task_index(name)?,
+            None => self.trajectory_task(&joints)?,
+        };
+        let number = self.begin(task, joints, &trajectory).await?;
+        let duration = trajectory.duration();
+        Ok(Reply::Execute(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration }))
+    }
+
+    /// Hands a trajectory to its task. Everything about it is checked before anything moves.
+    pub(super) async fn begin(
+        &self,
+        task: u16,
+        joints: Vec<u16>,
+        trajectory: &JointTrajectory,
+    ) -> Result<u64, RpcError> {
+        let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
+        self.check_rest(&joints, trajectory)?;
+        self.check_limits(&joints, &spline)?;
+        let number = self.parts.dispatcher.number();
+        let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
+        let planned = Planned { task, joints: joints.clone(), goal, duration: spline.duration() };
+        lock(&self.motions).plan(number, planned);
+        let log = json!({"execute": {"task": task, "motion": number, "trajectory": trajectory}});
+        let motion = Box::new(Motion { id: number, joints, spline });
+        let result = self.ask_logged(Request::Execute { task, motion }, log).await;
+        if result.is_err() {
+            lock(&self.motions).forget(number);
+        }
+        result.map(|_| number)
+    }
+
+    /// An arm is at rest before a trajectory and after it, so the trajectory must begin and end at rest.
+    fn check_rest(&self, joints: &[u16], trajectory: &JointTrajectory) -> Result<(), RpcError> {
+        let ends = [("start", trajectory.points.first()), ("end", trajectory.points.last())];
+        for (which, point) in ends.into_iter().filter_map(|(which, point)| Some((which, point?))) {
+            for (&joint, velocity) in joints.iter().zip(&point.velocities) {
+                if velocity.abs() > REST {
+                    let name = self.parts.names.joint(joint);
+                    let what = format!("{name} moves at {velocity:.3} rad/s at the {which} of the trajectory");
+                    return Err(RpcError::new(Code::InvalidTrajectory, what)
+                        .hint("let it begin and end with velocity 0, or leave the velocities out")
+                        .data(json!({"joint": name, "by": velocity})));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// F36: a trajectory that breaks a limit is refused before it begins, with the joint and the amount.
+    pub(super) fn check_limits(&self, joints: &[u16], spline: &Spline) -> Result<(), RpcError> {
+        for (k, &joint) in joints.iter().enumerate() {
+            let Some((arm, j)) = self.locate(joint) else { continue };
+            let l = &self.parts.config.arms[arm].limits;
+            let bounds =
+                Bounds::inside(l.position_lower[j], l.position_upper[j], l.velocity_max[j], l.acceleration_max[j]);
+            let e = spline.extremes(k);
+            let name = self.parts.names.joint(joint);
+            let refuse = |what: String, by: f64, hint: &str| {
+                let data = json!({"joint": name.clone(), "by": by});
+                Err(RpcError::new(Code::OutOfLimits, what).hint(hint.to_owned()).data(data))
+            };
+            let start = spline.start(k);
+            let (lower, upper) = (bounds.lower.min(start), bounds.upper.max(start));
+            let excess = (lower - e.lowest).max(e.highest - upper);
+            if excess > 1e-6 {
+                let what = format!("{name} would leave its limits {lower:.3} … {upper:.3} rad by {excess:.4} rad");
+                return refuse(what, excess, "limits are the arm's own, narrowed by `limits` in the blueprint");
+            }
+            for (what, unit, got, most) in [
+                ("as fast as", "rad/s", e.fastest, bounds.velocity),
+                ("with an acceleration of", "rad/s²", e.steepest, bounds.acceleration),
+            ] {
+                if got > most * SLACK + 1e-9 {
+                    let text = format!("{name} would move {what} {got:.3} {unit}, and may {most:.3} {unit}");
+                    let slower = if unit == "rad/s" { got / most } else { (got / most).sqrt() };
+                    let hint =
+                        format!("make the trajectory {slower:.2} times as long, or raise the limit in the blueprint");
+                    return refuse(text, got - most, &hint);
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+fn trajectory_of(given: api::Trajectory) -> JointTrajectory {
+    let points = given.points.into_iter().map(|p| TrajectoryPoint {
+        time_from_start: p.time_from_start,
+        positions: p.positions,
+        velocities: p.velocities.unwrap_or_default(),
+        accelerations: p.accelerations.unwrap_or_default(),
+    });
+    JointTrajectory { points: points.collect(), joint_names: given.joint_names }
+}
