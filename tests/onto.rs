@@ -1,16 +1,25 @@
 //! `replay --onto`: arms follow what was recorded, within limits or not at all. The real binary, on simulated arms.
 
+#[path = "support/virtual_run.rs"]
+#[allow(dead_code, reason = "shared with other tests")]
+mod virtual_run;
+
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use dimos::blueprint::{Overrides, find, load};
+use dimos::control::point_to_point::point_to_point;
+use dimos::control::request::Request;
 use dimos::hardware::registry::Registry;
+use dimos::joint::make_joints;
 use dimos::replay::motion::RecordedMotion;
 use dimos::replay::verify::{Finding, verify};
 use dimos::rpc::api::{Motion, Move};
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Options, Record, Run};
+use dimos::telemetry::TaskState;
+use virtual_run::{VirtualRun, one_arm};
 
 /// So far an arm may be from the recorded path [rad].
 const PATH: f64 = 1e-3;
@@ -28,6 +37,9 @@ hardware:
 tasks:
   - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
 ";
+
+/// What a run says that lost its time on a busy machine.
+const LATE: [&str; 3] = ["its states stopped coming", "lost too much time", "saw no heartbeat"];
 
 struct Home(tempfile::TempDir);
 
@@ -58,25 +70,77 @@ impl Home {
         (out, err)
     }
 
-    /// Records a move there and back on a simulated yourarm.
-    fn recorded(&self) -> PathBuf {
-        let log = self.path("recorded.mcap");
+    /// Runs the program until the machine let it keep its time: a run that lost it holds its arms, as it should.
+    #[track_caller]
+    fn run_in_time(&self, arguments: &str) -> (String, String) {
+        for again in 0..5 {
+            let arguments = format!("{arguments} --record try{again}.mcap");
+            let ended = self.command(&arguments).output().unwrap();
+            let (out, err) = (String::from_utf8(ended.stdout).unwrap(), String::from_utf8(ended.stderr).unwrap());
+            if ended.status.success() {
+                std::fs::rename(self.path(&format!("try{again}.mcap")), self.path("again.mcap")).unwrap();
+                return (out, err);
+            }
+            assert!(LATE.iter().any(|late| err.contains(late)), "stdout:\n{out}\nstderr:\n{err}");
+        }
+        panic!("the machine is too busy for any run");
+    }
+
+    /// Records moves to and fro on a simulated yourarm.
+    fn recorded_on_yourarm(&self) -> PathBuf {
         let registry = Registry::builtin();
         let found = find("coordinator-yourarm").unwrap_or_else(|e| panic!("{}", e.message));
         let blueprint = load(&found, &Overrides::default(), &registry).blueprint.unwrap();
-        let folder = RunFolder::at(self.path("runs"));
-        let options = Options { record: Record::To(log.clone()), folder, hold_latency: false, ..Options::default() };
-        let run = Run::start(&blueprint, options).unwrap();
-        for target in [GOAL, [0.1; 6], GOAL] {
-            let begun = run.call(&Move { arm: "arm".into(), target: target.to_vec(), speed: 0.7 }).unwrap();
-            let limit = Instant::now() + Duration::from_secs(30);
-            while !run.call(&Motion { motion: begun.motion }).unwrap().done {
-                assert!(Instant::now() < limit, "the move does not end");
-                std::thread::sleep(Duration::from_millis(10));
+        for again in 0..5 {
+            let log = self.path(&format!("yourarm{again}.mcap"));
+            let record = Record::To(log.clone());
+            let folder = RunFolder::at(self.path("runs"));
+            let run = Run::start(&blueprint, Options { record, folder, hold_latency: false, ..Options::default() });
+            let run = run.unwrap();
+            let done = [GOAL, [0.1; 6], GOAL].iter().all(|target| moved(&run, target));
+            run.stop();
+            if done {
+                return log;
             }
         }
-        run.stop();
+        panic!("the machine is too busy for any run");
+    }
+
+    /// Records the same moves on an ideal arm, on a clock that is set forward.
+    fn recorded(&self) -> PathBuf {
+        let log = self.path("recorded.mcap");
+        let config = one_arm(6);
+        let mut run = VirtualRun::start(&config, &log);
+        run.step();
+        run.ask(Request::Ready { arm: 0 });
+        (0..40).for_each(|_| run.step());
+        let mut from = [0.0; 6];
+        for target in [GOAL, [0.1; 6], GOAL] {
+            let names = make_joints("arm", 6);
+            run.execute(0, &point_to_point(&names, &from, &target, &config.arms[0].limits, 0.8).unwrap());
+            run.step();
+            while run.tasks[0].state == TaskState::Executing {
+                run.step();
+            }
+            assert_eq!(run.tasks[0].state, TaskState::Completed);
+            from = target;
+        }
+        run.finish();
         log
+    }
+}
+
+/// Whether a move ended where it should.
+fn moved(run: &Run, target: &[f64]) -> bool {
+    let Ok(begun) = run.call(&Move { arm: "arm".into(), target: target.to_vec(), speed: 0.7 }) else { return false };
+    let limit = Instant::now() + Duration::from_secs(30);
+    loop {
+        let report = run.call(&Motion { motion: begun.motion }).unwrap();
+        if report.done {
+            return report.state == "COMPLETED";
+        }
+        assert!(Instant::now() < limit, "the move does not end");
+        std::thread::sleep(Duration::from_millis(10));
     }
 }
 
@@ -102,21 +166,22 @@ fn assert_followed(recorded: &Path, again: &Path) {
         let nearest = is.rows.windows(2).map(|w| distance(pose, &w[0], &w[1])).fold(f64::MAX, f64::min);
         assert!(nearest <= PATH, "{pose:?} is {nearest} rad from the path");
     }
-    let ends = was.rows.last().unwrap().iter().zip(is.rows.last().unwrap());
-    assert!(ends.clone().all(|(a, b)| (a - b).abs() <= 1e-6), "{ends:?}");
+    // A task may end a step before its goal, when the arm is there within the goal tolerance.
+    let (end, goal) = (is.rows.last().unwrap(), was.rows.last().unwrap());
+    assert!(end.iter().zip(goal).all(|(a, b)| (a - b).abs() <= PATH), "{end:?} is not {goal:?}");
 }
 
 #[test]
 fn a_motion_recorded_within_limits_is_followed_by_another_run_and_by_another_arm() {
     let home = Home::new();
-    let log = home.recorded();
-    let (out, err) = home.run("replay recorded.mcap --onto coordinator-yourarm --record again.mcap", 0);
+    let log = home.recorded_on_yourarm();
+    let (out, err) = home.run_in_time(&format!("replay {} --onto coordinator-yourarm", log.display()));
     assert!(out.contains("motion: COMPLETED") && err.contains("approach: arm"), "{out}{err}");
     assert_followed(&log, &home.path("again.mcap"));
     assert_eq!(verify(&home.path("again.mcap")).unwrap().finding, Finding::Reproducible);
 
-    let (out, _) = home.run("replay recorded.mcap --onto mock6.yaml --record mock.mcap --rate 0.9 --json", 0);
-    assert_followed(&log, &home.path("mock.mcap"));
+    let (out, _) = home.run_in_time(&format!("replay {} --onto mock6.yaml --rate 0.9 --json", log.display()));
+    assert_followed(&log, &home.path("again.mcap"));
     let said: serde_json::Value = serde_json::from_str(&out).unwrap();
     assert_eq!(said["completed"], true);
     let deviation = said["deviation"].as_object().unwrap();
@@ -127,19 +192,27 @@ fn a_motion_recorded_within_limits_is_followed_by_another_run_and_by_another_arm
 #[test]
 fn limits_are_kept_or_the_motion_is_refused_before_anything_moves() {
     let home = Home::new();
-    home.recorded();
-    let (_, err) = home.run("replay recorded.mcap --onto mock6.yaml --rate 3 --record refused.mcap", 1);
-    assert!(err.contains("would break its acceleration limit by ") && err.contains("nothing has moved"), "{err}");
+    let log = home.recorded();
+    let (_, err) = home.run("replay recorded.mcap --onto mock6.yaml --rate 4 --record refused.mcap", 1);
+    assert!(err.contains("would break its acceleration limit by 10.48") && err.contains("nothing has moved"), "{err}");
     let commanded = motion(&home.path("refused.mcap"));
     assert!(commanded.rows.iter().flatten().all(|q| *q == 0.0), "nothing may have moved");
     let rate = err.split("--rate ").nth(1).and_then(|rest| rest.split(';').next()).unwrap();
-    assert!((1.0..3.0).contains(&rate.parse::<f64>().unwrap()), "{rate}");
-    home.run(&format!("replay recorded.mcap --onto mock6.yaml --no-record --rate {rate}"), 0);
+    assert!((1.5..4.0).contains(&rate.parse::<f64>().unwrap()), "{rate}");
+    home.run_in_time(&format!("replay recorded.mcap --onto mock6.yaml --rate {rate}"));
+    assert_followed(&log, &home.path("again.mcap"));
 
-    let narrow = MOCK.replace("adapter_type: mock", "adapter_type: mock\n    limits: {position: [-1, 0.4]}");
-    std::fs::write(home.path("narrow.yaml"), narrow).unwrap();
-    let (_, err) = home.run("replay recorded.mcap --onto narrow.yaml --no-record", 1);
-    assert!(err.contains("arm_joint3 would break its position limit by 0.1100 rad"), "{err}");
+    let narrow = |limits| {
+        let text = MOCK.replace("adapter_type: mock", &format!("adapter_type: mock\n    limits: {limits}"));
+        std::fs::write(home.path("narrow.yaml"), text).unwrap();
+        home.run("replay recorded.mcap --onto narrow.yaml --no-record", 1).1
+    };
+    let err = narrow("{position: [-1, 0.4]}");
+    assert!(err.contains("arm_joint3 would break its position limit by 0.1100 rad: 0.5000 of 0.3900 rad"), "{err}");
+    // Recorded at 0.8 times the speed: with 0.64 times 2 rad/s².
+    let err = narrow("{acceleration: 1}");
+    assert!(err.contains("would break its acceleration limit by 0.28"), "{err}");
+    assert!(err.contains("--rate 0.88"), "{err}");
 }
 
 #[test]

@@ -217,6 +217,47 @@ fn what_is_missing_ends_the_verification_there() {
     reproducible(&copy);
 }
 
+/// Whatever a file says, it is told that something is wrong with it, or that nothing is.
+#[test]
+fn damaged_messages_break_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, copy) = (folder.path().join("short.mcap"), folder.path().join("copy.mcap"));
+    let mut run = VirtualRun::start(&one_arm(2), &log);
+    run.step();
+    run.ask(Request::Ready { arm: 0 });
+    (0..30).for_each(|_| run.step());
+    let limits = JointLimits::uniform(2, 3.0, 2.0).with_defaults();
+    run.execute(0, &point_to_point(&make_joints("arm", 2), &[0.0; 2], &[0.05; 2], &limits, 1.0).unwrap());
+    (0..60).for_each(|_| run.step());
+    run.finish();
+    let mut random = 0x9e37_79b9_7f4a_7c15u64;
+    let mut next = move || {
+        random ^= random << 13;
+        random ^= random >> 7;
+        random ^= random << 17;
+        random
+    };
+    let mut found = [0; 3];
+    for _ in 0..150 {
+        rewrite(&log, &copy, |topic, bytes| {
+            if topic.starts_with("/arm_status") || !next().is_multiple_of(40) {
+                return None;
+            }
+            let mut bytes = bytes.to_vec();
+            let at = 4 + next() as usize % (bytes.len() - 4);
+            bytes[at] = next() as u8;
+            Some(bytes)
+        });
+        found[match verify(&copy).unwrap().finding {
+            Finding::Reproducible => 0,
+            Finding::Different(_) => 1,
+            Finding::Incomplete { .. } => 2,
+        }] += 1;
+        let _ = dimos::replay::motion::RecordedMotion::read(&copy, 0, u64::MAX).map(|m| dimos::replay::fit::fit(&m));
+    }
+    assert!(found[1] > 10 && found[2] > 10, "{found:?}");
+}
+
 fn blueprint(name: &str, set: &[&str]) -> Blueprint {
     let set = set.iter().map(|s| (*s).to_owned()).collect();
     let registry = Registry::builtin();

@@ -15,6 +15,9 @@ const AVERAGED: f64 = 0.1;
 /// The step between two sources is faded out over this time [s].
 const FADE: f64 = 1.0;
 
+/// Longest gap that a straight line may bridge [s].
+const LONGEST_GAP: f64 = 1.0;
+
 /// The motion of a log's joints.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedMotion {
@@ -47,8 +50,13 @@ impl RecordedMotion {
         let first = rows.iter().position(is_commanded).unwrap_or(whole.0);
         let last = rows.iter().rposition(is_commanded).unwrap_or(whole.1);
         let rows = rows.get(first..=last).unwrap_or_default();
-        let ticks: u64 = rows.windows(2).map(|w| w[1].tick.saturating_sub(w[0].tick).saturating_sub(1)).sum();
         let period = 1.0 / recorded.config.rate;
+        let gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > LONGEST_GAP + period;
+        if let Some(w) = rows.windows(2).find(|w| gap(w)) {
+            let what = format!("ticks {} to {} are missing, too many to be bridged", w[0].tick + 1, w[1].tick - 1);
+            return Err(RecordedError::Unfit { path: path.to_owned(), what });
+        }
+        let ticks: u64 = rows.windows(2).map(|w| w[1].tick.saturating_sub(w[0].tick).saturating_sub(1)).sum();
         let columns: Vec<Option<Vec<f64>>> = (0..names.len()).map(|j| column(rows, j, period)).collect();
         let known = |j: &usize| columns[*j].is_some();
         let joints = (0..names.len()).filter(known).map(|j| names[j].clone()).collect();

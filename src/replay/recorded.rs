@@ -72,7 +72,7 @@ impl Recorded {
 }
 
 fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Result<Names, String> {
-    if !(config.rate.is_finite() && config.rate > 0.0) {
+    if !(0.1..=1e5).contains(&config.rate) {
         return Err(format!("its tick rate is {} Hz", config.rate));
     }
     let joints: BTreeMap<String, Vec<String>> = metadata
