@@ -237,7 +237,9 @@ impl Service {
         let listened_to = self.parts.streams.has_joint_state_readers();
         let wanted = listened_to && self.parts.blueprint.coordinator.publish_joint_state;
         self.parts.pulse.streaming.store(wanted, Relaxed);
-        if !(wanted && ticked) {
+        // The tick wakes us for replies too, and one that we came late for shows the tick after it.
+        let ticks = self.parts.pulse.ticks.load(Relaxed);
+        if !(wanted && ticked) || self.published.swap(ticks, Relaxed) == ticks {
             return;
         }
         self.parts.streams.publish_joint_state(|| {

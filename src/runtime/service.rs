@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
@@ -63,6 +63,8 @@ pub struct Service {
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
     pub(super) repeats: Repeats,
+    /// Ticks done when the joint state was published last.
+    pub(super) published: AtomicU64,
     closed: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
@@ -75,6 +77,7 @@ impl Service {
             motions: Mutex::default(),
             recorder: OnceLock::new(),
             repeats: Repeats::default(),
+            published: AtomicU64::new(0),
             closed: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
