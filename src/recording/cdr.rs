@@ -81,6 +81,12 @@ impl<'a> Decoder<'a> {
         Ok(Self { bytes: &bytes[HEADER.len()..], at: 0 })
     }
 
+    /// Passes over bytes that are known already.
+    pub fn skip(&mut self, bytes: usize) -> Result<(), CdrError> {
+        self.at = self.at.saturating_add(bytes).min(self.bytes.len());
+        if self.at == self.bytes.len() { Err(self.short()) } else { Ok(()) }
+    }
+
     /// The little-endian bytes of a number, aligned to its size.
     pub fn number<const N: usize>(&mut self) -> Result<[u8; N], CdrError> {
         self.at = self.at.next_multiple_of(N);

@@ -10,8 +10,14 @@ use crate::clock::Mono;
 use crate::control::coordinator::TickTime;
 use crate::control::request::{Envelope, Request};
 use crate::joint::{ControlMode, Joints, MAX_DOF};
+use crate::recording::cdr::{CdrError, Decoder, Encoder};
 use crate::recording::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
-use crate::recording::wire::Message;
+use crate::recording::wire::{Field, Message};
+
+/// Length of what stands before every message [bytes].
+const HEADER: usize = 4;
+/// Where its time stamp ends [bytes].
+const STAMP_END: usize = HEADER + 8;
 
 /// What a message is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -97,6 +103,8 @@ pub(super) struct Assembler {
     /// The tick that is being put together, or is complete but for its events.
     pub logged: LoggedTick,
     closed: bool,
+    /// Frame and joint names as they stand in every message with joint values: read once, then compared.
+    names: Vec<u8>,
     /// Joint values read, until the tick is closed.
     states: JointState,
     waiting: BTreeMap<u64, Result<Request, String>>,
@@ -117,6 +125,7 @@ impl Assembler {
             spans,
             logged: LoggedTick { arms, ..LoggedTick::default() },
             closed: false,
+            names: Vec::new(),
             states: JointState::default(),
             waiting: BTreeMap::new(),
         }
@@ -174,16 +183,35 @@ impl Assembler {
         Ok(())
     }
 
-    fn joint_values(&self, bytes: &[u8]) -> Result<JointState, String> {
-        let values: JointState = message(bytes)?;
+    fn joint_values(&mut self, bytes: &[u8]) -> Result<JointState, String> {
+        let known = !self.names.is_empty() && bytes.get(STAMP_END..).is_some_and(|rest| rest.starts_with(&self.names));
+        let values = if known { self.lists(bytes).map_err(|e| e.to_string())? } else { self.first_values(bytes)? };
         let fits = |list: &[f64]| list.is_empty() || list.len() == self.joints.len();
-        if values.name != self.joints {
-            return Err("its joints are not those of the run".to_owned());
-        }
         if ![&values.position, &values.velocity, &values.effort].into_iter().all(|list| fits(list)) {
             return Err("it has not one value for each joint".to_owned());
         }
         Ok(values)
+    }
+
+    /// A message with names that were not seen before.
+    fn first_values(&mut self, bytes: &[u8]) -> Result<JointState, String> {
+        let values: JointState = message(bytes)?;
+        if values.name != self.joints {
+            return Err("its joints are not those of the run".to_owned());
+        }
+        let mut head = Encoder::default();
+        values.header.put(&mut head);
+        values.name.put(&mut head);
+        self.names = head.bytes().get(STAMP_END..).unwrap_or_default().to_vec();
+        Ok(values)
+    }
+
+    /// The lists of a message whose names are known.
+    fn lists(&self, bytes: &[u8]) -> Result<JointState, CdrError> {
+        let mut from = Decoder::new(bytes)?;
+        from.skip(STAMP_END - HEADER + self.names.len())?;
+        let mut list = || Vec::<f64>::get(&mut from);
+        Ok(JointState { position: list()?, velocity: list()?, effort: list()?, ..JointState::default() })
     }
 
     /// The joint values of a state stand in another message than the rest of it.
