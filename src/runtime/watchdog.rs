@@ -90,7 +90,9 @@ mod tests {
     fn a_sign_of_life_is_given_for_a_beat_and_for_nothing_else() {
         let (beat, signs, (endings, ended)) = (Arc::new(Beat::default()), Arc::new(AtomicUsize::new(0)), channel());
         let given = signs.clone();
-        let alive = move || drop(given.fetch_add(1, Ordering::Relaxed));
+        let alive = move || {
+            given.fetch_add(1, Ordering::Relaxed);
+        };
         let _watchdog = Watchdog::start(beat.clone(), Duration::from_millis(10), endings, alive).unwrap();
         assert!(ended.recv_timeout(3 * LOOK_EVERY).is_err(), "before the first beat nothing is silent");
         assert_eq!(signs.load(Ordering::Relaxed), 0);
