@@ -74,7 +74,7 @@ fn it_returns_when_the_arms_are_up_and_tells_run_pid_and_logs() {
     }
     assert!(text(&daemon.text_log()).contains("run coordinator-mock"));
     let told = home.dimos(&format!("run -d --duration 2m --no-record {RUN} --name plain")).with(0);
-    for part in ["run       plain", "pid       ", "log       none is written", "text log  "] {
+    for part in ["run       plain", "pid       ", "arm       arm: ready", "log       none is written", "text log  "] {
         assert!(told.out.contains(part), "no {part:?} in\n{}", told.out);
     }
     told.says(&["dimos down plain"]);
@@ -110,10 +110,25 @@ fn what_keeps_it_from_coming_up_is_told_with_its_exit_code() {
     let nobody = format!("run -d coordinator-yourarm --set hardware.arm.address={port}");
     let ended = home.dimos(&nobody).with(3).says(&["error: arm: ", "hint: "]);
     assert_eq!(ended.out, "");
+    let left = std::fs::read_dir(home.path().join("state/dimos")).unwrap().count();
+    assert_eq!(left, 0, "nothing is left of them");
     let _daemon = Daemon::start(&home, RUN);
     home.dimos(&format!("run -d {RUN}")).with(1).says(&["is live already", "hint: "]);
     home.dimos("down").with(0);
     assert_eq!(home.dimos("status --json").with(0).out, "[]\n", "none of these fell");
+}
+
+#[test]
+fn that_it_crashed_while_it_started_is_told() {
+    let home = Home::new();
+    // A controller that takes the connection and says nothing: the start waits for it.
+    let silent = TcpListener::bind("127.0.0.1:0").unwrap();
+    let slow = format!("run -d coordinator-yourarm --set hardware.arm.address={}", silent.local_addr().unwrap());
+    let command = home.start(&slow);
+    let pid = || home.runs().runs().unwrap().iter().map(|run| run.pid as i32).find_map(Pid::from_raw);
+    eventually("it starts", || pid().is_some());
+    kill_process(pid().unwrap(), Signal::KILL).unwrap();
+    command.wait().with(1).says(&["coordinator-yourarm crashed while it started (signal: 9 (SIGKILL))", "hint: "]);
 }
 
 #[test]

@@ -7,6 +7,7 @@
 //!      └──── one line: up, or why not                    a session of its own: no terminal can end it
 //! ```
 
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Write};
@@ -38,6 +39,8 @@ pub struct Up {
     pub pid: u32,
     /// Whether any arm is simulated.
     pub simulated: bool,
+    /// The phase of each arm.
+    pub arms: BTreeMap<String, String>,
     /// Its log, if one is written.
     pub log: Option<String>,
     /// Its text log.
@@ -77,6 +80,8 @@ pub fn start(args: &Args, registry: &Registry) -> Result {
         }
         Some(Word::Failed { exit, what, hint }) => {
             let _ = child.wait();
+            // All that it could tell is told here.
+            let _ = std::fs::remove_file(&text_log);
             Err(Failure { exit: Exit::of(exit), what, hint })
         }
         None => Err(died(run, &mut child, &text_log)),
@@ -137,6 +142,9 @@ fn print(up: &Up, json: bool) {
     let simulated = if up.simulated { "  SIMULATED" } else { "" };
     output::line(format_args!("run       {}{simulated}", up.run));
     output::line(format_args!("pid       {}", up.pid));
+    for (arm, phase) in &up.arms {
+        output::line(format_args!("arm       {arm}: {phase}"));
+    }
     output::line(format_args!("log       {}", up.log.as_deref().unwrap_or("none is written")));
     output::line(format_args!("text log  {}", up.text_log.display()));
     output::note(format_args!("dimos status shows it, dimos logs -f follows it, dimos down {} ends it", up.run));
@@ -169,6 +177,7 @@ impl Starter {
             run: report.run.clone(),
             pid: report.pid,
             simulated: report.simulated,
+            arms: report.arms.iter().map(|arm| (arm.hardware_id.clone(), arm.phase.clone())).collect(),
             log: report.log.clone(),
             text_log,
             socket: socket.map(PathBuf::from),

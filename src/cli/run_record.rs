@@ -69,8 +69,8 @@ impl RunRecord {
             process_began: process_began(pid).unwrap_or(0),
             started: now(),
             blueprint: report.blueprint.clone(),
-            log: report.log.as_ref().map(PathBuf::from),
-            text_log: text_log.map(PathBuf::from),
+            log: report.log.as_ref().map(absolute),
+            text_log: text_log.map(absolute),
             end: None,
         };
         record.keep();
@@ -158,6 +158,11 @@ impl RunRecord {
         };
         Some(Failure::new(Exit::Failed, what).hint(hint))
     }
+}
+
+/// A path for readers who are in another folder.
+fn absolute(path: impl AsRef<Path>) -> PathBuf {
+    std::path::absolute(path.as_ref()).unwrap_or_else(|_| path.as_ref().to_owned())
 }
 
 /// The time, written so that later times sort behind earlier ones.
