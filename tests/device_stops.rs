@@ -128,3 +128,21 @@ fn a_slow_arm_is_held_too_when_the_tick_falls_silent() {
     assert_eq!(written(&bench), before, "a tick that comes back does not move it again");
     bench.end();
 }
+
+#[test]
+fn a_change_of_mode_that_a_moving_arm_refuses_is_asked_for_again_and_is_no_fault() {
+    let mut bench = bench(100.0);
+    for _ in 0..5 {
+        bench.mock.fail("set_control_mode", AdapterError::Rejected("the arm is moving".into()));
+    }
+    let asked = |b: &Bench| b.mock.calls().iter().filter(|c| c.name() == "set_control_mode").count();
+    for refusals in 1..=5 {
+        bench.tick(|c| c.mode = Some(ControlMode::Velocity));
+        bench.until("the question", |b| asked(b) >= refusals);
+        assert_eq!(bench.states.read().link, Link::Up);
+        assert!(!bench.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"), "no value in the wrong mode");
+    }
+    bench.tick(|c| c.mode = Some(ControlMode::Velocity));
+    bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    bench.end();
+}

@@ -21,6 +21,8 @@ const TOO_MANY: u32 = 3;
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(5));
 /// So many readings in a row must agree before the motors are enabled.
 const PLAUSIBLE_AFTER: u32 = 3;
+/// How long an arm may refuse a change of mode because it still moves.
+const MODE_LIMIT: Duration = Duration::from_secs(1);
 /// How long `activate` waits for plausible states, and for the motors.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
 /// How long a stopped arm gets to stand still before its motors are disabled, and what counts as standing [rad/s, s].
@@ -39,6 +41,8 @@ pub(super) struct Worker {
     last: ArmCommand,
     /// A stop that the arm has not taken yet. Kept until it does, also over a new connection.
     stop_owed: bool,
+    /// Since when the arm refuses a change of mode.
+    mode_wanted: Option<Mono>,
     /// It was connected once and should be again.
     wanted: bool,
     connected: bool,
@@ -72,6 +76,7 @@ impl Worker {
             reading: JointReading::default(),
             last: ArmCommand::default(),
             stop_owed: false,
+            mode_wanted: None,
             wanted: false,
             connected: false,
             whole_state_at_once: false,
@@ -321,8 +326,14 @@ impl Worker {
         };
         let Some(mode) = command.mode else { return gripper };
         if adapter.get_control_mode() != mode {
-            adapter.set_control_mode(mode)?;
+            match adapter.set_control_mode(mode) {
+                // The arm may hold itself to be moving for a moment longer than we do: the tick waits for the mode,
+                // and this is asked again with the next command.
+                Err(AdapterError::Rejected(_)) if !self.waited_too_long_for_a_mode() => return gripper,
+                result => result?,
+            }
         }
+        self.mode_wanted = None;
         let values = command.values.get(..self.config.dof).unwrap_or_default();
         match mode {
             ControlMode::Velocity => adapter.write_joint_velocities(values)?,
@@ -331,6 +342,12 @@ impl Worker {
         self.state.written = command.seq;
         self.health.writes.fetch_add(1, Relaxed);
         gripper
+    }
+
+    /// Whether the arm has refused a change of mode for longer than it may take to stand still.
+    fn waited_too_long_for_a_mode(&mut self) -> bool {
+        let now = self.config.clock.now();
+        now.since(*self.mode_wanted.get_or_insert(now)) > MODE_LIMIT
     }
 
     /// Asks the arm to stop by its own means, again and again until it has taken it.
