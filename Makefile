@@ -47,9 +47,10 @@ test-rerun: .venv/readers-installed
 	.venv/bin/rerun analytics disable
 	DIMOS_RERUN=1 cargo test --locked --test readers rerun
 
-# Compute time of a tick, cost per arm, memory, start-up.
+# Compute time of a tick, cost per arm, memory, start-up, processor time; what talking to a run costs; how fast logs
+# are verified.
 bench:
-	cargo bench --locked --bench control
+	cargo bench --locked --bench control --bench rpc --bench verify
 
 # Lateness of the tick beside cyclictest.
 jitter:

@@ -41,6 +41,11 @@ impl LiveRun {
         self.child.id()
     }
 
+    /// The folder that stands for the user's own.
+    pub fn folder(&self) -> &Path {
+        self.home.path()
+    }
+
     /// Its log.
     pub fn log(&self) -> PathBuf {
         self.home.path().join("log.mcap")

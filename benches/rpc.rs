@@ -1,0 +1,160 @@
+//! `make bench`: what talking to a run costs: the round trip, and what readers do to the tick. Prints; judges, but
+//! never fails.
+
+#[path = "support/mod.rs"]
+#[allow(dead_code, reason = "shared with the other benchmarks")]
+mod support;
+
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use dimos::rpc::api::{State, Status};
+use dimos::rpc::client::Client;
+use dimos::rpc::streams::{Stream, Subscribe};
+use support::measure::{Goal, Measure, print, quantile};
+use support::run::LiveRun;
+use support::{Effort, machine};
+
+/// Readers of the joint state at the tick's rate.
+const READERS: usize = 4;
+/// Requests per second in the flood.
+const FLOOD: f64 = 10_000.0;
+
+fn main() {
+    let effort = Effort::told();
+    println!("\ndimos: what talking to a run costs{}\n", effort.of(" (quick)", ""));
+    machine::print();
+    if let Err(e) = round_trip(effort).and_then(|()| readers(effort)).and_then(|()| python(effort)) {
+        println!("SKIPPED: {e}");
+    }
+}
+
+fn fast_run() -> Result<LiveRun, String> {
+    LiveRun::start("coordinator-mock", &["--set", "coordinator.tick_rate=1000"]).map_err(|e| e.to_string())
+}
+
+/// Request and reply of `state`, one after the other.
+fn round_trip(effort: Effort) -> Result<(), String> {
+    let (mut p50, mut p99) = (Vec::new(), Vec::new());
+    for _ in 0..effort.of(2, 5) {
+        let mut run = fast_run()?;
+        let mut client = run.client()?;
+        let times: Result<Vec<f64>, String> = (0..effort.of(2_000, 10_000))
+            .map(|_| {
+                let began = Instant::now();
+                client.call(State {}).map_err(|e| e.to_string())?;
+                Ok(began.elapsed().as_secs_f64() * 1e6)
+            })
+            .collect();
+        let times = times?;
+        p50.push(quantile(&times, 0.5));
+        p99.push(quantile(&times, 0.99));
+    }
+    print(
+        "round trip of `state`, coordinator-mock at 1 kHz",
+        &[
+            Measure::new("p50", "µs", p50).goal(Goal::AtMost(60.0)),
+            Measure::new("p99", "µs", p99).goal(Goal::AtMost(300.0)),
+        ],
+    );
+    Ok(())
+}
+
+/// Lateness of the tick alone, with readers of the stream, and in a flood of requests, in turns.
+fn readers(effort: Effort) -> Result<(), String> {
+    let time = Duration::from_secs(effort.of(3, 10));
+    let (mut alone, mut read, mut flooded) = (Vec::new(), Vec::new(), Vec::new());
+    for _ in 0..effort.of(2, 5) {
+        alone.push(lateness(time, |_| Ok(Vec::new()))?);
+        read.push(lateness(time, |stop| (0..READERS).map(|_| Ok(reader(stop))).collect())?);
+        flooded.push(lateness(time, |stop| Ok(vec![flood(stop)]))?);
+    }
+    let ratio = |with: &[f64]| with.iter().zip(&alone).map(|(w, a)| w / a).collect::<Vec<_>>();
+    let (read_ratio, flood_ratio) = (ratio(&read), ratio(&flooded));
+    print(
+        "p99 lateness of the tick at 1 kHz",
+        &[
+            Measure::new("alone", "µs", alone.clone()),
+            Measure::new("4 readers of the joint state at 1 kHz", "µs", read),
+            Measure::new("10 000 requests/s", "µs", flooded),
+            Measure::new("4 readers, beside alone", "×", read_ratio).goal(Goal::AtMost(1.1)),
+            Measure::new("10 000 requests/s, beside alone", "×", flood_ratio).goal(Goal::AtMost(1.1)),
+        ],
+    );
+    Ok(())
+}
+
+type Load = Box<dyn FnOnce(Client) + Send>;
+
+/// p99 lateness of a run of its own under a load [µs].
+fn lateness(time: Duration, loads: impl FnOnce(&Arc<AtomicBool>) -> Result<Vec<Load>, String>) -> Result<f64, String> {
+    let mut run = fast_run()?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut threads: Vec<JoinHandle<()>> = Vec::new();
+    for load in loads(&stop)? {
+        let client = run.client()?;
+        threads.push(std::thread::spawn(move || load(client)));
+    }
+    std::thread::sleep(time);
+    let status = run.client()?.call(Status {}).map_err(|e| e.to_string())?;
+    stop.store(true, Ordering::Relaxed);
+    for thread in threads {
+        let _ = thread.join();
+    }
+    Ok(status.ticks.lateness_us.p99)
+}
+
+fn reader(stop: &Arc<AtomicBool>) -> Load {
+    let stop = stop.clone();
+    Box::new(move |mut client| {
+        let stream = Subscribe { stream: Stream::CoordinatorJointState, rate: None };
+        if client.call(stream).is_ok() {
+            while !stop.load(Ordering::Relaxed) && client.next_message().is_ok() {}
+        }
+    })
+}
+
+fn flood(stop: &Arc<AtomicBool>) -> Load {
+    let stop = stop.clone();
+    Box::new(move |mut client| {
+        let (began, mut sent) = (Instant::now(), 0u64);
+        while !stop.load(Ordering::Relaxed) {
+            if client.call(State {}).is_err() {
+                return;
+            }
+            sent += 1;
+            let due = began + Duration::from_secs_f64(sent as f64 / FLOOD);
+            std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        }
+        println!("  ({:.0} requests/s)", sent as f64 / began.elapsed().as_secs_f64());
+    })
+}
+
+const SERVO: &str = "\
+include: [coordinator-mock]
+tasks:
+  - {name: servo_arm, type: servo, joint_names: {hardware: arm}, priority: 20}
+";
+
+/// A policy loop in Python at 100 Hz: what it says of its own time.
+fn python(effort: Effort) -> Result<(), String> {
+    let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
+    let blueprint = folder.path().join("servo.yaml");
+    std::fs::write(&blueprint, SERVO).map_err(|e| e.to_string())?;
+    let mut run = LiveRun::start(&blueprint.display().to_string(), &[]).map_err(|e| e.to_string())?;
+    run.client()?;
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/python/example_policy.py");
+    let seconds = effort.of("10", "60");
+    let output = Command::new("python3")
+        .args([script, "servo_arm", "--rate", "100", "--seconds", seconds])
+        .env("XDG_RUNTIME_DIR", run.folder())
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .output()
+        .map_err(|e| format!("python3: {e} (make test-tools)"))?;
+    println!("servo from Python at 100 Hz for {seconds} s (goal: none missed)");
+    println!("  {}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    Ok(())
+}
