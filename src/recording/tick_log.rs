@@ -27,8 +27,9 @@ pub struct TickLog {
     names: Names,
     frame_id: String,
     wall: WallOffset,
-    /// Names of all joints, arm by arm.
-    joints: Vec<String>,
+    /// The messages of all arms, made once with their names and filled anew for each tick.
+    states: JointState,
+    commands: JointState,
     arms: Vec<ArmLog>,
     events: Vec<(u64, Described)>,
     /// Samples given up since the last tick was closed, because the end of their own tick never came.
@@ -46,15 +47,23 @@ struct ArmLog {
     error_text: String,
 }
 
+impl ArmLog {
+    /// What the tick read of the arm, if it read anything.
+    fn read(&self) -> Option<&ArmState> {
+        self.pending.as_ref().map(|s| &s.state).filter(|s| s.seq > 0)
+    }
+}
+
 /// What makes an arm's status worth telling at once.
 type StatusKey = (Phase, Cause, crate::arm::Link, ControlMode, bool, i32, VelocitySource, bool, String);
 
 impl TickLog {
     /// Nothing logged yet.
     pub fn new(run: String, names: Names, frame_id: String, wall: WallOffset) -> Self {
-        let joints = names.arms.iter().flat_map(|a| a.joints.clone()).collect();
+        let name = names.arms.iter().flat_map(|a| a.joints.clone()).collect();
+        let states = JointState { name, ..JointState::default() };
         let arms = names.arms.iter().map(|_| ArmLog::default()).collect();
-        Self { run, names, frame_id, wall, joints, arms, events: Vec::new(), given_up: 0 }
+        Self { run, names, frame_id, wall, commands: states.clone(), states, arms, events: Vec::new(), given_up: 0 }
     }
 
     /// What readers need to understand the log, for its metadata: the joints of each arm, and the offset between
@@ -179,50 +188,51 @@ impl TickLog {
         Header { stamp: Time::of(self.wall.wall(tick.deadline)), frame_id: self.frame_id.clone() }
     }
 
-    fn joint_states<W: Write + Seek>(&self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
-        let state = |arm: &ArmLog| arm.pending.map(|s| s.state).filter(|s| s.seq > 0);
-        if self.arms.iter().all(|arm| state(arm).is_none()) {
+    fn joint_states<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
+        if self.arms.iter().all(|arm| arm.read().is_none()) {
             return Ok(());
         }
-        let message = JointState {
-            header: self.header(tick),
-            name: self.joints.clone(),
-            position: self.column(|arm| state(arm).map(|s| s.position)),
-            velocity: self
-                .column(|arm| state(arm).filter(|s| s.velocity_source != VelocitySource::Absent).map(|s| s.velocity)),
-            effort: self.column(|arm| state(arm).and_then(|s| s.effort)),
-        };
-        log.publish("/joint_states", self.wall.wall(tick.deadline), &message)
+        let velocity = |s: &ArmState| (s.velocity_source != VelocitySource::Absent).then_some(s.velocity);
+        let mut message = std::mem::take(&mut self.states);
+        message.header = self.header(tick);
+        self.column(&mut message.position, |arm| arm.read().map(|s| s.position));
+        self.column(&mut message.velocity, |arm| arm.read().and_then(velocity));
+        self.column(&mut message.effort, |arm| arm.read().and_then(|s| s.effort));
+        self.states = message;
+        log.publish("/joint_states", self.wall.wall(tick.deadline), &self.states)
     }
 
-    fn joint_commands<W: Write + Seek>(&self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
-        let values = |wanted: fn(ControlMode) -> bool| {
-            self.column(|arm| arm.pending.filter(|s| s.command.mode.is_some_and(wanted)).map(|s| s.command.values))
+    fn joint_commands<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<()> {
+        let values = |arm: &ArmLog, wanted: fn(ControlMode) -> bool| {
+            let command = &arm.pending.as_ref()?.command;
+            command.mode.is_some_and(wanted).then_some(command.values)
         };
-        let message = JointState {
-            header: self.header(tick),
-            name: self.joints.clone(),
-            position: values(ControlMode::is_position),
-            velocity: values(|mode| mode == ControlMode::Velocity),
-            effort: values(|mode| mode == ControlMode::Torque),
-        };
+        let mut message = std::mem::take(&mut self.commands);
+        message.header = self.header(tick);
+        self.column(&mut message.position, |arm| values(arm, ControlMode::is_position));
+        self.column(&mut message.velocity, |arm| values(arm, |mode| mode == ControlMode::Velocity));
+        self.column(&mut message.effort, |arm| values(arm, |mode| mode == ControlMode::Torque));
+        self.commands = message;
+        let message = &self.commands;
         if message.position.is_empty() && message.velocity.is_empty() && message.effort.is_empty() {
             return Ok(());
         }
-        log.publish("/joint_commands", self.wall.wall(tick.deadline), &message)
+        log.publish("/joint_commands", self.wall.wall(tick.deadline), message)
     }
 
     /// One value per joint of all arms, NaN where an arm has none; empty if no arm has any.
-    fn column(&self, values: impl Fn(&ArmLog) -> Option<Joints>) -> Vec<f64> {
+    fn column(&self, column: &mut Vec<f64>, values: impl Fn(&ArmLog) -> Option<Joints>) {
         let mut any = false;
-        let mut column = Vec::with_capacity(self.joints.len());
+        column.clear();
         for (arm, names) in self.arms.iter().zip(&self.names.arms) {
             let values = values(arm);
             any |= values.is_some();
             let values = values.unwrap_or([f64::NAN; _]);
             column.extend(values.into_iter().take(names.joints.len()));
         }
-        if any { column } else { Vec::new() }
+        if !any {
+            column.clear();
+        }
     }
 
     fn one_arm<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample, index: usize) -> McapResult<()> {
