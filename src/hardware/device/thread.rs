@@ -1,4 +1,4 @@
-//! The loop of a device thread.
+//! The loop of a device thread. One loop and its state belong together, hence its length.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
