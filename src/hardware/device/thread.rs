@@ -41,6 +41,8 @@ pub(super) struct Worker {
     last: ArmCommand,
     /// A stop that the arm has not taken yet. Kept until it does, also over a new connection.
     stop_owed: bool,
+    /// What is told of writes that fail.
+    write_trouble: String,
     /// Since when the arm refuses a change of mode.
     mode_wanted: Option<Mono>,
     /// It was connected once and should be again.
@@ -76,6 +78,7 @@ impl Worker {
             reading: JointReading::default(),
             last: ArmCommand::default(),
             stop_owed: false,
+            write_trouble: String::new(),
             mode_wanted: None,
             wanted: false,
             connected: false,
@@ -370,7 +373,12 @@ impl Worker {
     fn not_taken(&mut self, adapter: &mut dyn ManipulatorAdapter, what: &str, error: &AdapterError) {
         self.health.write_errors.fetch_add(1, Relaxed);
         self.write_errors += 1;
-        self.trouble(&format!("{what}: {error}"));
+        // Commands and stops go the same way: the first that is not taken is told, the rest only count.
+        if self.write_errors == 1 {
+            self.write_trouble = format!("{what}: {error}");
+        }
+        let text = self.write_trouble.clone();
+        self.trouble(&text);
         self.after_error(adapter, error);
     }
 
