@@ -216,3 +216,24 @@ fn insta(got: &str, golden: &str) {
     let want = fs::read_to_string(&path).unwrap_or_default();
     assert_eq!(got, want, "run with DIMOS_REGENERATE=1 to keep the new text of {golden}");
 }
+
+#[test]
+fn a_stream_over_more_joints_than_a_target_holds_is_refused() {
+    let text = |task: &str| {
+        format!(
+            "hardware:
+  - {{hardware_id: left, joints: {{prefix: left, count: 9}}, adapter_type: mock}}
+  - {{hardware_id: right, joints: {{prefix: right, count: 9}}, adapter_type: mock}}
+tasks:
+  - {{name: both, type: {task}, joint_names: [{}]}}
+",
+            ["left", "right"].iter().flat_map(|p| dimos::joint::make_joints(p, 9)).collect::<Vec<_>>().join(", ")
+        )
+    };
+    for (task, errors) in [("trajectory", 0), ("servo", 1), ("velocity", 1)] {
+        let found = blueprint::Found { name: "wide".into(), source: Source::Embedded, bytes: text(task).into_bytes() };
+        let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin());
+        assert_eq!(loaded.errors(), errors, "{task}: {}", loaded.render(false));
+        assert!(errors == 0 || loaded.render(false).contains("at most 16 joints, this one names 18"));
+    }
+}

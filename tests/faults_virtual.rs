@@ -1,5 +1,5 @@
 //! Faults that the coordinator must withstand, on a virtual clock, each with the number that it must keep. Named
-//! after the table of faults in `docs/faults.md`. The rig checks every command of every test as well: finite,
+//! after the numbers of the project's table of faults. The rig checks every command of every test as well: finite,
 //! within position, velocity and acceleration limits, no motion without power, modes changed at standstill.
 
 #[path = "support/rig.rs"]

@@ -6,7 +6,7 @@ use crate::blueprint::arms::Found;
 use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::resolve::{Checker, Task, TaskKind};
 use crate::blueprint::schema::{JointNames, TaskEntry};
-use crate::joint::ControlMode;
+use crate::joint::{ControlMode, MAX_DOF};
 use crate::yaml::{Diag, Located, Missing, NodeId, did_you_mean, quote, read};
 
 /// The task types of this version.
@@ -122,6 +122,7 @@ fn kind(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, joints: &[usize],
     }
     let params = entry.params.as_ref().filter(|p| !p.value.is_null()).map(|p| p.at);
     let params = params.filter(|_| checker.has(entry.at, "params"));
+    check_width(checker, entry, joints);
     match entry.kind.as_str() {
         "trajectory" => Some(TaskKind::Trajectory(read_params::<TrajectoryParams>(checker, params))),
         "servo" => {
@@ -141,6 +142,16 @@ fn kind(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, joints: &[usize],
             checker.error(entry.kind.at, diag.maybe_hint(did_you_mean(other, KINDS, "there are")));
             None
         }
+    }
+}
+
+/// A stream's target crosses to the tick as one fixed array.
+fn check_width(checker: &mut Checker<'_>, entry: &TaskEntry, joints: &[usize]) {
+    if matches!(entry.kind.as_str(), "servo" | "velocity") && joints.len() > MAX_DOF {
+        let kind = entry.kind.as_str();
+        let diag =
+            Diag::error(format!("a {kind} task moves at most {MAX_DOF} joints, this one names {}", joints.len()));
+        checker.error(entry.joint_names.at, diag.hint("make one task per arm"));
     }
 }
 
