@@ -1,5 +1,7 @@
 //! The compile-time adapter table: one row per arm, in `arms/mod.rs`. `dimos list-adapters` prints it.
 
+use std::net::{IpAddr, SocketAddr};
+
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
@@ -89,8 +91,38 @@ pub trait Emulator: Send {
     fn inject(&self, fault: Fault) -> Result<(), String>;
 }
 
-/// Starts an emulator for an arm's configuration.
-pub type Emulate = fn(&AdapterConfig) -> AdapterResult<Box<dyn Emulator>>;
+/// Where an emulator listens, as far as the arm's transport has a choice.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum Place {
+    /// Where only this program finds it, and no privilege is needed: free loopback ports, a bus in memory.
+    #[default]
+    InProcess,
+    /// The arm's own ports on this address, which must be a loopback address.
+    Bind(IpAddr),
+    /// A CAN interface of the system.
+    Can(String),
+    /// A new pseudo-terminal.
+    Pty,
+}
+
+impl Place {
+    /// Where an emulator on TCP listens whose arm has its server at `port`; an error where that cannot be.
+    pub fn tcp(&self, port: u16) -> AdapterResult<SocketAddr> {
+        match self {
+            Self::InProcess => Ok(SocketAddr::from(([127, 0, 0, 1], 0))),
+            Self::Bind(address) if address.is_loopback() => Ok(SocketAddr::new(*address, port)),
+            Self::Bind(address) => Err(AdapterError::Rejected(format!(
+                "{address} is not a loopback address: emulators are reachable from this computer only"
+            ))),
+            Self::Can(_) | Self::Pty => {
+                Err(AdapterError::Rejected("this arm speaks TCP: its emulator has a loopback address".to_owned()))
+            }
+        }
+    }
+}
+
+/// Starts an emulator for an arm's configuration; `Unsupported` for a place that the arm's transport does not have.
+pub type Emulate = fn(&AdapterConfig, &Place) -> AdapterResult<Box<dyn Emulator>>;
 
 /// One row of the table.
 #[derive(Debug, Clone, Copy)]
@@ -125,6 +157,17 @@ pub struct AdapterSpec {
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
     pub emulate: Option<Emulate>,
+}
+
+/// An adapter that this build does not have: of another system, or behind a cargo feature that is off.
+#[derive(Debug, Clone, Copy)]
+pub struct Absent {
+    /// What its `adapter_type` would be.
+    pub name: &'static str,
+    /// One line: which arms it is for.
+    pub about: &'static str,
+    /// The way to get it, as a sentence: `build with --features can`.
+    pub remedy: &'static str,
 }
 
 /// The address that asks for the emulator.
@@ -208,7 +251,7 @@ pub fn create(name: &str, address: &str, dof: usize) -> AdapterResult<Box<dyn Ma
 /// ```
 pub fn emulate(name: &str, dof: usize) -> AdapterResult<Box<dyn Emulator>> {
     let start = builtin(name)?.emulate.ok_or(AdapterError::Unsupported)?;
-    start(&plain(name, SIM, dof))
+    start(&plain(name, SIM, dof), &Place::InProcess)
 }
 
 fn builtin(name: &str) -> AdapterResult<&'static AdapterSpec> {

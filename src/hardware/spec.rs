@@ -3,6 +3,12 @@
 //! Everything that crosses it is in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a
 //! default body and those of the rest that its device can do; the defaults say "no" in the agreed way, so the
 //! absence of a feature is never an error.
+//!
+//! A device either answers when it is asked, or sends its state by itself. For the second kind
+//! [`ManipulatorAdapter::state_fd`] names the descriptor on which the state arrives: the device thread then reads when
+//! something has come, and the age of the state is the device's doing alone.
+
+use std::os::fd::BorrowedFd;
 
 use crate::arm::Pose;
 use crate::clock::Mono;
@@ -136,6 +142,13 @@ pub trait ManipulatorAdapter: Send {
 
     // --- State ---
 
+    /// For a device that sends its state by itself: what becomes readable when something has arrived. The device
+    /// thread then calls [`ManipulatorAdapter::read_joints`] at once, which must take up all that has arrived without
+    /// waiting, and answer with the newest state and its own `stamp`: the same as before when nothing newer has come.
+    /// After a silence that a living device never keeps it answers with an error. `None`: the device is asked.
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        None
+    }
     /// Fills in the joint positions [rad].
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()>;
     /// Fills in the joint velocities [rad/s]; `false` when the device has none (the coordinator estimates them).

@@ -25,7 +25,7 @@ impl Wake {
 
     /// Waits until the event is raised or the time is over, and lowers it. `true`: it was raised.
     pub fn wait(&self, timeout: Duration) -> bool {
-        let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos() as i64 };
+        let timeout = timespec(timeout);
         let mut fds = [PollFd::new(&*self.0, PollFlags::IN)];
         match poll(&mut fds, Some(&timeout)) {
             Ok(n) if n > 0 => {
@@ -36,10 +36,28 @@ impl Wake {
         }
     }
 
+    /// The same, and ends also when `other` becomes readable (or broken, which a read will tell). `true`: it has.
+    pub fn wait_or_readable(&self, other: BorrowedFd<'_>, timeout: Duration) -> bool {
+        let timeout = timespec(timeout);
+        let mut fds = [PollFd::new(&*self.0, PollFlags::IN), PollFd::from_borrowed_fd(other, PollFlags::IN)];
+        if !poll(&mut fds, Some(&timeout)).is_ok_and(|n| n > 0) {
+            return false;
+        }
+        let [event, other] = fds;
+        if !event.revents().is_empty() {
+            self.lower();
+        }
+        !other.revents().is_empty()
+    }
+
     /// Lowers the event without waiting.
     pub fn lower(&self) {
         let _ = rustix::io::read(self.0.as_fd(), &mut [0u8; 8]);
     }
+}
+
+fn timespec(duration: Duration) -> Timespec {
+    Timespec { tv_sec: duration.as_secs() as i64, tv_nsec: duration.subsec_nanos() as i64 }
 }
 
 impl AsFd for Wake {
@@ -66,5 +84,16 @@ mod tests {
         wake.raise();
         assert!(wake.wait(Duration::from_secs(1)));
         assert!(!wake.wait(Duration::ZERO));
+    }
+
+    #[test]
+    fn a_readable_descriptor_ends_a_wait_and_stays_as_it_is() {
+        let (wake, other) = (Wake::new().unwrap(), Wake::new().unwrap());
+        assert!(!wake.wait_or_readable(other.as_fd(), Duration::ZERO));
+        wake.raise();
+        assert!(!wake.wait_or_readable(other.as_fd(), Duration::from_secs(1)), "only the event");
+        other.raise();
+        assert!(wake.wait_or_readable(other.as_fd(), Duration::from_secs(1)));
+        assert!(other.wait(Duration::ZERO), "not read by the wait");
     }
 }

@@ -9,7 +9,7 @@ use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
-use crate::hardware::registry::{AdapterConfig, Emulator, SIM};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
 use crate::joint::JointLimits;
 use crate::rt::beat::Beat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
@@ -118,7 +118,7 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     };
     match arm.adapter.emulate {
         Some(emulate) if arm.address == SIM => {
-            let emulator = emulate(&config).map_err(|e| hardware(arm, &e))?;
+            let emulator = emulate(&config, &Place::InProcess).map_err(|e| hardware(arm, &e))?;
             config.address = emulator.address();
             arms._emulators.push(emulator);
         }

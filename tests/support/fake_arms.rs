@@ -58,7 +58,7 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     options: OptionsSpec::of::<NetOptions>(),
     limits: |dof| JointLimits::uniform(dof, 3.0, 2.0),
     create: |_| Err(AdapterError::Rejected(NOT_HERE.to_owned())),
-    emulate: Some(|_| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
+    emulate: Some(|_, _| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
 };
 
 /// An arm in memory that needs no address.

@@ -1,9 +1,12 @@
 //! The arms in the box, one folder each. A new arm is one folder and one line here.
 
-use crate::hardware::registry::AdapterSpec;
+use crate::hardware::registry::{Absent, AdapterSpec};
 
 pub mod mock;
 pub mod yourarm;
 
 /// The compile-time adapter table.
 pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC];
+
+/// The adapters that this build does not have.
+pub const ABSENT: &[Absent] = &[];

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
@@ -38,7 +38,8 @@ impl Context {
             dof: row.dof.1,
             options: serde_json::json!({}),
         };
-        let emulator = row.emulate.map(|start| start(&config)).transpose().map_err(|e| e.to_string())?;
+        let emulator =
+            row.emulate.map(|start| start(&config, &Place::InProcess)).transpose().map_err(|e| e.to_string())?;
         if let Some(emulator) = &emulator {
             config.address = emulator.address();
         }

@@ -115,7 +115,14 @@ impl Worker {
         let due = if self.connected { self.next_read } else { self.reconnect.0 };
         let now = self.config.clock.now();
         let idle = if self.wanted { due.since(now) } else { Duration::from_secs(1) };
-        self.wake.wait(idle.min(Duration::from_secs(1)).min(self.until_silent(now)));
+        let idle = idle.min(Duration::from_secs(1)).min(self.until_silent(now));
+        let arrived = match adapter.state_fd() {
+            Some(states) if self.connected => self.wake.wait_or_readable(states, idle),
+            _ => {
+                self.wake.wait(idle);
+                false
+            }
+        };
         loop {
             match orders.try_recv() {
                 Ok(order) => {
@@ -134,7 +141,7 @@ impl Worker {
             self.pass_on_command(adapter);
             self.watch_the_tick();
             self.stop(adapter);
-            if self.config.clock.now() >= self.next_read {
+            if arrived || self.config.clock.now() >= self.next_read {
                 self.read(adapter);
             }
         } else if self.wanted && self.config.clock.now() >= self.reconnect.0 {
@@ -189,6 +196,8 @@ impl Worker {
         }
         let limits = adapter.get_limits().inspect_err(|_| adapter.disconnect())?;
         self.whole_state_at_once = info.whole_state_at_once;
+        // An older controller may deliver less often than its kind.
+        self.config.native_rate = self.config.native_rate.min(info.native_rate);
         self.wanted = true;
         self.connected = true;
         self.reconnect.1 = BACK_OFF.0;
@@ -303,9 +312,10 @@ impl Worker {
         if command.seq == before.seq {
             return;
         }
-        let lead = Duration::from_secs_f64((3.0 * self.read_time).max(1e-3)).min(self.config.tick_period / 2);
-        let earliest = self.last_read.after(self.config.read_period().mul_f64(0.8));
-        self.next_read = self.next_read.min(command.next_tick.before(lead)).max(earliest);
+        // A device that is asked is asked just before the tick; one that sends by itself sets its own pace.
+        if adapter.state_fd().is_none() {
+            self.read_before(command.next_tick);
+        }
         if self.state.self_held {
             return;
         }
@@ -314,6 +324,13 @@ impl Worker {
             Ok(()) => self.write_errors = 0,
             Err(error) => self.not_taken(adapter, "a command was not taken", &error),
         }
+    }
+
+    /// Sets the next read so that it ends just before the tick at `next_tick`.
+    fn read_before(&mut self, next_tick: Mono) {
+        let lead = Duration::from_secs_f64((3.0 * self.read_time).max(1e-3)).min(self.config.tick_period / 2);
+        let earliest = self.last_read.after(self.config.read_period().mul_f64(0.8));
+        self.next_read = self.next_read.min(next_tick.before(lead)).max(earliest);
     }
 
     fn write(
@@ -462,6 +479,9 @@ impl Worker {
 
     fn take_reading(&mut self, began: Mono) {
         let stamp = self.reading.stamp.unwrap_or(began);
+        if self.state.seq != 0 && self.reading.stamp == Some(self.state.stamp) {
+            return; // nothing new; its age tells
+        }
         let interval = stamp.seconds_since(self.state.stamp);
         let reach = self.config.velocity_max * 1.5 * interval.clamp(0.0, 0.1) + 0.02;
         let dof = self.config.dof;

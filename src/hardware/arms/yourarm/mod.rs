@@ -50,7 +50,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     options: OptionsSpec::of::<Options>(),
     limits,
     create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
-    emulate: Some(|config| Ok(Box::new(emulator::YourArmEmulator::start(config)?))),
+    emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
 };
 
 /// The data sheet's joint limits, here in the sheet's units: lowest and highest position [deg], top speed [deg/s].

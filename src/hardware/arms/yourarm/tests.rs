@@ -7,7 +7,7 @@ use super::emulator::{SimOptions, YourArmEmulator};
 use super::{SPEC, protocol::DOF};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
@@ -296,5 +296,5 @@ fn wrong_configurations_are_refused() {
         assert!(error.contains(part), "{error}");
     }
     let sim = serde_json::json!({"sim": {"initial_positions": [0, 0, 0, 0, 0, 9]}});
-    assert!(YourArmEmulator::start(&config("sim", 6, sim)).is_err());
+    assert!(YourArmEmulator::start(&config("sim", 6, sim), &Place::InProcess).is_err());
 }

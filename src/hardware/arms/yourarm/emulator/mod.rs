@@ -9,12 +9,15 @@ mod kinematics;
 mod server;
 pub mod wire;
 
+use std::net::SocketAddr;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{limits, protocol::DOF};
+use super::limits;
+use super::protocol::{DOF, PORT};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
@@ -56,13 +59,17 @@ pub struct YourArmEmulator {
 }
 
 impl YourArmEmulator {
-    /// Starts an emulator on a free loopback port, with the `sim` part of an adapter's options.
-    pub fn start(config: &AdapterConfig) -> AdapterResult<Self> {
-        Self::with(&config.options::<super::Options>()?.sim)
+    /// Starts an emulator at `place`, with the `sim` part of an adapter's options.
+    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+        Self::listen(&config.options::<super::Options>()?.sim, place.tcp(PORT)?)
     }
 
     /// Starts an emulator on a free loopback port.
     pub fn with(options: &SimOptions) -> AdapterResult<Self> {
+        Self::listen(options, Place::InProcess.tcp(PORT)?)
+    }
+
+    fn listen(options: &SimOptions, address: SocketAddr) -> AdapterResult<Self> {
         let rejected = |text| AdapterError::Rejected(format!("yourarm emulator: {text}"));
         check_kinds("the yourarm emulator", &options.faults, PLAYABLE).map_err(AdapterError::Rejected)?;
         let initial = &options.initial_positions;
@@ -77,7 +84,8 @@ impl YourArmEmulator {
             }
         }
         let controller = Controller::new(initial, &options.faults, MonotonicClock.now());
-        let server = Server::start(controller).map_err(|e| rejected(format!("cannot start: {e}")))?;
+        let server =
+            Server::start(controller, address).map_err(|e| rejected(format!("cannot listen at {address}: {e}")))?;
         Ok(Self { server })
     }
 

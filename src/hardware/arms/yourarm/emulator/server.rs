@@ -77,9 +77,9 @@ pub struct Server {
 }
 
 impl Server {
-    /// Listens on a free port of 127.0.0.1.
-    pub fn start(controller: Controller) -> std::io::Result<Self> {
-        let listener = TcpListener::bind("127.0.0.1:0")?;
+    /// Listens at `address`.
+    pub fn start(controller: Controller, address: SocketAddr) -> std::io::Result<Self> {
+        let listener = TcpListener::bind(address)?;
         let now = Instant::now();
         let shared = Arc::new(Shared {
             address: listener.local_addr()?,
