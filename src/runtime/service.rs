@@ -263,6 +263,17 @@ impl Service {
             Call::Motion(m) => self.motion(m.motion).map(Reply::Motion),
             Call::Move(m) => self.move_arm(m).await,
             Call::Execute(e) => self.execute(e).await,
+            Call::Plan(_)
+            | Call::Planning(_)
+            | Call::Preview(_)
+            | Call::ExecutePlan(_)
+            | Call::Planner(_)
+            | Call::World(_)
+            | Call::WorldAdd(_)
+            | Call::WorldMove(_)
+            | Call::WorldRemove(_)
+            | Call::Attach(_)
+            | Call::Detach(_) => self.planner_call(call).await,
             Call::Cancel(c) => self.cancel(c).await,
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
@@ -294,6 +305,7 @@ impl Backend for Service {
             Subject::All => true,
             Subject::Arm(id) => arm.hardware_id == id,
             Subject::Joints(joints) => joints.iter().any(|j| arm.joints.contains(j)),
+            Subject::Plan(plan) => self.joints_of_plan(plan).iter().any(|j| arm.joints.contains(j)),
             Subject::Task(name) => {
                 let range = self.joints_of_arm(*i as u16);
                 tasks.iter().any(|t| t.name == name && t.joints.iter().any(|j| range.contains(j)))
