@@ -7,6 +7,8 @@
 //!
 //! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
 
+pub mod kinematics;
 pub mod model;
+pub mod random;
 
 pub use model::{Geometry, Inertial, Joint, JointKind, Limits, Link, MeshFile, Mimic, RobotModel, Shape};
