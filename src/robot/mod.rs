@@ -8,5 +8,8 @@
 //! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
 
 pub mod model;
+pub mod packages;
+pub mod urdf;
+pub mod xml;
 
 pub use model::{Geometry, Inertial, Joint, JointKind, Limits, Link, MeshFile, Mimic, RobotModel, Shape};
