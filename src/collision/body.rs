@@ -5,7 +5,8 @@ use std::sync::Arc;
 use glamx::{DAffine3, DVec3};
 
 use crate::robot::kinematics::frame;
-use crate::robot::model::{Geometry, MeshFile, RobotModel};
+use crate::robot::mesh;
+use crate::robot::model::{Geometry, RobotModel};
 
 use super::shape::{Mesh, ShapeError, Solid};
 
@@ -18,9 +19,6 @@ pub enum MeshMode {
     /// Triangle by triangle.
     Triangles,
 }
-
-/// The triangles of a mesh file: vertices [m], not yet scaled, and triples of their indices.
-pub type Triangles = (Vec<[f64; 3]>, Vec<[u32; 3]>);
 
 /// Why a robot has no solids.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -47,12 +45,8 @@ pub enum BodyError {
     },
 }
 
-/// The collision solids of every link of a model, in the links' frames. `read` loads mesh files.
-pub fn solids(
-    model: &RobotModel,
-    mode: MeshMode,
-    mut read: impl FnMut(&MeshFile) -> Result<Triangles, String>,
-) -> Result<Vec<Vec<Solid>>, BodyError> {
+/// The collision solids of every link of a model, in the links' frames. Reads the mesh files.
+pub fn solids(model: &RobotModel, mode: MeshMode) -> Result<Vec<Vec<Solid>>, BodyError> {
     let link = |link: &crate::robot::model::Link| {
         let solid = |(i, shape): (usize, &crate::robot::model::Shape)| {
             let bad = |error| BodyError::Shape { link: link.name.clone(), number: i + 1, error };
@@ -63,13 +57,9 @@ pub fn solids(
                 Geometry::Cylinder { radius, length } => Solid::cylinder(*radius, *length, at).map_err(bad),
                 Geometry::Capsule { radius, length } => Solid::capsule(*radius, *length, at).map_err(bad),
                 Geometry::Mesh(file) => {
-                    let triangles = read(file).map_err(|error| BodyError::File {
-                        link: link.name.clone(),
-                        uri: file.uri.clone(),
-                        error,
-                    })?;
-                    let scale = DVec3::new(file.scale.x, file.scale.y, file.scale.z);
-                    of_mesh(triangles, scale, mode, at).map_err(bad)
+                    let (link, uri) = (link.name.clone(), file.uri.clone());
+                    let mesh = mesh::Mesh::load(file).map_err(|error| BodyError::File { link, uri, error })?;
+                    of_mesh(&mesh, mode, at).map_err(bad)
                 }
             }
         };
@@ -78,16 +68,11 @@ pub fn solids(
     model.links.iter().map(link).collect()
 }
 
-/// A solid of a mesh's triangles.
-pub fn of_mesh(
-    (vertices, triangles): Triangles,
-    scale: DVec3,
-    mode: MeshMode,
-    frame: DAffine3,
-) -> Result<Solid, ShapeError> {
-    let vertices: Vec<DVec3> = vertices.into_iter().map(|v| DVec3::from(v) * scale).collect();
+/// A solid of a mesh.
+pub fn of_mesh(mesh: &mesh::Mesh, mode: MeshMode, frame: DAffine3) -> Result<Solid, ShapeError> {
+    let vertices: Vec<DVec3> = mesh.vertices.iter().map(|v| DVec3::new(v.x, v.y, v.z)).collect();
     match mode {
         MeshMode::Hull => Solid::hull(&vertices, frame),
-        MeshMode::Triangles => Solid::mesh(Arc::new(Mesh::new(vertices, triangles)?), frame),
+        MeshMode::Triangles => Solid::mesh(Arc::new(Mesh::new(vertices, mesh.triangles.clone())?), frame),
     }
 }
