@@ -80,6 +80,9 @@ struct Row {
     cost: Option<f64>,
     duration_s: Option<f64>,
     path: Option<Vec<Vec<f64>>>,
+    /// Processor time of this thread: what `total_us` would be on an idle machine.
+    cpu_us: Option<f64>,
+    looks: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<String>,
 }
@@ -116,16 +119,16 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let kinematics = Arc::new(arm.kinematics(problem)?);
     let scene = arm.scene(&kinematics, problem, arguments.shapes)?;
     let (start, goal) = problem.ends();
-    let began = Instant::now();
+    let (began, cpu) = (Instant::now(), cpu_time());
     let mut checker = ExactChecker::new(scene, Resolution::default());
     let settings = PlanSettings { seed: arguments.seed, ..PlanSettings::default() };
     let stop = Stop::new(Some(began + Duration::from_secs_f64(arguments.timeout)), None);
     let found = plan(&mut checker, start, &[goal.to_vec()], &settings, &stop);
     let total = began.elapsed();
-    Ok(row(problem, found, total))
+    Ok(row(problem, found, total, cpu_time().saturating_sub(cpu)))
 }
 
-fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration) -> Row {
+fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: Duration) -> Row {
     let us = |d: Duration| d.as_secs_f64() * 1e6;
     let (family, index) = (problem.problem.clone(), problem.index);
     match found {
@@ -138,6 +141,8 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration) -> Ro
             total_us: Some(us(total)),
             cost: Some(plan.length),
             duration_s: None,
+            cpu_us: Some(us(cpu)),
+            looks: Some(plan.looks),
             path: Some(plan.path),
             why: None,
         },
@@ -145,7 +150,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration) -> Ro
             eprintln!("{family} {index}: {error}");
             let why = Some(error.to_string());
             let none = None;
-            Row { problem: family, index, solved: false, plan_us: none, simplify_us: none, total_us: none, cost: none, duration_s: none, path: None, why }
+            Row { problem: family, index, solved: false, plan_us: none, simplify_us: none, total_us: none, cost: none, duration_s: none, path: None, cpu_us: None, looks: None, why }
         }
     }
 }
@@ -171,10 +176,20 @@ fn report(rows: &[Row], level: &Level) {
             of(|r| r.duration_s, 0.5),
         );
     }
+    let cpu = |q| quantile(rows.iter().filter_map(|r| r.cpu_us).collect(), q) / 1e3;
+    let mut looks: Vec<f64> = rows.iter().filter_map(|r| r.looks).map(|n| n as f64).collect();
+    looks.sort_by(f64::total_cmp);
+    println!("\nprocessor time: median {:.3} ms, p95 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
+        cpu(0.5), cpu(0.95), cpu(1.0), quantile(looks.clone(), 0.5), looks.iter().sum::<f64>() / looks.len().max(1) as f64);
 }
 
 fn quantile(mut values: Vec<f64>, q: f64) -> f64 {
     values.sort_by(f64::total_cmp);
     let rank = ((values.len() as f64 * q).ceil() as usize).clamp(1, values.len().max(1));
     values.get(rank - 1).copied().unwrap_or(f64::NAN)
+}
+
+fn cpu_time() -> Duration {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }

@@ -40,27 +40,15 @@ impl Stop {
 /// How finely motions are checked.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Resolution {
-    /// Largest distance between two configurations that are looked at, in the Euclidean norm of all joints [rad].
-    pub step: f64,
-    /// A proven motion may leave out of account what happens within this much motion of any point of the robot [m].
-    pub proof: f64,
+    /// A motion is free when nothing touches anywhere on it; that may leave out of account what happens while no point
+    /// of the robots moves by more than this [m].
+    pub motion: f64,
 }
 
 impl Default for Resolution {
     fn default() -> Self {
-        Self { step: 1.0 / 32.0, proof: 1e-4 }
+        Self { motion: 1e-4 }
     }
-}
-
-/// What a checker finds at one configuration.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Verdict {
-    /// Nothing touches, and nothing will within the margin that was asked for.
-    Free,
-    /// Nothing was found to touch, but something may within the margin.
-    Close,
-    /// These touch.
-    Hit(Pair),
 }
 
 /// Tells where a robot, or several, can be. A configuration holds the joints of all robots, one after the other.
@@ -74,13 +62,15 @@ pub trait CollisionChecker {
     /// How finely motions are checked.
     fn resolution(&self) -> Resolution;
 
-    /// Looks at configuration `q` [rad or m]. With a `margin` for each joint [rad or m], `Free` means that nothing
-    /// touches at any configuration that differs by no more than these.
-    fn look(&mut self, q: &[f64], margin: Option<&[f64]>) -> Verdict;
+    /// Whether nothing touches at configuration `q` [rad or m].
+    fn is_free(&mut self, q: &[f64]) -> bool;
 
-    /// An upper bound of how far any point of the robots moves, or moves relative to another link that it could
-    /// touch, when each joint moves by this much [m].
-    fn reach(&self, motion: &[f64]) -> f64;
+    /// Whether nothing touches on the straight line between two configurations, ends included, at the resolution.
+    /// `false` when it was stopped.
+    fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool;
+
+    /// What touches first, of those that are quickly found.
+    fn first_contact(&mut self, q: &[f64]) -> Option<Pair>;
 
     /// The least distance between things that must not touch, and the pair; `None` when there is nothing to touch.
     fn clearance(&mut self, q: &[f64]) -> Option<Contact>;
@@ -88,8 +78,6 @@ pub trait CollisionChecker {
     /// Everything that touches at a configuration, the deepest first.
     fn contacts(&mut self, q: &[f64]) -> Vec<Contact>;
 
-    /// Whether nothing touches at a configuration.
-    fn is_free(&mut self, q: &[f64]) -> bool {
-        self.look(q, None) == Verdict::Free
-    }
+    /// Configurations that were looked at so far.
+    fn looks(&self) -> u64;
 }

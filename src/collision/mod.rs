@@ -12,6 +12,7 @@ pub mod body;
 pub mod checker;
 pub mod cloud;
 pub mod exact;
+mod motion;
 pub mod pairs;
 pub mod ply;
 pub mod report;

@@ -48,6 +48,8 @@ pub struct StandingObstacle {
     pub(super) solid: Solid,
     /// A box around its core.
     pub(super) guard: (DAffine3, DVec3),
+    /// Whether that box is the core itself: for boxes, capsules and spheres.
+    pub(super) boxy: bool,
 }
 
 impl StandingObstacle {
@@ -277,11 +279,15 @@ fn stand(obstacle: &super::world::Obstacle) -> StandingObstacle {
     let mut solid = obstacle.solid.clone();
     solid.radius += obstacle.padding;
     let mut standing =
-        StandingObstacle { name: obstacle.name.clone(), guard: (solid.frame, DVec3::ZERO), solid };
+        StandingObstacle { name: obstacle.name.clone(), guard: (solid.frame, DVec3::ZERO), boxy: true, solid };
     standing.guard = match &standing.solid.core {
         Core::Point => (standing.solid.frame, DVec3::ZERO),
         Core::Segment { half } => (standing.solid.frame, DVec3::new(0.0, 0.0, *half)),
-        _ => standing.placed().guard().unwrap_or(standing.guard),
+        Core::Box { half } => (standing.solid.frame, *half),
+        _ => {
+            standing.boxy = false;
+            standing.placed().guard().unwrap_or(standing.guard)
+        }
     };
     standing
 }

@@ -2,12 +2,11 @@
 //! deadline it is given, the same seed gives the same path.
 //!
 //! ```text
-//!  pose ─▶ ik ─▶ goals ─▶ planner: straight line │ rrt_connect ─▶ shortcut ─▶ proof ─▶ path
-//!                                                                                       │
+//!  pose ─▶ ik ─▶ goals ─▶ planner: straight line │ rrt_connect ─▶ shortcut ─▶ path
+//!                                                                             │
 //!                                 JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
 //! ```
 
-pub mod edge;
 pub mod nearest;
 pub mod path;
 pub mod planner;

@@ -1,4 +1,4 @@
-//! One plan: from a start to the nearest goal that can be reached, as a path that is proven free.
+//! One plan: from a start to the nearest goal that can be reached, as a path that is free at the checker's resolution.
 
 use std::time::{Duration, Instant};
 
@@ -6,7 +6,6 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
-use super::edge::Edges;
 use super::path::{Path, between, distance, length};
 use super::rrt_connect::{Ended, RrtSettings, SearchCount, search};
 use super::sampler::Sampler;
@@ -42,7 +41,7 @@ impl Default for PlanSettings {
 /// A path and how it was found.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// Configurations to be joined by straight lines, from the start to one of the goals; proven free.
+    /// Configurations to be joined by straight lines, from the start to one of the goals.
     pub path: Path,
     /// Its length [rad].
     pub length: f64,
@@ -56,7 +55,7 @@ pub struct Plan {
     pub looks: u64,
     /// Time to find a path.
     pub search_time: Duration,
-    /// Time to shorten and prove it.
+    /// Time to shorten it.
     pub shorten_time: Duration,
 }
 
@@ -118,47 +117,38 @@ pub fn plan<C: CollisionChecker>(
     stop: &Stop,
 ) -> Result<Plan, PlanError> {
     let began = Instant::now();
-    let mut edges = Edges::new(checker.dof());
+    let looked = checker.looks();
     let lead = lead_in(checker, start, settings, stop)?;
     let from = lead.last().map_or(start, Vec::as_slice).to_vec();
     let goals = usable_goals(checker, &from, goals)?;
-    let straight = goals.iter().find(|g| {
-        edges.is_free(checker, &from, g, stop) && edges.is_proven(checker, &from, g, stop)
-    });
+    let straight = goals.iter().find(|goal| checker.motion_is_free(&from, goal, stop));
     let mut count = SearchCount::default();
-    let finish = |path: Path, edges: &Edges, straight, count, search_time: Duration| {
-        let mut path = path;
-        path.splice(..1, lead.iter().cloned());
-        let shorten_time = began.elapsed() - search_time;
-        let (length, looks) = (length(&path), edges.looks);
-        Ok(Plan { path, length, straight, seed: settings.seed, count, looks, search_time, shorten_time })
-    };
-    if let Some(goal) = straight {
-        let searched = began.elapsed();
-        return finish(vec![from.clone(), goal.clone()], &edges, true, count, searched);
-    }
-    // Edges of the search are checked by samples; should the result hold one that cannot be proven, the search is
-    // done again with proof for each.
-    for prove in [false, true] {
-        edges.prove = prove;
-        let mut sampler = Sampler::new(checker.limits(), &from, settings.seed);
-        let (found, made) = search(checker, &mut edges, &from, &goals, &settings.search, &mut sampler, stop);
-        count.samples += made.samples;
-        count.nodes += made.nodes;
-        let path = found.map_err(|ended| match ended {
-            Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
-            Ended::Stopped => PlanError::Timeout(count),
-            Ended::Exhausted => PlanError::Exhausted(count),
-        })?;
-        let searched = began.elapsed();
-        let short = shorten(checker, &mut edges, &path, &settings.shortcut, settings.seed, stop);
-        // What remains to be proven may take as long as it takes: it is bounded, and without it there is no path.
-        let patient = Stop::never();
-        if short.windows(2).all(|e| edges.is_proven(checker, &e[0], &e[1], &patient)) {
-            return finish(short, &edges, false, count, searched);
+    let found = match straight {
+        Some(goal) => vec![from.clone(), goal.clone()],
+        None => {
+            let mut sampler = Sampler::new(checker.limits(), &from, settings.seed);
+            let (found, made) = search(checker, &from, &goals, &settings.search, &mut sampler, stop);
+            count = made;
+            found.map_err(|ended| match ended {
+                Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
+                Ended::Stopped => PlanError::Timeout(count),
+                Ended::Exhausted => PlanError::Exhausted(count),
+            })?
         }
-    }
-    Err(PlanError::Exhausted(count))
+    };
+    let search_time = began.elapsed();
+    let mut path = shorten(checker, &found, &settings.shortcut, settings.seed, stop);
+    path.splice(..1, lead);
+    Ok(Plan {
+        length: length(&path),
+        path,
+        straight: straight.is_some(),
+        seed: settings.seed,
+        count,
+        looks: checker.looks() - looked,
+        search_time,
+        shorten_time: began.elapsed() - search_time,
+    })
 }
 
 /// The way from the start to a configuration inside the limits where nothing touches: the start alone, mostly.

@@ -4,7 +4,6 @@
 
 use crate::collision::checker::{CollisionChecker, Stop};
 
-use super::edge::Edges;
 use super::nearest::Tree;
 use super::path::{Path, between, distance};
 use super::sampler::Sampler;
@@ -53,7 +52,6 @@ pub struct SearchCount {
 /// Searches a path from `start` to any of `goals`, all of them free. The same sampler gives the same path.
 pub fn search<C: CollisionChecker>(
     checker: &mut C,
-    edges: &mut Edges,
     start: &[f64],
     goals: &[Vec<f64>],
     settings: &RrtSettings,
@@ -66,7 +64,7 @@ pub fn search<C: CollisionChecker>(
     for goal in goals {
         trees[1].add(goal, None);
     }
-    let mut grow = Grow { checker, edges, settings, stop };
+    let mut grow = Grow { checker, settings, stop };
     let mut count = SearchCount::default();
     let mut sample = vec![0.0; dof];
     let mut at = vec![0.0; dof];
@@ -109,7 +107,6 @@ pub fn search<C: CollisionChecker>(
 
 struct Grow<'a, C> {
     checker: &'a mut C,
-    edges: &'a mut Edges,
     settings: &'a RrtSettings,
     stop: &'a Stop,
 }
@@ -117,7 +114,7 @@ struct Grow<'a, C> {
 impl<C: CollisionChecker> Grow<'_, C> {
     /// Whether a node reaches a configuration; its domain shrinks if not.
     fn reaches(&mut self, tree: &mut Tree, node: usize, to: &[f64]) -> bool {
-        let free = self.edges.is_good(self.checker, tree.node(node), to, self.stop);
+        let free = self.checker.motion_is_free(tree.node(node), to, self.stop);
         let radius = tree.radius(node);
         if free {
             if radius.is_finite() {
@@ -146,7 +143,7 @@ impl<C: CollisionChecker> Grow<'_, C> {
             if k == steps {
                 at.copy_from_slice(to);
             }
-            if !self.edges.is_good(self.checker, tree.node(node), &at, self.stop) {
+            if !self.checker.motion_is_free(tree.node(node), &at, self.stop) {
                 return None;
             }
             node = tree.add(&at, Some(node));

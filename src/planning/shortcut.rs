@@ -1,9 +1,8 @@
-//! Shorter paths: corners are left out where the straight way is proven free, then cut between random points.
+//! Shorter paths: corners are left out where the straight way is free, then cut between random points.
 
 use crate::collision::checker::{CollisionChecker, Stop};
 use crate::robot::random::Random;
 
-use super::edge::Edges;
 use super::path::{Path, between, distance, length, tidy};
 
 /// How much is tried.
@@ -23,17 +22,16 @@ impl Default for ShortcutSettings {
     }
 }
 
-/// Shortens a path; every new edge is checked by samples, then proven. Edges that stay are as they were. The same seed
+/// Shortens a path; every new edge is checked. Edges that stay are as they were. The same seed
 /// gives the same path; when it is stopped, what was reached so far is returned.
 pub fn shorten<C: CollisionChecker>(
     checker: &mut C,
-    edges: &mut Edges,
     path: &[Vec<f64>],
     settings: &ShortcutSettings,
     seed: u64,
     stop: &Stop,
 ) -> Path {
-    let mut path = leave_out(checker, edges, path, stop);
+    let mut path = leave_out(checker, path, stop);
     let mut random = Random::new(seed);
     let mut idle = 0;
     for _ in 0..settings.tries {
@@ -45,7 +43,7 @@ pub fn shorten<C: CollisionChecker>(
         let (a, b) = (point_at(&path, s.min(t)), point_at(&path, s.max(t)));
         idle += 1;
         let saved = (s - t).abs() - distance(&a.1, &b.1);
-        if a.0 == b.0 || saved < settings.gain * whole || !is_good(checker, edges, &a.1, &b.1, stop) {
+        if a.0 == b.0 || saved < settings.gain * whole || !checker.motion_is_free(&a.1, &b.1, stop) {
             continue;
         }
         let mut shorter: Path = path[..=a.0].to_vec();
@@ -54,19 +52,15 @@ pub fn shorten<C: CollisionChecker>(
         path = tidy(&shorter);
         idle = 0;
     }
-    leave_out(checker, edges, &path, stop)
-}
-
-fn is_good<C: CollisionChecker>(checker: &mut C, edges: &mut Edges, a: &[f64], b: &[f64], stop: &Stop) -> bool {
-    edges.is_free(checker, a, b, stop) && edges.is_proven(checker, a, b, stop)
+    leave_out(checker, &path, stop)
 }
 
 /// From each configuration on, goes straight to the farthest one that can be reached so.
-fn leave_out<C: CollisionChecker>(checker: &mut C, edges: &mut Edges, path: &[Vec<f64>], stop: &Stop) -> Path {
+fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], stop: &Stop) -> Path {
     let mut kept: Path = path.first().cloned().into_iter().collect();
     let mut at = 0;
     while at + 1 < path.len() {
-        let next = (at + 2..path.len()).rev().find(|&to| is_good(checker, edges, &path[at], &path[to], stop));
+        let next = (at + 2..path.len()).rev().find(|&to| checker.motion_is_free(&path[at], &path[to], stop));
         at = next.unwrap_or(at + 1);
         kept.push(path[at].clone());
     }
