@@ -40,9 +40,15 @@ pub mod yaml;
 
 pub mod rt;
 
+pub mod robot;
+
+pub mod collision;
+
 pub mod hardware;
 
 pub mod control;
+
+pub mod planning;
 
 pub mod rpc;
 
