@@ -164,6 +164,11 @@ impl World {
         &self.obstacles
     }
 
+    /// The same world with other robots in it, one in place of each.
+    pub fn with_robots(&self, robots: Vec<Robot>) -> Self {
+        Self { robots, ..self.clone() }
+    }
+
     /// The robots.
     pub fn robots(&self) -> &[Robot] {
         &self.robots
