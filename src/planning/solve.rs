@@ -9,9 +9,10 @@ use super::path::{Path, between, distance, length};
 use super::planner::{PlanError, PlanSettings, plan};
 use super::setup::{PlannedRobot, Setup};
 use super::timing::{TimingSettings, bounds, time};
-use super::{goals, line};
+use super::goals;
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use crate::robot::kinematics::frame;
 use crate::robot::model::Limits;
 use crate::trajectory::JointTrajectory;
 
@@ -86,6 +87,8 @@ impl Failure {
 pub(super) struct Stage<'a> {
     /// The robots that move.
     pub robots: Vec<&'a PlannedRobot>,
+    /// Their indices in the setup.
+    pub indices: Vec<usize>,
     /// Names of their joints in the coordinator, robot after robot.
     pub joints: Vec<String>,
     /// Limits of the same.
@@ -101,13 +104,13 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
     let mut times = BTreeMap::new();
     let mut stage = stage(setup, world, request)?;
     let began = Instant::now();
-    let mut lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
+    let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
         Instant::now()
     };
     let (path, fraction) = match request.goals.as_slice() {
         [(_, Goal::Line(target))] => {
-            let (path, fraction) = line::straight(&mut stage, target, stop)?;
+            let (path, fraction) = goals::line(&mut stage, &frame(target), stop)?;
             lap(&mut times, "search", began);
             (path, Some(fraction))
         }
@@ -115,14 +118,13 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
             return Err(Failure::new("a straight line is planned for one robot at a time"));
         }
         wanted => {
-            let goals = goals::configurations(&mut stage, wanted, request.seed, stop)?;
-            let searching = lap(&mut times, "ik", began);
+            let goals = goals::configurations(&stage, wanted, request.seed, stop)?;
+            lap(&mut times, "ik", began);
             let settings = PlanSettings { seed: request.seed, ..PlanSettings::default() };
             let start = stage.start.clone();
             let found = plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| told(&stage, &e))?;
             times.insert("search".into(), found.search_time.as_secs_f64());
             times.insert("shorten".into(), found.shorten_time.as_secs_f64());
-            let _ = searching;
             (found.path, None)
         }
     };
@@ -135,7 +137,7 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
     let clearance = clearance(&mut stage.checker, &path);
     lap(&mut times, "clearance", looking);
     Ok(Found {
-        robots: request.goals.iter().map(|(robot, _)| *robot).collect(),
+        robots: stage.indices,
         path,
         trajectory,
         clearance,
@@ -145,26 +147,24 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
 }
 
 fn stage<'a>(setup: &'a Setup, world: &World, request: &Request) -> Result<Stage<'a>, Failure> {
-    let moves = |index: usize| request.goals.iter().any(|(robot, _)| *robot == index);
-    let mut bodies = Vec::new();
-    let mut stage =
-        (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut robots, mut indices, mut bodies) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
     for (index, robot) in setup.robots.iter().enumerate() {
         let at = request.positions.get(index).filter(|at| at.len() == robot.joints.len());
         let at = at.ok_or_else(|| Failure::new(format!("the positions of {} are not known", robot.config.name)))?;
-        if moves(index) {
-            bodies.push(robot.body.clone());
-            stage.0.push(robot);
-            stage.1.extend(robot.config.coordinator_joints.iter().cloned());
-            stage.2.extend_from_slice(&robot.limits);
-            stage.3.extend_from_slice(at);
-        } else {
+        if !request.goals.iter().any(|(moves, _)| *moves == index) {
             bodies.push(robot.standing(at).map_err(Failure::new)?);
+            continue;
         }
+        bodies.push(robot.body.clone());
+        robots.push(robot);
+        indices.push(index);
+        joints.extend(robot.config.coordinator_joints.iter().cloned());
+        limits.extend_from_slice(&robot.limits);
+        start.extend_from_slice(at);
     }
     let checker = ExactChecker::new(world.with_robots(bodies).snapshot(), Resolution::default());
-    let (robots, joints, limits, start) = stage;
-    Ok(Stage { robots, joints, limits, start, checker })
+    Ok(Stage { robots, indices, joints, limits, start, checker })
 }
 
 /// A planner's error in the user's words: joints by name.

@@ -1,1 +1,0 @@
-//! Straight lines of the end effector.
