@@ -308,3 +308,18 @@ fn the_kernels_slcan_driver_understands_the_emulated_adapter() {
         assert_eq!(frames(&mut port, 3), sent);
     });
 }
+
+/// A test in a guest that could not fail would be worth nothing.
+#[test]
+fn a_guest_tells_how_its_script_ended() {
+    let limit = Duration::from_secs(100);
+    let Some(ran) = uml::run(&[], "echo one; sh -c 'exit 7'; echo two", limit) else { return };
+    assert_eq!((ran.status, ran.output.as_str()), (7, "one\n"), "the first failure ends it");
+    let text = |panic: Box<dyn std::any::Any + Send>| *panic.downcast::<String>().expect("a message");
+    let late = std::panic::catch_unwind(|| uml::run(&[], "sleep 1000", Duration::from_secs(8)));
+    assert!(text(late.err().expect("too late")).starts_with("the guest did not end within 8s"));
+    let nothing = std::panic::catch_unwind(|| in_guest("no_such_test", &Guest::with(""), || {}));
+    assert!(text(nothing.err().expect("no such test")).starts_with("no test is named no_such_test"));
+    let missing = std::panic::catch_unwind(|| uml::run(&["net/can/can't"], "true", limit).expect("tools").status);
+    assert!(missing.is_err() || missing.is_ok_and(|status| status != 0), "a module that is not there");
+}

@@ -123,7 +123,10 @@ pub fn run(modules: &[&str], script: &str, limit: Duration) -> Option<Ran> {
         }
         std::thread::sleep(Duration::from_millis(20));
     };
-    guest.end();
+    if status.is_some() {
+        guest.end();
+    }
+    drop(guest);
     let text = |name| String::from_utf8_lossy(&fs::read(at(name)).unwrap_or_default()).into_owned();
     let output = text("output");
     let Some(status) = status else {
