@@ -214,6 +214,19 @@ fn what_cannot_be_opened_is_refused_with_a_hint() {
     });
 }
 
+/// As after bus-off: the kernel swallows what is sent.
+#[test]
+fn an_interface_without_carrier_is_refused() {
+    in_guest("an_interface_without_carrier_is_refused", &Guest::with(uml::VXCAN), || {
+        sh("ip link set sim0 down");
+        let error = refusal("can0");
+        assert!(error.starts_with("cannot open CAN interface can0 for arm: it has no carrier: "), "{error}");
+        assert!(error.contains("\nhint: ") && error.contains("ip link set can0 type can restart"), "{error}");
+        sh("ip link set sim0 up");
+        open("can0", &[]);
+    });
+}
+
 #[test]
 fn two_interfaces_do_not_hear_each_other() {
     in_guest("two_interfaces_do_not_hear_each_other", &Guest::with(uml::VXCAN), || {

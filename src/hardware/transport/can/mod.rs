@@ -134,6 +134,14 @@ fn open_interface(device: &str, name: &str, _filters: &[CanFilter]) -> AdapterRe
 mod tests {
     use super::*;
 
+    #[cfg(not(feature = "can"))]
+    #[test]
+    fn a_build_without_can_says_so() {
+        let error = open("arm", &CanAddress::Interface("can0".into()), &[]).err().unwrap().to_string();
+        let hint = "this build has no CAN\nhint: build with --features can, on Linux";
+        assert_eq!(error, format!("cannot open CAN interface can0 for arm: {hint}"));
+    }
+
     #[test]
     fn frames_hold_eight_bytes_at_most() {
         assert_eq!(CanFrame::new(0x151, &[1, 2]), CanFrame { id: 0x151, len: 2, data: [1, 2, 0, 0, 0, 0, 0, 0] });
