@@ -46,7 +46,7 @@ impl CanFrame {
 /// What the controller of the bus reports beside frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanTrouble {
-    /// The controller has left the bus after too many errors.
+    /// The controller has left the bus after too many errors. What is sent from now on is swallowed without a word.
     BusOff,
     /// Nobody acknowledges what is sent: no other node, no power, a wrong bit rate.
     NoAcknowledge,

@@ -68,7 +68,7 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
     if std::fs::read_to_string(format!("{INTERFACES}/{name}/carrier")).is_ok_and(|carrier| carrier.trim() == "0") {
         return Err(failed(&format!(
             "it has no carrier: its controller is bus-off, or the other end of a virtual pair is down\nhint: look at the \
-             wiring, the terminators and the bit rate, then ip link set {name} type can restart (as root)"
+             wiring, the terminators and the bit rate; then ip link set {name} down; ip link set {name} up (as root)"
         )));
     }
     Ok(SocketPort { socket, peer: format!("{device} at {name}"), broken: None, lost: 0 })
