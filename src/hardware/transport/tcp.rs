@@ -2,6 +2,7 @@
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -150,16 +151,8 @@ impl TcpLink {
         let deadline = Instant::now() + timeout;
         let mut left = timeout;
         loop {
-            while !self.filled.is_empty() {
-                let bytes = self.buffer.get(self.filled.clone()).unwrap_or_default();
-                match scan(bytes) {
-                    Scan::More => break,
-                    Scan::Skip(n) => self.used(n.max(1)),
-                    Scan::Take(n, frame) => {
-                        self.used(n.max(1));
-                        return Ok(frame);
-                    }
-                }
+            if let Some(frame) = self.arrived(&mut scan) {
+                return Ok(frame);
             }
             if left.is_zero() {
                 return Err(AdapterError::Timeout(format!("{} did not answer within {timeout:?}", self.peer)));
@@ -167,6 +160,33 @@ impl TcpLink {
             self.fill(left)?;
             left = deadline.saturating_duration_since(Instant::now());
         }
+    }
+
+    /// The next frame among what has arrived already, without waiting; `None` when there is none. `scan` as above.
+    pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
+        loop {
+            if let Some(frame) = self.arrived(&mut scan) {
+                return Ok(Some(frame));
+            }
+            if !self.fill_at_once()? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// The first frame in the buffer.
+    fn arrived<T>(&mut self, scan: &mut impl FnMut(&[u8]) -> Scan<T>) -> Option<T> {
+        while !self.filled.is_empty() {
+            match scan(self.buffer.get(self.filled.clone()).unwrap_or_default()) {
+                Scan::More => return None,
+                Scan::Skip(n) => self.used(n.max(1)),
+                Scan::Take(n, frame) => {
+                    self.used(n.max(1));
+                    return Some(frame);
+                }
+            }
+        }
+        None
     }
 
     fn used(&mut self, n: usize) {
@@ -179,20 +199,42 @@ impl TcpLink {
             self.stream.set_read_timeout(Some(timeout)).map_err(|e| self.broken(&e))?;
             self.timeout = timeout;
         }
+        let room = self.room()?;
+        let read = self.stream.read(self.buffer.get_mut(room..).unwrap_or_default());
+        self.took(read).map(|_| ())
+    }
+
+    /// Reads what has arrived, without waiting; `false` when nothing has.
+    fn fill_at_once(&mut self) -> AdapterResult<bool> {
+        let room = self.room()?;
+        let read = rustix::net::recv(
+            &self.stream,
+            self.buffer.get_mut(room..).unwrap_or_default(),
+            rustix::net::RecvFlags::DONTWAIT,
+        );
+        self.took(read.map(|(n, _)| n).map_err(std::io::Error::from))
+    }
+
+    /// Makes room behind what waits for the rest of its frame; answers where the room begins.
+    fn room(&mut self) -> AdapterResult<usize> {
         self.buffer.copy_within(self.filled.clone(), 0);
         self.filled = 0..self.filled.len();
-        let room = self.buffer.get_mut(self.filled.end..).unwrap_or_default();
-        if room.is_empty() {
+        if self.filled.end == self.buffer.len() {
             return Err(AdapterError::Protocol(format!("{} sent a frame that is too long", self.peer)));
         }
-        match self.stream.read(room) {
+        Ok(self.filled.end)
+    }
+
+    /// What a read brought; `false` for nothing.
+    fn took(&mut self, read: std::io::Result<usize>) -> AdapterResult<bool> {
+        match read {
             Ok(0) => Err(AdapterError::Io(format!("{} closed the connection", self.peer))),
             Ok(n) => {
                 self.filled.end += n;
-                Ok(())
+                Ok(true)
             }
             Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
-                Ok(())
+                Ok(false)
             }
             Err(e) => Err(self.broken(&e)),
         }
@@ -200,6 +242,13 @@ impl TcpLink {
 
     fn broken(&self, error: &std::io::Error) -> AdapterError {
         AdapterError::Io(format!("the connection to {} broke: {}", self.peer, reason(error)))
+    }
+}
+
+/// Becomes readable when something has arrived.
+impl AsFd for TcpLink {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.stream.as_fd()
     }
 }
 
@@ -266,6 +315,23 @@ mod tests {
         assert_eq!(link.receive(wait, scan), Ok(b"#cd".to_vec()));
         let late = link.receive(Duration::from_millis(20), scan);
         assert!(matches!(late, Err(AdapterError::Timeout(_))), "{late:?}");
+    }
+
+    #[test]
+    fn what_has_arrived_is_taken_without_waiting() {
+        let mut link =
+            TcpLink::connect("test", &peer(vec![b"x#ab#".to_vec(), b"cd".to_vec()]), Duration::from_secs(2)).unwrap();
+        let mut next = || {
+            let end = Instant::now() + Duration::from_secs(10);
+            while Instant::now() < end {
+                if let Some(frame) = link.poll(scan).unwrap() {
+                    return frame;
+                }
+            }
+            panic!("nothing came")
+        };
+        assert_eq!((next(), next()), (b"#ab".to_vec(), b"#cd".to_vec()));
+        assert_eq!(link.poll(scan), Ok(None));
     }
 
     #[test]
