@@ -6,10 +6,10 @@ use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use super::incoming::Incoming;
+pub use super::incoming::Scan;
 use crate::hardware::spec::{AdapterError, AdapterResult};
 
-/// Most bytes that may wait for the rest of their frame.
-const BUFFER: usize = 4096;
 /// A peer that acknowledges nothing for this long is gone [ms].
 const USER_TIMEOUT_MS: u32 = 1000;
 
@@ -85,25 +85,13 @@ impl std::fmt::Display for Endpoint {
     }
 }
 
-/// What stands at the front of the received bytes, as a protocol sees it.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Scan<T> {
-    /// The beginning of a frame; more bytes are needed.
-    More,
-    /// So many bytes (at least 1) are not the awaited frame.
-    Skip(usize),
-    /// The awaited frame, and how many bytes it takes.
-    Take(usize, T),
-}
-
 /// A connection over which frames go both ways.
 #[derive(Debug)]
 pub struct TcpLink {
     stream: TcpStream,
     peer: String,
-    buffer: Vec<u8>,
-    /// The received bytes that are not used up yet.
-    filled: std::ops::Range<usize>,
+    incoming: Incoming,
+    /// How long a read waits.
     timeout: Duration,
 }
 
@@ -132,7 +120,7 @@ impl TcpLink {
         };
         prepare().map_err(|e| failed(reason(&e)))?;
         let peer = format!("{device} at {endpoint}");
-        Ok(Self { stream, peer, buffer: vec![0; BUFFER], filled: 0..0, timeout })
+        Ok(Self { stream, peer, incoming: Incoming::new(), timeout })
     }
 
     /// The device and its address, for messages.
@@ -142,106 +130,48 @@ impl TcpLink {
 
     /// Sends all of `bytes`.
     pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
-        self.stream.write_all(bytes).map_err(|e| self.broken(&e))
+        self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))
     }
 
     /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
     /// a frame; it must skip what is not for it. `Timeout` leaves the connection usable; `Io` does not.
-    pub fn receive<T>(&mut self, timeout: Duration, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
-        let deadline = Instant::now() + timeout;
-        let mut left = timeout;
-        loop {
-            if let Some(frame) = self.arrived(&mut scan) {
-                return Ok(frame);
+    pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
+        let Self { stream, peer, incoming, timeout: set } = self;
+        incoming.receive(peer, timeout, scan, |room, left| {
+            if *set != left {
+                stream.set_read_timeout(Some(left)).map_err(|e| broken(peer, &e))?;
+                *set = left;
             }
-            if left.is_zero() {
-                return Err(AdapterError::Timeout(format!("{} did not answer within {timeout:?}", self.peer)));
+            match stream.read(room) {
+                Ok(0) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
+                Ok(n) => Ok(n),
+                Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
+                    Ok(0)
+                }
+                Err(e) => Err(broken(peer, &e)),
             }
-            self.fill(left)?;
-            left = deadline.saturating_duration_since(Instant::now());
-        }
+        })
     }
 
     /// The next frame among what has arrived already, without waiting; `None` when there is none. `scan` as above.
     pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
+        let Self { stream, peer, incoming, .. } = self;
         loop {
-            if let Some(frame) = self.arrived(&mut scan) {
+            if let Some(frame) = incoming.next(&mut scan) {
                 return Ok(Some(frame));
             }
-            if !self.fill_at_once()? {
+            let arrived = incoming.fill(peer, |room| {
+                match rustix::net::recv(&*stream, room, rustix::net::RecvFlags::DONTWAIT) {
+                    Ok((0, _)) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
+                    Ok((n, _)) => Ok(n),
+                    Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
+                    Err(e) => Err(broken(peer, &e.into())),
+                }
+            })?;
+            if arrived == 0 {
                 return Ok(None);
             }
         }
-    }
-
-    /// The first frame in the buffer.
-    fn arrived<T>(&mut self, scan: &mut impl FnMut(&[u8]) -> Scan<T>) -> Option<T> {
-        while !self.filled.is_empty() {
-            match scan(self.buffer.get(self.filled.clone()).unwrap_or_default()) {
-                Scan::More => return None,
-                Scan::Skip(n) => self.used(n.max(1)),
-                Scan::Take(n, frame) => {
-                    self.used(n.max(1));
-                    return Some(frame);
-                }
-            }
-        }
-        None
-    }
-
-    fn used(&mut self, n: usize) {
-        self.filled.start = self.filled.start.saturating_add(n).min(self.filled.end);
-    }
-
-    /// Reads what has arrived, waiting up to `timeout`; nothing when nothing arrives.
-    fn fill(&mut self, timeout: Duration) -> AdapterResult<()> {
-        if self.timeout != timeout {
-            self.stream.set_read_timeout(Some(timeout)).map_err(|e| self.broken(&e))?;
-            self.timeout = timeout;
-        }
-        let room = self.room()?;
-        let read = self.stream.read(self.buffer.get_mut(room..).unwrap_or_default());
-        self.took(read).map(|_| ())
-    }
-
-    /// Reads what has arrived, without waiting; `false` when nothing has.
-    fn fill_at_once(&mut self) -> AdapterResult<bool> {
-        let room = self.room()?;
-        let read = rustix::net::recv(
-            &self.stream,
-            self.buffer.get_mut(room..).unwrap_or_default(),
-            rustix::net::RecvFlags::DONTWAIT,
-        );
-        self.took(read.map(|(n, _)| n).map_err(std::io::Error::from))
-    }
-
-    /// Makes room behind what waits for the rest of its frame; answers where the room begins.
-    fn room(&mut self) -> AdapterResult<usize> {
-        self.buffer.copy_within(self.filled.clone(), 0);
-        self.filled = 0..self.filled.len();
-        if self.filled.end == self.buffer.len() {
-            return Err(AdapterError::Protocol(format!("{} sent a frame that is too long", self.peer)));
-        }
-        Ok(self.filled.end)
-    }
-
-    /// What a read brought; `false` for nothing.
-    fn took(&mut self, read: std::io::Result<usize>) -> AdapterResult<bool> {
-        match read {
-            Ok(0) => Err(AdapterError::Io(format!("{} closed the connection", self.peer))),
-            Ok(n) => {
-                self.filled.end += n;
-                Ok(true)
-            }
-            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
-                Ok(false)
-            }
-            Err(e) => Err(self.broken(&e)),
-        }
-    }
-
-    fn broken(&self, error: &std::io::Error) -> AdapterError {
-        AdapterError::Io(format!("the connection to {} broke: {}", self.peer, reason(error)))
     }
 }
 
@@ -250,6 +180,10 @@ impl AsFd for TcpLink {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.stream.as_fd()
     }
+}
+
+fn broken(peer: &str, error: &std::io::Error) -> AdapterError {
+    AdapterError::Io(format!("the connection to {peer} broke: {}", reason(error)))
 }
 
 /// An I/O error in plain words, without the system's number.
@@ -267,6 +201,7 @@ fn reason(error: &std::io::Error) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::incoming::BUFFER;
     use super::*;
     use std::net::TcpListener;
 
@@ -315,23 +250,6 @@ mod tests {
         assert_eq!(link.receive(wait, scan), Ok(b"#cd".to_vec()));
         let late = link.receive(Duration::from_millis(20), scan);
         assert!(matches!(late, Err(AdapterError::Timeout(_))), "{late:?}");
-    }
-
-    #[test]
-    fn what_has_arrived_is_taken_without_waiting() {
-        let mut link =
-            TcpLink::connect("test", &peer(vec![b"x#ab#".to_vec(), b"cd".to_vec()]), Duration::from_secs(2)).unwrap();
-        let mut next = || {
-            let end = Instant::now() + Duration::from_secs(10);
-            while Instant::now() < end {
-                if let Some(frame) = link.poll(scan).unwrap() {
-                    return frame;
-                }
-            }
-            panic!("nothing came")
-        };
-        assert_eq!((next(), next()), (b"#ab".to_vec(), b"#cd".to_vec()));
-        assert_eq!(link.poll(scan), Ok(None));
     }
 
     #[test]

@@ -52,6 +52,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongDof,
+    FaultKind::WrongModel,
     FaultKind::Sag,
     FaultKind::Blocked,
 ];

@@ -133,7 +133,13 @@ impl Controller {
 
     fn version(&mut self, t: f64, out: &mut Vec<u8>) {
         let axes = self.identity.axes + usize::from(self.script.take(FaultKind::WrongDof, t).is_some());
-        let ([major, minor, revision], kind, serial) = (self.firmware, self.identity.kind, &self.identity.serial);
+        let another = self.script.take(FaultKind::WrongModel, t).is_some();
+        let kind = match self.identity.kind {
+            6 if another => 9, // a Lite 6
+            _ if another => 6,
+            kind => kind,
+        };
+        let ([major, minor, revision], serial) = (self.firmware, &self.identity.serial);
         let text = format!("{axes},{kind},{serial},AC1305,v{major}.{minor}.{revision}");
         out.extend(text.bytes().chain([0; 40]).take(40));
     }
