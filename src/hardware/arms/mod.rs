@@ -3,10 +3,11 @@
 use crate::hardware::registry::{Absent, AdapterSpec};
 
 pub mod mock;
+pub mod xarm;
 pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC];
+pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC, xarm::SPEC];
 
 /// The adapters that this build does not have.
 pub const ABSENT: &[Absent] = &[];
