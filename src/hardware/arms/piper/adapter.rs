@@ -124,7 +124,8 @@ impl PiperAdapter {
         }
         if age > LOST {
             self.wire = None;
-            let text = format!("the connection to piper at {} broke: no state for {} ms", self.address, age.as_millis());
+            let text =
+                format!("the connection to piper at {} broke: no state for {} ms", self.address, age.as_millis());
             return Err(AdapterError::Io(text));
         }
         Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, age.as_millis())))
@@ -157,7 +158,7 @@ impl PiperAdapter {
         if self.picture.joints_at != Mono::ZERO {
             return AdapterError::Timeout(format!("piper at {address}: some of its motors send no state"));
         }
-        if counts.leader > 0 && counts.decoded == 0 {
+        if counts.leader > 0 {
             return AdapterError::Rejected(format!(
                 "piper at {address}: this arm leads others: it sends commands instead of its state\nhint: make it a \
                  follower with the vendor's SDK, MasterSlaveConfig(0xFC, 0, 0, 0), and switch it off and on"
@@ -460,7 +461,7 @@ impl ManipulatorAdapter for PiperAdapter {
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
         let before = self.picture.motors.map(|motor| i32::from(motor.speed).abs());
-        if self.picture.enabled() {
+        if self.picture.enabled() && self.picture.status.arm != ESTOP {
             self.hold()?;
         }
         let sent = self.picture.joints_at;
@@ -518,7 +519,8 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(self.refuse("the pose is not finite, or absurd".into()));
         }
         self.may_move()?;
-        let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
+        let ([x, y, z], [roll, pitch, yaw]) =
+            (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
         self.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
     }
 

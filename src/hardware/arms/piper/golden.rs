@@ -6,7 +6,8 @@ use crate::hardware::transport::can::CanFrame;
 /// A frame from its text.
 pub fn frame(text: &str) -> CanFrame {
     let (id, data) = text.split_once('#').unwrap();
-    let bytes: Vec<u8> = (0..data.len() / 2).map(|i| u8::from_str_radix(&data[2 * i..2 * i + 2], 16).unwrap()).collect();
+    let bytes: Vec<u8> =
+        (0..data.len() / 2).map(|i| u8::from_str_radix(&data[2 * i..2 * i + 2], 16).unwrap()).collect();
     CanFrame::new(u16::from_str_radix(id, 16).unwrap(), &bytes)
 }
 

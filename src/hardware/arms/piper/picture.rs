@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use super::protocol::{Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, DOF};
+use super::protocol::{DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text};
 use crate::clock::Mono;
 
 /// Frames of one burst arrive within less than a period of the arm.
@@ -322,7 +322,7 @@ mod tests {
     #[test]
     fn the_firmware_is_found_in_its_pieces() {
         let mut picture = Picture::default();
-        for (piece, length) in [(b"\0xH-V1.2-", 8), (b"1 S-V1.6", 8), (b"-3\0\0\0\0\0\0", 2)] {
+        for (piece, length) in [(b"\0H-V1.2-", 8), (b"1 S-V1.6", 8), (b"-3\0\0\0\0\0\0", 2)] {
             assert_eq!(picture.firmware(), None);
             picture.take(Feedback::Firmware(*piece, length), ms(0));
         }

@@ -200,9 +200,14 @@ pub fn decode(frame: &CanFrame) -> Feedback {
     let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
     let from = |first: u16| usize::from(id.wrapping_sub(first));
     let feedback = match id {
-        0x2A1 => {
-            Feedback::Status(Status { control: a, arm: b, move_mode: c, moving: e != 0, limits: g & 0x3F, silent: h & 0x3F })
-        }
+        0x2A1 => Feedback::Status(Status {
+            control: a,
+            arm: b,
+            move_mode: c,
+            moving: e != 0,
+            limits: g & 0x3F,
+            silent: h & 0x3F,
+        }),
         0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
         0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
         0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], torque: i16::from_be_bytes([e, f]), status: g }),

@@ -29,7 +29,8 @@ fn feedback_is_read_from_the_golden_bytes() {
     assert_eq!(read(golden::GRIPPER_FEEDBACK), Feedback::Gripper(gripper));
     assert_eq!(read(golden::MOTOR_1), Feedback::Motor(0, Motor { speed: -1500, current: 2000 }));
     assert_eq!(read(golden::MOTOR_6), Feedback::Motor(5, Motor { speed: 1, current: -1 }));
-    let driver = Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0, bus_current: 1500 };
+    let driver =
+        Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0, bus_current: 1500 };
     assert_eq!(read(golden::DRIVER_3), Feedback::Driver(2, driver));
     assert!(driver.enabled());
     assert_eq!(read(golden::LIMITS_3), Feedback::Limits(2, MotorLimits { upper: 0, lower: -1700, speed: 3000 }));

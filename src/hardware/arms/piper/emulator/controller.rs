@@ -8,9 +8,9 @@ use std::f64::consts::TAU;
 use std::time::Duration;
 
 use super::super::{GripperKind, RANGES, SPEED, limits, protocol::DOF};
+use super::SimOptions;
 use super::kinematics;
 use super::wire::{self, Request, Status};
-use super::SimOptions;
 use crate::clock::Mono;
 use crate::hardware::sim::faults::{Fault, FaultKind, FaultScript};
 use crate::hardware::sim::gripper::Gripper;
@@ -418,7 +418,8 @@ impl Controller {
         };
         out.push(status.frame());
         let [x, y, z, roll, pitch, yaw] = kinematics::to_values(&kinematics::forward(&positions));
-        let ([x, y, z], [roll, pitch, yaw]) = ([x, y, z].map(|v| (v * 1e6).round() as i32), [roll, pitch, yaw].map(millidegrees));
+        let ([x, y, z], [roll, pitch, yaw]) =
+            ([x, y, z].map(|v| (v * 1e6).round() as i32), [roll, pitch, yaw].map(millidegrees));
         out.extend(wire::triple(0x2A2, [x, y, z, roll, pitch, yaw]));
         out.extend(wire::triple(0x2A5, positions.map(millidegrees)));
         if self.has_gripper {

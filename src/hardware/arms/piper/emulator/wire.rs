@@ -204,6 +204,9 @@ mod tests {
         assert_eq!(acceleration(3, 5000), frame(golden::ACCELERATION_3));
         assert_eq!(acknowledge(0x471), frame(golden::ACK_ENABLE));
         assert_eq!(firmware(b"S-V1.6-3"), frame(golden::FIRMWARE));
-        assert_eq!(leading(JOINTS, 42_500)[1..4], golden::MOVE_JOINTS[1..].iter().map(|t| frame(t)).collect::<Vec<_>>());
+        assert_eq!(
+            leading(JOINTS, 42_500)[1..4],
+            golden::MOVE_JOINTS[1..].iter().map(|t| frame(t)).collect::<Vec<_>>()
+        );
     }
 }
