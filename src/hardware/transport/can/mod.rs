@@ -7,6 +7,7 @@
 pub mod address;
 pub mod bus;
 pub mod slcan;
+pub mod slcan_pty;
 #[cfg(all(feature = "can", target_os = "linux"))]
 pub mod socket;
 
@@ -14,6 +15,8 @@ use std::os::fd::BorrowedFd;
 
 use crate::hardware::spec::AdapterResult;
 pub use address::CanAddress;
+pub use bus::Bus;
+pub use slcan_pty::SlcanPty;
 
 /// A classic CAN 2.0A data frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -96,7 +99,7 @@ pub trait CanPort: Send {
     fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize>;
     /// The next event, if one has arrived. `Io` when the interface is gone or down.
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>>;
-    /// Readable when something has arrived.
+    /// Readable when something has arrived. Fetch until there is nothing before waiting for it.
     fn fd(&self) -> BorrowedFd<'_>;
     /// About how many frames of this port still wait for the bus, where that can be known. A number that stays above 0
     /// says that nobody acknowledges: those frames go out later, when somebody does.
