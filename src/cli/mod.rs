@@ -1,5 +1,6 @@
 //! The command line: one file per verb. stdout is data, stderr is diagnostics; exit codes are a contract ([`exit`]).
 
+pub mod adapter;
 pub mod arguments;
 pub mod arm;
 pub mod banner;
@@ -78,6 +79,8 @@ enum Command {
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
+    /// Bring your own arm: the start of an adapter for it
+    Adapter(adapter::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),
     /// List the blueprints that `run` finds by name
@@ -113,6 +116,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),
         Command::Logs(args) => logs::run(args),
+        Command::Adapter(args) => adapter::run(args, &registry),
         Command::ListAdapters(args) => list_adapters::run(args, &registry),
         Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
         Command::Check(args) => check::run(args, &registry),

@@ -39,6 +39,10 @@ pub enum FaultKind {
     Truncated,
     /// The arm says that it has one joint more than it has.
     WrongDof,
+    /// The arm says that it is another model.
+    WrongModel,
+    /// Measurements stand still for `duration`, time stamps and all, while the arm goes on.
+    Frozen,
     /// The arm sinks by `amount` [rad] at its second joint when its motors are enabled.
     Sag,
     /// Joint number `joint` does not move for `duration`.
