@@ -266,9 +266,7 @@ impl Plant {
         let still = |joint: &Joint| joint.velocity == 0.0;
         self.sag <= 0.0
             && match self.drive {
-                Drive::Disabled => {
-                    self.active().iter().all(|j| still(j) && (self.fall == 0.0 || j.fallen()))
-                }
+                Drive::Disabled => self.active().iter().all(|j| still(j) && (self.fall == 0.0 || j.fallen())),
                 Drive::Stop => self.active().iter().all(still),
                 Drive::Position | Drive::Servo => self.active().iter().all(|j| still(j) && j.position == j.target),
                 Drive::Velocity => self.active().iter().all(|j| still(j) && j.target == 0.0),

@@ -27,10 +27,12 @@ use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 /// Longest waits for the first whole state, and then for what was asked.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(300);
+/// What has arrived within this time need not be looked for again: the arm's period.
+const RECENT: Duration = Duration::from_millis(5);
 /// A state older than this is no state: a living arm sends one every 5 ms; the rest is for a busy host.
-const SILENCE: Duration = Duration::from_millis(200);
-/// After this long without a state the connection is given up.
-const LOST: Duration = Duration::from_millis(1000);
+const SILENCE: Duration = Duration::from_millis(150);
+/// After this long without a state the connection is given up: the arm has lost its power.
+const LOST: Duration = Duration::from_millis(400);
 /// Enabling and disabling are asked for again and again, as the vendor does, and for so long.
 const REPEAT: Duration = Duration::from_millis(10);
 const ENABLE_TIMEOUT: Duration = Duration::from_millis(1000);
@@ -60,6 +62,8 @@ pub struct PiperAdapter {
     options: Options,
     wire: Option<Wire>,
     picture: Picture,
+    /// When what had arrived was last taken up.
+    drained_at: Mono,
     mode: ControlMode,
 }
 
@@ -76,6 +80,7 @@ impl PiperAdapter {
             options: config.options()?,
             wire: None,
             picture: Picture::default(),
+            drained_at: Mono::ZERO,
             mode: ControlMode::Position,
         })
     }
@@ -89,6 +94,7 @@ impl PiperAdapter {
 
     fn drain(&mut self) -> AdapterResult<()> {
         let wire = self.wire.as_mut().ok_or(AdapterError::NotConnected)?;
+        self.drained_at = MonotonicClock.now();
         let result = wire.drain(&mut self.picture);
         if result.is_err() {
             self.wire = None;
@@ -131,9 +137,15 @@ impl PiperAdapter {
         Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, age.as_millis())))
     }
 
-    /// The picture, for reads that answer from memory.
-    fn known(&self) -> AdapterResult<&Picture> {
-        if self.wire.is_some() { Ok(&self.picture) } else { Err(AdapterError::NotConnected) }
+    /// The picture, for reads that mostly follow one of the joints and then answer from memory.
+    fn known(&mut self) -> AdapterResult<&Picture> {
+        if self.wire.is_none() {
+            return Err(AdapterError::NotConnected);
+        }
+        if MonotonicClock.now().since(self.drained_at) > RECENT {
+            self.drain()?;
+        }
+        Ok(&self.picture)
     }
 
     /// Waits for a whole state, then for what was asked.

@@ -301,7 +301,9 @@ fn wrong_configurations_are_refused() {
     let emulate = |sim: serde_json::Value, place: &Place| {
         PiperEmulator::start(&config("sim", serde_json::json!({ "sim": sim })), place).err().unwrap().to_string()
     };
-    assert!(emulate(serde_json::json!({ "initial_positions": [0, 0, 1, 0, 0, 0] }), &Place::InProcess).contains("limits"));
+    assert!(
+        emulate(serde_json::json!({ "initial_positions": [0, 0, 1, 0, 0, 0] }), &Place::InProcess).contains("limits")
+    );
     assert!(emulate(serde_json::json!({ "feedback_hz": 500 }), &Place::InProcess).contains("between 20 and 200"));
     assert!(emulate(serde_json::json!({ "firmware": "1.6" }), &Place::InProcess).contains("8 characters"));
     let bind = Place::Bind([127, 0, 0, 5].into());

@@ -302,8 +302,7 @@ impl Controller {
     }
 
     fn listens(&self, mode: u8) -> bool {
-        // A target that could not be reached is forgiven with the next one.
-        self.control == 1 && self.mode == mode && matches!(self.arm, 0 | state::NO_SOLUTION | state::LIMIT)
+        self.control == 1 && self.mode == mode && self.arm == 0
     }
 
     fn switch(&mut self, motor: u8, action: u8, now: Mono) {
@@ -350,19 +349,19 @@ impl Controller {
         let goal = kinematics::from_values([x, y, z, roll, pitch, yaw]);
         let found = kinematics::inverse(&goal, &self.six()).map(|joints| joints.map(millidegrees));
         match found.filter(|joints| self.outside(joints) == 0) {
-            None => self.arm = state::NO_SOLUTION,
-            Some(joints) => {
-                (self.arm, self.beyond) = (0, 0);
-                self.plant.move_to(&joints.map(radians), self.fraction());
+            None => {
+                self.arm = state::NO_SOLUTION;
+                self.plant.stop();
             }
+            Some(joints) => self.plant.move_to(&joints.map(radians), self.fraction()),
         }
     }
 
     fn move_joints(&mut self, target: [i32; 6], now: Mono) {
         self.beyond = self.outside(&target);
-        self.arm = if self.beyond == 0 { 0 } else { state::LIMIT };
         if self.beyond != 0 {
-            return;
+            self.arm = state::LIMIT;
+            return self.plant.stop();
         }
         let values = target.map(radians);
         let before = self.target.replace(target);

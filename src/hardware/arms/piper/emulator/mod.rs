@@ -161,4 +161,8 @@ impl Emulator for PiperEmulator {
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
     }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.joints().0)
+    }
 }
