@@ -47,6 +47,12 @@ pub enum FaultKind {
     Sag,
     /// Joint number `joint` does not move for `duration`.
     Blocked,
+    /// The computer's CAN controller leaves the bus after too many errors.
+    BusOff,
+    /// The CAN interface has no room for what is sent.
+    NoBuffers,
+    /// The arm leads others: it sends commands instead of its state.
+    Leader,
 }
 
 /// One fault of a script.
