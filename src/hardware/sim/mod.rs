@@ -6,5 +6,6 @@ pub mod can_server;
 pub mod faults;
 pub mod gripper;
 pub mod plant;
+pub mod serial_server;
 pub mod stream;
 pub mod tcp_server;
