@@ -4,6 +4,9 @@
 #[path = "../assets/templates/can/mod.rs"]
 mod can;
 #[allow(dead_code, reason = "a library's public parts")]
+#[path = "../assets/templates/serial/mod.rs"]
+mod serial;
+#[allow(dead_code, reason = "a library's public parts")]
 #[path = "../assets/templates/tcp/mod.rs"]
 mod tcp;
 
@@ -36,6 +39,11 @@ fn conforms(row: &AdapterSpec) {
 #[test]
 fn the_can_template_conforms() {
     conforms(&can::SPEC);
+}
+
+#[test]
+fn the_serial_template_conforms() {
+    conforms(&serial::SPEC);
 }
 
 #[test]
