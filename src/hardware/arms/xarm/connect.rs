@@ -109,7 +109,7 @@ fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()
     };
     let (name, joints) = (model.name(), model.axes());
     Err(AdapterError::Rejected(format!(
-        "xarm at {address}: expected an {name} with {joints} joints, found {what}\nhint: {hint}"
+        "xarm at {address}: expected the model {name} with {joints} joints, found {what}\nhint: {hint}"
     )))
 }
 
