@@ -98,7 +98,9 @@ fn what_is_wrong_with_an_xarm_is_one_line_and_exit_3() {
     // The emulator plays an xArm 6 with error 31, or a Lite 6.
     let simulated = "--set hardware.arm.address=sim --no-record";
     home.write("error.yaml", &with_faults("{kind: error_code, code: 31}"));
-    home.dimos(&format!("run error.yaml {simulated}")).with(3).says(&["fault 31: a collision", "hint: clear the arm's"]);
+    home.dimos(&format!("run error.yaml {simulated}"))
+        .with(3)
+        .says(&["fault 31: a collision", "hint: clear the arm's"]);
     let run = home.run(&format!("error.yaml {simulated} --set hardware.arm.auto_enable=false"));
     let status = home.status();
     assert_eq!((&status["arms"][0]["enabled"], &status["arms"][0]["error"]["code"]), (&false.into(), &31.into()));
