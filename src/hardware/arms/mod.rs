@@ -3,10 +3,11 @@
 use crate::hardware::registry::{Absent, AdapterSpec};
 
 pub mod mock;
+pub mod remote;
 pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC];
+pub const TABLE: &[AdapterSpec] = &[mock::SPEC, remote::SPEC, yourarm::SPEC];
 
 /// The adapters that this build does not have.
 pub const ABSENT: &[Absent] = &[];
