@@ -82,7 +82,7 @@ class Arm:  # the adapter, called from one thread only
             self.turn = (self.turn + 1) % (len(READS) - len(FEEDBACK))
             self.read(*READS if self.quick else [READS[self.turn]])
         unknown = [name for name in FEEDBACK if not self.quick or name not in self.measured]
-        return {"state": {**self.state, **dict.fromkeys(unknown)}, "refused": refused}
+        return {"state": {**self.state, "held": self.held, **dict.fromkeys(unknown)}, "refused": refused}
     def reply(self, line):
         request = json.loads(line)
         id, method = request.pop("id"), {"hello": self.hello, "cycle": self.cycle}.get(request["do"])

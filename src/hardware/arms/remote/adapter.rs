@@ -84,9 +84,14 @@ impl RemoteAdapter {
             return Err(AdapterError::Rejected(format!("{} finite values are needed, one per joint", self.dof)));
         }
         self.with(Session::take_up)?;
-        let (enabled, error) = self.recent(|state| (state.enabled, state.error))?;
+        let (enabled, held, error) = self.recent(|state| (state.enabled, state.held, state.error))?;
         if let Some((code @ (1.. | ..=-1), text)) = error {
             return Err(AdapterError::Fault { code, text: text.to_string() });
+        }
+        if held {
+            return Err(AdapterError::Rejected(
+                "the process that serves the arm has stopped it: enable it anew".into(),
+            ));
         }
         if enabled == Some(false) {
             return Err(AdapterError::Rejected("the motors are disabled".into()));
@@ -231,9 +236,10 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
-        // An arm that cannot say so is what it was last made.
+        // An arm that cannot say so is what it was last made. One that its peer holds takes no command, as if its
+        // motors were off.
         let assumed = self.assumed_enabled;
-        self.recent(|state| state.enabled.unwrap_or(assumed))
+        self.recent(|state| state.enabled.unwrap_or(assumed) && !state.held)
     }
 
     // --- Motion ---

@@ -178,6 +178,9 @@ pub struct Measured {
     /// Whether the motors are on.
     #[serde(default, rename = "read_enabled")]
     pub enabled: Option<bool>,
+    /// Whether the peer takes no command before the arm is enabled anew.
+    #[serde(default)]
+    pub held: bool,
     /// The device's error and what it means.
     #[serde(default, rename = "read_error")]
     pub error: Option<(i32, Text)>,

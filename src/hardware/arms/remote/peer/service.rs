@@ -217,6 +217,7 @@ impl Service {
                 "read_joint_velocities": reading.velocity.as_ref().map(joints),
                 "read_joint_efforts": reading.effort.as_ref().map(joints),
                 "read_enabled": self.adapter.read_enabled()?,
+                "held": self.held.is_some(),
                 "read_error": [json!(code), json!(text)],
                 "read_state": { "state": codes.state, "mode": codes.mode },
                 "get_control_mode": self.adapter.get_control_mode(),
