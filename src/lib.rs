@@ -40,6 +40,8 @@ pub mod yaml;
 
 pub mod rt;
 
+pub mod robot;
+
 pub mod hardware;
 
 pub mod control;

@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
-use crate::joint::{ControlMode, JointLimits};
+use crate::joint::{ControlMode, JointLimits, Joints};
 use crate::yaml;
 
 /// How far an adapter has been proven without its hardware.
@@ -89,6 +89,10 @@ pub trait Emulator: Send {
     fn address(&self) -> String;
     /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that it can play.
     fn inject(&self, fault: Fault) -> Result<(), String>;
+    /// Where the joints truly are behind the wire [rad], for checks and for people; `None` when it does not tell.
+    fn true_positions(&self) -> Option<Joints> {
+        None
+    }
 }
 
 /// Where an emulator listens, as far as the arm's transport has a choice.

@@ -57,6 +57,8 @@ pub struct Controller {
     powered_up: Mono,
     advanced_to: Mono,
     trace: Option<Vec<Received>>,
+    /// The last report, for the fault that shows nothing newer.
+    reported: Option<Report>,
 }
 
 impl Controller {
@@ -78,6 +80,7 @@ impl Controller {
             powered_up: now,
             advanced_to: now,
             trace: None,
+            reported: None,
         }
     }
 
@@ -158,7 +161,9 @@ impl Controller {
         match (outcome, frame.request) {
             (Ok(()), Ok(Request::Hello)) => {
                 let dof = DOF as u8 + u8::from(self.script.take(FaultKind::WrongDof, t).is_some());
-                reply(out, frame, status, |out| put_hello(out, "YOURARM-6", dof, [2, 1, 3], "YA6-00042"));
+                let other = self.script.take(FaultKind::WrongModel, t).is_some();
+                let model = if other { "YOURARM-6L" } else { "YOURARM-6" };
+                reply(out, frame, status, |out| put_hello(out, model, dof, [2, 1, 3], "YA6-00042"));
             }
             (Ok(()), Ok(Request::GetState)) => {
                 let report = self.report(now, t);
@@ -296,6 +301,11 @@ impl Controller {
     }
 
     fn report(&mut self, now: Mono, t: f64) -> Report {
+        if let Some(old) = self.reported
+            && self.script.take(FaultKind::Frozen, t).is_some()
+        {
+            return old;
+        }
         let degrees = |values: &Joints| first(values).map(|v| v.to_degrees() as f32);
         let state = match (self.error, self.plant.enabled()) {
             (0, false) => 0,
@@ -331,6 +341,7 @@ impl Controller {
         } else if self.script.take(FaultKind::ZeroState, t).is_some() {
             report.joints = [[0.0; 6]; 3];
         }
+        self.reported = Some(report);
         report
     }
 }

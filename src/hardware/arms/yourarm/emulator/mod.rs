@@ -37,6 +37,8 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongDof,
+    FaultKind::WrongModel,
+    FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
 ];
@@ -136,5 +138,9 @@ impl Emulator for YourArmEmulator {
         check_kinds("the yourarm emulator", &[fault], PLAYABLE)?;
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.joints().0)
     }
 }

@@ -1,0 +1,218 @@
+//! Where the files are that a description names: `package://`, `file://`, relative paths, `$(find …)`.
+//!
+//! A name may not lead out of its package by `..`: paths are made plain as text before anything is opened.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Component, Path, PathBuf};
+
+/// How far above a description its own package is looked for.
+const LEVELS: usize = 8;
+
+/// Where packages are.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Packages {
+    /// Given by name: `package_paths` of a blueprint, `--package`.
+    named: BTreeMap<String, PathBuf>,
+    /// Folders of packages, from `ROS_PACKAGE_PATH`.
+    ros: Vec<PathBuf>,
+    /// Prefixes, from `AMENT_PREFIX_PATH`.
+    ament: Vec<PathBuf>,
+}
+
+impl Packages {
+    /// Packages given by name, and none else.
+    pub fn named(named: BTreeMap<String, PathBuf>) -> Self {
+        Self { named, ..Self::default() }
+    }
+
+    /// The same with those that ROS's environment variables show.
+    pub fn with_environment(mut self) -> Self {
+        let paths = |name| std::env::var_os(name).map(|v| std::env::split_paths(&v).collect()).unwrap_or_default();
+        self.ros = paths("ROS_PACKAGE_PATH");
+        self.ament = paths("AMENT_PREFIX_PATH");
+        self
+    }
+
+    /// The folder of a package: the one given by name, then ROS 1's and ROS 2's, then the package that the file
+    /// itself lies in. The error says where it was looked for.
+    pub fn find(&self, package: &str, beside: &Path) -> Result<PathBuf, String> {
+        if package.is_empty() || package.contains(['/', '\\']) || package.starts_with('.') {
+            return Err(format!("`{package}` is no name of a package"));
+        }
+        if let Some(folder) = self.named.get(package) {
+            return match folder.is_dir() {
+                true => Ok(absolute(folder)),
+                false => Err(format!("the folder given for package `{package}` does not exist: {}", folder.display())),
+            };
+        }
+        let ros = self.ros.iter().flat_map(|folder| {
+            let itself = is_package(folder, package).then(|| folder.clone());
+            itself.into_iter().chain([folder.join(package)])
+        });
+        let ament = self.ament.iter().map(|prefix| prefix.join("share").join(package));
+        if let Some(found) = ros.chain(ament).find(|folder| folder.is_dir()) {
+            return Ok(absolute(&found));
+        }
+        let beside = absolute(beside);
+        if let Some(own) = beside.ancestors().take(LEVELS).find(|folder| is_package(folder, package)) {
+            return Ok(own.to_owned());
+        }
+        Err(format!(
+            "the package `{package}` is not known\nhint: say where it is: --package {package}=FOLDER, or \
+             `package_paths` in a blueprint; ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are looked at too"
+        ))
+    }
+
+    /// The file that a URI means, for a description in the folder `beside`. It exists.
+    pub fn resolve(&self, uri: &str, beside: &Path) -> Result<PathBuf, String> {
+        let path = if let Some(rest) = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://")) {
+            let (package, inside) = rest.split_once('/').unwrap_or((rest, ""));
+            let root = self.find(package, beside)?;
+            let path = plain(&root.join(decoded(inside)));
+            if !path.starts_with(&root) {
+                return Err(format!("`{uri}` leads out of its package"));
+            }
+            path
+        } else if let Some(rest) = uri.strip_prefix("file://") {
+            let path = decoded(rest);
+            match Path::new(&path).is_absolute() {
+                true => plain(Path::new(&path)),
+                false => plain(&absolute(beside).join(path)),
+            }
+        } else if let Some((scheme, _)) = uri.split_once("://") {
+            return Err(format!("files cannot be read by `{scheme}://`\nhint: use package://, file:// or a path"));
+        } else {
+            plain(&absolute(beside).join(uri))
+        };
+        match path.is_file() {
+            true => Ok(path),
+            false => Err(format!("there is no file {}", path.display())),
+        }
+    }
+
+    /// The folders that a description in the folder `beside` may include files from: its own package, or that folder
+    /// alone where there is none.
+    pub fn own(&self, beside: &Path) -> PathBuf {
+        let beside = absolute(beside);
+        let own = beside.ancestors().take(LEVELS).find(|folder| folder.join("package.xml").is_file());
+        own.unwrap_or(&beside).to_owned()
+    }
+}
+
+/// Whether a folder is a package: by its own name, or by the name in its `package.xml`.
+fn is_package(folder: &Path, package: &str) -> bool {
+    if folder.file_name().is_some_and(|name| name == package) {
+        return true;
+    }
+    let manifest = folder.join("package.xml");
+    let small = fs::metadata(&manifest).is_ok_and(|m| m.is_file() && m.len() < 1 << 20);
+    let text = if small { fs::read_to_string(manifest).unwrap_or_default() } else { String::new() };
+    let name = text.split_once("<name>").and_then(|(_, rest)| rest.split_once("</name>"));
+    name.is_some_and(|(name, _)| name.trim() == package)
+}
+
+/// An absolute path without `.` and `..`, made so as text.
+pub fn absolute(path: &Path) -> PathBuf {
+    plain(&std::path::absolute(path).unwrap_or_else(|_| path.to_owned()))
+}
+
+/// A path without `.` and `..`, made so as text: what is opened is exactly what was checked.
+pub fn plain(path: &Path) -> PathBuf {
+    let mut out = PathBuf::new();
+    for part in path.components() {
+        match part {
+            Component::CurDir => {}
+            Component::ParentDir => {
+                if !out.pop() {
+                    out.push("..");
+                }
+            }
+            other => out.push(other),
+        }
+    }
+    out
+}
+
+/// A URI's path with its `%20` resolved.
+fn decoded(text: &str) -> String {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.as_bytes();
+    while let Some((first, after)) = rest.split_first() {
+        let hex = after.get(..2).filter(|_| *first == b'%').and_then(|h| std::str::from_utf8(h).ok());
+        match hex.and_then(|h| u8::from_str_radix(h, 16).ok()) {
+            Some(byte) => {
+                bytes.push(byte);
+                rest = after.get(2..).unwrap_or_default();
+            }
+            None => {
+                bytes.push(*first);
+                rest = after;
+            }
+        }
+    }
+    String::from_utf8(bytes).unwrap_or_else(|_| text.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn folder() -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for file in
+            ["given/a.stl", "ros/p/b.stl", "ament/share/q/c.stl", "own_repo/package.xml", "own_repo/urdf/d e.stl"]
+        {
+            let path = folder.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "<package><name>own</name></package>").unwrap();
+        }
+        folder
+    }
+
+    fn packages(root: &Path) -> Packages {
+        Packages {
+            named: [("g".to_owned(), root.join("given"))].into(),
+            ros: vec![root.join("ros")],
+            ament: vec![root.join("ament")],
+        }
+    }
+
+    #[test]
+    fn files_are_found_in_every_way() {
+        let folder = folder();
+        let (root, beside) = (absolute(folder.path()), folder.path().join("own_repo/urdf"));
+        let packages = packages(&root);
+        for (uri, file) in [
+            ("package://g/a.stl", "given/a.stl"),
+            ("package://p/./x/../b.stl", "ros/p/b.stl"),
+            ("package://q/c.stl", "ament/share/q/c.stl"),
+            ("package://own/urdf/d%20e.stl", "own_repo/urdf/d e.stl"),
+            ("package://own_repo/urdf/d e.stl", "own_repo/urdf/d e.stl"),
+            ("d e.stl", "own_repo/urdf/d e.stl"),
+            ("../package.xml", "own_repo/package.xml"),
+            (&format!("file://{}/given/a.stl", root.display()), "given/a.stl"),
+        ] {
+            assert_eq!(packages.resolve(uri, &beside), Ok(root.join(file)), "{uri}");
+        }
+        assert_eq!(packages.own(&beside), root.join("own_repo"));
+        assert_eq!(packages.own(&root.join("ros/p")), root.join("ros/p"));
+    }
+
+    #[test]
+    fn what_is_not_there_is_said() {
+        let folder = folder();
+        let packages = packages(folder.path());
+        for (uri, what) in [
+            ("package://zz/a.stl", "--package zz=FOLDER"),
+            ("package://g/../ros/p/b.stl", "leads out of its package"),
+            ("package://g/%2e%2e/ros/p/b.stl", "leads out of its package"),
+            ("package://../given/a.stl", "is no name of a package"),
+            ("package://g/none.stl", "there is no file"),
+            ("https://x/a.stl", "cannot be read by `https://`"),
+        ] {
+            let error = packages.resolve(uri, folder.path()).unwrap_err();
+            assert!(error.contains(what), "{uri}: {error}");
+        }
+    }
+}

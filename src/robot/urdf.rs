@@ -1,0 +1,296 @@
+//! URDF → [`RobotModel`]. Everything that is wrong is reported at once, each at its place; tags without meaning here
+//! (`gazebo`, `transmission`, `ros2_control` …) are passed over.
+//!
+//! Read from our own tree and not by a URDF crate, so that mistakes have places: docs/decisions/0017.
+
+mod numbers;
+mod shapes;
+mod tree;
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+use nalgebra::{Unit, Vector3};
+
+use crate::robot::model::{Joint, JointKind, Limits, Link, Mimic, RobotModel};
+use crate::robot::xml::{Calls, Element, Place};
+use crate::yaml::{Diag, Tree, did_you_mean, quote};
+
+/// The most links of a robot.
+pub const MAX_LINKS: usize = 512;
+
+/// What to do about mesh files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Meshes {
+    /// Look for each: a missing collision mesh is an error, a missing visual mesh a warning.
+    #[default]
+    Find,
+    /// Do not look: shapes keep their names of files, for uses that need no shapes.
+    Ignore,
+}
+
+/// Where a file is that a description names, or why it cannot be found.
+pub type Resolve<'a> = dyn Fn(&str) -> Result<PathBuf, String> + 'a;
+
+/// Reads a robot from the root element of a description.
+pub fn read(
+    root: &Element,
+    tree: &mut Tree,
+    calls: &Calls,
+    meshes: Meshes,
+    resolve: &Resolve<'_>,
+) -> Option<RobotModel> {
+    let mut reader = Reader { tree, calls, meshes, resolve, materials: HashMap::new(), errors: 0 };
+    let model = reader.robot(root);
+    model.filter(|_| reader.errors == 0)
+}
+
+/// Reads a robot from a text without looking for its meshes; the mistakes as text. For tests and built-in robots.
+pub fn from_text(name: &str, text: &str) -> Result<RobotModel, String> {
+    let mut tree = Tree::new();
+    let source = tree.add_source(name, text);
+    let calls = Calls::default();
+    let model = crate::robot::xml::parse(&mut tree, source)
+        .and_then(|document| read(&document.root, &mut tree, &calls, Meshes::Ignore, &|uri| Err(uri.to_owned())));
+    let lines = || tree.diags().iter().map(|d| crate::yaml::render(&tree, d, false)).collect::<Vec<_>>().join("\n");
+    model.ok_or_else(lines)
+}
+
+/// Reads one description.
+struct Reader<'t> {
+    tree: &'t mut Tree,
+    calls: &'t Calls,
+    meshes: Meshes,
+    resolve: &'t Resolve<'t>,
+    /// Colours by material name.
+    materials: HashMap<String, [f64; 4]>,
+    errors: usize,
+}
+
+/// A joint as written, before its links are known.
+struct RawJoint {
+    joint: Joint,
+    at: Place,
+    parent: (String, Place),
+    child: (String, Place),
+    mimic: Option<RawMimic>,
+}
+
+/// A `mimic` as written.
+struct RawMimic {
+    leader: String,
+    at: Place,
+    multiplier: f64,
+    offset: f64,
+}
+
+impl Reader<'_> {
+    fn error(&mut self, at: Place, what: impl Into<String>) {
+        self.report(at, Diag::error(what));
+    }
+
+    fn report(&mut self, at: Place, diag: Diag) {
+        self.errors += usize::from(diag.severity == crate::yaml::Severity::Error);
+        let diag = self.calls.explain(diag.at(at.label()), at);
+        self.tree.report(diag);
+    }
+
+    fn warn(&mut self, at: Place, what: impl Into<String>) {
+        self.report(at, Diag::warning(what));
+    }
+
+    /// An attribute that must be there and not be empty.
+    fn needed<'e>(&mut self, element: &'e Element, name: &str) -> Option<(&'e str, Place)> {
+        match element.attribute(name) {
+            Some(a) if !a.value.trim().is_empty() => Some((a.value.as_str(), a.at)),
+            Some(a) => {
+                self.error(a.at, format!("`{name}` of this `{}` is empty", element.name));
+                None
+            }
+            None => {
+                self.error(element.at, format!("this `{}` has no `{name}`", element.name));
+                None
+            }
+        }
+    }
+
+    fn robot(&mut self, root: &Element) -> Option<RobotModel> {
+        if root.name != "robot" {
+            let diag = Diag::error(format!("the root element is `{}`, not `robot`", root.name));
+            self.report(root.at, diag.hint("a URDF starts with <robot name=\"…\">"));
+            return None;
+        }
+        let name = self.needed(root, "name").map(|(name, _)| name.to_owned());
+        self.collect_materials(root);
+        let mut links = Vec::new();
+        let mut joints = Vec::new();
+        for element in root.elements() {
+            match element.name.as_str() {
+                "link" if links.len() < MAX_LINKS => links.extend(self.link(element)),
+                "link" => {
+                    self.error(element.at, format!("a robot may have {MAX_LINKS} links at most"));
+                    return None;
+                }
+                "joint" if joints.len() < MAX_LINKS => joints.extend(self.joint(element)),
+                "joint" => {
+                    self.error(element.at, format!("a robot may have {} joints at most", MAX_LINKS - 1));
+                    return None;
+                }
+                _ => {}
+            }
+        }
+        if links.is_empty() {
+            self.error(root.at, "the robot has no links");
+            return None;
+        }
+        self.assemble(name?, links, joints)
+    }
+
+    fn link(&mut self, element: &Element) -> Option<(Link, Place)> {
+        let (name, at) = self.needed(element, "name")?;
+        let visuals = element.named("visual").filter_map(|e| self.shape(e, false)).collect();
+        let collisions = element.named("collision").filter_map(|e| self.shape(e, true)).collect();
+        let inertial = element.child("inertial").and_then(|e| self.inertial(e));
+        Some((Link { name: name.to_owned(), visuals, collisions, inertial }, at))
+    }
+
+    fn joint(&mut self, element: &Element) -> Option<RawJoint> {
+        let name = self.needed(element, "name");
+        let kind = self.kind(element);
+        let end = |reader: &mut Self, which: &str| match element.child(which) {
+            Some(end) => reader.needed(end, "link").map(|(link, at)| (link.to_owned(), at)),
+            None => {
+                reader.error(element.at, format!("this joint has no `{which}`"));
+                None
+            }
+        };
+        let (parent, child) = (end(self, "parent"), end(self, "child"));
+        let origin = self.origin(element);
+        let moves = kind.is_some_and(|k| k != JointKind::Fixed);
+        let axis = if moves { self.axis(element) } else { Some(Vector3::x_axis()) };
+        let limits = kind.and_then(|kind| self.limits(element, kind));
+        let mimic = element.child("mimic").filter(|_| moves).map(|e| self.mimic(e));
+        let (name, at) = name?;
+        // Values stand in for those that were reported: the joint's place in the tree is checked all the same.
+        let joint = Joint {
+            name: name.to_owned(),
+            kind: kind.unwrap_or(JointKind::Fixed),
+            parent: 0,
+            child: 0,
+            origin: origin.unwrap_or_default(),
+            axis: axis.unwrap_or(Vector3::x_axis()),
+            limits: limits.unwrap_or(Limits::NONE),
+            mimic: None,
+        };
+        Some(RawJoint { joint, at, parent: parent?, child: child?, mimic: mimic.flatten() })
+    }
+
+    fn kind(&mut self, element: &Element) -> Option<JointKind> {
+        let (word, at) = self.needed(element, "type")?;
+        match word {
+            "fixed" => Some(JointKind::Fixed),
+            "revolute" => Some(JointKind::Revolute),
+            "continuous" => Some(JointKind::Continuous),
+            "prismatic" => Some(JointKind::Prismatic),
+            "floating" | "planar" | "spherical" => {
+                let diag = Diag::error(format!("joints of type `{word}` cannot be driven"));
+                self.report(at, diag.hint("an arm's joints are revolute, continuous, prismatic or fixed"));
+                None
+            }
+            other => {
+                let hint = did_you_mean(other, ["fixed", "revolute", "continuous", "prismatic"], "the types are");
+                self.report(at, Diag::error(format!("no joint type is named {}", quote(other))).maybe_hint(hint));
+                None
+            }
+        }
+    }
+
+    fn axis(&mut self, element: &Element) -> Option<Unit<Vector3<f64>>> {
+        let Some(xyz) = element.child("axis") else { return Some(Vector3::x_axis()) };
+        let (_, at) = self.needed(xyz, "xyz")?;
+        let vector: Vector3<f64> = self.vector(xyz, "xyz")?.into();
+        let axis = Unit::try_new(vector, 1e-9);
+        if axis.is_none() {
+            self.report(at, Diag::error("this axis is zero").hint("an axis is a direction, such as 0 0 1"));
+        }
+        axis
+    }
+
+    fn limits(&mut self, element: &Element, kind: JointKind) -> Option<Limits> {
+        let bounded = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
+        let Some(limit) = element.child("limit").filter(|_| kind != JointKind::Fixed) else {
+            if !bounded {
+                return Some(Limits::NONE);
+            }
+            let hint = "add <limit lower=\"…\" upper=\"…\" velocity=\"…\" effort=\"…\"/>, or make it continuous";
+            let diag = Diag::error(format!("this {} joint has no `limit`", kind.name()));
+            self.report(element.at, diag.hint(hint));
+            return None;
+        };
+        let mut limits = Limits::NONE;
+        let mut fine = true;
+        if bounded {
+            if limit.attribute("lower").is_none() && limit.attribute("upper").is_none() {
+                self.error(limit.at, "this limit has neither `lower` nor `upper`");
+                fine = false;
+            }
+            // URDF: an end that is not stated is zero.
+            let lower = self.number_or(limit, "lower", 0.0);
+            let upper = self.number_or(limit, "upper", 0.0);
+            match (lower, upper) {
+                (Some(lower), Some(upper)) if lower > upper => {
+                    let diag = Diag::error(format!("the lower limit {lower} is above the upper limit {upper}"));
+                    let at = limit.attribute("lower").map_or(limit.at, |a| a.at);
+                    self.report(at, diag.hint("are they swapped?"));
+                    fine = false;
+                }
+                (Some(lower), Some(upper)) => (limits.lower, limits.upper) = (lower, upper),
+                _ => fine = false,
+            }
+        }
+        let missing = limit.attribute("velocity").is_none();
+        if bounded && missing {
+            self.error(limit.at, "this limit has no `velocity`");
+        }
+        limits.velocity = self.rate(limit, "velocity")?;
+        limits.effort = self.rate(limit, "effort")?;
+        limits.acceleration = self.rate(limit, "acceleration").filter(|v| v.is_finite());
+        limits.jerk = self.rate(limit, "jerk").filter(|v| v.is_finite());
+        (fine && !(bounded && missing)).then_some(limits)
+    }
+
+    /// A limit that is positive; not stated means infinite. Zero is what exporters write where nobody said anything.
+    fn rate(&mut self, limit: &Element, name: &str) -> Option<f64> {
+        let value = self.number_or(limit, name, f64::INFINITY)?;
+        let at = limit.attribute(name).map_or(limit.at, |a| a.at);
+        if value < 0.0 {
+            self.error(at, format!("the {name} limit {value} is negative"));
+            return None;
+        }
+        if value == 0.0 {
+            if name == "velocity" {
+                let what = "a velocity limit of 0 is taken for one that was never stated";
+                self.report(at, Diag::warning(what).hint("state the joint's real limit"));
+            }
+            return Some(f64::INFINITY);
+        }
+        Some(value)
+    }
+
+    fn mimic(&mut self, element: &Element) -> Option<RawMimic> {
+        let (leader, at) = self.needed(element, "joint")?;
+        let multiplier = self.number_or(element, "multiplier", 1.0)?;
+        let offset = self.number_or(element, "offset", 0.0)?;
+        Some(RawMimic { leader: leader.to_owned(), at, multiplier, offset })
+    }
+}
+
+/// A follower that is not resolved yet.
+impl From<(&RawMimic, usize)> for Mimic {
+    fn from((raw, leader): (&RawMimic, usize)) -> Self {
+        Self { leader, multiplier: raw.multiplier, offset: raw.offset }
+    }
+}
+
+#[cfg(test)]
+mod tests;

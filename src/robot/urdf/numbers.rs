@@ -1,0 +1,73 @@
+//! Numbers, vectors and poses in attributes: each finite, and as many as needed.
+
+use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
+
+use super::Reader;
+use crate::robot::model::pose;
+use crate::robot::xml::{Attribute, Element};
+use crate::yaml::quote;
+
+impl Reader<'_> {
+    /// `N` finite numbers from an attribute.
+    pub(super) fn numbers<const N: usize>(&mut self, attribute: &Attribute) -> Option<[f64; N]> {
+        let words: Vec<&str> = attribute.value.split_whitespace().collect();
+        if words.len() != N {
+            let many = |n: usize| if n == 1 { "1 number".to_owned() } else { format!("{n} numbers") };
+            let what = format!("`{}` takes {}, found {}", attribute.name, many(N), words.len());
+            self.error(attribute.at, what);
+            return None;
+        }
+        let mut values = [0.0; N];
+        for (value, word) in values.iter_mut().zip(words) {
+            match word.parse::<f64>() {
+                Ok(number) if number.is_finite() => *value = number,
+                Ok(_) => {
+                    self.error(
+                        attribute.at,
+                        format!("`{}` is {word}: only finite numbers are allowed", attribute.name),
+                    );
+                    return None;
+                }
+                Err(_) => {
+                    self.error(attribute.at, format!("`{}`: {} is no number", attribute.name, quote(word)));
+                    return None;
+                }
+            }
+        }
+        Some(values)
+    }
+
+    /// A vector that must be there.
+    pub(super) fn vector(&mut self, element: &Element, name: &str) -> Option<[f64; 3]> {
+        self.needed(element, name)?;
+        element.attribute(name).and_then(|a| self.numbers(a))
+    }
+
+    /// A number; another one where it is not stated.
+    pub(super) fn number_or(&mut self, element: &Element, name: &str, otherwise: f64) -> Option<f64> {
+        match element.attribute(name) {
+            Some(attribute) => self.numbers::<1>(attribute).map(|[value]| value),
+            None => Some(otherwise),
+        }
+    }
+
+    /// The pose of an `origin` child; identity where there is none.
+    pub(super) fn origin(&mut self, element: &Element) -> Option<Isometry3<f64>> {
+        let Some(origin) = element.child("origin") else { return Some(Isometry3::identity()) };
+        let three = |reader: &mut Self, name: &str| match origin.attribute(name) {
+            Some(attribute) => reader.numbers::<3>(attribute),
+            None => Some([0.0; 3]),
+        };
+        let xyz = three(self, "xyz");
+        if let Some(quaternion) = origin.attribute("quat_xyzw") {
+            let [x, y, z, w] = self.numbers::<4>(quaternion)?;
+            let Some(rotation) = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9) else {
+                self.error(quaternion.at, "this quaternion is zero");
+                return None;
+            };
+            return Some(Isometry3::from_parts(xyz?.into(), rotation));
+        }
+        let rpy = three(self, "rpy");
+        Some(pose(xyz?, rpy?))
+    }
+}

@@ -1,0 +1,460 @@
+//! XML as an owned tree whose every element and attribute knows where it was written.
+//!
+//! Parsing is `roxmltree`'s; this tree can be changed (xacro does), keeps prefixes and CDATA as written, and is
+//! printed in one canonical form. Entities and DTDs are refused.
+
+use roxmltree::{ParsingOptions, TextPos};
+
+use crate::yaml::{Diag, Label, SourceId, Tree};
+
+/// The largest file that is read [bytes].
+pub const MAX_BYTES: usize = 8 << 20;
+/// The deepest nesting of elements.
+pub const MAX_DEPTH: usize = 128;
+/// The most nodes of one file.
+const MAX_NODES: u32 = 1_000_000;
+/// The namespace of xacro's elements.
+const XACRO: &str = "xmlns:xacro=\"http://www.ros.org/wiki/xacro\"";
+
+/// Where something was written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Place {
+    /// The text.
+    pub source: SourceId,
+    /// First byte.
+    pub start: u32,
+    /// Byte after the last.
+    pub end: u32,
+    /// The macro call that it came out of: an index into [`Calls`]; 0 where there is none.
+    pub call: u32,
+}
+
+impl Place {
+    pub(super) fn new(source: SourceId, range: std::ops::Range<usize>) -> Self {
+        Self { source, start: range.start as u32, end: range.end as u32, call: 0 }
+    }
+
+    /// The place as a label of a mistake.
+    pub fn label(self) -> Label {
+        Label { source: self.source, range: self.start as usize..self.end as usize, text: String::new() }
+    }
+}
+
+/// An attribute.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Attribute {
+    /// Name with prefix, as written.
+    pub name: String,
+    /// Value, entities resolved.
+    pub value: String,
+    /// Where the value stands.
+    pub at: Place,
+}
+
+/// An element.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Element {
+    /// Name with prefix, as written.
+    pub name: String,
+    /// Where the start tag's name stands.
+    pub at: Place,
+    /// Attributes, in the order they were written.
+    pub attributes: Vec<Attribute>,
+    /// What it contains.
+    pub children: Vec<Node>,
+}
+
+/// What an element contains.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Node {
+    /// An element.
+    Element(Element),
+    /// Text.
+    Text(String, Place),
+    /// Text that is never looked into.
+    CData(String),
+    /// A comment.
+    Comment(String, Place),
+    /// A processing instruction.
+    Instruction(String),
+    /// What xacro leaves behind so that comments above are kept; prints as nothing.
+    Barrier(u32),
+}
+
+/// A file: comments around a root element.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Document {
+    /// Comments and instructions before the root.
+    pub before: Vec<Node>,
+    /// The root element.
+    pub root: Element,
+}
+
+/// The macro calls of an expansion, so that what came out of one can be traced. Number 0 is no call.
+#[derive(Debug, Clone, Default)]
+pub struct Calls(Vec<(String, Place)>);
+
+impl Calls {
+    /// Notes a call; its number.
+    pub(super) fn add(&mut self, name: &str, at: Place) -> u32 {
+        self.0.push((name.to_owned(), at));
+        self.0.len() as u32
+    }
+
+    /// Adds to a mistake the calls that led to its place, innermost first.
+    pub fn explain(&self, mut diag: Diag, at: Place) -> Diag {
+        let mut call = at.call;
+        // Two are enough to find it, and a recursive macro has hundreds.
+        for _ in 0..2 {
+            let Some((name, place)) = (call as usize).checked_sub(1).and_then(|i| self.0.get(i)) else { break };
+            diag = diag.also(place.label().with_text(format!("in this call of the macro `{name}`")));
+            call = place.call;
+        }
+        diag
+    }
+}
+
+impl Element {
+    /// The attribute of a name.
+    pub fn attribute(&self, name: &str) -> Option<&Attribute> {
+        self.attributes.iter().find(|a| a.name == name)
+    }
+
+    /// Sets an attribute, replacing one of the same name.
+    pub fn set(&mut self, name: &str, value: String, at: Place) {
+        match self.attributes.iter_mut().find(|a| a.name == name) {
+            Some(attribute) => attribute.value = value,
+            None => self.attributes.push(Attribute { name: name.to_owned(), value, at }),
+        }
+    }
+
+    /// Child elements.
+    pub fn elements(&self) -> impl Iterator<Item = &Element> {
+        self.children.iter().filter_map(|node| match node {
+            Node::Element(element) => Some(element),
+            _ => None,
+        })
+    }
+
+    /// Child elements of a name.
+    pub fn named<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a Element> {
+        self.elements().filter(move |e| e.name == name)
+    }
+
+    /// The first child element of a name.
+    pub fn child<'a>(&'a self, name: &'a str) -> Option<&'a Element> {
+        self.elements().find(|e| e.name == name)
+    }
+
+    /// Marks everything inside as having come out of a macro call.
+    pub(super) fn stamp(&mut self, call: u32) {
+        self.at.call = call;
+        self.attributes.iter_mut().for_each(|a| a.at.call = call);
+        for node in &mut self.children {
+            match node {
+                Node::Element(element) => element.stamp(call),
+                Node::Text(_, at) | Node::Comment(_, at) => at.call = call,
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Parses a source. What is wrong is reported, at its place; then nothing comes out.
+pub fn parse(tree: &mut Tree, source: SourceId) -> Option<Document> {
+    let text = tree.source(source)?.text.clone();
+    if text.len() > MAX_BYTES {
+        let what = format!("the file is larger than {} MiB", MAX_BYTES >> 20);
+        tree.report(Diag::error(what).at(Label::start_of(source)));
+        return None;
+    }
+    let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
+    match roxmltree::Document::parse_with_options(&text, options) {
+        Ok(xml) => {
+            let mut copy = Copy { source, text: &text, too_deep: None };
+            let before =
+                xml.root().children().take_while(|n| !n.is_element()).filter_map(|n| copy.node(n, 0)).collect();
+            let root = copy.element(xml.root_element(), 0);
+            if let Some(at) = copy.too_deep {
+                let what = format!("elements are nested deeper than {MAX_DEPTH}");
+                tree.report(Diag::error(what).at(at.label()));
+                return None;
+            }
+            Some(Document { before, root })
+        }
+        Err(error) => {
+            let at = offset(&text, error.pos());
+            let label = Label { source, range: at..at, text: String::new() };
+            let hint = match &error {
+                roxmltree::Error::UnknownNamespace(prefix, _) if prefix == "xacro" => {
+                    Some(format!("declare it in the root element: {XACRO}"))
+                }
+                roxmltree::Error::DtdDetected => Some("remove the DOCTYPE; a robot description needs none".to_owned()),
+                _ => None,
+            };
+            let words = error.to_string();
+            let what = words.rsplit_once(" at ").map_or(words.as_str(), |(what, _)| what);
+            tree.report(Diag::error(format!("not well-formed XML: {what}")).at(label).maybe_hint(hint));
+            None
+        }
+    }
+}
+
+/// The byte of a row and column, both counted from 1.
+fn offset(text: &str, pos: TextPos) -> usize {
+    let line = text.split_inclusive('\n').take(pos.row.saturating_sub(1) as usize).map(str::len).sum::<usize>();
+    let rest = text.get(line..).unwrap_or_default();
+    let column = rest.chars().take(pos.col.saturating_sub(1) as usize).map(char::len_utf8).sum::<usize>();
+    (line + column).min(text.len())
+}
+
+/// Copies roxmltree's tree.
+struct Copy<'t> {
+    source: SourceId,
+    text: &'t str,
+    too_deep: Option<Place>,
+}
+
+impl Copy<'_> {
+    fn element(&mut self, node: roxmltree::Node<'_, '_>, depth: usize) -> Element {
+        let start = node.range().start + 1;
+        let rest = self.text.get(start..).unwrap_or_default();
+        let length = rest.find(|c: char| c.is_whitespace() || c == '/' || c == '>').unwrap_or(rest.len());
+        let at = Place::new(self.source, start..start + length);
+        let name = rest.get(..length).unwrap_or_default().to_owned();
+        if depth > MAX_DEPTH {
+            self.too_deep.get_or_insert(at);
+            return Element { name, at, ..Element::default() };
+        }
+        let mut attributes = self.declarations(node, at);
+        for attribute in node.attributes() {
+            let name = self.text.get(attribute.range_qname()).unwrap_or_default().to_owned();
+            let at = Place::new(self.source, attribute.range_value());
+            attributes.push(Attribute { name, value: attribute.value().to_owned(), at });
+        }
+        let mut children = Vec::new();
+        for child in node.children() {
+            match child.is_text() {
+                true => self.texts(child, &mut children),
+                false => children.extend(self.node(child, depth + 1)),
+            }
+        }
+        Element { name, at, attributes, children }
+    }
+
+    /// The namespaces that an element declares itself.
+    fn declarations(&self, node: roxmltree::Node<'_, '_>, at: Place) -> Vec<Attribute> {
+        let parent = node.parent_element();
+        let own = |ns: &&roxmltree::Namespace<'_>| {
+            ns.name() != Some("xml") && parent.is_none_or(|p| p.lookup_namespace_uri(ns.name()) != Some(ns.uri()))
+        };
+        let attribute = |ns: &roxmltree::Namespace<'_>| Attribute {
+            name: ns.name().map_or_else(|| "xmlns".to_owned(), |prefix| format!("xmlns:{prefix}")),
+            value: ns.uri().to_owned(),
+            at,
+        };
+        node.namespaces().filter(own).map(attribute).collect()
+    }
+
+    fn node(&mut self, node: roxmltree::Node<'_, '_>, depth: usize) -> Option<Node> {
+        let at = Place::new(self.source, node.range());
+        if node.is_element() {
+            return Some(Node::Element(self.element(node, depth)));
+        }
+        if node.is_comment() {
+            return Some(Node::Comment(node.text().unwrap_or_default().to_owned(), at));
+        }
+        let instruction = node.pi()?;
+        Some(Node::Instruction(format!("{} {}", instruction.target, instruction.value.unwrap_or_default())))
+    }
+
+    /// A text with the CDATA sections in it told apart: roxmltree joins them.
+    fn texts(&self, node: roxmltree::Node<'_, '_>, children: &mut Vec<Node>) {
+        const OPEN: &str = "<![CDATA[";
+        let at = Place::new(self.source, node.range());
+        let text = node.text().unwrap_or_default();
+        let end = match node.next_sibling() {
+            Some(next) => next.range().start,
+            None => {
+                let all = node.parent().map_or(0..0, |p| p.range());
+                let tag = self.text.get(all.clone()).and_then(|t| t.rfind("</")).unwrap_or(0);
+                all.start + tag
+            }
+        };
+        let raw = self.text.get(node.range().start..end).unwrap_or_default();
+        if !raw.contains(OPEN) {
+            children.push(Node::Text(text.to_owned(), at));
+            return;
+        }
+        let mut rest = raw;
+        while let Some((before, inside)) = rest.split_once(OPEN) {
+            let (data, after) = inside.split_once("]]>").unwrap_or((inside, ""));
+            if !before.is_empty() {
+                children.push(Node::Text(resolved(before), at));
+            }
+            children.push(Node::CData(data.replace("\r\n", "\n")));
+            rest = after;
+        }
+        if !rest.is_empty() {
+            children.push(Node::Text(resolved(rest), at));
+        }
+    }
+}
+
+/// Text with its character references resolved.
+fn resolved(raw: &str) -> String {
+    let wrapped = format!("<t>{raw}</t>");
+    let parsed = roxmltree::Document::parse(&wrapped);
+    parsed.ok().and_then(|d| d.root_element().text().map(str::to_owned)).unwrap_or_default()
+}
+
+impl Document {
+    /// The canonical text: two spaces a level, attributes in the order of their names, no white space between
+    /// elements but line breaks. What xacro prints, without its banner.
+    pub fn to_text(&self) -> String {
+        let mut out = String::from("<?xml version=\"1.0\" ?>\n");
+        self.before.iter().for_each(|node| write_node(node, 0, &mut out));
+        write_element(&self.root, 0, &mut out);
+        out
+    }
+}
+
+fn write_node(node: &Node, depth: usize, out: &mut String) {
+    let indent = |out: &mut String| out.extend(std::iter::repeat_n("  ", depth));
+    match node {
+        Node::Element(element) => write_element(element, depth, out),
+        Node::Text(text, _) => {
+            if !text.trim().is_empty() {
+                indent(out);
+                escape(text, out);
+                out.push('\n');
+            }
+        }
+        Node::CData(text) => {
+            // What stands in a section must not end it.
+            let text = text.replace("]]>", "]]]]><![CDATA[>");
+            out.push_str(&format!("<![CDATA[{text}]]>"));
+        }
+        Node::Comment(text, _) => {
+            indent(out);
+            out.push_str(&format!("<!--{text}-->\n"));
+        }
+        Node::Instruction(text) => {
+            indent(out);
+            out.push_str(&format!("<?{text}?>\n"));
+        }
+        Node::Barrier(_) => {}
+    }
+}
+
+fn write_element(element: &Element, depth: usize, out: &mut String) {
+    let indent: String = "  ".repeat(depth);
+    out.push_str(&format!("{indent}<{}", element.name));
+    let mut attributes: Vec<&Attribute> = element.attributes.iter().collect();
+    attributes.sort_by(|a, b| a.name.cmp(&b.name));
+    for attribute in attributes {
+        out.push_str(&format!(" {}=\"", attribute.name));
+        escape(&attribute.value, out);
+        out.push('"');
+    }
+    let visible: Vec<&Node> = element.children.iter().filter(|n| !matches!(n, Node::Barrier(_))).collect();
+    match visible[..] {
+        [] => out.push_str("/>\n"),
+        [Node::Text(text, _)] => {
+            out.push('>');
+            escape(text, out);
+            out.push_str(&format!("</{}>\n", element.name));
+        }
+        _ => {
+            out.push_str(">\n");
+            visible.iter().for_each(|node| write_node(node, depth + 1, out));
+            out.push_str(&format!("{indent}</{}>\n", element.name));
+        }
+    }
+}
+
+fn escape(text: &str, out: &mut String) {
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            c => out.push(c),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> (Tree, Option<Document>) {
+        let mut tree = Tree::new();
+        let source = tree.add_source("t.xml", text);
+        let document = parse(&mut tree, source);
+        (tree, document)
+    }
+
+    #[test]
+    fn places_prefixes_and_namespaces_are_kept() {
+        let text = "<r xmlns:g='http://g' a='1 &amp; 2'>\n <g:x g:y=\"µ\"/></r>";
+        let (_, document) = read(text);
+        let root = document.unwrap().root;
+        let x = root.elements().next().unwrap();
+        assert_eq!((x.name.as_str(), x.attributes[0].name.as_str()), ("g:x", "g:y"));
+        let place = x.attributes[0].at;
+        assert_eq!(&text[place.start as usize..place.end as usize], "µ");
+        assert_eq!(root.attribute("a").unwrap().value, "1 & 2");
+        assert_eq!(root.attribute("xmlns:g").unwrap().value, "http://g");
+        assert!(x.attribute("xmlns:g").is_none());
+    }
+
+    #[test]
+    fn cdata_is_told_from_text() {
+        for (text, expected) in [
+            ("<r><![CDATA[a<b]]></r>", vec![Node::CData("a<b".into())]),
+            (
+                "<r>x&amp;<![CDATA[&amp;]]></r>",
+                vec![Node::Text("x&".into(), Place::default()), Node::CData("&amp;".into())],
+            ),
+            (
+                "<r><![CDATA[1]]>y<!--c--></r>",
+                vec![
+                    Node::CData("1".into()),
+                    Node::Text("y".into(), Place::default()),
+                    Node::Comment("c".into(), Place::default()),
+                ],
+            ),
+        ] {
+            let plain = |node: Node| match node {
+                Node::Text(t, _) => Node::Text(t, Place::default()),
+                Node::Comment(t, _) => Node::Comment(t, Place::default()),
+                other => other,
+            };
+            let (_, document) = read(text);
+            let children: Vec<Node> = document.unwrap().root.children.into_iter().map(plain).collect();
+            assert_eq!(children, expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn mistakes_have_places() {
+        let (tree, none) = read("<r>\n  <a></b>\n</r>");
+        assert!(none.is_none());
+        let report = tree.diags()[0].located(&tree);
+        assert_eq!((report.line, report.column), (Some(2), Some(6)), "{report:?}");
+        let (tree, _) = read("<r><xacro:if value='1'/></r>");
+        assert!(tree.diags()[0].hint.as_ref().unwrap().contains("xmlns:xacro"));
+        let (tree, _) = read("<!DOCTYPE r [<!ENTITY a 'x'>]><r>&a;</r>");
+        assert_eq!(tree.diags().len(), 1);
+    }
+
+    #[test]
+    fn depth_is_bounded() {
+        let deep = |n: usize| format!("{}{}", "<a>".repeat(n), "</a>".repeat(n));
+        assert!(read(&deep(MAX_DEPTH)).1.is_some());
+        assert!(read(&deep(MAX_DEPTH + 5)).1.is_none());
+        assert!(read(&deep(200_000)).1.is_none());
+    }
+}
