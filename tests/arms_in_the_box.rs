@@ -95,3 +95,43 @@ fn coordinator_piper_xarm() {
     ];
     exercise("coordinator-piper-xarm", &arms);
 }
+
+#[test]
+#[cfg(feature = "can")]
+fn a_piper_that_cannot_be_reached_or_leads_is_told_in_one_line() {
+    let home = Home::new();
+    let nowhere = "run coordinator-piper --no-record --set hardware.arm.address=nosuchcan7";
+    home.dimos(nowhere).with(3).says(&["nosuchcan7", "hint: "]);
+    home.write(
+        "leader.yaml",
+        "include: [coordinator-piper]\nhardware: [{hardware_id: arm, options: {sim: {faults: [{kind: leader}]}}}]\n",
+    );
+    let leader = home.dimos("run leader.yaml --sim --no-record").with(3);
+    leader.says(&["this arm leads others: it sends commands instead of its state", "hint: ", "MasterSlaveConfig(0xFC"]);
+}
+
+#[test]
+#[cfg(feature = "can")]
+fn a_piper_has_no_velocity_mode_and_check_says_so() {
+    let home = Home::new();
+    home.write(
+        "velocity.yaml",
+        "include: [coordinator-piper]\ntasks: [{name: v, type: velocity, joint_names: {hardware: arm}, priority: 20}]\n",
+    );
+    home.dimos("check velocity.yaml").with(2).says(&["velocity", "piper"]);
+    home.dimos("check coordinator-piper").with(0);
+}
+
+#[test]
+#[cfg(feature = "can")]
+fn a_piper_that_falls_is_told_of_wherever_its_motors_go_off() {
+    let home = Home::new();
+    assert!(home.dimos("list-adapters").with(0).out.lines().any(|l| l.contains("piper") && l.contains("no, falls")));
+    let checked = home.dimos("check coordinator-piper --set hardware.arm.on_exit=disable --sim");
+    assert!(
+        format!("{}{}", checked.out, checked.err).contains("it FALLS unless supported"),
+        "{}{}",
+        checked.out,
+        checked.err
+    );
+}
