@@ -13,6 +13,7 @@ use dimos::hardware::transport::can::socket::SEND_QUEUE;
 use dimos::hardware::transport::can::{
     CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble, SlcanPty, open as open_at,
 };
+use dimos::hardware::transport::serial::Pty;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use uml::{Guest, in_guest, sh};
 
@@ -214,6 +215,19 @@ fn what_cannot_be_opened_is_refused_with_a_hint() {
     });
 }
 
+/// As after bus-off: the kernel swallows what is sent.
+#[test]
+fn an_interface_without_carrier_is_refused() {
+    in_guest("an_interface_without_carrier_is_refused", &Guest::with(uml::VXCAN), || {
+        sh("ip link set sim0 down");
+        let error = refusal("can0");
+        assert!(error.starts_with("cannot open CAN interface can0 for arm: it has no carrier: "), "{error}");
+        assert!(error.contains("\nhint: ") && error.contains("ip link set can0 down; ip link set can0 up"), "{error}");
+        sh("ip link set sim0 up");
+        open("can0", &[]);
+    });
+}
+
 #[test]
 fn two_interfaces_do_not_hear_each_other() {
     in_guest("two_interfaces_do_not_hear_each_other", &Guest::with(uml::VXCAN), || {
@@ -288,24 +302,73 @@ fn frames_that_nobody_fetches_in_time_are_reported_lost() {
     });
 }
 
+/// Runs a command while the adapter does as the kernel's driver says.
+fn while_serving(adapter: &mut dyn CanPort, command: &str) {
+    std::thread::scope(|scope| {
+        let command = scope.spawn(|| sh(command));
+        while !command.is_finished() {
+            assert_eq!(adapter.receive(), Ok(None));
+            readable(adapter, Duration::from_millis(10));
+        }
+    });
+    assert_eq!(adapter.receive(), Ok(None));
+}
+
 /// The kernel's own driver for serial CAN adapters takes our double for one.
 #[test]
 fn the_kernels_slcan_driver_understands_the_emulated_adapter() {
     in_guest("the_kernels_slcan_driver_understands_the_emulated_adapter", &Guest::with(""), || {
         let mut adapter = SlcanPty::open().unwrap();
-        sh(&format!("slcan_attach -s8 -o -n ser0 {}; ip link set ser0 up", adapter.path()));
-        let start = Instant::now();
-        while !adapter.channel_open() {
-            assert!(start.elapsed() < WAIT);
-            assert_eq!(adapter.receive(), Ok(None));
-        }
-        let mut port = open("ser0", &[]);
+        sh(&format!("slcan_attach -n can0 {}", adapter.path()));
+        assert!(refusal("can0").contains("the interface is down\nhint: ip link set can0 up type can bitrate 1000000"));
+        // The driver sets the bit rate and opens the channel meanwhile.
+        while_serving(&mut adapter, "ip link set can0 up type can bitrate 1000000");
+        assert!(adapter.channel_open());
+        let mut port = open("can0", &[]);
         let sent = [CanFrame::new(0x471, &[7, 2]), CanFrame::new(0x7FF, &[]), CanFrame::new(0, &[0xAB; 8])];
         assert_eq!(port.send(&sent), Ok(3));
         let mut adapter: Port = Box::new(adapter);
         assert_eq!(frames(&mut adapter, 3), sent);
         assert_eq!(adapter.send(&sent), Ok(3));
         assert_eq!(frames(&mut port, 3), sent);
+        while_serving(&mut *adapter, "ip link set can0 down");
+        assert!(matches!(port.receive(), Err(AdapterError::Io(_))));
+        while_serving(&mut *adapter, "ip link set can0 up");
+        assert_eq!(open("can0", &[]).send(&sent), Ok(3));
+        assert_eq!(frames(&mut adapter, 3), sent, "and up again");
+    });
+}
+
+/// A controller in trouble, by way of the kernel's driver for serial CAN adapters: its adapters tell their state as `s`
+/// lines (state, counters) and errors as `e` lines.
+#[test]
+fn the_kernel_tells_what_a_controller_reports() {
+    in_guest("the_kernel_tells_what_a_controller_reports", &Guest::with(""), || {
+        let pty = Pty::open().unwrap();
+        sh(&format!("slcan_attach -s8 -o -n can0 {}; ip link set can0 up", pty.path()));
+        let mut port = open("can0", &[CanFilter { id: 1, mask: 0x7FF }]);
+        let mut told = |line: &str| {
+            pty.write(line.as_bytes()).unwrap();
+            match events(&mut port, 1)[..] {
+                [CanEvent::Trouble(trouble)] => trouble,
+                ref other => panic!("{line:?}: {other:?}"),
+            }
+        };
+        assert_eq!(told("sw097003\r"), CanTrouble::Other(0x204), "a warning, with its counters");
+        assert_eq!(told("sp003129\r"), CanTrouble::Passive);
+        assert_eq!(told("e1a\r"), CanTrouble::NoAcknowledge);
+        assert_eq!(told("e1o\r"), CanTrouble::Overflow);
+        assert_eq!(told("sa000000\r"), CanTrouble::Restarted);
+        assert_eq!(told("sb000256\r"), CanTrouble::BusOff);
+        assert_eq!(port.send(&numbered(2)), Ok(2), "swallowed without a word");
+        assert!(refusal("can0").contains("it has no carrier: its controller is bus-off"));
+        sh("ip link set can0 down; ip link set can0 up");
+        let mut port = open("can0", &[]);
+        let mut room = [0; 256];
+        while pty.read(&mut room, Duration::from_millis(50)).unwrap() > 0 {}
+        assert_eq!(port.send(&[CanFrame::new(0x472, &[1])]), Ok(1));
+        let n = pty.read(&mut room, WAIT).unwrap();
+        assert_eq!(room[..n], *b"t472101\r", "and nothing from before");
     });
 }
 

@@ -2,6 +2,7 @@
 
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::arms::{mock, yourarm};
+use dimos::hardware::conformance::gently::{Motion, move_gently, refusal};
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
 use dimos::hardware::spec::*;
@@ -34,6 +35,7 @@ const OLD_NEWS_AFTER_CONNECT: u8 = 20;
 const WRONG_SIGN_BOTH_WAYS: u8 = 21;
 const IGNORES_MODEL: u8 = 22;
 const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
+const VELOCITIES_IN_DEGREES: u8 = 24;
 
 /// An arm with one mistake.
 struct Wrong<const MISTAKE: u8> {
@@ -146,6 +148,9 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if MISTAKE == ZERO_VELOCITIES {
             reading.velocity = Some(Default::default());
         }
+        if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_IN_DEGREES) {
+            *velocity = velocity.map(f64::to_degrees);
+        }
         if MISTAKE == STAMPS_ANEW {
             reading.stamp = Some(MonotonicClock.now());
         }
@@ -250,4 +255,68 @@ fn each_mistake_is_found_by_the_check_for_it() {
             });
         }
     });
+}
+
+/// The small slow motion of a wrong arm, which begins to be interrupted at the `looks`th look.
+fn moved_gently(row: &AdapterSpec, looks: u32) -> (Motion, Inner) {
+    let config = AdapterConfig {
+        hardware_id: "arm".into(),
+        address: String::new(),
+        dof: 6,
+        options: serde_json::json!({"initial_positions": [0, 0, 0, 0, 0, 0]}),
+    };
+    let mut adapter = (row.create)(&config).unwrap();
+    adapter.connect().unwrap();
+    let mut left = looks;
+    let interrupted = std::cell::Cell::new(false);
+    let motion = move_gently(&mut *adapter, &|| interrupted.get(), &mut |_| {
+        left -= 1;
+        interrupted.set(left == 0);
+    });
+    (motion, adapter)
+}
+
+#[test]
+fn the_small_slow_motion_ends_where_something_is_odd() {
+    let cases: &[(AdapterSpec, &str)] = &[
+        (Wrong::<DEGREES>::SPEC, "joint 1 was sent by +2.00° and moved by"),
+        (Wrong::<WRONG_SIGN>::SPEC, "joint 2 was sent by +2.00° and moves the other way"),
+        (Wrong::<SWAPPED_JOINTS>::SPEC, "joint 3 moved by"),
+        (Wrong::<MOVES_ON_ACTIVATION>::SPEC, "moved by 0.5"),
+        (Wrong::<DEAF_TO_STOP>::SPEC, "in spite of a stop"),
+        (Wrong::<STOP_DROPS_POWER>::SPEC, "the motors went off"),
+        (Wrong::<VELOCITIES_IN_DEGREES>::SPEC, "are they in rad/s"),
+        (Wrong::<STOP_IS_FINAL>::SPEC, "stopped"),
+    ];
+    std::thread::scope(|scope| {
+        for (row, says) in cases {
+            scope.spawn(move || {
+                let (motion, mut adapter) = moved_gently(row, u32::MAX);
+                let odd = motion.odd.unwrap_or_else(|| panic!("{says}: nothing was odd in {:?}", motion.ways));
+                assert!(odd.contains(says), "{odd}");
+                println!("{odd}");
+                // Whatever it was, the arm stands.
+                let mut before = [0.0; 6];
+                let mut after = [0.0; 6];
+                adapter.read_joint_positions(&mut before).unwrap();
+                std::thread::sleep(std::time::Duration::from_millis(100));
+                adapter.read_joint_positions(&mut after).unwrap();
+                assert_eq!(before, after, "{says}");
+            });
+        }
+    });
+}
+
+#[test]
+fn the_small_slow_motion_can_be_interrupted_and_refused() {
+    let (motion, mut adapter) = moved_gently(&mock::SPEC, 3);
+    assert!(motion.interrupted && motion.odd.is_none() && motion.ways.len() == 1, "{motion:?}");
+    assert_eq!(motion.left, "motors off, as they were found");
+    assert!(refusal(&mut *adapter).is_ok());
+    adapter.set_control_mode(ControlMode::ServoPosition).unwrap();
+    adapter.activate().unwrap();
+    adapter.write_joint_positions(&[0.0, 0.0, 0.0, 6.25, 0.0, 0.0], 1.0).unwrap();
+    std::thread::sleep(std::time::Duration::from_secs(3));
+    let refused = refusal(&mut *adapter).unwrap_err();
+    assert!(refused.contains("joint 4 at 358.10° has 1.90° to its upper limit"), "{refused}");
 }

@@ -1,6 +1,12 @@
 //! The templates of `dimos adapter new`, as they stand: their unit tests, and the conformance suite over each.
 
 #[allow(dead_code, reason = "a library's public parts")]
+#[path = "../assets/templates/can/mod.rs"]
+mod can;
+#[allow(dead_code, reason = "a library's public parts")]
+#[path = "../assets/templates/serial/mod.rs"]
+mod serial;
+#[allow(dead_code, reason = "a library's public parts")]
 #[path = "../assets/templates/tcp/mod.rs"]
 mod tcp;
 
@@ -28,6 +34,16 @@ fn conforms(row: &AdapterSpec) {
             .collect()
     });
     assert!(failures.is_empty(), "\n{}", failures.join("\n"));
+}
+
+#[test]
+fn the_can_template_conforms() {
+    conforms(&can::SPEC);
+}
+
+#[test]
+fn the_serial_template_conforms() {
+    conforms(&serial::SPEC);
 }
 
 #[test]

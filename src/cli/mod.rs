@@ -36,6 +36,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use crate::blueprint;
 use crate::hardware::registry::{AdapterSpec, Registry};
 
 const AFTER_HELP: &str = "\
@@ -99,7 +100,50 @@ enum Command {
     Replay(replay::ReplayArgs),
 }
 
-/// Runs the command line, with more adapters than those in the box. What `main` of an embedding program calls.
+/// The whole program, with what another crate adds to it.
+///
+/// ```no_run
+/// use std::process::ExitCode;
+/// use dimos::hardware::registry::AdapterSpec;
+///
+/// # mod acme { pub const SPEC: dimos::hardware::registry::AdapterSpec = dimos::hardware::arms::mock::SPEC; }
+/// fn main() -> ExitCode {
+///     let blueprint = "hardware: [{hardware_id: arm, adapter_type: acme, joints: {prefix: arm, count: 6}}]";
+///     dimos::cli::Program::new().adapter(acme::SPEC).blueprint("coordinator-acme", blueprint).main()
+/// }
+/// ```
+#[derive(Debug, Clone, Default)]
+pub struct Program {
+    adapters: Vec<AdapterSpec>,
+    blueprints: Vec<(&'static str, &'static str)>,
+}
+
+impl Program {
+    /// The program as it is.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds an adapter; it wins over one of the same name in the box.
+    pub fn adapter(mut self, row: AdapterSpec) -> Self {
+        self.adapters.push(row);
+        self
+    }
+
+    /// Adds a blueprint that is run by name, wherever the program is started: its name, and its text in YAML.
+    pub fn blueprint(mut self, name: &'static str, text: &'static str) -> Self {
+        self.blueprints.push((name, text));
+        self
+    }
+
+    /// Runs the command line: what `main` does.
+    pub fn main(self) -> ExitCode {
+        blueprint::embed(self.blueprints);
+        main_with(&self.adapters)
+    }
+}
+
+/// Runs the command line with more adapters than those in the box. [`Program`] can add blueprints too.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
     // Usage errors, `--help` and `--version` end here, with 2 or 0.
     let cli = Cli::parse_from(std::env::args_os().map(spelled_out));

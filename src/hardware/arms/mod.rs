@@ -5,12 +5,14 @@ use crate::hardware::registry::{Absent, AdapterSpec};
 pub mod mock;
 #[cfg(feature = "can")]
 pub mod piper;
+pub mod xarm;
 pub mod yourarm;
 
 /// The compile-time adapter table.
 pub const TABLE: &[AdapterSpec] = &[
     mock::SPEC,
     yourarm::SPEC,
+    xarm::SPEC,
     #[cfg(feature = "can")]
     piper::SPEC,
 ];

@@ -92,8 +92,11 @@ fn in_motion(context: &mut Context) -> Result<(), String> {
     context.ready(ControlMode::Position)?;
     set_off(context)?;
     cut(context)?;
-    let here = mend(context)?;
-    std::thread::sleep(Duration::from_millis(50));
+    mend(context)?;
+    // Where it stops by itself it needs a moment for that.
+    std::thread::sleep(Duration::from_millis(300));
+    let here = context.positions()?;
+    std::thread::sleep(Duration::from_millis(100));
     let went_on = farthest(&context.positions()?, &here) > 0.002;
     context.stop()?;
     let stopped = context.standstill()?;

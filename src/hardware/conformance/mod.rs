@@ -7,6 +7,8 @@ mod context;
 mod cuts;
 mod device;
 mod faults;
+pub mod figures;
+pub mod gently;
 mod identity;
 mod lifecycle;
 mod motion;
@@ -17,6 +19,8 @@ mod stops;
 pub use context::{Context, Subject};
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::hardware::registry::AdapterSpec;
 
@@ -111,4 +115,40 @@ pub fn run_on(subject: &Subject, check: &Check) -> (Outcome, Option<String>) {
             (Outcome::Failed(format!("panicked: {text}")), None)
         }
     }
+}
+
+/// Checks of an emulated arm that run side by side: they mostly wait for motion.
+const SIDE_BY_SIDE: usize = 12;
+
+/// A check that was made, what came out of it, and what it found worth telling.
+pub type Made = (&'static Check, Outcome, Option<String>);
+
+/// Runs those checks on a subject, until `interrupted` says so; `tell` hears of each as it is done, from any thread.
+/// The answer is in their order.
+pub fn run_all(
+    subject: &Subject,
+    checks: &[&'static Check],
+    tell: &(dyn Fn(&Check, &Outcome) + Sync),
+    interrupted: &(dyn Fn() -> bool + Sync),
+) -> Vec<Made> {
+    let next = AtomicUsize::new(0);
+    let made = Mutex::new(Vec::new());
+    // A real device has one wire, and is asked one thing at a time.
+    let workers = if subject.real { 1 } else { SIDE_BY_SIDE };
+    std::thread::scope(|scope| {
+        for _ in 0..workers {
+            scope.spawn(|| {
+                loop {
+                    let index = next.fetch_add(1, Ordering::Relaxed);
+                    let Some(check) = checks.get(index).filter(|_| !interrupted()) else { return };
+                    let (outcome, found) = run_on(subject, check);
+                    tell(check, &outcome);
+                    made.lock().unwrap_or_else(|e| e.into_inner()).push((index, (*check, outcome, found)));
+                }
+            });
+        }
+    });
+    let mut made = made.into_inner().unwrap_or_else(|e| e.into_inner());
+    made.sort_by_key(|(index, _)| *index);
+    made.into_iter().map(|(_, made)| made).collect()
 }

@@ -1,5 +1,5 @@
 //! Emulated controllers on a stream of bytes: requests in, answers out, and what faults leave of them. The streams
-//! themselves are TCP connections ([`super::tcp_server`]).
+//! themselves are TCP connections ([`super::tcp_server`]) and serial lines ([`super::serial_server`]).
 
 use std::io::{Read, Write};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};

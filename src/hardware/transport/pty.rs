@@ -1,6 +1,8 @@
 //! A pseudo-terminal: the far end of a serial line, for emulators.
 
+use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use rustix::event::PollFlags;
@@ -11,13 +13,19 @@ use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 use super::serial::{make_raw, wait};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 
+/// So many lines that are gone keep their numbers. The system would give them to the next lines, and a client that
+/// comes back for its own would find another's.
+const KEEP: usize = 64;
+/// The far ends that keep them.
+static GONE: Mutex<VecDeque<OwnedFd>> = Mutex::new(VecDeque::new());
+
 /// A new serial line without hardware: clients open [`Pty::path`], the emulator has this end. Dropping it looks to
 /// them as if the device were unplugged.
 #[derive(Debug)]
 pub struct Pty {
     near: OwnedFd,
     /// Held open so that a client that goes is no end of the line: the next may come.
-    _far: OwnedFd,
+    far: Option<OwnedFd>,
     path: String,
 }
 
@@ -35,7 +43,7 @@ impl Pty {
             tcsetattr(&far, OptionalActions::Now, &settings)?;
             rustix::io::ioctl_fionbio(&near, true)?;
             let path = ptsname(&near, Vec::new())?.to_string_lossy().into_owned();
-            Ok(Self { near, _far: far, path })
+            Ok(Self { near, far: Some(far), path })
         };
         make().map_err(|e| AdapterError::Io(format!("cannot make a pseudo-terminal: {e}")))
     }
@@ -66,6 +74,15 @@ impl Pty {
 
     fn broken(&self, error: Errno) -> AdapterError {
         AdapterError::Io(format!("the pseudo-terminal {} broke: {error}", self.path))
+    }
+}
+
+impl Drop for Pty {
+    fn drop(&mut self) {
+        let mut gone = GONE.lock().unwrap_or_else(PoisonError::into_inner);
+        gone.extend(self.far.take());
+        let excess = gone.len().saturating_sub(KEEP);
+        gone.drain(..excess);
     }
 }
 

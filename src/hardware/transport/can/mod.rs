@@ -46,7 +46,7 @@ impl CanFrame {
 /// What the controller of the bus reports beside frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanTrouble {
-    /// The controller has left the bus after too many errors.
+    /// The controller has left the bus after too many errors. What is sent from now on is swallowed without a word.
     BusOff,
     /// Nobody acknowledges what is sent: no other node, no power, a wrong bit rate.
     NoAcknowledge,
@@ -133,6 +133,14 @@ fn open_interface(device: &str, name: &str, _filters: &[CanFilter]) -> AdapterRe
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(not(feature = "can"))]
+    #[test]
+    fn a_build_without_can_says_so() {
+        let error = open("arm", &CanAddress::Interface("can0".into()), &[]).err().unwrap().to_string();
+        let hint = "this build has no CAN\nhint: build with --features can, on Linux";
+        assert_eq!(error, format!("cannot open CAN interface can0 for arm: {hint}"));
+    }
 
     #[test]
     fn frames_hold_eight_bytes_at_most() {
