@@ -92,28 +92,23 @@ impl Arm {
         &self.model
     }
 
-    /// The kinematics of a problem's joints: by name, else by a suffix that only one joint has.
+    /// The kinematics of a problem's joints: by name, else by what remains without the prefix that all joints share,
+    /// else by an ending that only one joint has.
     pub fn kinematics(&self, problem: &Problem) -> Result<Kinematics, Box<dyn Error>> {
-        let independent = self.model.independent_joints();
+        let own: Vec<(usize, &str)> =
+            self.model.independent_joints().into_iter().map(|j| (j, self.model.joints[j].name.as_str())).collect();
+        let prefix = shared_prefix(&own.iter().map(|o| o.1).collect::<Vec<_>>());
+        let foreign = shared_prefix(&problem.joints.iter().map(String::as_str).collect::<Vec<_>>());
         let find = |name: &String| {
-            if let Some(j) = independent.iter().find(|&&j| self.model.joints[j].name == *name) {
-                return Ok(*j);
-            }
-            let starts = name.match_indices(['_', '/', '-']).map(|(at, _)| at);
-            for suffix in starts.map(|at| &name[at..]) {
-                let bare = &suffix[1..];
-                let ends = |j: &&usize| {
-                    let own = &self.model.joints[**j].name;
-                    own == bare || own.ends_with(suffix)
-                };
-                let found: Vec<&usize> = independent.iter().filter(ends).collect();
-                match found.as_slice() {
-                    [] => {}
-                    [one] => return Ok(**one),
-                    _ => break,
-                }
-            }
-            Err(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
+            let only = |is: &dyn Fn(&str) -> bool| match own.iter().filter(|o| is(o.1)).collect::<Vec<_>>()[..] {
+                [one] => Some(one.0),
+                _ => None,
+            };
+            let ends = |suffix: &str| only(&|o| o.ends_with(suffix));
+            only(&|o| o == name)
+                .or_else(|| only(&|o| o[prefix..] == name[foreign..]))
+                .or_else(|| name.match_indices(['_', '/', '-']).find_map(|(at, _)| ends(&name[at..])))
+                .ok_or(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
         };
         let joints = problem.joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
         Ok(Kinematics::new(&self.model, &joints, &[])?)
@@ -177,4 +172,11 @@ pub fn packages(arguments: &[String]) -> Result<Packages, Box<dyn Error>> {
         named.insert(name.to_owned(), folder.into());
     }
     Ok(Packages::named(named).with_environment())
+}
+
+/// Length of the prefix that all names share, up to a separator.
+fn shared_prefix(names: &[&str]) -> usize {
+    let first = names.first().copied().unwrap_or_default();
+    let ends = first.match_indices(['_', '/', '-']).map(|(at, _)| at + 1);
+    ends.filter(|&end| names.iter().all(|n| n.starts_with(&first[..end]))).last().unwrap_or(0)
 }

@@ -7,9 +7,14 @@
 //!                                 JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
 //! ```
 
+pub mod blend;
 pub mod nearest;
 pub mod path;
 pub mod planner;
 pub mod rrt_connect;
 pub mod sampler;
 pub mod shortcut;
+mod smooth;
+pub mod timing;
+pub mod topp;
+pub mod verify;
