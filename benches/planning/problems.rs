@@ -123,7 +123,12 @@ impl Arm {
     }
 
     /// The scene of a problem.
-    pub fn scene(&self, kinematics: &Arc<Kinematics>, problem: &Problem, shapes: Shapes) -> Result<Arc<Scene>, Box<dyn Error>> {
+    pub fn scene(
+        &self,
+        kinematics: &Arc<Kinematics>,
+        problem: &Problem,
+        shapes: Shapes,
+    ) -> Result<Arc<Scene>, Box<dyn Error>> {
         let mut world = World::new();
         world.add_robot(Robot {
             name: String::new(),

@@ -94,7 +94,12 @@ fn neighbours_may_touch_and_others_may_not() {
     // Folded back onto itself: the end over the first link.
     assert_eq!(checker.first_contact(&[0.0, 3.05, 3.05]), Some(Pair::Links(1, 3)));
     let mut world = World::new();
-    world.add_robot(Robot { allowed: vec![("l3".into(), "l1".into()), ("base".into(), "l3".into()), ("base".into(), "l2".into())], ..arm("", DVec3::ZERO) }).unwrap();
+    world
+        .add_robot(Robot {
+            allowed: vec![("l3".into(), "l1".into()), ("base".into(), "l3".into()), ("base".into(), "l2".into())],
+            ..arm("", DVec3::ZERO)
+        })
+        .unwrap();
     assert!(self::checker(&world).is_free(&[0.0, 3.05, 3.05]));
 }
 
@@ -118,7 +123,8 @@ fn two_robots_see_each_other() {
 fn held_objects_move_along_and_touch_what_they_may() {
     let mut world = one_arm(&[ball("post", DVec3::new(1.2, 0.0, 0.1), 0.05)]);
     assert!(checker(&world).is_free(&[0.0; 3]));
-    let rod = Solid::cuboid(DVec3::new(0.4, 0.02, 0.02), DAffine3::from_translation(DVec3::new(0.2, 0.0, 0.0))).unwrap();
+    let rod =
+        Solid::cuboid(DVec3::new(0.4, 0.02, 0.02), DAffine3::from_translation(DVec3::new(0.2, 0.0, 0.0))).unwrap();
     let held = Attached {
         name: "rod".into(),
         robot: 0,

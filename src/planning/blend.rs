@@ -95,7 +95,8 @@ impl Corner {
         let turn = distance(&u1, &u2);
         let room = 0.5 * distance(a, b).min(distance(b, c));
         // A reversal cannot be rounded: the curve would stand still in it.
-        let half = if turn > 1.99 || deviation <= 0.0 { 0.0 } else { (16.0 * deviation / (3.0 * turn.max(1e-9))).min(room) };
+        let half =
+            if turn > 1.99 || deviation <= 0.0 { 0.0 } else { (16.0 * deviation / (3.0 * turn.max(1e-9))).min(room) };
         Self { u1, u2, half }
     }
 

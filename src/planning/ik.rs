@@ -34,15 +34,7 @@ pub struct IkSettings {
 
 impl Default for IkSettings {
     fn default() -> Self {
-        Self {
-            position: 1e-6,
-            rotation: 1e-6,
-            position_only: false,
-            attempts: 100,
-            steps: 60,
-            solutions: 1,
-            seed: 0,
-        }
+        Self { position: 1e-6, rotation: 1e-6, position_only: false, attempts: 100, steps: 60, solutions: 1, seed: 0 }
     }
 }
 
@@ -75,7 +67,10 @@ impl IkFailure {
         let missing = format!("{:.1} mm and {:.2}°", self.position * 1e3, self.rotation.to_degrees());
         let limit = self.limit.as_ref().map(|(_, joint)| format!("; the limit of joint {joint:?} is in the way"));
         let stopped = if self.stopped { ", then it was stopped" } else { "" };
-        format!("the pose is not reached: {missing} are missing after {n} attempts{stopped}{}", limit.unwrap_or_default())
+        format!(
+            "the pose is not reached: {missing} are missing after {n} attempts{stopped}{}",
+            limit.unwrap_or_default()
+        )
     }
 }
 
@@ -203,8 +198,7 @@ impl<'a> Ik<'a> {
     fn miss(&mut self, target: &DAffine3, settings: &IkSettings) -> Miss {
         self.kinematics.forward(&self.q, &mut self.frames);
         let at = self.kinematics.link_frame(self.link, &self.frames);
-        let angular =
-            if settings.position_only { DVec3::ZERO } else { rotation_between(&at.matrix3, &target.matrix3) };
+        let angular = if settings.position_only { DVec3::ZERO } else { rotation_between(&at.matrix3, &target.matrix3) };
         Miss { linear: target.translation - at.translation, angular }
     }
 
