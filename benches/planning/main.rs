@@ -150,7 +150,20 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
             eprintln!("{family} {index}: {error}");
             let why = Some(error.to_string());
             let none = None;
-            Row { problem: family, index, solved: false, plan_us: none, simplify_us: none, total_us: none, cost: none, duration_s: none, path: None, cpu_us: None, looks: None, why }
+            Row {
+                problem: family,
+                index,
+                solved: false,
+                plan_us: none,
+                simplify_us: none,
+                total_us: none,
+                cost: none,
+                duration_s: none,
+                path: None,
+                cpu_us: None,
+                looks: None,
+                why,
+            }
         }
     }
 }
@@ -158,8 +171,22 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
 fn report(rows: &[Row], level: &Level) {
     let mut families: Vec<&str> = rows.iter().map(|r| r.problem.as_str()).collect();
     families.dedup();
-    println!("\n{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}", "family", "solved", "plan", "simplify", "total", "p95", "max", "cost", "duration");
-    println!("{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}", format!("{level:?}").to_lowercase(), "", "med ms", "med ms", "med ms", "ms", "ms", "med rad", "med s");
+    println!(
+        "\n{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}",
+        "family", "solved", "plan", "simplify", "total", "p95", "max", "cost", "duration"
+    );
+    println!(
+        "{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}",
+        format!("{level:?}").to_lowercase(),
+        "",
+        "med ms",
+        "med ms",
+        "med ms",
+        "ms",
+        "ms",
+        "med rad",
+        "med s"
+    );
     for family in families.into_iter().chain(["all"]) {
         let own: Vec<&Row> = rows.iter().filter(|r| family == "all" || r.problem == family).collect();
         let of = |f: fn(&Row) -> Option<f64>, q: f64| quantile(own.iter().filter_map(|r| f(r)).collect(), q);
@@ -179,8 +206,14 @@ fn report(rows: &[Row], level: &Level) {
     let cpu = |q| quantile(rows.iter().filter_map(|r| r.cpu_us).collect(), q) / 1e3;
     let mut looks: Vec<f64> = rows.iter().filter_map(|r| r.looks).map(|n| n as f64).collect();
     looks.sort_by(f64::total_cmp);
-    println!("\nprocessor time: median {:.3} ms, p95 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
-        cpu(0.5), cpu(0.95), cpu(1.0), quantile(looks.clone(), 0.5), looks.iter().sum::<f64>() / looks.len().max(1) as f64);
+    println!(
+        "\nprocessor time: median {:.3} ms, p95 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
+        cpu(0.5),
+        cpu(0.95),
+        cpu(1.0),
+        quantile(looks.clone(), 0.5),
+        looks.iter().sum::<f64>() / looks.len().max(1) as f64
+    );
 }
 
 fn quantile(mut values: Vec<f64>, q: f64) -> f64 {

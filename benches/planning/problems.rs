@@ -10,7 +10,7 @@ use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{Scene, Solid, World};
 use dimos::robot::kinematics::Kinematics;
-use dimos::robot::model::RobotModel;
+use dimos::robot::model::{JointKind, RobotModel};
 use dimos::robot::packages::Packages;
 use dimos::robot::urdf::{Meshes, read};
 use dimos::robot::xml::{Calls, parse};
@@ -111,11 +111,24 @@ impl Arm {
                 .ok_or(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
         };
         let joints = problem.joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
-        Ok(Kinematics::new(&self.model, &joints, &[])?)
+        // Sliding joints of the others are a gripper's: it is open.
+        let open = |j: &dimos::robot::Joint| if j.kind == JointKind::Prismatic { j.limits.upper } else { 0.0 };
+        let mut rest: Vec<f64> = self.model.joints.iter().map(open).collect();
+        for (j, joint) in self.model.joints.iter().enumerate() {
+            if let Some(mimic) = joint.mimic {
+                rest[j] = mimic.multiplier * rest[mimic.leader] + mimic.offset;
+            }
+        }
+        Ok(Kinematics::new(&self.model, &joints, &rest)?)
     }
 
     /// The scene of a problem.
-    pub fn scene(&self, kinematics: &Arc<Kinematics>, problem: &Problem, shapes: Shapes) -> Result<Arc<Scene>, Box<dyn Error>> {
+    pub fn scene(
+        &self,
+        kinematics: &Arc<Kinematics>,
+        problem: &Problem,
+        shapes: Shapes,
+    ) -> Result<Arc<Scene>, Box<dyn Error>> {
         let mut world = World::new();
         world.add_robot(Robot {
             name: String::new(),

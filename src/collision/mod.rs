@@ -25,3 +25,6 @@ pub use exact::ExactChecker;
 pub use scene::Scene;
 pub use shape::Solid;
 pub use world::World;
+
+#[cfg(test)]
+mod tests;

@@ -36,7 +36,15 @@ impl Pieces {
     pub(super) fn new(dof: usize, pairs: usize) -> Self {
         let none = Vec::new;
         let (now, next) = (Vec::new(), Vec::new());
-        Self { q: vec![0.0; dof], reach: vec![0.0; pairs], now, next, pairs_now: none(), pairs_next: none(), links: vec![] }
+        Self {
+            q: vec![0.0; dof],
+            reach: vec![0.0; pairs],
+            now,
+            next,
+            pairs_now: none(),
+            pairs_next: none(),
+            links: vec![],
+        }
     }
 }
 

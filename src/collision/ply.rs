@@ -147,7 +147,8 @@ fn binary(
             _ => bits as f64,
         }
     };
-    let point = |record: &[u8]| DVec3::new(value(record, wanted[0]), value(record, wanted[1]), value(record, wanted[2]));
+    let point =
+        |record: &[u8]| DVec3::new(value(record, wanted[0]), value(record, wanted[1]), value(record, wanted[2]));
     Ok(body.chunks_exact(size.max(1)).take(count).map(point).collect())
 }
 

@@ -313,9 +313,8 @@ fn ball_around(solids: &[Solid]) -> (DVec3, f64) {
         }
     }
     let farthest = |from: DVec3| {
-        let by = |a: &&(DVec3, f64), b: &&(DVec3, f64)| {
-            (a.0.distance(from) + a.1).total_cmp(&(b.0.distance(from) + b.1))
-        };
+        let by =
+            |a: &&(DVec3, f64), b: &&(DVec3, f64)| (a.0.distance(from) + a.1).total_cmp(&(b.0.distance(from) + b.1));
         balls.iter().max_by(by).copied().unwrap_or((DVec3::ZERO, 0.0))
     };
     let a = farthest(balls.first().map_or(DVec3::ZERO, |b| b.0));

@@ -103,7 +103,8 @@ impl Mesh {
         let (middle, half) = bounds(vertices.iter().copied());
         let merge = TriMeshFlags::MERGE_DUPLICATE_VERTICES | TriMeshFlags::DELETE_DEGENERATE_TRIANGLES;
         let mut surface = TriMesh::with_flags(vertices, triangles, merge).map_err(|e| bad(&e.to_string()))?;
-        let closed = is_closed(surface.indices()) && surface.set_flags(surface.flags() | TriMeshFlags::ORIENTED).is_ok();
+        let closed =
+            is_closed(surface.indices()) && surface.set_flags(surface.flags() | TriMeshFlags::ORIENTED).is_ok();
         Ok(Self { surface, closed, middle, half })
     }
 

@@ -8,6 +8,8 @@
 //! ```
 
 pub mod blend;
+pub mod cartesian;
+pub mod ik;
 pub mod nearest;
 pub mod path;
 pub mod planner;

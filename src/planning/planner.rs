@@ -174,7 +174,8 @@ fn lead_in<C: CollisionChecker>(
     }
     let contacts = checker.contacts(&inside);
     let depth = contacts.first().map_or(0.0, |c| -c.distance);
-    match (depth <= settings.contact_tolerance).then(|| way_out(checker, &inside, depth, settings.seed, stop)).flatten() {
+    match (depth <= settings.contact_tolerance).then(|| way_out(checker, &inside, depth, settings.seed, stop)).flatten()
+    {
         Some(free) => {
             lead.push(free);
             Ok(lead)
@@ -194,9 +195,8 @@ fn way_out<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed:
         let size = 0.01 + 0.1 * f64::from(k) / 200.0;
         let moved: Vec<f64> = from.iter().map(|x| x + random.between(-size, size)).collect();
         let to = clamped(checker, &moved);
-        let deeper = |checker: &mut C, q: &[f64]| {
-            checker.contacts(q).first().is_some_and(|c| -c.distance > depth + 1e-4)
-        };
+        let deeper =
+            |checker: &mut C, q: &[f64]| checker.contacts(q).first().is_some_and(|c| -c.distance > depth + 1e-4);
         let mut passes = |part: f64| {
             between(from, &to, part, &mut at);
             !deeper(checker, &at)

@@ -155,7 +155,8 @@ fn emit(
     let mut excess = Excess::default();
     for curve in curves(path, &deviation) {
         let grid = parameterize(&curve, bounds);
-        let (own, used) = if jerky { averaged(names, &curve, &grid, bounds) } else { on_grid(names, &curve, &grid, bounds) }?;
+        let (own, used) =
+            if jerky { averaged(names, &curve, &grid, bounds) } else { on_grid(names, &curve, &grid, bounds) }?;
         excess = excess.max(used);
         let start = points.last().map_or(0.0, |p| p.time_from_start);
         let skip = usize::from(!points.is_empty());

@@ -31,10 +31,8 @@ pub fn gap(a: &DAffine3, half_a: DVec3, b: &DAffine3, half_b: DVec3) -> f64 {
                 continue;
             }
             let along = t[i2] * r[i1][j] - t[i1] * r[i2][j];
-            let reach = ha[i1] * r[i2][j].abs()
-                + ha[i2] * r[i1][j].abs()
-                + hb[j1] * r[i][j2].abs()
-                + hb[j2] * r[i][j1].abs();
+            let reach =
+                ha[i1] * r[i2][j].abs() + ha[i2] * r[i1][j].abs() + hb[j1] * r[i][j2].abs() + hb[j2] * r[i][j1].abs();
             widest = widest.max((along.abs() - reach) / length);
         }
     }

@@ -4,7 +4,7 @@
 use glamx::{DAffine3, DPose3, DQuat, DVec3};
 use parry3d_f64::query::gjk::{self, CsoPoint, GJKResult, VoronoiSimplex};
 use parry3d_f64::query::{self, ClosestPoints};
-use parry3d_f64::shape::{Ball, Cuboid, Cylinder, Segment, Shape, SupportMap};
+use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shape, SupportMap};
 
 use super::super::shape::Placed;
 
@@ -43,8 +43,9 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
     with_shape(a, |pa, sa| {
         with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
             (Some(ma), Some(mb)) => convex_within(&pa.inv_mul(pb), ma, mb, reach),
-            // What parry cannot tell counts as touching.
-            _ => !matches!(query::closest_points(pa, sa, pb, sb, reach), Ok(ClosestPoints::Disjoint)),
+            // What parry cannot tell counts as touching. Its closest points are not asked: for a box and a triangle
+            // they are not always the closest.
+            _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance) <= reach,
         })
     })
 }
@@ -71,8 +72,8 @@ pub fn nearest(a: &Placed, b: &Placed) -> Nearest {
         return if swapped { Nearest { a: found.b, b: found.a, ..found } } else { found };
     }
     let inside = holds(a, b) || holds(b, a);
-    with_shape(a, |pa, sa| {
-        with_shape(b, |pb, sb| {
+    with_hull(a, |pa, sa| {
+        with_hull(b, |pb, sb| {
             let touching = |at: DVec3| Nearest { distance: 0.0, a: at, b: at };
             match query::closest_points(pa, sa, pb, sb, f64::MAX) {
                 Ok(ClosestPoints::WithinMargin(p, q)) => {
@@ -123,4 +124,19 @@ fn with_shape<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R
         Placed::Mesh(frame, mesh) => f(&pose(frame), mesh.surface()),
         Placed::Cloud(frame, _) => f(&pose(frame), &Ball::new(0.0)),
     }
+}
+
+/// The same with boxes as hulls: parry's closest points of boxes are not always the closest.
+fn with_hull<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R {
+    if let Placed::Box(frame, half) = placed {
+        let corner = |i: u8| {
+            let sign = |bit: u8| if i >> bit & 1 == 0 { -1.0 } else { 1.0 };
+            *half * DVec3::new(sign(0), sign(1), sign(2))
+        };
+        let corners: Vec<DVec3> = (0..8).map(corner).collect();
+        if let Some(hull) = ConvexPolyhedron::from_convex_hull(&corners) {
+            return f(&pose(frame), &hull);
+        }
+    }
+    with_shape(placed, f)
 }

@@ -57,3 +57,6 @@ fn gap_to(a: &Placed, frame: &DAffine3, half: DVec3) -> f64 {
         _ => 0.0,
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -59,10 +59,8 @@ pub fn cholesky(gram: &Gram) -> Option<Gram> {
     let mut l = [[0.0; 6]; 6];
     for i in 0..6 {
         for k in 0..=i {
-            let mut sum = gram[i][k];
-            for j in 0..k {
-                sum -= l[i][j] * l[k][j];
-            }
+            let dot: f64 = l[i].iter().zip(&l[k]).take(k).map(|(a, b)| a * b).sum();
+            let sum = gram[i][k] - dot;
             if i == k {
                 if sum <= 0.0 || !sum.is_finite() {
                     return None;

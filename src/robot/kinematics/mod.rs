@@ -239,10 +239,7 @@ impl Kinematics {
 pub fn frame(pose: &Isometry3<f64>) -> DAffine3 {
     let (t, r) = (pose.translation.vector, pose.rotation.to_rotation_matrix());
     let column = |c: usize| DVec3::new(r[(0, c)], r[(1, c)], r[(2, c)]);
-    DAffine3 {
-        matrix3: DMat3::from_cols(column(0), column(1), column(2)),
-        translation: DVec3::new(t.x, t.y, t.z),
-    }
+    DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: DVec3::new(t.x, t.y, t.z) }
 }
 
 /// A rotation matrix and translation as a pose.
