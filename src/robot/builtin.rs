@@ -1,0 +1,22 @@
+//! The robots in the box: descriptions written for this project from published dimensions and limits, with shapes
+//! made of primitives.
+
+/// What marks the name of one of them in place of a path: `builtin:xarm6`.
+pub const PREFIX: &str = "builtin:";
+
+macro_rules! robots {
+    ($($name:literal),*) => {
+        /// Their names.
+        pub const NAMES: &[&str] = &[$($name),*];
+
+        /// The URDF of one.
+        pub fn text(name: &str) -> Option<&'static str> {
+            match name {
+                $($name => Some(include_str!(concat!("../../assets/robots/", $name, ".urdf"))),)*
+                _ => None,
+            }
+        }
+    };
+}
+
+robots!();
