@@ -19,4 +19,19 @@ macro_rules! robots {
     };
 }
 
-robots!();
+robots!(
+    "lite6",
+    "lite6_gripper",
+    "piper",
+    "piper_gripper",
+    "xarm5",
+    "xarm5_gripper",
+    "xarm6",
+    "xarm6_gripper",
+    "xarm7",
+    "xarm7_gripper",
+    "xarm850",
+    "xarm850_gripper",
+    "yourarm",
+    "yourarm_gripper"
+);

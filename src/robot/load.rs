@@ -8,9 +8,10 @@ use serde_json::json;
 
 use crate::robot::model::RobotModel;
 use crate::robot::packages::{Packages, absolute};
+use crate::robot::srdf::{self, Semantics};
 use crate::robot::urdf::{self, Meshes};
 use crate::robot::xml::{self, Calls, Document};
-use crate::robot::{builtin, xacro};
+use crate::robot::{builtin, joint_limits, xacro};
 use crate::yaml::{Diag, Label, Report, Severity, Tree, render};
 
 /// Which description to read, and how.
@@ -22,6 +23,10 @@ pub struct Source {
     pub packages: BTreeMap<String, PathBuf>,
     /// Values of `xacro:arg`s.
     pub xacro_args: BTreeMap<String, String>,
+    /// The robot's SRDF, which may be xacro too.
+    pub srdf: Option<PathBuf>,
+    /// The robot's `joint_limits.yaml`.
+    pub joint_limits: Option<PathBuf>,
     /// What to do about mesh files.
     pub meshes: Meshes,
 }
@@ -39,6 +44,8 @@ pub struct Loaded {
     tree: Tree,
     /// The robot; `None` when there are mistakes.
     pub model: Option<RobotModel>,
+    /// What its SRDF says; empty where there is none.
+    pub semantics: Semantics,
     /// The expanded URDF.
     pub document: Option<Document>,
     /// Every file that was read, the first one first. Empty for those in the box.
@@ -66,7 +73,7 @@ impl Loaded {
         self.tree.has_errors()
     }
 
-    /// Adds a mistake that showed later; `range` is the place in the first file, where it has one.
+    /// Adds a mistake that showed later, in a file that the description names.
     pub fn report(&mut self, diag: Diag) {
         self.tree.report(diag);
     }
@@ -86,45 +93,60 @@ impl Loaded {
     pub fn to_json(&self) -> serde_json::Value {
         json!({"valid": !self.has_errors() && self.model.is_some(), "problems": self.reports()})
     }
-
-    /// The sources and mistakes, for readers of files that belong to the description.
-    pub(super) fn tree(&mut self) -> &mut Tree {
-        &mut self.tree
-    }
 }
 
-/// Reads a description: expanded if it is xacro, with every mistake that it has.
+/// Reads a description: expanded if it is xacro, completed by its SRDF and limits, with every mistake that it has.
 pub fn load(source: &Source) -> Loaded {
     let mut loaded = Loaded::default();
-    let name = source.path.display().to_string();
-    let Some(text) = text_of(source, &name, &mut loaded) else { return loaded };
-    let id = loaded.tree.add_source(name, text);
-    let Some(document) = xml::parse(&mut loaded.tree, id) else { return loaded };
     let packages = Packages::named(source.packages.clone()).with_environment();
-    let mut calls = Calls::default();
-    let document = if xacro::is_xacro(&source.path, &document) {
-        let expansion = xacro::expand(&mut loaded.tree, &source.path, document, &packages, &source.xacro_args);
-        let Some(expansion) = expansion else { return loaded };
-        calls = expansion.calls;
-        loaded.files = expansion.files;
-        expansion.document
-    } else {
-        for name in source.xacro_args.keys() {
-            let what = format!("the argument `{name}` has no effect: the description is no xacro");
-            loaded.tree.report(Diag::warning(what).at(Label::start_of(id)));
-        }
-        document
-    };
+    let Some((document, calls)) = expanded(&source.path, source, &packages, true, &mut loaded) else { return loaded };
     let folder = absolute(&source.path).parent().map(Path::to_owned).unwrap_or_default();
     let resolve = |uri: &str| packages.resolve(uri, &folder);
-    loaded.model = urdf::read(&document.root, &mut loaded.tree, &calls, source.meshes, &resolve);
+    let mut model = urdf::read(&document.root, &mut loaded.tree, &calls, source.meshes, &resolve);
     loaded.document = Some(document);
+    if let Some(robot) = &mut model {
+        if let Some(path) = &source.srdf
+            && let Some((document, calls)) = expanded(path, source, &packages, false, &mut loaded)
+        {
+            loaded.semantics = srdf::read(&document.root, robot, &mut loaded.tree, &calls).unwrap_or_default();
+        }
+        if let Some(path) = &source.joint_limits
+            && let Some(text) = text_of(path, &mut loaded)
+        {
+            let id = loaded.tree.add_source(path.display().to_string(), text);
+            joint_limits::apply(&mut loaded.tree, id, robot);
+        }
+    }
+    loaded.model = model.filter(|_| !loaded.tree.has_errors());
     loaded
 }
 
-/// The text of the first file.
-fn text_of(source: &Source, name: &str, loaded: &mut Loaded) -> Option<String> {
-    if let Some(robot) = name.strip_prefix(builtin::PREFIX) {
+/// An XML file, expanded if it is xacro. Only the main one minds arguments without effect.
+fn expanded(
+    path: &Path,
+    source: &Source,
+    packages: &Packages,
+    main: bool,
+    loaded: &mut Loaded,
+) -> Option<(Document, Calls)> {
+    let text = text_of(path, loaded)?;
+    let id = loaded.tree.add_source(path.display().to_string(), text);
+    let document = xml::parse(&mut loaded.tree, id)?;
+    if xacro::is_xacro(path, &document) {
+        let expansion = xacro::expand(&mut loaded.tree, path, document, packages, &source.xacro_args)?;
+        loaded.files.extend(expansion.files.into_iter().skip(1));
+        return Some((expansion.document, expansion.calls));
+    }
+    for name in source.xacro_args.keys().filter(|_| main) {
+        let what = format!("the argument `{name}` has no effect: the description is no xacro");
+        loaded.tree.report(Diag::warning(what).at(Label::start_of(id)));
+    }
+    Some((document, Calls::default()))
+}
+
+/// The text of a file, or of a robot in the box.
+fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
+    if let Some(robot) = path.to_str().and_then(|name| name.strip_prefix(builtin::PREFIX)) {
         if let Some(text) = builtin::text(robot) {
             return Some(text.to_owned());
         }
@@ -132,7 +154,6 @@ fn text_of(source: &Source, name: &str, loaded: &mut Loaded) -> Option<String> {
         loaded.tree.report(Diag::error(format!("no robot in the box is named `{robot}`")).maybe_hint(hint));
         return None;
     }
-    let path = &source.path;
     let refused = |what: String| Diag::error(format!("{}: {what}", path.display()));
     let read = || {
         let size = fs::metadata(path).map_err(|e| refused(e.to_string()))?.len();

@@ -8,10 +8,12 @@
 //! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
 
 pub mod builtin;
+mod joint_limits;
 mod load;
 pub mod mesh;
 pub mod model;
 pub mod packages;
+pub mod srdf;
 pub mod urdf;
 pub mod xacro;
 pub mod xml;
