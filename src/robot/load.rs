@@ -135,6 +135,11 @@ fn expanded(
     if xacro::is_xacro(path, &document) {
         let expansion = xacro::expand(&mut loaded.tree, path, document, packages, &source.xacro_args)?;
         loaded.files.extend(expansion.files.into_iter().skip(1));
+        for (name, near) in expansion.unknown_args.into_iter().filter(|_| main) {
+            let what = format!("no xacro:arg is named `{name}`: the argument has no effect");
+            let diag = Diag::warning(what).at(Label::start_of(id));
+            loaded.tree.report(diag.maybe_hint(near.map(|near| format!("did you mean `{near}`?"))));
+        }
         return Some((expansion.document, expansion.calls));
     }
     for name in source.xacro_args.keys().filter(|_| main) {

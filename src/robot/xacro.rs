@@ -44,6 +44,8 @@ pub struct Expansion {
     pub calls: Calls,
     /// Every file that was read, the first one first.
     pub files: Vec<PathBuf>,
+    /// Arguments that no file knows, each with a name that is close.
+    pub unknown_args: Vec<(String, Option<String>)>,
 }
 
 /// Whether a description needs expansion: by its name, or by what its root declares.
@@ -60,11 +62,19 @@ pub fn expand(
     packages: &Packages,
     args: &BTreeMap<String, String>,
 ) -> Option<Expansion> {
-    std::thread::scope(|scope| {
+    let source = document.root.at.source;
+    let done = std::thread::scope(|scope| {
         let work = || expand::Expander::new(tree, path, packages, args).run(document);
         let thread = std::thread::Builder::new().name("xacro".to_owned()).stack_size(STACK);
-        thread.spawn_scoped(scope, work).ok()?.join().ok().flatten()
-    })
+        thread.spawn_scoped(scope, work).map(|thread| thread.join())
+    });
+    let failed = match done {
+        Ok(Ok(expansion)) => return expansion,
+        Ok(Err(_)) => "the expansion failed within: this is a mistake of the program".to_owned(),
+        Err(error) => format!("the expansion cannot be started: {error}"),
+    };
+    tree.report(Diag::error(failed).at(Place { source, ..Place::default() }.label()));
+    None
 }
 
 /// Why an expansion ended.

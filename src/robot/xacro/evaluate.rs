@@ -412,7 +412,8 @@ fn integers(sign: &str, a: i64, b: i64) -> Evaluated {
         "-" => whole(a.checked_sub(b)),
         "*" => whole(a.checked_mul(b)),
         "/" if b == 0 => Err("division by zero".to_owned()),
-        "//" | "%" if b == 0 => Err("integer division or modulo by zero".to_owned()),
+        "//" if b == 0 => Err("integer division or modulo by zero".to_owned()),
+        "%" if b == 0 => Err("integer modulo by zero".to_owned()),
         "/" => Ok(Value::Float(a as f64 / b as f64)),
         // Rounded down, and the remainder has the divisor's sign.
         "//" => whole(a.checked_div(b).map(|q| if (a % b != 0) && ((a < 0) != (b < 0)) { q - 1 } else { q })),

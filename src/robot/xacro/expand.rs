@@ -93,12 +93,10 @@ impl<'t> Expander<'t> {
             self.tree.report(trouble.diag(&self.calls, source));
             return None;
         }
-        for name in self.given.keys().filter(|name| !self.declared.contains(*name)) {
-            let near = closest(name, self.declared.iter().map(String::as_str));
-            let diag = Diag::warning(format!("no xacro:arg is named `{name}`: the argument has no effect"));
-            self.tree.report(diag.maybe_hint(near.map(|near| format!("did you mean `{near}`?"))));
-        }
-        Some(Expansion { document, calls: self.calls, files: self.read })
+        let unknown = self.given.keys().filter(|name| !self.declared.contains(*name));
+        let near = |name: &str| closest(name, self.declared.iter().map(String::as_str)).map(str::to_owned);
+        let unknown_args = unknown.map(|name| (name.clone(), near(name))).collect();
+        Some(Expansion { document, calls: self.calls, files: self.read, unknown_args })
     }
 
     /// Goes one level deeper; `leave` comes back.

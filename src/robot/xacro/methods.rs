@@ -7,7 +7,7 @@ use super::value::{Dict, Value};
 
 /// Calls a method.
 pub(super) fn call(object: &Value, name: &str, values: &[Value], named: &[(String, Value)]) -> Evaluated {
-    let missing = || format!("'{}' object has no method '{name}'", object.type_name());
+    let missing = || format!("'{}' object has no attribute '{name}'", object.type_name());
     match object {
         Value::Str(text) => of_text(text, name, values, named).unwrap_or_else(|| Err(missing())),
         Value::List(list) | Value::Tuple(list) => of_list(list, name, values).unwrap_or_else(|| Err(missing())),
