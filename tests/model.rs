@@ -32,7 +32,7 @@ fn random(seed: u64) -> impl FnMut() -> f64 {
 #[test]
 fn vendors_models_are_read_with_their_meshes() {
     let Some(models) = support::shared("models") else { return };
-    for (name, links, moving) in [("panda", 11, 8), ("piper", 10, 8), ("xarm6", 17, 7), ("xarm7", 18, 8)] {
+    for (name, links, moving) in [("panda", 14, 8), ("piper", 11, 8), ("xarm6", 17, 7), ("xarm7", 18, 8)] {
         let loaded = load(&Source::new(models.join(name).join(format!("{name}.urdf"))));
         assert_eq!(loaded.render(false), "", "{name}");
         let robot = loaded.model.unwrap();

@@ -125,6 +125,3 @@ impl Trouble {
         diag
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -9,6 +9,9 @@ use super::{Result, Trouble};
 use crate::robot::xml::{Element, Node};
 use crate::yaml::{Diag, closest};
 
+/// The work of a call, in steps.
+const CALL: usize = 30;
+
 impl Expander<'_> {
     /// `xacro:macro`
     pub(super) fn define(&mut self, element: Element, env: Env) -> Result {
@@ -84,6 +87,8 @@ impl Expander<'_> {
             return Err(Trouble::new(format!("unknown macro name: {}", call.name)).at(at).hint(near));
         };
         self.enter().map_err(|e| e.at(at))?;
+        // A call makes scopes and copies a body: more work than an element.
+        self.charge(CALL).map_err(|e| Trouble::new(e).at(at))?;
         let inner =
             Env { symbols: self.scopes.below(outer.symbols, false), macros: self.macros.below(Some(outer.macros)) };
         let mut open: Vec<&Parameter> = found.parameters.iter().collect();

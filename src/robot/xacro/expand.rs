@@ -17,7 +17,7 @@ use crate::yaml::{Diag, Tree, closest};
 /// The deepest nesting of elements, macro calls and properties that wait for each other.
 const MAX_DEPTH: usize = 400;
 /// The most work of one expansion, in elements, attributes and steps of expressions.
-const MAX_STEPS: usize = 5_000_000;
+const MAX_STEPS: usize = 3_000_000;
 /// The longest text that an attribute may come to [bytes].
 const MAX_TEXT: usize = 1 << 20;
 
