@@ -4,7 +4,6 @@
 #[path = "support/program.rs"]
 mod program;
 
-use dimos::hardware::registry::Registry;
 use program::{Home, eventually};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -86,9 +85,6 @@ fn coordinator_piper() {
 #[test]
 #[cfg(feature = "can")]
 fn coordinator_piper_xarm() {
-    if Registry::builtin().get("xarm").is_none() {
-        return println!("SKIPPED: the adapter xarm (not in this build)");
-    }
     let arms = [
         Arm { name: "piper", target: &PIPER, gripper: Some(0.07) },
         Arm { name: "xarm", target: &XARM, gripper: Some(0.085) },

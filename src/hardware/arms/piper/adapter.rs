@@ -195,7 +195,7 @@ impl PiperAdapter {
         AdapterError::Rejected(format!("{}: {why}", self.hardware_id))
     }
 
-    /// An error unless the arm is in order and listens to CAN.
+    /// An error unless the arm is in order and listens to nobody but us.
     fn in_order(&self) -> AdapterResult<()> {
         let code = self.picture.error_code();
         if code != 0 {
@@ -207,6 +207,12 @@ impl PiperAdapter {
                 );
             }
             return Err(AdapterError::Fault { code, text });
+        }
+        if MonotonicClock.now().since(self.picture.commanded_at) < SILENCE {
+            return Err(self.refuse(
+                "somebody else commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
+                    .into(),
+            ));
         }
         match self.picture.status.control {
             0 | 1 => Ok(()),
