@@ -44,6 +44,11 @@ fn exercise(blueprint: &str, arms: &[Arm]) {
     }
     let stopped = home.dimos("stop").with(0);
     assert!(!stopped.out.contains("not confirmed"), "{}", stopped.out);
+    assert_eq!(stopped.out.matches("confirmed").count(), arms.len(), "{blueprint}: {}", stopped.out);
+    let first = &arms[0];
+    assert!(home.dimos(&format!("arm reset {}", first.name)).with(0).out.contains("standby"));
+    assert!(home.dimos(&format!("arm enable {}", first.name)).with(0).out.contains("ready"));
+    assert_eq!(home.positions(first.name).len(), first.target.len());
     run.end(Signal::INT).with(130);
     let played = home.dimos("replay log.mcap --json --rate 1000 --topics /joint_states").with(0);
     let messages: Vec<Value> = played.out.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
@@ -73,21 +78,47 @@ fn grip(home: &Home, arm: &str, opening: f64) {
     }
 }
 
-const PIPER: [f64; 6] = [0.4, 0.9, -0.9, -0.2, 0.3, 0.3];
-const XARM: [f64; 6] = [0.3, -0.2, -0.3, 0.2, 0.4, 0.1];
+const PIPER: &[f64] = &[0.4, 0.9, -0.9, -0.2, 0.3, 0.3];
+const XARM6: &[f64] = &[0.2, -0.5, -0.9, 0.1, 1.3, -0.1];
+const XARM7: &[f64] = &[0.2, -0.4, 0.1, 0.8, 0.0, 1.2, -0.1];
+const LITE6: &[f64] = &[0.2, 0.3, 1.2, 0.1, 0.9, -0.1];
+
+#[test]
+fn coordinator_xarm6() {
+    exercise("coordinator-xarm6", &[Arm { name: "arm", target: XARM6, gripper: Some(0.085) }]);
+}
+
+#[test]
+fn coordinator_xarm7() {
+    exercise("coordinator-xarm7", &[Arm { name: "arm", target: XARM7, gripper: Some(0.085) }]);
+}
+
+#[test]
+fn coordinator_lite6() {
+    exercise("coordinator-lite6", &[Arm { name: "arm", target: LITE6, gripper: None }]);
+}
+
+#[test]
+fn coordinator_dual_xarm() {
+    let arms = [
+        Arm { name: "left_arm", target: XARM7, gripper: Some(0.085) },
+        Arm { name: "right_arm", target: XARM6, gripper: Some(0.085) },
+    ];
+    exercise("coordinator-dual-xarm", &arms);
+}
 
 #[test]
 #[cfg(feature = "can")]
 fn coordinator_piper() {
-    exercise("coordinator-piper", &[Arm { name: "arm", target: &PIPER, gripper: Some(0.07) }]);
+    exercise("coordinator-piper", &[Arm { name: "arm", target: PIPER, gripper: Some(0.07) }]);
 }
 
 #[test]
 #[cfg(feature = "can")]
 fn coordinator_piper_xarm() {
     let arms = [
-        Arm { name: "piper", target: &PIPER, gripper: Some(0.07) },
-        Arm { name: "xarm", target: &XARM, gripper: Some(0.085) },
+        Arm { name: "piper", target: PIPER, gripper: Some(0.07) },
+        Arm { name: "xarm", target: XARM6, gripper: Some(0.085) },
     ];
     exercise("coordinator-piper-xarm", &arms);
 }
@@ -130,4 +161,40 @@ fn a_piper_that_falls_is_told_of_wherever_its_motors_go_off() {
         checked.out,
         checked.err
     );
+}
+
+#[test]
+fn what_is_wrong_with_an_xarm_is_one_line_and_exit_3() {
+    let home = Home::new();
+    home.dimos("run coordinator-xarm6 --set hardware.arm.address=127.0.0.1:9:9 --no-record")
+        .with(3)
+        .says(&["cannot connect to xarm at 127.0.0.1:9:9: connection refused", "hint: "]);
+    // The emulator plays an xArm 6 with error 31, or a Lite 6.
+    let simulated = "--set hardware.arm.address=sim --no-record";
+    home.write("error.yaml", &with_faults("{kind: error_code, code: 31}"));
+    home.dimos(&format!("run error.yaml {simulated}"))
+        .with(3)
+        .says(&["fault 31: a collision", "hint: clear the arm's"]);
+    let run = home.run(&format!("error.yaml {simulated} --set hardware.arm.auto_enable=false"));
+    let status = home.status();
+    assert_eq!((&status["arms"][0]["enabled"], &status["arms"][0]["error"]["code"]), (&false.into(), &31.into()));
+    run.end(Signal::INT).with(130);
+    home.write("model.yaml", &with_faults("{kind: wrong_model}"));
+    let said = ["expected the model xArm 6 with 6 joints, found a", "hint: is the address right?", "{model: lite6}"];
+    home.dimos(&format!("run model.yaml {simulated}")).with(3).says(&said);
+}
+
+/// A blueprint of an xArm 6 whose emulator has these faults.
+fn with_faults(faults: &str) -> String {
+    format!(
+        "hardware:
+  - hardware_id: arm
+    joints: {{prefix: arm, count: 6}}
+    adapter_type: xarm
+    address: sim
+    options: {{sim: {{faults: [{faults}]}}}}
+tasks:
+  - {{name: traj_arm, type: trajectory, joint_names: {{hardware: arm}}}}
+"
+    )
 }

@@ -49,7 +49,7 @@ impl CanPort for SlcanPort {
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
         let filters = &self.filters;
         let wanted = |line: &[u8]| decode(line).filter(|frame| CanFilter::any(filters, frame.id));
-        let frame = self.line.next(wanted, |line, peer, room| read_line(line, peer, room))?;
+        let frame = self.line.next(wanted, read_line)?;
         Ok(frame.map(CanEvent::Frame))
     }
 
