@@ -6,6 +6,7 @@ pub mod emulator;
 mod golden;
 pub mod picture;
 pub mod protocol;
+mod session;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
