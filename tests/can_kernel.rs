@@ -382,7 +382,7 @@ fn a_guest_tells_how_its_script_ended() {
     let late = std::panic::catch_unwind(|| uml::run(&[], "sleep 1000", Duration::from_secs(8)));
     assert!(text(late.err().expect("too late")).starts_with("the guest did not end within 8s"));
     let nothing = std::panic::catch_unwind(|| in_guest("no_such_test", &Guest::with(""), || {}));
-    assert!(text(nothing.err().expect("no such test")).starts_with("no test is named no_such_test"));
+    assert!(text(nothing.expect_err("no such test")).starts_with("no test is named no_such_test"));
     let missing = std::panic::catch_unwind(|| uml::run(&["net/can/can't"], "true", limit).expect("tools").status);
     assert!(missing.is_err() || missing.is_ok_and(|status| status != 0), "a module that is not there");
 }

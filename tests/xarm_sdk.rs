@@ -3,7 +3,7 @@
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use dimos::hardware::arms::xarm::emulator::XArmEmulator;
@@ -36,35 +36,39 @@ fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmu
     }
 }
 
+/// The client's process, and the home folder that it may write to.
+struct Client {
+    child: Child,
+    _home: tempfile::TempDir,
+}
+
 /// Runs a scenario of `tests/python/xarm_sdk.py` to its end; `None` where the client is not installed.
-fn client(scenario: &str, host: &str) -> Option<std::process::Child> {
+fn client(scenario: &str, host: &str) -> Option<Client> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = root.join(".venv/bin/python");
-    let has = |python: &Path| {
-        let import = Command::new(python).args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null());
-        import.status().is_ok_and(|status| status.success())
-    };
-    if !has(&python) {
+    let mut import = Command::new(&python);
+    import.args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null());
+    if !import.status().is_ok_and(|status| status.success()) {
         skip("xarm-python-sdk (make test-tools)");
         return None;
     }
-    let folder = tempfile::tempdir().unwrap();
+    let home = tempfile::tempdir().unwrap();
     let child = Command::new(python)
         .arg(root.join("tests/python/xarm_sdk.py"))
         .args([scenario, host])
-        .env("HOME", folder.path())
+        .env("HOME", home.path())
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    Some(child)
+    Some(Client { child, _home: home })
 }
 
 /// Waits for the end of a scenario, two minutes at most.
 #[track_caller]
-fn ends_well(mut child: std::process::Child) {
+fn ends_well(Client { mut child, _home }: Client) {
     let end = std::time::Instant::now() + Duration::from_secs(120);
     while child.try_wait().unwrap().is_none() && std::time::Instant::now() < end {
         std::thread::sleep(Duration::from_millis(20));

@@ -38,7 +38,8 @@ def enable(arm, mode):
     ok(arm.motion_enable(True), "motion_enable")
     ok(arm.set_mode(mode), "set_mode")
     ok(arm.set_state(0), "set_state")
-    until(f"mode {mode}", lambda: arm.mode == mode and arm.state in (1, 2) and arm.motor_enable_states[:6] == [1] * 6)
+    motors = lambda: all(arm.motor_enable_states[: arm.axis])
+    until(f"mode {mode}", lambda: arm.mode == mode and arm.state in (1, 2) and motors())
 
 
 def session(host):

@@ -128,13 +128,14 @@ impl PiperAdapter {
         if age <= SILENCE {
             return Ok(());
         }
+        // The same words each time, so that they are told once.
         if age > LOST {
             self.wire = None;
             let text =
-                format!("the connection to piper at {} broke: no state for {} ms", self.address, age.as_millis());
+                format!("the connection to piper at {} broke: no state for {} ms", self.address, LOST.as_millis());
             return Err(AdapterError::Io(text));
         }
-        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, age.as_millis())))
+        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, SILENCE.as_millis())))
     }
 
     /// The picture, for reads that mostly follow one of the joints and then answer from memory.

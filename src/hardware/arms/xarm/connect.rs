@@ -100,7 +100,7 @@ fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()
     }
     let (axes, kind) = (found.axes, found.kind);
     let what = match is {
-        Some(other) => format!("an {} with {axes} joints", other.name()),
+        Some(other) => format!("{} {} with {axes} joints", other.article(), other.name()),
         None => format!("an unknown arm with {axes} joints (kind {kind})"),
     };
     let hint = match is {
@@ -109,7 +109,7 @@ fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()
     };
     let (name, joints) = (model.name(), model.axes());
     Err(AdapterError::Rejected(format!(
-        "xarm at {address}: expected an {name} with {joints} joints, found {what}\nhint: {hint}"
+        "xarm at {address}: expected the model {name} with {joints} joints, found {what}\nhint: {hint}"
     )))
 }
 

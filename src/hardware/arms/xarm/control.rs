@@ -212,3 +212,58 @@ fn find(pending: &[Option<Pending>], transaction: u16, register: u8) -> Option<u
     let is_it = |slot: &Option<Pending>| slot.is_some_and(|p| p.transaction == transaction && p.register == register);
     pending.iter().position(is_it)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read, Write};
+    use std::net::TcpListener;
+    use std::sync::mpsc::channel;
+
+    use super::*;
+    use crate::hardware::transport::tcp::Endpoint;
+
+    #[test]
+    fn responses_are_matched_by_number_and_late_and_stray_ones_are_counted() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let (go, told) = channel();
+        std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            // Register 13, transactions 1 to 3: seven bytes each.
+            stream.read_exact(&mut [0; 21]).unwrap();
+            let answer = |transaction| [0, transaction, 0, 2, 0, 3, 13, 0, 10 + transaction];
+            for transactions in [&[9, 3][..], &[1], &[1, 2]] {
+                told.recv().unwrap();
+                transactions.iter().for_each(|t| stream.write_all(&answer(*t)).unwrap());
+            }
+            let _ = stream.read(&mut [0; 1]);
+        });
+        let endpoint = Endpoint { host: "127.0.0.1".into(), port };
+        let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
+        (0..3).for_each(|_| control.post(&Command::GetState, Purpose::Health).unwrap());
+        let next = |control: &mut Control| {
+            let end = std::time::Instant::now() + Duration::from_secs(10);
+            while std::time::Instant::now() < end {
+                if let Some((purpose, response)) = control.next().unwrap() {
+                    assert_eq!(purpose, Purpose::Health);
+                    return response;
+                }
+            }
+            panic!("no response")
+        };
+        go.send(()).unwrap();
+        assert_eq!(next(&mut control).data(), [13], "the third came first, after one to nobody");
+        go.send(()).unwrap();
+        assert_eq!(next(&mut control).data(), [11]);
+        let second = |control: &Control| control.pending.iter().flatten().map(|p| p.transaction).collect::<Vec<_>>();
+        assert_eq!(second(&control), [2]);
+        std::thread::sleep(REPLY_TIMEOUT + Duration::from_millis(10));
+        assert_eq!(control.next().unwrap().map(|_| ()), None);
+        assert_eq!(control.counts(), Counts { sent: 3, late: 0, overdue: 1, stray: 1 });
+        go.send(()).unwrap();
+        while control.counts().late == 0 {
+            assert_eq!(control.next().unwrap().map(|_| ()), None, "nobody wants it any more");
+        }
+        assert_eq!(control.counts(), Counts { sent: 3, late: 1, overdue: 1, stray: 2 });
+    }
+}

@@ -103,6 +103,11 @@ impl Model {
         }
     }
 
+    /// What goes before the name in a sentence.
+    pub fn article(self) -> &'static str {
+        if self == Self::Lite6 { "a" } else { "an" }
+    }
+
     /// The name in a blueprint.
     pub fn option(self) -> &'static str {
         match self {

@@ -299,6 +299,7 @@ impl Session {
         self.fault()?;
         if self.change.is_none_or(|change| change.target != mode) {
             if self.change.is_none() {
+                let _ = self.heed_refusal(); // of a set point; but it may tell that the arm was stopped
                 self.may_be_commanded()?;
             }
             if self.moves() {
@@ -370,7 +371,7 @@ impl Session {
         if !self.enabled() {
             Err(AdapterError::Rejected("the motors are disabled".into()))
         } else if self.halted || !is_ready(self.motion.state) {
-            Err(AdapterError::Rejected(format!("the arm is stopped (state {}): enable it again", self.motion.state)))
+            Err(AdapterError::Rejected("the arm was stopped: enable it again".into()))
         } else {
             Ok(())
         }
@@ -390,10 +391,16 @@ impl Session {
     pub fn stream(&mut self, mode: u8, command: &Command) -> AdapterResult<()> {
         self.may_move(mode)?;
         self.control.post(command, Purpose::Motion)?;
-        match self.control.take_refusal() {
-            Some(status) => Err(self.refused(status)),
-            None => Ok(()),
-        }
+        self.heed_refusal()
+    }
+
+    /// Tells of a set point that was refused. An arm that is not ready was stopped by somebody: the response may say so
+    /// before the report does.
+    fn heed_refusal(&mut self) -> AdapterResult<()> {
+        let Some(status) = self.control.take_refusal() else { return Ok(()) };
+        self.halted |= status.not_ready();
+        self.known.condition.changed |= status.not_ready();
+        Err(self.refused(status))
     }
 
     /// Whether a move that the controller plans would be sent.
@@ -414,6 +421,7 @@ impl Session {
             self.known.condition.warning = 0;
             return Err(AdapterError::Rejected(format!("xarm refuses the move: {} ({code})", warning_text(code))));
         }
+        self.halted |= status.not_ready();
         if status.not_ready() || status.invalid() { Err(self.refused(status)) } else { Ok(()) }
     }
 

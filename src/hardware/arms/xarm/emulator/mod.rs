@@ -176,6 +176,10 @@ impl Emulator for XArmEmulator {
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
     }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.joints().0)
+    }
 }
 
 fn rejected(text: String) -> AdapterError {
