@@ -1,8 +1,8 @@
 //! `docs/adding-an-arm.md`, executed from its beginning to its end.
 //!
 //! Blocks and what becomes of them: `console`: the lines after `$ ` are run by a shell, what stands below each is what
-//! they must say, loosely (`…`: anything). `console up`: the same, and the last command goes on in the background until
-//! the next such block. `rust in=FILE`: these lines stand in FILE. `diff in=FILE`: the change is made there.
+//! they must say, loosely (`…`: anything). `console up=TERMINAL`: the same, and the last command goes on in that
+//! terminal until the next such block. `rust in=FILE`: these lines stand in FILE. `diff in=FILE`: the change is made there.
 //! `yaml file=NAME`, `python file=NAME`: the file is written. `checkout=NAME`: there is a copy of this checkout.
 //! `needs=ARM`: only where the table has that arm.
 
@@ -33,10 +33,6 @@ struct Block {
 }
 
 impl Block {
-    fn has(&self, word: &str) -> bool {
-        self.words.iter().any(|w| w == word)
-    }
-
     fn value(&self, key: &str) -> Option<&str> {
         self.words.iter().find_map(|word| word.strip_prefix(key)?.strip_prefix('='))
     }
@@ -105,8 +101,8 @@ struct Reader {
     /// Where the shell is.
     folder: PathBuf,
     path: String,
-    /// The command that goes on in the first terminal.
-    up: Option<(Started, String)>,
+    /// The commands that go on, in which terminals.
+    up: Vec<(Started, String, String)>,
 }
 
 impl Reader {
@@ -114,7 +110,7 @@ impl Reader {
         let home = Home::new();
         let program = Path::new(env!("CARGO_BIN_EXE_dimos")).parent().unwrap();
         let path = format!("{}:{}", program.display(), std::env::var("PATH").unwrap());
-        Self { folder: home.path().to_owned(), home, path, up: None }
+        Self { folder: home.path().to_owned(), home, path, up: Vec::new() }
     }
 
     fn shell(&self, line: &str) -> Command {
@@ -162,8 +158,8 @@ impl Reader {
     }
 
     /// Starts what goes on until the next such command.
-    fn up(&mut self, command: &str, expected: &[&str]) {
-        self.down();
+    fn up(&mut self, terminal: &str, command: &str, expected: &[&str]) {
+        self.down(|other| other == terminal);
         let began = Instant::now();
         let started = Started::of(self.shell(&format!("exec {command}")).process_group(0));
         loop {
@@ -175,15 +171,17 @@ impl Reader {
             std::thread::sleep(Duration::from_millis(10));
         }
         println!("$ {command}  [goes on]");
-        self.up = Some((started, command.to_owned()));
+        self.up.push((started, command.to_owned(), terminal.to_owned()));
     }
 
-    /// Ctrl-C in the first terminal.
-    fn down(&mut self) {
-        let Some((started, command)) = self.up.take() else { return };
-        kill_process_group(Pid::from_raw(started.pid() as i32).unwrap(), Signal::INT).unwrap();
-        let ended = started.wait();
-        assert!(matches!(ended.code, Some(0 | 130)), "{command}: {:?}\n{}{}", ended.code, ended.out, ended.err);
+    /// Ctrl-C in terminals, the last first.
+    fn down(&mut self, which: impl Fn(&str) -> bool) {
+        for index in (0..self.up.len()).rev().filter(|index| which(&self.up[*index].2)).collect::<Vec<_>>() {
+            let (started, command, _) = self.up.remove(index);
+            kill_process_group(Pid::from_raw(started.pid() as i32).unwrap(), Signal::INT).unwrap();
+            let ended = started.wait();
+            assert!(matches!(ended.code, Some(0 | 130)), "{command}: {:?}\n{}{}", ended.code, ended.out, ended.err);
+        }
     }
 }
 
@@ -265,9 +263,9 @@ fn the_page_is_true_from_beginning_to_end() {
         match (block.kind.as_str(), block.value("in"), block.value("file")) {
             ("console", ..) => {
                 let mut commands = commands(&block.text);
-                let last = if block.has("up") { commands.pop() } else { None };
+                let last = block.value("up").and_then(|terminal| Some((terminal.to_owned(), commands.pop()?)));
                 commands.iter().for_each(|(command, expected)| reader.run(command, expected));
-                last.iter().for_each(|(command, expected)| reader.up(command, expected));
+                last.iter().for_each(|(terminal, (command, expected))| reader.up(terminal, command, expected));
             }
             ("rust", Some(file), _) => stands_in(&reader.folder.join(file), &block.text),
             ("diff", Some(file), _) => change(&reader.folder.join(file), &block.text),
@@ -277,7 +275,7 @@ fn the_page_is_true_from_beginning_to_end() {
         }
         made += 1;
     }
-    reader.down();
+    reader.down(|_| true);
     assert!(made > 15, "{made} blocks");
 }
 

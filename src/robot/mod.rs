@@ -7,9 +7,20 @@
 //!
 //! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
 
+pub mod mesh;
 pub mod model;
 pub mod packages;
 pub mod urdf;
 pub mod xml;
 
 pub use model::{Geometry, Inertial, Joint, JointKind, Limits, Link, MeshFile, Mimic, RobotModel, Shape};
+
+/// A small generator for tests: the same numbers for the same seed.
+#[cfg(test)]
+fn test_random(seed: u64) -> impl FnMut() -> u64 {
+    let mut state = seed;
+    move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state >> 33
+    }
+}

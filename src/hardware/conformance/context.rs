@@ -6,11 +6,13 @@ use std::time::{Duration, Instant};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
 use crate::hardware::sim::faults::Fault;
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
+use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
 
 /// Longest wait for something that must happen.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// How long an arm at rest may put a change of mode off.
+const MODE_LIMIT: Duration = Duration::from_secs(1);
 /// When the first fault of an arm without an emulator strikes, and how much later each further one: time since the
 /// connection [s].
 const STRIKES_AT: f64 = 1.0;
@@ -137,7 +139,19 @@ impl Context {
     pub fn ready(&mut self, mode: ControlMode) -> Result<(), String> {
         self.connect()?;
         self.activate()?;
-        self.adapter.set_control_mode(mode).map_err(|e| format!("set_control_mode {}: {e}", mode.name()))
+        self.set_mode(mode).map_err(|e| format!("set_control_mode {}: {e}", mode.name()))
+    }
+
+    /// Brings the arm into a mode. As to the device thread, `Rejected` means: not yet, ask again.
+    pub fn set_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        let end = Instant::now() + MODE_LIMIT;
+        loop {
+            let result = self.adapter.set_control_mode(mode);
+            if !matches!(result, Err(AdapterError::Rejected(_))) || Instant::now() > end {
+                return result;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 
     /// Activates, and waits for the motors as the device thread does.

@@ -103,7 +103,7 @@ fn modes(context: &mut Context) -> Result<(), String> {
         ControlMode::Impedance,
     ];
     for mode in all {
-        let result = context.adapter.set_control_mode(mode);
+        let result = context.set_mode(mode);
         if context.row.modes.contains(&mode) {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
             let now = context.adapter.get_control_mode();

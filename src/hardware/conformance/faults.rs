@@ -48,13 +48,16 @@ fn estop(context: &mut Context) -> Result<(), String> {
         return context.skip("its double has no E-stop line");
     }
     context.ready(context.first_mode())?;
-    let start = context.positions()?;
+    let mut start = context.positions()?;
     context.strike()?;
     context.until("the E-stop", |context| Ok(context.error()?.0 != 0))?;
     require(context.adapter.write_enable(true).is_err(), || "enabling in E-stop is accepted".into())?;
     context.until("the release", |context| Ok(context.adapter.write_clear_errors().is_ok()))?;
     require(!context.enabled()?, || "clearing switched the motors on".into())?;
     context.activate()?;
+    if !context.row.holds_when_disabled {
+        start = context.standstill()?; // it fell when the motors lost their power
+    }
     context.stays(&start, 0.005)
 }
 

@@ -120,7 +120,7 @@ fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
     let error = context.error()?;
     require(error.0 == 0, || format!("after a stop it reports error {}: {}", error.0, error.1))?;
     context.activate()?;
-    context.adapter.set_control_mode(ControlMode::Position).map_err(|e| format!("set_control_mode: {e}"))?;
+    context.set_mode(ControlMode::Position).map_err(|e| format!("set_control_mode: {e}"))?;
     context.command(&start, 0.5)?;
     context.until("arrival", |context| Ok(farthest(&context.positions()?, &start) < 1e-3))
 }

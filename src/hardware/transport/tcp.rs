@@ -2,6 +2,7 @@
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
@@ -150,6 +151,34 @@ impl TcpLink {
                 Err(e) => Err(broken(peer, &e)),
             }
         })
+    }
+
+    /// The next frame among what has arrived already, without waiting; `None` when there is none. `scan` as above.
+    pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
+        let Self { stream, peer, incoming, .. } = self;
+        loop {
+            if let Some(frame) = incoming.next(&mut scan) {
+                return Ok(Some(frame));
+            }
+            let arrived = incoming.fill(peer, |room| {
+                match rustix::net::recv(&*stream, room, rustix::net::RecvFlags::DONTWAIT) {
+                    Ok((0, _)) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
+                    Ok((n, _)) => Ok(n),
+                    Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
+                    Err(e) => Err(broken(peer, &e.into())),
+                }
+            })?;
+            if arrived == 0 {
+                return Ok(None);
+            }
+        }
+    }
+}
+
+/// Becomes readable when something has arrived.
+impl AsFd for TcpLink {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.stream.as_fd()
     }
 }
 

@@ -7,6 +7,7 @@
 pub mod address;
 pub mod bus;
 pub mod slcan;
+pub mod slcan_pty;
 #[cfg(all(feature = "can", target_os = "linux"))]
 pub mod socket;
 
@@ -14,6 +15,8 @@ use std::os::fd::BorrowedFd;
 
 use crate::hardware::spec::AdapterResult;
 pub use address::CanAddress;
+pub use bus::Bus;
+pub use slcan_pty::SlcanPty;
 
 /// A classic CAN 2.0A data frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -43,7 +46,7 @@ impl CanFrame {
 /// What the controller of the bus reports beside frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanTrouble {
-    /// The controller has left the bus after too many errors.
+    /// The controller has left the bus after too many errors. What is sent from now on is swallowed without a word.
     BusOff,
     /// Nobody acknowledges what is sent: no other node, no power, a wrong bit rate.
     NoAcknowledge,
@@ -96,7 +99,7 @@ pub trait CanPort: Send {
     fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize>;
     /// The next event, if one has arrived. `Io` when the interface is gone or down.
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>>;
-    /// Readable when something has arrived.
+    /// Readable when something has arrived. Fetch until there is nothing before waiting for it.
     fn fd(&self) -> BorrowedFd<'_>;
     /// About how many frames of this port still wait for the bus, where that can be known. A number that stays above 0
     /// says that nobody acknowledges: those frames go out later, when somebody does.
@@ -130,6 +133,14 @@ fn open_interface(device: &str, name: &str, _filters: &[CanFilter]) -> AdapterRe
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(not(feature = "can"))]
+    #[test]
+    fn a_build_without_can_says_so() {
+        let error = open("arm", &CanAddress::Interface("can0".into()), &[]).err().unwrap().to_string();
+        let hint = "this build has no CAN\nhint: build with --features can, on Linux";
+        assert_eq!(error, format!("cannot open CAN interface can0 for arm: {hint}"));
+    }
 
     #[test]
     fn frames_hold_eight_bytes_at_most() {

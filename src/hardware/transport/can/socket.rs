@@ -21,6 +21,8 @@ pub const SEND_QUEUE: usize = 16;
 const FRAME_MEMORY: usize = 768;
 /// Asked for as the receive buffer [bytes]: a Piper fills it in about a second. The system may grant less.
 const RECEIVE_BUFFER: usize = 1 << 20;
+/// Where the kernel tells of its interfaces.
+const INTERFACES: &str = "/sys/class/net";
 /// A protocol error at this place is a missing acknowledgement (`linux/can/error.h`).
 const LOCATION_ACK: u8 = 0x19;
 
@@ -62,6 +64,13 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
     if let Ok(Err(errno)) = sockopt::socket_error(&socket) {
         return Err(failed(&why_not(name, &errno.into())));
     }
+    // Without a carrier the kernel swallows what is sent, and says that it was sent.
+    if std::fs::read_to_string(format!("{INTERFACES}/{name}/carrier")).is_ok_and(|carrier| carrier.trim() == "0") {
+        return Err(failed(&format!(
+            "it has no carrier: its controller is bus-off, or the other end of a virtual pair is down\nhint: look at the \
+             wiring, the terminators and the bit rate; then ip link set {name} down; ip link set {name} up (as root)"
+        )));
+    }
     Ok(SocketPort { socket, peer: format!("{device} at {name}"), broken: None, lost: 0 })
 }
 
@@ -72,7 +81,7 @@ fn why_not(name: &str, error: &Error) -> String {
             "the interface is down\nhint: ip link set {name} up type can bitrate 1000000 (as root; for a virtual \
              interface: ip link set {name} up)"
         ),
-        Some(ENODEV) if std::path::Path::new("/sys/class/net").join(name).exists() => {
+        Some(ENODEV) if std::path::Path::new(INTERFACES).join(name).exists() => {
             format!("it is no CAN interface\nhint: {}", others())
         }
         Some(ENODEV) => format!("there is no such interface\nhint: {}", others()),
@@ -90,7 +99,7 @@ fn others() -> String {
     let is_can = |entry: &std::fs::DirEntry| {
         std::fs::read_to_string(entry.path().join("type")).is_ok_and(|kind| kind.trim() == CAN_TYPE)
     };
-    let entries = std::fs::read_dir("/sys/class/net").into_iter().flatten().flatten();
+    let entries = std::fs::read_dir(INTERFACES).into_iter().flatten().flatten();
     let mut names: Vec<_> =
         entries.filter(is_can).map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
     names.sort();

@@ -1,0 +1,172 @@
+use super::*;
+
+const ONE: Vector3<f64> = Vector3::new(1.0, 1.0, 1.0);
+
+/// A tetrahedron's corners and triangles, anticlockwise from outside.
+const POINTS: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]];
+const FACES: [[usize; 3]; 4] = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
+
+fn binary_stl(header: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0; 80];
+    bytes[..header.len()].copy_from_slice(header);
+    bytes.extend(4u32.to_le_bytes());
+    for face in FACES {
+        bytes.extend([0; 12]);
+        face.iter().flat_map(|i| POINTS[*i]).for_each(|v| bytes.extend(v.to_le_bytes()));
+        bytes.extend([0, 0]);
+    }
+    bytes
+}
+
+fn ascii_stl() -> String {
+    let vertex = |i: usize| POINTS[i].map(|v| v.to_string()).join(" ");
+    let facet = |f: &[usize; 3]| {
+        let [a, b, c] = f.map(vertex);
+        format!("facet normal 0 0 0\nouter loop\nvertex {a}\nvertex {b}\nvertex {c}\nendloop\nendfacet\n")
+    };
+    format!("solid t\n{}endsolid t\n", FACES.iter().map(facet).collect::<String>())
+}
+
+fn obj() -> String {
+    let points: String = POINTS.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
+    let faces: String = FACES.iter().map(|f| format!("f {} {} {}\n", f[0] + 1, f[1] + 1, f[2] + 1)).collect();
+    format!("mtllib nowhere.mtl\n{points}usemtl none\n{faces}")
+}
+
+fn dae(unit: &str, axis: &str, nodes: &str) -> String {
+    let points = POINTS.iter().flatten().map(f32::to_string).collect::<Vec<_>>().join(" ");
+    // Two indices a corner: of the vertex, and of a normal that is not there.
+    let p = FACES.iter().flatten().map(|i| format!("{i} 0")).collect::<Vec<_>>().join(" ");
+    format!(
+        "<COLLADA xmlns='http://www.collada.org/2005/11/COLLADASchema' version='1.4.1'>\
+         <asset><unit meter='{unit}'/><up_axis>{axis}</up_axis></asset>\
+         <library_geometries><geometry id='g'><mesh><source id='s'><float_array id='f' count='12'>{points}</float_array>\
+         <technique_common><accessor source='#f' count='4' stride='3'/></technique_common></source>\
+         <vertices id='v'><input semantic='POSITION' source='#s'/></vertices>\
+         <triangles count='4'><input semantic='VERTEX' source='#v' offset='0'/>\
+         <input semantic='NORMAL' source='#n' offset='1'/><p>{p}</p></triangles></mesh></geometry></library_geometries>\
+         <library_visual_scenes><visual_scene id='x'>{nodes}</visual_scene></library_visual_scenes>\
+         <scene><instance_visual_scene url='#x'/></scene></COLLADA>"
+    )
+}
+
+fn read(name: &str, bytes: &[u8], scale: Vector3<f64>) -> Result<Mesh, String> {
+    Mesh::from_bytes(bytes, Path::new(name), scale)
+}
+
+/// Six times the volume that the triangles enclose: negative when they are inside out.
+fn volume(mesh: &Mesh) -> f64 {
+    let corner = |i: u32| mesh.vertices[i as usize].coords;
+    mesh.triangles.iter().map(|[a, b, c]| corner(*a).dot(&corner(*b).cross(&corner(*c)))).sum()
+}
+
+#[test]
+fn every_format_gives_the_same_mesh() {
+    let plain = "<node id='n'><instance_geometry url='#g'/></node>";
+    for (name, bytes) in [
+        ("a.stl", binary_stl(b"binary")),
+        ("a.STL", binary_stl(b"solid but binary all the same")),
+        ("a.stl", ascii_stl().into_bytes()),
+        ("a.obj", obj().into_bytes()),
+        ("a.dae", dae("1", "Z_UP", plain).into_bytes()),
+        ("a.dae", dae("1", "Y_UP", plain).into_bytes()),
+    ] {
+        let mesh = read(name, &bytes, ONE).unwrap_or_else(|e| panic!("{name}: {e}"));
+        assert_eq!((mesh.vertices.len(), mesh.triangles.len()), (4, 4), "{name}");
+        assert_eq!(mesh.bounds(), (Point3::origin(), Point3::new(1.0, 2.0, 3.0)), "{name}");
+        assert!((volume(&mesh) - 6.0).abs() < 1e-12, "{name}");
+    }
+}
+
+#[test]
+fn scales_apply_and_mirrors_stay_right_side_out() {
+    for (scale, high) in [([0.001, 0.001, 0.001], 0.003), ([1.0, -1.0, 1.0], 3.0), ([-1.0, -1.0, 2.0], 6.0)] {
+        let mesh = read("a.stl", &binary_stl(b""), scale.into()).unwrap();
+        assert!((mesh.bounds().1.z - high).abs() < 1e-12);
+        assert!(volume(&mesh) > 0.0, "{scale:?}");
+    }
+}
+
+#[test]
+fn units_and_nodes_of_collada_apply() {
+    let nodes = "<node><translate>0 0 100</translate><rotate>0 0 1 90</rotate>\
+                   <node><scale>2 2 2</scale><instance_geometry url='#g'/></node></node>\
+                 <node><matrix>1 0 0 500 0 1 0 0 0 0 1 0 0 0 0 1</matrix><instance_geometry url='#g'/></node>";
+    let mesh = read("a.dae", dae("0.01", "Z_UP", nodes).as_bytes(), ONE).unwrap();
+    assert_eq!((mesh.vertices.len(), mesh.triangles.len()), (8, 8));
+    let (low, high) = mesh.bounds();
+    // The first: twice as large, turned by 90° about z, one metre up. The second: five metres along x.
+    assert!((low - Point3::new(-0.04, 0.0, 0.0)).norm() < 1e-9, "{low}");
+    assert!((high - Point3::new(5.01, 0.02, 1.06)).norm() < 1e-9, "{high}");
+    let mirrored = "<node><scale>1 1 -1</scale><instance_geometry url='#g'/></node>";
+    assert!(volume(&read("a.dae", dae("1", "Z_UP", mirrored).as_bytes(), ONE).unwrap()) > 0.0);
+}
+
+#[test]
+fn polygons_strips_and_fans_are_triangles() {
+    let square = |kind: &str, inside: &str| {
+        let primitive = format!("<{kind}><input semantic='VERTEX' source='#v' offset='0'/>{inside}</{kind}>");
+        let text = dae("1", "Z_UP", "<node><instance_geometry url='#g'/></node>");
+        let (before, rest) = text.split_once("<triangles").unwrap();
+        let (_, after) = rest.split_once("</triangles>").unwrap();
+        read("a.dae", format!("{before}{primitive}{after}").as_bytes(), ONE).unwrap().triangles
+    };
+    let fan = vec![[0, 1, 2], [0, 2, 3]];
+    assert_eq!(square("polylist", "<vcount>4 3</vcount><p>0 1 2 3 0 1 2</p>"), [[0, 1, 2], [0, 2, 3], [0, 1, 2]]);
+    assert_eq!(square("polygons", "<p>0 1 2 3</p>"), fan);
+    assert_eq!(square("trifans", "<p>0 1 2 3</p>"), fan);
+    assert_eq!(square("tristrips", "<p>0 1 2 3</p>"), [[0, 1, 2], [2, 1, 3]]);
+}
+
+#[test]
+fn what_cannot_be_used_is_refused() {
+    let mut nan = binary_stl(b"");
+    nan[96..100].copy_from_slice(&f32::NAN.to_le_bytes());
+    let mut short = binary_stl(b"");
+    short.truncate(120);
+    let own = "<node id='n'><instance_node url='#n'/></node>";
+    for (name, bytes, what) in [
+        ("a.stl", nan, "a vertex at NaN"),
+        ("a.stl", short, ""),
+        ("a.stl", Vec::new(), ""),
+        ("a.ply", Vec::new(), "meshes of type `ply` cannot be read"),
+        ("a.obj", b"v 1 2 3\nf 1 2 9\n".to_vec(), ""),
+        ("a.obj", b"v 1 2 3\n".to_vec(), "no triangle"),
+        ("a.dae", b"<COLLADA/>".to_vec(), "no triangle"),
+        ("a.dae", dae("-1", "Z_UP", "").into_bytes(), "the unit of -1 metres"),
+        ("a.dae", dae("1", "Z_UP", own).into_bytes(), "refer to each other"),
+        ("a.dae", dae("1", "Z_UP", "<node><instance_geometry url='#q'/></node>").into_bytes(), "nothing has the id"),
+    ] {
+        let error = read(name, &bytes, ONE).expect_err(name);
+        assert!(error.contains(what), "{what}: {error}");
+    }
+}
+
+#[test]
+fn damaged_bytes_never_panic() {
+    let plain = dae("1", "Z_UP", "<node id='n'><instance_geometry url='#g'/></node>");
+    let files = [
+        ("a.stl", binary_stl(b"")),
+        ("a.stl", ascii_stl().into_bytes()),
+        ("a.obj", obj().into_bytes()),
+        ("a.dae", plain.into_bytes()),
+    ];
+    let mut random = crate::robot::test_random(7);
+    for (name, bytes) in files {
+        for _ in 0..1500 {
+            let mut bytes = bytes.clone();
+            for _ in 0..1 + random() % 4 {
+                let at = random() as usize % bytes.len();
+                match random() % 3 {
+                    0 => bytes[at] = random() as u8,
+                    1 => bytes.truncate(at.max(1)),
+                    _ => bytes[at] = b" -0919<>/\"ef\n"[random() as usize % 13],
+                }
+            }
+            if let Ok(mesh) = read(name, &bytes, ONE) {
+                assert!(mesh.triangles.iter().flatten().all(|i| (*i as usize) < mesh.vertices.len()));
+                assert!(mesh.vertices.iter().all(|v| v.iter().all(|c| c.is_finite())));
+            }
+        }
+    }
+}
