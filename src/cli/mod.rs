@@ -37,7 +37,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use crate::blueprint;
-use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::hardware::registry::{Absent, AdapterSpec, Registry};
 
 const AFTER_HELP: &str = "\
 Start with:  dimos run coordinator-yourarm
@@ -115,6 +115,7 @@ enum Command {
 #[derive(Debug, Clone, Default)]
 pub struct Program {
     adapters: Vec<AdapterSpec>,
+    absent: Vec<Absent>,
     blueprints: Vec<(&'static str, &'static str)>,
 }
 
@@ -130,6 +131,12 @@ impl Program {
         self
     }
 
+    /// Names an adapter that this build does not have, and the way to get it.
+    pub fn absent(mut self, row: Absent) -> Self {
+        self.absent.push(row);
+        self
+    }
+
     /// Adds a blueprint that is run by name, wherever the program is started: its name, and its text in YAML.
     pub fn blueprint(mut self, name: &'static str, text: &'static str) -> Self {
         self.blueprints.push((name, text));
@@ -139,17 +146,20 @@ impl Program {
     /// Runs the command line: what `main` does.
     pub fn main(self) -> ExitCode {
         blueprint::embed(self.blueprints);
-        main_with(&self.adapters)
+        command_line(&Registry::with(&self.adapters).lacking(&self.absent))
     }
 }
 
-/// Runs the command line with more adapters than those in the box. [`Program`] can add blueprints too.
+/// Runs the command line with more adapters than those in the box. [`Program`] can add more than that.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
+    command_line(&Registry::with(adapters))
+}
+
+fn command_line(registry: &Registry) -> ExitCode {
     // Usage errors, `--help` and `--version` end here, with 2 or 0.
     let cli = Cli::parse_from(std::env::args_os().map(spelled_out));
-    let registry = Registry::with(adapters);
     let result = match &cli.command {
-        Command::Run(args) => run::run(args, &registry),
+        Command::Run(args) => run::run(args, registry),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
         Command::Move(args) => move_to::run(args),
@@ -160,16 +170,16 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),
         Command::Logs(args) => logs::run(args),
-        Command::Adapter(args) => adapter::run(args, &registry),
-        Command::ListAdapters(args) => list_adapters::run(args, &registry),
-        Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
-        Command::Check(args) => check::run(args, &registry),
+        Command::Adapter(args) => adapter::run(args, registry),
+        Command::ListAdapters(args) => list_adapters::run(args, registry),
+        Command::ListBlueprints(args) => list_blueprints::run(args, registry),
+        Command::Check(args) => check::run(args, registry),
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
-        Command::Schema(args) => schema::run(args, &registry),
+        Command::Schema(args) => schema::run(args, registry),
         Command::Replay(args) => {
-            return match replay::run(args, &registry) {
+            return match replay::run(args, registry) {
                 Ok(code) => ExitCode::from(code),
                 Err(e) => {
                     output::failure(&exit::Failure::new(exit::Exit::Failed, e.to_string()));

@@ -181,12 +181,13 @@ pub const SIM: &str = "sim";
 #[derive(Debug, Clone, Default)]
 pub struct Registry {
     rows: Vec<AdapterSpec>,
+    absent: Vec<Absent>,
 }
 
 impl Registry {
     /// The arms in the box.
     pub fn builtin() -> Self {
-        Self { rows: crate::hardware::arms::TABLE.to_vec() }
+        Self { rows: crate::hardware::arms::TABLE.to_vec(), absent: crate::hardware::arms::ABSENT.to_vec() }
     }
 
     /// The arms in the box and `more`, which win over rows of the same name.
@@ -195,6 +196,17 @@ impl Registry {
         registry.rows.retain(|row| !more.iter().any(|m| m.name == row.name));
         registry.rows.extend_from_slice(more);
         registry
+    }
+
+    /// The same table, that also knows of adapters which this build does not have.
+    pub fn lacking(mut self, more: &[Absent]) -> Self {
+        self.absent.extend_from_slice(more);
+        self
+    }
+
+    /// The adapters that this build does not have.
+    pub fn absent(&self) -> impl Iterator<Item = &Absent> {
+        self.absent.iter().filter(|absent| self.get(absent.name).is_none())
     }
 
     /// All rows, in table order.
@@ -261,7 +273,11 @@ pub fn emulate(name: &str, dof: usize) -> AdapterResult<Box<dyn Emulator>> {
 fn builtin(name: &str) -> AdapterResult<&'static AdapterSpec> {
     let table = crate::hardware::arms::TABLE;
     table.iter().find(|row| row.name == name).ok_or_else(|| {
-        AdapterError::Rejected(format!("no adapter named {name:?}; there are {}", available().join(", ")))
+        let absent = crate::hardware::arms::ABSENT.iter().find(|absent| absent.name == name);
+        AdapterError::Rejected(match absent {
+            Some(absent) => format!("adapter {name} is not in this build\nhint: {}", absent.remedy),
+            None => format!("no adapter named {name:?}; there are {}", available().join(", ")),
+        })
     })
 }
 

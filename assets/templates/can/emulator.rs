@@ -45,14 +45,6 @@ impl AcmeEmulator {
         let controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
         CanServer::start("acme", controller, place, Duration::from_secs_f64(1.0 / NATIVE_RATE)).map(Self)
     }
-
-    /// True joint positions [rad] and velocities [rad/s] now.
-    pub fn joints(&self) -> (Joints, Joints) {
-        self.0.with(|controller, now| {
-            controller.arm.advance(now);
-            controller.arm.joints()
-        })
-    }
 }
 
 impl Emulator for AcmeEmulator {
@@ -64,6 +56,13 @@ impl Emulator for AcmeEmulator {
         check_kinds("the acme emulator", &[fault], PLAYABLE)?;
         self.0.with(|controller, now| controller.arm.inject(fault, now));
         Ok(())
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        self.0.with(|controller, now| {
+            controller.arm.advance(now);
+            Some(controller.arm.joints().0)
+        })
     }
 }
 

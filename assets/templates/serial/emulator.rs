@@ -47,14 +47,6 @@ impl AcmeEmulator {
         let arm = SimArm::new(&limits, &options, VELOCITY_TIMEOUT, MonotonicClock.now());
         SerialServer::start("acme", AcmeController { arm }, place).map(Self)
     }
-
-    /// True joint positions [rad] and velocities [rad/s] now.
-    pub fn joints(&self) -> (Joints, Joints) {
-        self.0.with(|controller, now| {
-            controller.arm.advance(now);
-            controller.arm.joints()
-        })
-    }
 }
 
 impl Emulator for AcmeEmulator {
@@ -66,6 +58,13 @@ impl Emulator for AcmeEmulator {
         check_kinds("the acme emulator", &[fault], PLAYABLE)?;
         self.0.with(|controller, now| controller.arm.inject(fault, now));
         Ok(())
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        self.0.with(|controller, now| {
+            controller.arm.advance(now);
+            Some(controller.arm.joints().0)
+        })
     }
 }
 

@@ -5,6 +5,7 @@ use crate::hardware::registry::{Absent, AdapterSpec};
 pub mod mock;
 #[cfg(feature = "can")]
 pub mod piper;
+pub mod remote;
 pub mod xarm;
 pub mod yourarm;
 
@@ -15,6 +16,7 @@ pub const TABLE: &[AdapterSpec] = &[
     xarm::SPEC,
     #[cfg(feature = "can")]
     piper::SPEC,
+    remote::SPEC,
 ];
 
 /// The adapters that this build does not have.

@@ -200,11 +200,13 @@ impl Worker {
         self.config.native_rate = self.config.native_rate.min(info.native_rate);
         self.wanted = true;
         self.connected = true;
+        self.write_errors = 0;
         self.reconnect.1 = BACK_OFF.0;
         self.plausible = 0;
         self.take_command();
         self.read(adapter);
-        Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range() })
+        let (gripper_range, state_timeout) = (adapter.get_gripper_range(), self.config.state_timeout());
+        Ok(Connected { info, limits, gripper_range, state_timeout })
     }
 
     fn connect_again(&mut self, adapter: &mut dyn ManipulatorAdapter) {

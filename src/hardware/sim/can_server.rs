@@ -10,6 +10,7 @@ use crate::hardware::registry::Place;
 use crate::hardware::sim::arm::Delivery;
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::bus::Bus;
+use crate::hardware::transport::can::slcan_pty::SlcanPty;
 use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanPort};
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -62,8 +63,14 @@ impl<C: CanController> CanServer<C> {
                 let port = can::open(&format!("the {name} emulator"), &address, &[])?;
                 (None, address, port)
             }
-            Place::Bind(_) | Place::Pty => {
-                return Err(AdapterError::Rejected(format!("{name} speaks CAN: its emulator has a CAN interface")));
+            Place::Pty => {
+                let pty = SlcanPty::open()?;
+                let address = pty.address();
+                (None, address, Box::new(pty))
+            }
+            Place::Bind(_) => {
+                let what = "is on a CAN bus: its emulator has an interface or a pseudo-terminal, no IP address";
+                return Err(AdapterError::Rejected(format!("{name} {what}")));
             }
         };
         let failed = |e: std::io::Error| AdapterError::Io(format!("{name} emulator: {e}"));

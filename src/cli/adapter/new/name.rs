@@ -1,6 +1,5 @@
 //! The name of a new arm, in the forms in which code and files write it.
 
-use crate::hardware::arms::ABSENT;
 use crate::hardware::registry::Registry;
 
 /// Longest name: it stands in lines of code.
@@ -50,7 +49,7 @@ impl Name {
 
     /// Whether an adapter has the name already, in this build or in another.
     pub fn is_taken(&self, registry: &Registry) -> bool {
-        registry.get(&self.snake).is_some() || ABSENT.iter().any(|row| row.name == self.snake)
+        registry.get(&self.snake).is_some() || registry.absent().any(|absent| absent.name == self.snake)
     }
 }
 

@@ -83,10 +83,7 @@ impl Arm {
 
     /// Rust code of this arm.
     fn code(&self, text: &str) -> String {
-        self.joints(text)
-            .replace("coordinator-acme", &self.blueprint())
-            .replace("acme", &self.name.snake)
-            .replace("Acme", &self.name.camel)
+        self.written(text, &[("acme", &self.name.snake)])
     }
 
     /// Any other text of this arm.
@@ -96,21 +93,86 @@ impl Arm {
             Transport::Can => "can0",
             Transport::Serial => "/dev/ttyUSB0",
         };
-        self.joints(text)
-            .replace("adapter_type: acme", &format!("adapter_type: {}", self.name.snake))
-            .replace("acme", &self.name.kebab)
-            .replace("Acme", &self.name.camel)
-            .replace("ADDRESS", address)
+        let adapter_type = format!("adapter_type: {}", self.name.snake);
+        let more = [("adapter_type: acme", &*adapter_type), ("acme", &self.name.kebab), ("ADDRESS", address)];
+        self.written(text, &more)
     }
 
-    /// The text with this arm's number of joints.
-    fn joints(&self, text: &str) -> String {
-        let dof = self.dof;
+    /// The text with this arm's name and number of joints, and `more` in place of what it says.
+    fn written(&self, text: &str, more: &[(&str, &str)]) -> String {
+        let (dof, camel) = (self.dof, &self.name.camel);
         let article = if matches!(dof, 8 | 11) { "an" } else { "a" };
         let several = if dof == 1 { "" } else { "s" };
-        text.replace("const DOF: usize = 6;", &format!("const DOF: usize = {dof};"))
-            .replace("a 6-joint arm", &format!("{article} {dof}-joint arm"))
-            .replace("Acme with 6 joints", &format!("Acme with {dof} joint{several}"))
-            .replace("count: 6}", &format!("count: {dof}}}"))
+        let own = [
+            ("coordinator-acme", self.blueprint()),
+            ("const DOF: usize = 6;", format!("const DOF: usize = {dof};")),
+            ("a 6-joint arm", format!("{article} {dof}-joint arm")),
+            ("with 6 joints", format!("with {dof} joint{several}")),
+            ("count: 6}", format!("count: {dof}}}")),
+            ("Acme", camel.clone()),
+        ];
+        let own = own.iter().map(|(from, to)| (*from, to.as_str()));
+        replace(text, &own.chain(more.iter().copied()).collect::<Vec<_>>())
+    }
+}
+
+/// The text with each pair's second in place of its first, in one go: what is put in is not looked at again. Where two
+/// pairs begin at the same place, the first one counts.
+fn replace(text: &str, pairs: &[(&str, &str)]) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    let next =
+        |rest: &str| pairs.iter().filter_map(|pair| rest.find(pair.0).map(|at| (at, *pair))).min_by_key(|(at, _)| *at);
+    while let Some((at, (from, to))) = next(rest) {
+        out.push_str(&rest[..at]);
+        out.push_str(to);
+        rest = &rest[at + from.len()..];
+    }
+    out + rest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn arm(name: &str, dof: u8, transport: Transport) -> Arm {
+        Arm { name: Name::parse(name).unwrap(), dof, transport }
+    }
+
+    #[test]
+    fn an_arm_like_the_template_is_the_template() {
+        for (transport, sources) in [(Transport::Tcp, TCP), (Transport::Can, CAN), (Transport::Serial, SERIAL)] {
+            let files = arm("acme", 6, transport).own_crate("path = \"x\"");
+            for (file, text) in sources {
+                let path = if file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
+                assert!(files.contains(&(path, text.to_owned())), "{file}");
+            }
+        }
+    }
+
+    #[test]
+    fn names_that_contain_the_template_s_are_put_in_once() {
+        let files = arm("acme-2", 8, Transport::Can).own_crate("git = \"x\"");
+        let text = |path: &str| &files.iter().find(|(p, _)| p == path).unwrap().1;
+        assert!(text("src/main.rs").contains("include_str!(\"../blueprints/coordinator-acme-2.yaml\")"));
+        assert!(text("src/main.rs").contains("acme_2::SPEC"));
+        assert!(text("src/lib.rs").contains("Acme2, an 8-joint arm") && text("src/lib.rs").contains("usize = 8;"));
+        assert!(text("src/lib.rs").contains("name: \"acme_2\""));
+        assert!(
+            text("Cargo.toml").contains("name = \"acme-2\"") && text("Cargo.toml").contains("dimos = { git = \"x\" }")
+        );
+        assert!(text("blueprints/coordinator-acme-2.yaml").contains("adapter_type: acme_2\n"));
+        assert!(text("README.md").contains("hardware.arm.address=can0"));
+        assert!(files.iter().all(|(_, text)| !text.contains("acme_2_2") && !text.contains("DIMOS")));
+    }
+
+    #[test]
+    fn in_the_tree_nothing_is_of_another_crate() {
+        for transport in [Transport::Tcp, Transport::Can, Transport::Serial] {
+            let files = arm("otto", 7, transport).in_tree();
+            assert_eq!(files.len(), 6);
+            let left = |text: &str| text.contains("dimos::") || text.to_lowercase().contains("acme");
+            assert!(files.iter().all(|(_, text)| !left(text)), "{transport:?}");
+        }
     }
 }
