@@ -159,7 +159,7 @@ fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
         loaded.tree.report(Diag::error(format!("no robot in the box is named `{robot}`")).maybe_hint(hint));
         return None;
     }
-    let refused = |what: String| Diag::error(format!("{}: {what}", path.display()));
+    let refused = |what: String| format!("{}: {what}", path.display());
     let read = || {
         let size = fs::metadata(path).map_err(|e| refused(e.to_string()))?.len();
         if size > xml::MAX_BYTES as u64 {
@@ -173,8 +173,8 @@ fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
             loaded.files.push(absolute(path));
             Some(text)
         }
-        Err(diag) => {
-            loaded.tree.report(diag);
+        Err(what) => {
+            loaded.tree.report(Diag::error(what));
             None
         }
     }
