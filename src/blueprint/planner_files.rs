@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use crate::blueprint::planner::{ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry};
+use crate::blueprint::planner::{
+    ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry,
+};
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::yaml::{Located, NodeId};
@@ -41,7 +43,12 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> RobotConfig {
         exclusions: typed.collision_exclusion_pairs.clone(),
         max_velocity: typed.max_velocity,
         max_acceleration: typed.max_acceleration,
-        named_poses: typed.named_poses.0.iter().map(|(n, p)| (n.value.clone(), p.value.clone())).collect::<BTreeMap<_, _>>(),
+        named_poses: typed
+            .named_poses
+            .0
+            .iter()
+            .map(|(n, p)| (n.value.clone(), p.value.clone()))
+            .collect::<BTreeMap<_, _>>(),
     }
 }
 

@@ -155,13 +155,14 @@ impl Drop for Desk {
 fn work(setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
     while let Ok(order) = orders.recv() {
         let began = Instant::now();
-        let outcome =
-            catch_unwind(AssertUnwindSafe(|| solve(setup, &order.world, &order.request, &order.stop)));
+        let outcome = catch_unwind(AssertUnwindSafe(|| solve(setup, &order.world, &order.request, &order.stop)));
         let took = began.elapsed();
         let progress = match outcome {
             Ok(Ok(found)) => Progress::Found(Arc::new(found), took),
             Ok(Err(failure)) => Progress::Failed(failure, took),
-            Err(_) => Progress::Failed(Failure::new("the planner failed at this request: a defect of the program"), took),
+            Err(_) => {
+                Progress::Failed(Failure::new("the planner failed at this request: a defect of the program"), took)
+            }
         };
         if let Some(job) = lock(&shared.jobs).iter_mut().find(|job| job.id == order.id) {
             job.progress = progress;

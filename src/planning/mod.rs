@@ -9,14 +9,19 @@
 
 pub mod blend;
 pub mod cartesian;
+pub mod config;
+pub mod desk;
+mod goals;
 pub mod ik;
 pub mod nearest;
 pub mod path;
 pub mod planner;
 pub mod rrt_connect;
 pub mod sampler;
+pub mod setup;
 pub mod shortcut;
 mod smooth;
+pub mod solve;
 pub mod timing;
 pub mod topp;
 pub mod verify;

@@ -168,9 +168,7 @@ pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
         ObjectShape::Box(size) => Solid::cuboid(DVec3::from_array(*size), at),
         ObjectShape::Sphere(radius) => Solid::sphere(*radius, at),
         ObjectShape::Cylinder([radius, length]) => Solid::cylinder(*radius, *length, at),
-        ObjectShape::Mesh(path) => {
-            of_mesh(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, MeshMode::Triangles, at)
-        }
+        ObjectShape::Mesh(path) => of_mesh(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, MeshMode::Triangles, at),
         ObjectShape::Cloud(path) => {
             let data = std::fs::read(path).map_err(|e| format!("{}: {e}", path.display()))?;
             let points = ply::read(&data).map_err(|e| format!("{}: {e}", path.display()))?;

@@ -5,11 +5,11 @@ use std::time::Instant;
 
 use nalgebra::{Isometry3, Vector3};
 
+use super::goals;
 use super::path::{Path, between, distance, length};
 use super::planner::{PlanError, PlanSettings, plan};
 use super::setup::{PlannedRobot, Setup};
 use super::timing::{TimingSettings, bounds, time};
-use super::goals;
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use crate::robot::kinematics::frame;
@@ -136,14 +136,7 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
     let looking = lap(&mut times, "timing", timing);
     let clearance = clearance(&mut stage.checker, &path);
     lap(&mut times, "clearance", looking);
-    Ok(Found {
-        robots: stage.indices,
-        path,
-        trajectory,
-        clearance,
-        fraction,
-        times,
-    })
+    Ok(Found { robots: stage.indices, path, trajectory, clearance, fraction, times })
 }
 
 fn stage<'a>(setup: &'a Setup, world: &World, request: &Request) -> Result<Stage<'a>, Failure> {
@@ -175,11 +168,12 @@ fn told(stage: &Stage<'_>, error: &PlanError) -> Failure {
             Failure::new(format!("{which}: {name} at {position:.4} rad is outside its limits {lower:.4} … {upper:.4}"))
                 .hint("`dimos state` shows where the joints are, `dimos model info` their limits")
         }
-        PlanError::Collides { which: "start", .. } => {
-            Failure::new(error.to_string()).hint("move out of it with `dimos move … --direct` or by hand, or correct the world")
-        }
+        PlanError::Collides { which: "start", .. } => Failure::new(error.to_string())
+            .hint("move out of it with `dimos move … --direct` or by hand, or correct the world"),
         PlanError::Collides { .. } => Failure::new(error.to_string()).hint("choose another goal, or correct the world"),
-        PlanError::Timeout(_) => Failure::new(error.to_string()).hint("give it more time with --timeout, or another --seed"),
+        PlanError::Timeout(_) => {
+            Failure::new(error.to_string()).hint("give it more time with --timeout, or another --seed")
+        }
         PlanError::Cancelled => Failure { cancelled: true, ..Failure::new("cancelled") },
         _ => Failure::new(error.to_string()),
     }

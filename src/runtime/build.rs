@@ -54,9 +54,11 @@ impl Run {
         let log = log_path(blueprint, &options, &name, wall)?;
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
-        let planner = blueprint.planner.as_ref().map(PlannerPort::start).transpose().map_err(|what| {
-            StartError::Blueprint { what, hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned() }
-        })?;
+        let planner =
+            blueprint.planner.as_ref().map(PlannerPort::start).transpose().map_err(|what| StartError::Blueprint {
+                what,
+                hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
+            })?;
         let pulse = Arc::new(Pulse::default());
         let (notes, noted) = channel();
 

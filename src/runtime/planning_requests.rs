@@ -15,7 +15,7 @@ use crate::planning::desk::{Desk, Job, Progress};
 use crate::planning::path::length;
 use crate::planning::setup::{Setup, obstacle};
 use crate::planning::solve::{Found, Goal, Request};
-use crate::robot::kinematics::{frame, pose};
+use crate::robot::kinematics::pose;
 use crate::rpc::api::{self, Done, PlanSummary, PoseSpec, Reply, Request as Call, ShapeSpec, WorldObject};
 use crate::rpc::{Code, RpcError};
 
@@ -93,9 +93,9 @@ impl Service {
         let positions = self.robot_positions(setup)?;
         let request = Request { goals, positions, speed: plan.speed, seed: plan.seed };
         let id = self.parts.dispatcher.number();
-        port.desk.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|busy| {
-            RpcError::new(Code::Planning, busy.to_string()).hint("wait for it, or `dimos cancel`")
-        })?;
+        port.desk
+            .begin(id, request, plan.timeout.map(Duration::from_secs_f64))
+            .map_err(|busy| RpcError::new(Code::Planning, busy.to_string()).hint("wait for it, or `dimos cancel`"))?;
         Ok(api::PlanReply { plan: id })
     }
 
@@ -151,8 +151,7 @@ impl Service {
     async fn execute_plan(&self, port: &PlannerPort, plan: Option<u64>) -> Result<Reply, RpcError> {
         let (job, found) = found(port, plan)?;
         let setup = port.desk.setup();
-        let mut tasks: Vec<_> =
-            found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.clone()).collect();
+        let mut tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.clone()).collect();
         tasks.dedup();
         // Several robots move in one trajectory: one task must have the joints of all.
         let task = if let [task] = tasks.as_slice() { Some(task.clone()) } else { None };
@@ -239,11 +238,7 @@ impl Service {
     }
 
     /// Where a robot's link is now, in the frame `map`.
-    fn link_pose(
-        &self,
-        robot: &crate::planning::setup::PlannedRobot,
-        link: &str,
-    ) -> Result<Isometry3<f64>, RpcError> {
+    fn link_pose(&self, robot: &crate::planning::setup::PlannedRobot, link: &str) -> Result<Isometry3<f64>, RpcError> {
         let names: Vec<&str> = robot.model.links.iter().map(|link| link.name.as_str()).collect();
         let index = robot.model.link_index(link);
         let index = index.ok_or_else(|| RpcError::unknown(Code::InvalidParams, "link", link, &names))?;
