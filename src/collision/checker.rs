@@ -72,7 +72,8 @@ pub trait CollisionChecker {
     /// What touches first, of those that are quickly found.
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair>;
 
-    /// The least distance between things that must not touch, and the pair; `None` when there is nothing to touch.
+    /// The least distance between things that must not touch and that can move relative to each other, and the pair;
+    /// `None` when there is nothing to touch.
     fn clearance(&mut self, q: &[f64]) -> Option<Contact>;
 
     /// Everything that touches at a configuration, the deepest first.

@@ -298,7 +298,8 @@ impl CollisionChecker for ExactChecker {
     fn clearance(&mut self, q: &[f64]) -> Option<Contact> {
         self.place(q);
         let mut best: Option<Contact> = None;
-        for pair in self.scene.clone().all_pairs() {
+        // Only of what a motion can change: a base on its table is always as close.
+        for pair in self.pairs.clone() {
             if best.as_ref().is_none_or(|b| self.least_distance(pair) < b.distance)
                 && let Some(contact) = self.contact(pair)
                 && best.as_ref().is_none_or(|b| contact.distance < b.distance)

@@ -210,7 +210,7 @@ fn clearance(checker: &mut ExactChecker, path: &Path) -> Option<(f64, [String; 2
         let steps = (distance(a, b) / CLEARANCE_STEP).ceil().max(1.0) as usize;
         for step in 0..=steps {
             between(a, b, step as f64 / steps as f64, &mut q);
-            let Some(contact) = checker.clearance(&q) else { return None };
+            let contact = checker.clearance(&q)?;
             if least.as_ref().is_none_or(|(distance, _)| contact.distance < *distance) {
                 least = Some((contact.distance, [contact.link, contact.other]));
             }

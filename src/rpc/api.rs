@@ -63,7 +63,6 @@ macro_rules! methods {
         /// What comes back: the variant of the same name.
         #[derive(Debug, Clone, PartialEq, Serialize)]
         #[serde(untagged)]
-        #[expect(clippy::large_enum_variant, reason = "a reply is moved a few times and never kept")]
         pub enum Reply { $($(#[$doc])* $variant($reply),)* }
 
         /// Names of all methods, those that the connection itself answers at the end.
