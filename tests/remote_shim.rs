@@ -6,7 +6,7 @@
 mod program;
 
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::{IpAddr, Ipv4Addr, TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -14,8 +14,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
 use dimos::hardware::arms::remote::SPEC;
+use dimos::hardware::arms::xarm::emulator::XArmEmulator;
 use dimos::hardware::conformance::{Check, Outcome, checks, run};
-use dimos::hardware::registry::{AdapterSpec, Emulator};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use program::{Home, Started, eventually};
 use rustix::process::Signal;
@@ -262,6 +263,57 @@ fn a_slow_sdk_keeps_its_own_pace() {
     let rate = home.status()["arms"][0]["measured_rate_hz"].as_f64().unwrap();
     assert!((1.0..25.0).contains(&rate), "{rate}");
     run.end(Signal::INT).with(130);
+}
+
+/// Skips a test whose tools are missing; an error where nothing may be skipped.
+fn skip(what: &str) {
+    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{what}");
+    println!("SKIPPED: {what}");
+}
+
+#[test]
+fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
+    let python = in_tree(".venv/bin/python");
+    let import = Command::new(&python).args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null()).status();
+    if !import.is_ok_and(|status| status.success()) {
+        return skip("xarm-python-sdk (make test-tools)");
+    }
+    let (ip, options) = (IpAddr::V4(Ipv4Addr::new(127, 0, 7, 2)), serde_json::json!({}));
+    let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
+    let emulator = match XArmEmulator::start(&config, &Place::Bind(ip)) {
+        Ok(emulator) => emulator,
+        Err(error) if error.to_string().contains(":502: ") => return skip("port 502"),
+        Err(error) => panic!("{error}"),
+    };
+    let start = emulator.joints().0;
+    let home = Home::new();
+    let address = format!("unix:{}/arm.sock", home.path().display());
+    let mut command = Command::new(python);
+    command.args([&in_tree("assets/python/dimos_shim.py"), "xarm_guide:XArmAdapter", "--address", &ip.to_string()]);
+    home.settle(command.args(["--dof", "6", "--hz", "20", "--at", &address]).stdin(Stdio::null()));
+    command.current_dir(in_tree("tests/python")).env("PYTHONPYCACHEPREFIX", home.path());
+    let shim = Started::of(&mut command);
+    shim.until("Ctrl-C ends it");
+    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", &address));
+    let run = home.run("remote.yaml");
+    assert_eq!(home.positions("arm").len(), 6);
+    for (now, then) in emulator.joints().0.iter().zip(start) {
+        assert!((now - then).abs() < 1e-3, "starting moves nothing");
+    }
+    home.dimos("move arm 0.3 -0.5 -0.9 0.1 1.3 -0.1 --speed 0.3").with(0);
+    let there = [0.3, -0.5, -0.9, 0.1, 1.3, -0.1];
+    for ((now, plant), then) in home.positions("arm").iter().zip(emulator.joints().0).zip(there) {
+        assert!((now - then).abs() < 0.01 && (plant - then).abs() < 0.01, "{now} {plant} {then}");
+    }
+    home.dimos("move arm 2.0 -0.5 -0.9 0.1 1.3 -0.1 --speed 0.2 --no-wait").with(0);
+    eventually("it moves", || emulator.joints().0[0] > 0.5);
+    home.dimos("stop --json").with(0);
+    eventually("it stands", || emulator.joints().1.iter().all(|v| v.abs() < 1e-3));
+    let stopped = emulator.joints().0[0];
+    assert!(stopped < 1.9, "{stopped}");
+    run.end(Signal::INT).with(130);
+    assert!((emulator.joints().0[0] - stopped).abs() < 0.01, "leaving moves nothing");
+    shim.end(Signal::INT).with(0);
 }
 
 // --- What is not right ---

@@ -2,7 +2,6 @@
     python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock
 """
 import argparse, enum, importlib, json, os, select, signal, socket, sys, time, types
-
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after so long without a request [s]; bytes of a line
 FEEDBACK, EXTRAS = ["read_joint_velocities", "read_joint_efforts"], ["modes", "gripper_range", "holds_when_disabled"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",
@@ -76,6 +75,7 @@ class Arm:  # the adapter, called from one thread only
                 self.call("write_joint_velocities" if velocity else "write_joint_positions", *args)
             except Exception as e:
                 refused = str(e) or repr(e)
+        time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # who asks again waits for something new
         if time.monotonic() >= self.due:
             self.state["read_joint_positions"] = self.adapter.read_joint_positions()
             self.state["time"], self.due = time.monotonic_ns(), time.monotonic() + 0.5 / self.hz

@@ -119,6 +119,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.assumed_enabled = false;
         let mut session = Session::open(&self.address, self.dof)?;
         self.mode = session.recent()??.mode.unwrap_or_default();
+        session.newest()??; // asks for the next state, which then comes without being asked for
         self.last = Some(session.description.clone());
         self.session = Some(session);
         Ok(())

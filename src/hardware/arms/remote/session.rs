@@ -121,7 +121,8 @@ impl Session {
         let mut link = Link::connect(address, CONNECT_TIMEOUT)?;
         let mut line = Vec::with_capacity(LINE);
         protocol::hello(1, dof, &mut line);
-        link.send(&line)?;
+        // Who is turned away may find the connection closed already; the reason can be read all the same.
+        let _ = link.send(&line);
         let description = introduction(&mut link)?;
         let (peer, found) = (link.peer().to_owned(), description.dof);
         if found != dof {

@@ -42,6 +42,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Estop,
     FaultKind::Nan,
     FaultKind::WrongDof,
+    FaultKind::Frozen,
 ];
 
 /// A peer that serves an adapter until it is dropped.

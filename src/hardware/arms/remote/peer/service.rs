@@ -27,6 +27,8 @@ pub struct Service {
     /// The error that is played, and until when it cannot be cleared.
     error: i32,
     error_until: Instant,
+    /// The reading that is repeated, while that is played.
+    frozen: Option<JointReading>,
     script: FaultScript,
     first_hello: Option<Instant>,
 }
@@ -41,6 +43,7 @@ impl Service {
             commanded: false,
             error: 0,
             error_until: Instant::now(),
+            frozen: None,
             script: FaultScript::new(faults),
             first_hello: None,
         }
@@ -203,6 +206,11 @@ impl Service {
         self.adapter.read_joints(&mut reading)?;
         if self.strikes(FaultKind::Nan).is_some() || !reading.position.iter().all(|v| v.is_finite()) {
             return Err(AdapterError::Protocol("the position of a joint is not a number".to_owned()));
+        }
+        if self.strikes(FaultKind::Frozen).is_some() {
+            reading = *self.frozen.get_or_insert(reading);
+        } else {
+            self.frozen = None;
         }
         let own = self.adapter.read_error()?;
         let (code, text) = if self.error == 0 { own } else { (self.error, self.error_text()) };
