@@ -185,21 +185,13 @@ impl Reader {
     }
 }
 
-/// A crate is built where dimos is, with the versions and the settings of dimos, so that nothing is compiled twice.
+/// A crate is built where dimos is, with its versions, so that nothing is compiled twice.
 fn share_builds(folder: &Path) {
-    let (manifest, root) = (folder.join("Cargo.toml"), Path::new(env!("CARGO_MANIFEST_DIR")));
-    if !manifest.is_file() || folder.join("target").exists() {
-        return;
+    if folder.join("Cargo.toml").is_file() && !folder.join("target").exists() {
+        std::fs::copy(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.lock"), folder.join("Cargo.lock")).unwrap();
+        let built = Path::new(env!("CARGO_BIN_EXE_dimos")).ancestors().nth(2).unwrap();
+        std::os::unix::fs::symlink(built, folder.join("target")).unwrap();
     }
-    let ours = std::fs::read_to_string(root.join("Cargo.toml")).unwrap();
-    let profiles = &ours[ours.find("[profile.").unwrap()..];
-    let theirs = std::fs::read_to_string(&manifest).unwrap();
-    let before = theirs.split("[profile.").next().unwrap();
-    let dimos = "[profile.dev.package.dimos]\nopt-level = 0\n";
-    std::fs::write(manifest, format!("{before}{profiles}\n{dimos}")).unwrap();
-    std::fs::copy(root.join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
-    let built = Path::new(env!("CARGO_BIN_EXE_dimos")).ancestors().nth(2).unwrap();
-    std::os::unix::fs::symlink(built, folder.join("target")).unwrap();
 }
 
 /// A copy of what is needed of this checkout.

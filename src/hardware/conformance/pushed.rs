@@ -34,6 +34,17 @@ fn readable(context: &Context, limit: Duration) -> Result<bool, String> {
     poll(&mut fds, Some(&timeout)).map(|n| n > 0).map_err(|e| format!("poll of state_fd: {e}"))
 }
 
+/// Waits for the next state as the device thread does, which also reads when a period has passed without news.
+fn news(context: &mut Context) -> Result<(), String> {
+    let period = Duration::from_secs_f64(1.0 / context.adapter.get_info().native_rate);
+    let end = MonotonicClock.now().after(PATIENCE);
+    while !readable(context, period)? {
+        require(MonotonicClock.now() < end, || format!("nothing came for {PATIENCE:?}"))?;
+        stamp(context)?;
+    }
+    Ok(())
+}
+
 /// One reading's stamp, which such a device must give.
 fn stamp(context: &mut Context) -> Result<Mono, String> {
     let mut reading = JointReading::default();
@@ -49,7 +60,7 @@ fn wakes(context: &mut Context) -> Result<(), String> {
     let first = stamp(context)?;
     let (mut last, mut news) = (first, 0);
     for _ in 0..TRIES {
-        require(readable(context, PATIENCE)?, || format!("nothing came for {PATIENCE:?}"))?;
+        news(context)?;
         let now = stamp(context)?;
         news += usize::from(now > last);
         last = now;
@@ -66,7 +77,7 @@ fn drains(context: &mut Context) -> Result<(), String> {
     }
     let mut quiet = 0;
     for _ in 0..TRIES {
-        require(readable(context, PATIENCE)?, || format!("nothing came for {PATIENCE:?}"))?;
+        news(context)?;
         // Some room, so that more than one packet may be waiting.
         std::thread::sleep(Duration::from_millis(5));
         stamp(context)?;
@@ -84,7 +95,7 @@ fn never_waits(context: &mut Context) -> Result<(), String> {
     }
     let (mut same, mut times) = (0, Vec::with_capacity(TRIES));
     for _ in 0..TRIES {
-        require(readable(context, PATIENCE)?, || format!("nothing came for {PATIENCE:?}"))?;
+        news(context)?;
         let before = stamp(context)?;
         let began = MonotonicClock.now();
         let after = stamp(context)?;
