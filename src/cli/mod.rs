@@ -13,6 +13,7 @@ pub mod down;
 pub mod execute;
 pub mod exit;
 mod follow;
+mod goal;
 pub mod list_adapters;
 pub mod list_blueprints;
 pub mod logs;
@@ -20,6 +21,8 @@ pub mod man;
 pub mod model;
 pub mod move_to;
 pub mod output;
+pub mod plan;
+pub mod preview;
 pub mod replay;
 pub mod run;
 pub mod run_record;
@@ -31,6 +34,7 @@ mod targets;
 pub mod task;
 mod text_log;
 mod trajectory_file;
+pub mod world;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -67,9 +71,15 @@ enum Command {
     State(state::Args),
     /// Move an arm to joint positions, and wait until it is there
     Move(move_to::Args),
-    /// Follow a trajectory from a file (JSON or CSV), and wait for its end
+    /// Plan a collision-free motion and show it; moves nothing
+    Plan(plan::Args),
+    /// Show a plan moment by moment, or write its trajectory to a file
+    Preview(preview::Args),
+    /// Carry out the newest plan, or a trajectory from a file (JSON or CSV), and wait for its end
     Execute(execute::Args),
-    /// End running motions by decelerating
+    /// The obstacles that the planner keeps clear of: list, add, move, remove, load, attach, detach
+    World(world::Args),
+    /// End running motions by decelerating, and planning
     Cancel(cancel::Args),
     /// Hold arms at once and keep them held until `arm reset`: an operational stop
     Stop(stop::Args),
@@ -166,7 +176,10 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
         Command::Move(args) => move_to::run(args),
+        Command::Plan(args) => plan::run(args),
+        Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),
+        Command::World(args) => world::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Stop(args) => stop::run(args),
         Command::Arm(args) => arm::run(args),

@@ -9,10 +9,12 @@
 
 pub mod builtin;
 mod joint_limits;
+pub mod kinematics;
 mod load;
 pub mod mesh;
 pub mod model;
 pub mod packages;
+pub mod random;
 pub mod srdf;
 pub mod urdf;
 pub mod xacro;
