@@ -16,6 +16,7 @@ pub mod list_adapters;
 pub mod list_blueprints;
 pub mod logs;
 pub mod man;
+pub mod model;
 pub mod move_to;
 pub mod output;
 pub mod replay;
@@ -86,6 +87,8 @@ enum Command {
     Check(check::Args),
     /// Print the JSON Schema of blueprints, for editors
     Schema(schema::Args),
+    /// Look into robot descriptions: joints, limits, shapes, mistakes
+    Model(model::Args),
     /// Check this computer: real time, permissions, clock, disk, CAN links
     Doctor(doctor::Args),
     /// Print completions for a shell
@@ -119,6 +122,7 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
+        Command::Model(args) => model::run(args),
         Command::Schema(args) => schema::run(args, &registry),
         Command::Replay(args) => {
             return match replay::run(args, &registry) {
