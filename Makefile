@@ -2,6 +2,8 @@
 
 PYTHON ?= python3
 READERS := tests/readers
+SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
+SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
 .PHONY: run install check test test-tools test-rerun bench jitter
 
@@ -26,10 +28,11 @@ test:
 	else cargo test --locked --lib --bins --tests; \
 	fi
 
-# The tools that tests compare with: cyclictest (as root), and other people's readers of logs.
+# What tests compare with and run in: other people's readers of logs; as root, also cyclictest, and a guest kernel that
+# has CAN, with the tools for its interfaces.
 test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json
-	@if [ "$$(id -u)" = 0 ] && ! command -v cyclictest >/dev/null; \
-	then apt-get update -q && apt-get install -qy --no-install-recommends rt-tests; \
+	@if [ "$$(id -u)" = 0 ]; then missing=; for tool in $(SYSTEM_TOOLS); do command -v $$tool >/dev/null || missing=yes; done; \
+	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
 	fi
 
 .venv/readers-installed: $(READERS)/requirements.txt

@@ -6,8 +6,10 @@ mod fake_arms;
 use std::fs;
 use std::path::Path;
 
-use dimos::blueprint::{Origin, Overrides, SearchPath, Source, Summary, find, json_schema, load_from, reference};
-use dimos::hardware::registry::Registry;
+use dimos::blueprint::{
+    Found, Origin, Overrides, SearchPath, Source, Summary, find, json_schema, load_from, reference,
+};
+use dimos::hardware::registry::{Absent, Registry};
 
 /// Two folders: the first has `one` and a broken one, the second has another `one` and `two`.
 fn folders() -> (tempfile::TempDir, SearchPath) {
@@ -140,4 +142,22 @@ fn the_reference_has_the_adapters_options() {
     assert!(page.contains("## `options` of `yourarm`") && page.contains("How long to wait for an answer [s]."));
     assert!(page.contains("## `options` of `mock`\n\nan arm in memory. Address: `none`.\n\nIt has no keys."), "{page}");
     assert!(!reference(&Registry::default()).contains("`options` of"));
+}
+
+#[test]
+fn an_adapter_of_another_build_is_told_with_the_way_to_get_it() {
+    let absent = Absent { name: "servobot", about: "a serial arm", remedy: "build with --features servobot" };
+    let text = "hardware: [{hardware_id: arm, adapter_type: servobot, joints: {prefix: arm, count: 6}}]\n\
+                tasks: [{name: t, type: trajectory, joint_names: {hardware: arm}}]\n";
+    let answer = |registry: &Registry| {
+        let found = Found { name: "absent".to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() };
+        load_from(&SearchPath::default(), &found, &Overrides::default(), registry).render(false)
+    };
+    let said = answer(&Registry::builtin().lacking(&[absent]));
+    assert!(said.contains("error: adapter `servobot` is not in this build"), "{said}");
+    assert!(said.contains("hint: build with --features servobot"), "{said}");
+    assert!(said.ends_with("1 error\n"), "nothing else: {said}");
+    assert!(answer(&Registry::builtin()).contains("there is no adapter `servobot`"));
+    let there = fake_arms::registry().lacking(&[absent]);
+    assert_eq!(there.absent().count(), 0, "a row is a row");
 }

@@ -3,7 +3,7 @@
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-use dimos::hardware::conformance::{Outcome, checks, run};
+use dimos::hardware::conformance::{Outcome, Subject, checks, run_all};
 use dimos::hardware::registry::Registry;
 
 /// Counts the allocations of each thread.
@@ -38,13 +38,8 @@ fn every_adapter_conforms() {
     assert!(!registry.rows().is_empty());
     let mut failures = Vec::new();
     for row in registry.rows() {
-        // The checks mostly wait for motion, so those of a row run side by side.
-        let outcomes: Vec<_> = std::thread::scope(|scope| {
-            let threads: Vec<_> =
-                checks().map(|check| (check, scope.spawn(|| run(row, check, Some(allocations))))).collect();
-            threads.into_iter().map(|(check, thread)| (check, thread.join().unwrap())).collect()
-        });
-        for (check, outcome) in outcomes {
+        let subject = Subject { allocations: Some(allocations), ..Subject::emulated(row) };
+        for (check, outcome, _) in run_all(&subject, &checks().collect::<Vec<_>>(), &|_, _| (), &|| false) {
             match outcome {
                 Outcome::Passed => println!("{:10} {:32} passed", row.name, check.name),
                 Outcome::Skipped(why) => println!("{:10} {:32} does not apply: {why}", row.name, check.name),

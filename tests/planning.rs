@@ -23,8 +23,8 @@ use dimos::robot::kinematics::Kinematics;
 use dimos::robot::packages::Packages;
 use dimos::robot::random::Random;
 use dimos::trajectory::{Cursor, Sample, Spline};
-use python::ask_python;
 use problems::{Arm, Problem, Shapes, load};
+use python::ask_python;
 use serde_json::json;
 use shared::shared;
 

@@ -194,9 +194,15 @@ fn adapter(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>) -> Option<
     }
     let row = checker.adapters.get(&entry.adapter_type).copied();
     if row.is_none() {
-        let diag = Diag::error(format!("there is no adapter {}", quote(&entry.adapter_type)));
-        let hint = did_you_mean(&entry.adapter_type, checker.adapters.names(), "there are");
-        checker.error(entry.adapter_type.at, diag.maybe_hint(hint));
+        let name = quote(&entry.adapter_type);
+        let diag = match checker.adapters.absent().find(|absent| absent.name == entry.adapter_type.value) {
+            Some(absent) => Diag::error(format!("adapter {name} is not in this build")).hint(absent.remedy),
+            None => {
+                let hint = did_you_mean(&entry.adapter_type, checker.adapters.names(), "there are");
+                Diag::error(format!("there is no adapter {name}")).maybe_hint(hint)
+            }
+        };
+        checker.error(entry.adapter_type.at, diag);
     }
     row
 }

@@ -25,7 +25,7 @@ pub use json_schema::json_schema;
 pub use limits::JointOverride;
 pub use load::{Loaded, Overrides, load, load_from};
 pub use reference::reference;
-pub use registry::{FindError, Found, Listing, SearchPath, Source, find, list};
+pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list};
 pub use resolve::{Arm, Blueprint, Task, TaskKind};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

@@ -1,8 +1,9 @@
 //! Which file a blueprint's name stands for.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::{env, fs, io};
 
 use serde::Serialize;
@@ -13,6 +14,20 @@ use crate::yaml::{MAX_BYTES, did_you_mean, quote};
 
 /// Names and texts of the blueprints in the binary, made by `build.rs` from `blueprints/`.
 const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints.rs"));
+
+/// Those that the program which embeds this crate brings along.
+static MORE: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
+
+/// Lets the names of `more` stand for their texts, like the blueprints in the box and before those of the same name. For
+/// `main`, once, before anything else.
+pub fn embed(more: Vec<(&'static str, &'static str)>) {
+    let _ = MORE.set(more);
+}
+
+/// All blueprints in the program, by name.
+fn embedded() -> BTreeMap<&'static str, &'static str> {
+    EMBEDDED.iter().chain(MORE.get().into_iter().flatten()).copied().collect()
+}
 
 /// Where a blueprint comes from.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -62,8 +77,8 @@ impl Found {
     }
 
     fn embedded(name: &str) -> Option<Self> {
-        let (name, text) = EMBEDDED.iter().find(|(n, _)| *n == name)?;
-        Some(Self { name: (*name).to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() })
+        let text = embedded().remove(name)?;
+        Some(Self { name: name.to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() })
     }
 
     fn file_at(path: &Path) -> io::Result<Self> {
@@ -167,8 +182,8 @@ impl SearchPath {
                 }
             }
         }
-        let embedded = EMBEDDED.iter().filter(|(name, _)| !seen.contains(*name));
-        out.extend(embedded.map(|(name, _)| ((*name).to_owned(), Source::Embedded)));
+        let embedded = embedded().into_keys().filter(|name| !seen.contains(*name));
+        out.extend(embedded.map(|name| (name.to_owned(), Source::Embedded)));
         out.sort();
         out
     }

@@ -4,7 +4,7 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::hardware::registry::{Absent, AdapterSpec, Registry};
 
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
@@ -21,7 +21,7 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     if args.json {
-        output::json(&registry.rows().iter().map(to_json).collect::<Vec<_>>());
+        output::json(&registry.rows().iter().map(to_json).chain(registry.absent().map(lacking)).collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
     let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS"]);
@@ -37,11 +37,20 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
             if row.holds_when_disabled { "yes" } else { "no, falls" }.to_owned(),
         ]);
     }
+    for absent in registry.absent() {
+        let nothing = ["-"; 6].map(str::to_owned);
+        table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
+    }
     table.print();
     for row in registry.rows() {
         output::line("");
         output::line(format_args!("{}: {}", row.name, row.about));
         output::line(format_args!("  modes: {}", modes(row).join(", ")));
+    }
+    for absent in registry.absent() {
+        output::line("");
+        output::line(format_args!("{}: {}", absent.name, absent.about));
+        output::line(format_args!("  not in this build: {}", absent.remedy));
     }
     Ok(Exit::Ok)
 }
@@ -61,6 +70,7 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
     json!({
         "name": row.name,
         "about": row.about,
+        "in_this_build": true,
         "level": row.level.name(),
         "transport": row.transport,
         "dof": {"min": row.dof.0, "max": row.dof.1},
@@ -72,4 +82,9 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
         "gripper": row.gripper,
         "emulator": row.emulate.is_some(),
     })
+}
+
+/// An adapter that is not in this build has a way to get it, and nothing else.
+fn lacking(absent: &Absent) -> serde_json::Value {
+    json!({"name": absent.name, "about": absent.about, "in_this_build": false, "remedy": absent.remedy})
 }

@@ -1,5 +1,6 @@
 //! The command line: one file per verb. stdout is data, stderr is diagnostics; exit codes are a contract ([`exit`]).
 
+pub mod adapter;
 pub mod arguments;
 pub mod arm;
 pub mod banner;
@@ -36,7 +37,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::blueprint;
+use crate::hardware::registry::{Absent, AdapterSpec, Registry};
 
 const AFTER_HELP: &str = "\
 Start with:  dimos run coordinator-yourarm
@@ -79,6 +81,8 @@ enum Command {
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
+    /// Bring your own arm: the start of an adapter for it
+    Adapter(adapter::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),
     /// List the blueprints that `run` finds by name
@@ -99,13 +103,66 @@ enum Command {
     Replay(replay::ReplayArgs),
 }
 
-/// Runs the command line, with more adapters than those in the box. What `main` of an embedding program calls.
+/// The whole program, with what another crate adds to it.
+///
+/// ```no_run
+/// use std::process::ExitCode;
+/// use dimos::hardware::registry::AdapterSpec;
+///
+/// # mod acme { pub const SPEC: dimos::hardware::registry::AdapterSpec = dimos::hardware::arms::mock::SPEC; }
+/// fn main() -> ExitCode {
+///     let blueprint = "hardware: [{hardware_id: arm, adapter_type: acme, joints: {prefix: arm, count: 6}}]";
+///     dimos::cli::Program::new().adapter(acme::SPEC).blueprint("coordinator-acme", blueprint).main()
+/// }
+/// ```
+#[derive(Debug, Clone, Default)]
+pub struct Program {
+    adapters: Vec<AdapterSpec>,
+    absent: Vec<Absent>,
+    blueprints: Vec<(&'static str, &'static str)>,
+}
+
+impl Program {
+    /// The program as it is.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds an adapter; it wins over one of the same name in the box.
+    pub fn adapter(mut self, row: AdapterSpec) -> Self {
+        self.adapters.push(row);
+        self
+    }
+
+    /// Names an adapter that this build does not have, and the way to get it.
+    pub fn absent(mut self, row: Absent) -> Self {
+        self.absent.push(row);
+        self
+    }
+
+    /// Adds a blueprint that is run by name, wherever the program is started: its name, and its text in YAML.
+    pub fn blueprint(mut self, name: &'static str, text: &'static str) -> Self {
+        self.blueprints.push((name, text));
+        self
+    }
+
+    /// Runs the command line: what `main` does.
+    pub fn main(self) -> ExitCode {
+        blueprint::embed(self.blueprints);
+        command_line(&Registry::with(&self.adapters).lacking(&self.absent))
+    }
+}
+
+/// Runs the command line with more adapters than those in the box. [`Program`] can add more than that.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
+    command_line(&Registry::with(adapters))
+}
+
+fn command_line(registry: &Registry) -> ExitCode {
     // Usage errors, `--help` and `--version` end here, with 2 or 0.
     let cli = Cli::parse_from(std::env::args_os().map(spelled_out));
-    let registry = Registry::with(adapters);
     let result = match &cli.command {
-        Command::Run(args) => run::run(args, &registry),
+        Command::Run(args) => run::run(args, registry),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
         Command::Move(args) => move_to::run(args),
@@ -116,16 +173,17 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
         Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),
         Command::Logs(args) => logs::run(args),
-        Command::ListAdapters(args) => list_adapters::run(args, &registry),
-        Command::ListBlueprints(args) => list_blueprints::run(args, &registry),
-        Command::Check(args) => check::run(args, &registry),
+        Command::Adapter(args) => adapter::run(args, registry),
+        Command::ListAdapters(args) => list_adapters::run(args, registry),
+        Command::ListBlueprints(args) => list_blueprints::run(args, registry),
+        Command::Check(args) => check::run(args, registry),
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
         Command::Model(args) => model::run(args),
-        Command::Schema(args) => schema::run(args, &registry),
+        Command::Schema(args) => schema::run(args, registry),
         Command::Replay(args) => {
-            return match replay::run(args, &registry) {
+            return match replay::run(args, registry) {
                 Ok(code) => ExitCode::from(code),
                 Err(e) => {
                     output::failure(&exit::Failure::new(exit::Exit::Failed, e.to_string()));

@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
-use crate::joint::{ControlMode, JointLimits};
+use crate::joint::{ControlMode, JointLimits, Joints};
 use crate::yaml;
 
 /// How far an adapter has been proven without its hardware.
@@ -89,6 +89,10 @@ pub trait Emulator: Send {
     fn address(&self) -> String;
     /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that it can play.
     fn inject(&self, fault: Fault) -> Result<(), String>;
+    /// Where the joints truly are behind the wire [rad], for checks and for people; `None` when it does not tell.
+    fn true_positions(&self) -> Option<Joints> {
+        None
+    }
 }
 
 /// Where an emulator listens, as far as the arm's transport has a choice.
@@ -177,12 +181,13 @@ pub const SIM: &str = "sim";
 #[derive(Debug, Clone, Default)]
 pub struct Registry {
     rows: Vec<AdapterSpec>,
+    absent: Vec<Absent>,
 }
 
 impl Registry {
     /// The arms in the box.
     pub fn builtin() -> Self {
-        Self { rows: crate::hardware::arms::TABLE.to_vec() }
+        Self { rows: crate::hardware::arms::TABLE.to_vec(), absent: crate::hardware::arms::ABSENT.to_vec() }
     }
 
     /// The arms in the box and `more`, which win over rows of the same name.
@@ -191,6 +196,17 @@ impl Registry {
         registry.rows.retain(|row| !more.iter().any(|m| m.name == row.name));
         registry.rows.extend_from_slice(more);
         registry
+    }
+
+    /// The same table, that also knows of adapters which this build does not have.
+    pub fn lacking(mut self, more: &[Absent]) -> Self {
+        self.absent.extend_from_slice(more);
+        self
+    }
+
+    /// The adapters that this build does not have.
+    pub fn absent(&self) -> impl Iterator<Item = &Absent> {
+        self.absent.iter().filter(|absent| self.get(absent.name).is_none())
     }
 
     /// All rows, in table order.
@@ -257,7 +273,11 @@ pub fn emulate(name: &str, dof: usize) -> AdapterResult<Box<dyn Emulator>> {
 fn builtin(name: &str) -> AdapterResult<&'static AdapterSpec> {
     let table = crate::hardware::arms::TABLE;
     table.iter().find(|row| row.name == name).ok_or_else(|| {
-        AdapterError::Rejected(format!("no adapter named {name:?}; there are {}", available().join(", ")))
+        let absent = crate::hardware::arms::ABSENT.iter().find(|absent| absent.name == name);
+        AdapterError::Rejected(match absent {
+            Some(absent) => format!("adapter {name} is not in this build\nhint: {}", absent.remedy),
+            None => format!("no adapter named {name:?}; there are {}", available().join(", ")),
+        })
     })
 }
 

@@ -48,8 +48,6 @@ pub struct BroughtUp {
     pub slots: Slots,
     /// What each arm said of itself, and its effective limits.
     pub connected: Vec<(Connected, JointLimits)>,
-    /// From when on a state is stale, per arm.
-    pub state_timeouts: Vec<Duration>,
 }
 
 /// Connects all arms at once, or none: on the first that fails, all others are let go again.
@@ -62,7 +60,6 @@ pub fn bring_up(
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
     let mut arms = Arms { devices: Vec::new(), disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
     let mut slots = Slots::default();
-    let mut state_timeouts = Vec::new();
     for (index, arm) in blueprint.arms.iter().enumerate() {
         let config = configure(arm, &mut arms)?;
         let adapter = (arm.adapter.create)(&config).map_err(|e| hardware(arm, &e))?;
@@ -80,7 +77,6 @@ pub fn bring_up(
             clock: Arc::new(MonotonicClock),
             notes: Box::new(move |what| note(index, what)),
         };
-        state_timeouts.push(device.state_timeout());
         let thread = |e| StartError::other(format!("no device thread for {}: {e}", arm.hardware_id), "see ulimit -u");
         arms.devices.push(Arc::new(Device::spawn(device, adapter, state_writer, command_reader).map_err(thread)?));
         arms.disable.push(arm.on_exit == OnExit::Disable);
@@ -105,7 +101,7 @@ pub fn bring_up(
             }
         }
     }
-    Ok(BroughtUp { arms, slots, connected, state_timeouts })
+    Ok(BroughtUp { arms, slots, connected })
 }
 
 /// Locks the device or starts its emulator; answers what the adapter is made from.

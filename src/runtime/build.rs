@@ -60,9 +60,8 @@ impl Run {
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
         let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
-        let BroughtUp { mut arms, slots, connected, state_timeouts } =
-            arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
-        let config = coordinator_config(blueprint, &connected, &state_timeouts);
+        let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
+        let config = coordinator_config(blueprint, &connected);
 
         let samples = ring_size(&config);
         let (mut sample_producer, mut sample_consumer) = rtrb::RingBuffer::new(samples);
@@ -288,19 +287,18 @@ fn names_of(blueprint: &Blueprint) -> Names {
 fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, crate::joint::JointLimits)],
-    state_timeouts: &[Duration],
 ) -> CoordinatorConfig {
-    let arms = blueprint.arms.iter().zip(connected).zip(state_timeouts);
+    let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
         rate: blueprint.coordinator.tick_rate,
         arms: arms
-            .map(|((arm, (said, limits)), timeout)| ArmConfig {
+            .map(|(arm, (said, limits))| ArmConfig {
                 name: arm.hardware_id.clone(),
                 dof: arm.joints.len().min(MAX_DOF),
                 limits: limits.clone(),
                 modes: said.info.modes.to_vec(),
                 gripper: arm.adapter.gripper,
-                state_timeout: *timeout,
+                state_timeout: said.state_timeout,
             })
             .collect(),
         tasks: blueprint

@@ -10,7 +10,7 @@ mod arm_requests;
 mod arms;
 mod build;
 mod builder;
-mod device_lock;
+pub(crate) mod device_lock;
 mod dispatch;
 mod handle;
 mod in_process;

@@ -165,6 +165,11 @@ impl Started {
         }
     }
 
+    /// Whether it has ended, or at least will say no more.
+    pub fn over(&self) -> bool {
+        self.readers.iter().all(JoinHandle::is_finished)
+    }
+
     pub fn signal(&self, signal: Signal) {
         kill_process(Pid::from_raw(self.pid() as i32).unwrap(), signal).unwrap();
     }

@@ -10,7 +10,11 @@ pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> O
     let python = root.join(".venv/bin/python");
     let has = Command::new(&python).args(["-c", &format!("import {module}")]).stderr(Stdio::null()).status();
     if !has.is_ok_and(|s| s.success()) {
-        assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "Python's {module} is missing (make test-tools)");
+        assert_ne!(
+            std::env::var("DIMOS_NO_SKIP").as_deref(),
+            Ok("1"),
+            "Python's {module} is missing (make test-tools)"
+        );
         println!("SKIPPED: Python's {module} (make test-tools)");
         return None;
     }

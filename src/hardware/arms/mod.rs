@@ -3,10 +3,24 @@
 use crate::hardware::registry::{Absent, AdapterSpec};
 
 pub mod mock;
+#[cfg(feature = "can")]
+pub mod piper;
+pub mod remote;
+pub mod xarm;
 pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC];
+pub const TABLE: &[AdapterSpec] = &[
+    mock::SPEC,
+    yourarm::SPEC,
+    xarm::SPEC,
+    #[cfg(feature = "can")]
+    piper::SPEC,
+    remote::SPEC,
+];
 
 /// The adapters that this build does not have.
-pub const ABSENT: &[Absent] = &[];
+pub const ABSENT: &[Absent] = &[
+    #[cfg(not(feature = "can"))]
+    Absent { name: "piper", about: "AgileX Piper, 6 joints and gripper", remedy: "build with --features can" },
+];

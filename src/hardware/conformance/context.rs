@@ -1,7 +1,9 @@
 //! What a check works with: an adapter, the emulator it talks to, and the usual steps.
 
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
@@ -9,8 +11,35 @@ use crate::joint::{ControlMode, JointLimits};
 
 /// Longest wait for something that must happen.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// When a fault of an arm without an emulator strikes: time since the connection [s].
-const STRIKES_AT: f64 = 0.5;
+/// When the first fault of an arm without an emulator strikes, and how much later each further one: time since the
+/// connection [s].
+const STRIKES_AT: f64 = 1.0;
+
+/// What the checks are made on.
+#[derive(Debug, Clone)]
+pub struct Subject {
+    /// The row of the arm.
+    pub row: AdapterSpec,
+    /// What the adapter is made from. The address is only used with a real device.
+    pub config: AdapterConfig,
+    /// A real device stands at the address: nothing may be done to it that a check for emulators does.
+    pub real: bool,
+    /// Counts the calling thread's allocations so far, where the program has a counting allocator.
+    pub allocations: Option<fn() -> u64>,
+}
+
+impl Subject {
+    /// The emulator of a row, with as many joints as the row allows at most and default options.
+    pub fn emulated(row: &AdapterSpec) -> Self {
+        let config = AdapterConfig {
+            hardware_id: "conformance".into(),
+            address: String::new(),
+            dof: row.dof.1,
+            options: serde_json::json!({}),
+        };
+        Self { row: *row, config, real: false, allocations: None }
+    }
+}
 
 /// An adapter that is not connected yet, and the other end of its wire.
 pub struct Context {
@@ -18,33 +47,36 @@ pub struct Context {
     pub row: AdapterSpec,
     /// What the adapter was made from.
     pub config: AdapterConfig,
-    /// The other end of the wire; `None` where the adapter is its own plant.
+    /// The other end of the wire; `None` where the adapter is its own plant, or the device is real.
     pub emulator: Option<Box<dyn Emulator>>,
     /// The adapter under test.
     pub adapter: Box<dyn ManipulatorAdapter>,
     /// Counts the thread's allocations so far.
     pub allocations: Option<fn() -> u64>,
+    /// A real device, with noise in what it measures.
+    pub real: bool,
     /// Why the check does not apply.
     pub(super) skipped: Option<String>,
-    fault: Option<Fault>,
+    /// What comes of the check, for people.
+    pub(super) found: Option<String>,
+    faults: VecDeque<Fault>,
 }
 
 impl Context {
-    /// A fresh adapter with as many joints as the row allows at most, default options, and a fresh emulator.
-    pub(super) fn new(row: &AdapterSpec, allocations: Option<fn() -> u64>) -> Result<Self, String> {
-        let mut config = AdapterConfig {
-            hardware_id: "conformance".into(),
-            address: String::new(),
-            dof: row.dof.1,
-            options: serde_json::json!({}),
+    /// A fresh adapter, and a fresh emulator where the device is not real.
+    pub(super) fn new(subject: &Subject) -> Result<Self, String> {
+        let (row, mut config) = (subject.row, subject.config.clone());
+        let emulator = match row.emulate.filter(|_| !subject.real) {
+            Some(start) => Some(start(&config, &Place::InProcess).map_err(|e| e.to_string())?),
+            None => None,
         };
-        let emulator =
-            row.emulate.map(|start| start(&config, &Place::InProcess)).transpose().map_err(|e| e.to_string())?;
         if let Some(emulator) = &emulator {
             config.address = emulator.address();
         }
         let adapter = (row.create)(&config).map_err(|e| format!("cannot be made: {e}"))?;
-        Ok(Self { row: *row, config, emulator, adapter, allocations, skipped: None, fault: None })
+        let (allocations, real) = (subject.allocations, subject.real);
+        let faults = VecDeque::new();
+        Ok(Self { row, config, emulator, adapter, allocations, real, skipped: None, found: None, faults })
     }
 
     /// Ends a check that does not apply.
@@ -53,27 +85,44 @@ impl Context {
         Ok(())
     }
 
-    /// Prepares a fault; `false` when the arm's double cannot play it. Comes first in a check.
-    pub fn prepare(&mut self, fault: Fault) -> bool {
-        let playable = match &self.emulator {
-            // A fault in the far future only asks whether it is playable.
-            Some(emulator) => emulator.inject(fault.at(1e6)).is_ok(),
-            None => {
-                let script = serde_json::to_value(fault.at(STRIKES_AT)).unwrap_or_default();
-                self.config.options = serde_json::json!({ "faults": [script] });
-                (self.row.create)(&self.config).is_ok_and(|adapter| {
-                    self.adapter = adapter;
-                    true
-                })
-            }
-        };
-        self.fault = Some(fault);
-        playable
+    /// Notes what was found, for the report.
+    pub fn found(&mut self, what: impl Into<String>) -> Result<(), String> {
+        self.found = Some(what.into());
+        Ok(())
     }
 
-    /// Lets the prepared fault happen, now or soon.
+    /// How far a joint at rest may seem to move [rad]: nothing but rounding, or a real encoder's noise.
+    pub fn rest(&self) -> f64 {
+        if self.real { 0.002 } else { 1e-6 }
+    }
+
+    /// Prepares a fault; `false` when the arm's double cannot play it. Comes first in a check; faults strike in the
+    /// order in which they were prepared.
+    pub fn prepare(&mut self, fault: Fault) -> bool {
+        if self.real {
+            return false;
+        }
+        self.faults.push_back(fault);
+        if let Some(emulator) = &self.emulator {
+            // A fault in the far future only asks whether it is playable.
+            return emulator.inject(fault.at(1e6)).is_ok();
+        }
+        let script = self.faults.iter().enumerate().map(|(i, fault)| fault.at(STRIKES_AT * (i + 1) as f64));
+        let script = serde_json::to_value(script.collect::<Vec<_>>()).unwrap_or_default();
+        let mut config = self.config.clone();
+        match config.options.as_object_mut() {
+            Some(options) => drop(options.insert("faults".to_owned(), script)),
+            None => config.options = serde_json::json!({ "faults": script }),
+        }
+        (self.row.create)(&config).is_ok_and(|adapter| {
+            self.adapter = adapter;
+            true
+        })
+    }
+
+    /// Lets the next prepared fault happen, now or soon.
     pub fn strike(&mut self) -> Result<(), String> {
-        match (&self.emulator, self.fault.take()) {
+        match (&self.emulator, self.faults.pop_front()) {
             (Some(emulator), Some(fault)) => emulator.inject(fault),
             _ => Ok(()),
         }
@@ -87,22 +136,67 @@ impl Context {
     /// Connects, activates and sets a mode.
     pub fn ready(&mut self, mode: ControlMode) -> Result<(), String> {
         self.connect()?;
+        self.activate()?;
+        self.set_mode(mode).map_err(|e| format!("set_control_mode {}: {e}", mode.name()))
+    }
+
+    /// Brings the arm into a mode. As to the device thread, `Rejected` means: not yet, ask again.
+    pub fn set_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        let end = Instant::now() + PATIENCE;
+        loop {
+            let result = self.adapter.set_control_mode(mode);
+            if !matches!(result, Err(AdapterError::Rejected(_))) || Instant::now() > end {
+                return result;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// Activates, and waits for the motors as the device thread does.
+    pub fn activate(&mut self) -> Result<(), String> {
         self.adapter.activate().map_err(|e| format!("activate: {e}"))?;
-        self.adapter.set_control_mode(mode).map_err(|e| format!("set_control_mode {}: {e}", mode.name()))
+        self.until("the motors to come on", Self::enabled)
     }
 
-    /// Joint positions [rad].
+    /// The mode that the row names first.
+    pub fn first_mode(&self) -> ControlMode {
+        self.row.modes.first().copied().unwrap_or_default()
+    }
+
+    /// Joint positions [rad], measured after this call.
     pub fn positions(&mut self) -> Result<Vec<f64>, String> {
-        let mut positions = vec![0.0; self.config.dof];
-        self.steadily(|adapter| adapter.read_joint_positions(&mut positions), "read_joint_positions")?;
-        Ok(positions)
+        let reading = self.joints()?;
+        Ok(reading.position.get(..self.config.dof).unwrap_or_default().to_vec())
     }
 
-    /// All of the joints.
+    /// All of the joints, measured after this call.
     pub fn joints(&mut self) -> Result<JointReading, String> {
+        let asked = MonotonicClock.now();
+        loop {
+            let reading = self.read()?;
+            let pushed = self.adapter.state_fd().is_some();
+            match reading.stamp {
+                Some(stamp) if pushed && stamp < asked => {}
+                _ => return Ok(reading),
+            }
+            if MonotonicClock.now().since(asked) > PATIENCE {
+                return Err(format!("read_joints: no newer state within {PATIENCE:?}"));
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// One call of `read_joints`, which may be late twice on a busy machine.
+    fn read(&mut self) -> Result<JointReading, String> {
         let mut reading = JointReading::default();
-        self.steadily(|adapter| adapter.read_joints(&mut reading), "read_joints")?;
-        Ok(reading)
+        let mut result = self.adapter.read_joints(&mut reading);
+        for _ in 0..2 {
+            if !matches!(result, Err(AdapterError::Timeout(_))) {
+                break;
+            }
+            result = self.adapter.read_joints(&mut reading);
+        }
+        result.map(|()| reading).map_err(|e| format!("read_joints: {e}"))
     }
 
     /// The joint limits.
@@ -110,25 +204,34 @@ impl Context {
         self.adapter.get_limits().map_err(|e| format!("get_limits: {e}"))
     }
 
-    /// Whether the motors are on.
+    /// Whether the motors are on, as the device says after this call.
     pub fn enabled(&mut self) -> Result<bool, String> {
+        self.joints()?;
         self.adapter.read_enabled().map_err(|e| format!("read_enabled: {e}"))
     }
 
-    /// A call that may be late twice on a busy machine.
-    fn steadily(
-        &mut self,
-        mut call: impl FnMut(&mut dyn ManipulatorAdapter) -> AdapterResult<()>,
-        name: &str,
-    ) -> Result<(), String> {
-        let mut result = call(&mut *self.adapter);
-        for _ in 0..2 {
-            if !matches!(result, Err(AdapterError::Timeout(_))) {
-                break;
-            }
-            result = call(&mut *self.adapter);
-        }
-        result.map_err(|e| format!("{name}: {e}"))
+    /// The error code, as the device says after this call.
+    pub fn error(&mut self) -> Result<(i32, String), String> {
+        self.joints()?;
+        self.adapter.read_error().map_err(|e| format!("read_error: {e}"))
+    }
+
+    /// Joint positions at nine tenths of the way from the lower to the upper limits [rad]: a long way from anywhere
+    /// that an arm stands at power-up.
+    pub fn far(&mut self) -> Result<Vec<f64>, String> {
+        let limits = self.limits()?;
+        let range = limits.position_lower.iter().zip(&limits.position_upper);
+        Ok(range.map(|(lower, upper)| lower + 0.9 * (upper - lower)).collect())
+    }
+
+    /// Commands joint positions.
+    pub fn command(&mut self, positions: &[f64], speed: f64) -> Result<(), String> {
+        self.adapter.write_joint_positions(positions, speed).map_err(|e| format!("write_joint_positions: {e}"))
+    }
+
+    /// Stops.
+    pub fn stop(&mut self) -> Result<(), String> {
+        self.adapter.write_stop().map(drop).map_err(|e| format!("write_stop: {e}"))
     }
 
     /// Joint positions a little off `from` [rad]: another amount for each joint, alternately up and down, inside
@@ -166,7 +269,7 @@ impl Context {
         self.until("standstill", |context| {
             std::thread::sleep(Duration::from_millis(50));
             let now = context.positions()?;
-            let still = farthest(&now, &last) < 1e-6;
+            let still = farthest(&now, &last) <= context.rest();
             last = now;
             Ok(still)
         })?;

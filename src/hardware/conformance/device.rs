@@ -1,19 +1,20 @@
 //! Reading the arm, its modes and its optional parts.
 
 use super::Check;
+use super::Needs::{Motion, Nothing};
 use super::context::{Context, farthest, require};
 use crate::hardware::spec::{AdapterError, JointReading};
 use crate::joint::ControlMode;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check { name: "reads_agree", about: "read_joints says the same as the single reads", run: reads_agree },
-    Check { name: "positions_are_plausible", about: "positions are in rad, inside the limits", run: plausible },
-    Check { name: "stamps_are_of_the_past", about: "stamps grow and are never of the future", run: stamps },
-    Check { name: "reads_do_not_allocate", about: "a cycle's reads and writes allocate nothing", run: no_allocation },
-    Check { name: "modes_are_what_it_says", about: "its modes work, others are Unsupported", run: modes },
-    Check { name: "optional_parts_never_fail", about: "what it has not is None or Unsupported", run: optional_parts },
-    Check { name: "gripper_is_in_metres", about: "the gripper goes where it is sent", run: gripper },
+    Check::new(Nothing, "reads_agree", "read_joints says the same as the single reads", reads_agree),
+    Check::new(Nothing, "positions_are_plausible", "positions are in rad, inside the limits", plausible),
+    Check::new(Nothing, "stamps_are_of_the_past", "stamps grow and are never of the future", stamps),
+    Check::new(Motion, "reads_do_not_allocate", "a cycle's reads and writes allocate nothing", no_allocation),
+    Check::new(Motion, "modes_are_what_it_says", "its modes work, others are Unsupported", modes),
+    Check::new(Motion, "optional_parts_never_fail", "what it has not is None or Unsupported", optional_parts),
+    Check::new(Motion, "gripper_is_in_metres", "the gripper goes where it is sent", gripper),
 ];
 
 fn reads_agree(context: &mut Context) -> Result<(), String> {
@@ -23,13 +24,14 @@ fn reads_agree(context: &mut Context) -> Result<(), String> {
     let mut buffer = vec![f64::NAN; dof];
     context.adapter.read_joint_positions(&mut buffer).map_err(|e| e.to_string())?;
     let (position, rest) = reading.position.split_at(dof);
-    require(farthest(position, &buffer) < 1e-6 && buffer.iter().all(|v| v.is_finite()), || {
+    require(farthest(position, &buffer) <= context.rest() && buffer.iter().all(|v| v.is_finite()), || {
         format!("read_joint_positions {buffer:?}, read_joints {position:?}")
     })?;
     require(rest.iter().all(|v| *v == 0.0), || "entries past dof are not zero".into())?;
     let velocities = context.adapter.read_joint_velocities(&mut buffer).map_err(|e| e.to_string())?;
     require(velocities == reading.velocity.is_some(), || "the two disagree on having velocities".into())?;
-    require(!velocities || buffer.iter().all(|v| v.abs() < 1e-3), || format!("velocities at rest: {buffer:?}"))?;
+    let still = if context.real { 0.05 } else { 1e-3 };
+    require(!velocities || buffer.iter().all(|v| v.abs() < still), || format!("velocities at rest: {buffer:?}"))?;
     let efforts = context.adapter.read_joint_efforts(&mut buffer).map_err(|e| e.to_string())?;
     require(efforts == reading.effort.is_some(), || "the two disagree on having torques".into())?;
     context.adapter.read_state().map(|_| ()).map_err(|e| format!("read_state: {e}"))
@@ -38,6 +40,8 @@ fn reads_agree(context: &mut Context) -> Result<(), String> {
 fn plausible(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let (positions, limits) = (context.positions()?, context.limits()?);
+    let degrees: Vec<_> = positions.iter().map(|v| format!("{:.1}°", v.to_degrees())).collect();
+    context.found(format!("at {}", degrees.join(" ")))?;
     let range = limits.position_lower.iter().zip(&limits.position_upper);
     for (i, (position, (lower, upper))) in positions.iter().zip(range).enumerate() {
         let inside = (lower - 0.01..=upper + 0.01).contains(position);
@@ -87,7 +91,7 @@ fn no_allocation(context: &mut Context) -> Result<(), String> {
 
 fn modes(context: &mut Context) -> Result<(), String> {
     context.connect()?;
-    context.adapter.activate().map_err(|e| format!("activate: {e}"))?;
+    context.activate()?;
     let start = context.positions()?;
     let all = [
         ControlMode::Position,
@@ -99,20 +103,21 @@ fn modes(context: &mut Context) -> Result<(), String> {
         ControlMode::Impedance,
     ];
     for mode in all {
-        let result = context.adapter.set_control_mode(mode);
+        let result = context.set_mode(mode);
         if context.row.modes.contains(&mode) {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
             let now = context.adapter.get_control_mode();
             require(now == mode, || format!("set to {}, says {}", mode.name(), now.name()))?;
+            context.stays(&start, 1e-3)?;
         } else {
             require(result == Err(AdapterError::Unsupported), || format!("{}: {result:?}", mode.name()))?;
         }
     }
-    context.stays(&start, 1e-3)
+    Ok(())
 }
 
 fn optional_parts(context: &mut Context) -> Result<(), String> {
-    context.ready(context.row.modes.first().copied().unwrap_or_default())?;
+    context.ready(context.first_mode())?;
     let dof = context.config.dof;
     let adapter = &mut context.adapter;
     let pose = adapter.read_cartesian_position().map_err(|e| format!("read_cartesian_position: {e}"))?;
@@ -137,7 +142,7 @@ fn optional_parts(context: &mut Context) -> Result<(), String> {
 }
 
 fn gripper(context: &mut Context) -> Result<(), String> {
-    context.ready(context.row.modes.first().copied().unwrap_or_default())?;
+    context.ready(context.first_mode())?;
     let opening = |context: &mut Context| context.adapter.read_gripper_position().map_err(|e| e.to_string());
     let Some(start) = opening(context)? else {
         return context.skip("it has no gripper");

@@ -1,17 +1,18 @@
 //! What an adapter says of itself.
 
 use super::Check;
+use super::Needs::Nothing;
 use super::context::{Context, require};
 use crate::hardware::registry::AdapterConfig;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check { name: "row_is_complete", about: "the table row is filled in and consistent", run: row_is_complete },
-    Check { name: "describes_itself", about: "get_info and get_dof agree with the row", run: describes_itself },
-    Check { name: "limits_are_usable", about: "limits are finite, ordered, one per joint", run: limits_are_usable },
-    Check { name: "addresses_are_checked", about: "ill-formed addresses are refused", run: addresses_are_checked },
-    Check { name: "options_are_strict", about: "unknown options are refused by name", run: options_are_strict },
-    Check { name: "dof_is_checked", about: "a number of joints it cannot have is refused", run: dof_is_checked },
+    Check::new(Nothing, "row_is_complete", "the table row is filled in and consistent", row_is_complete),
+    Check::new(Nothing, "describes_itself", "get_info and get_dof agree with the row", describes_itself),
+    Check::new(Nothing, "limits_are_usable", "limits are finite, ordered, one per joint", limits_are_usable),
+    Check::new(Nothing, "addresses_are_checked", "ill-formed addresses are refused", addresses_are_checked),
+    Check::new(Nothing, "options_are_strict", "unknown options are refused by name", options_are_strict),
+    Check::new(Nothing, "dof_is_checked", "a number of joints it cannot have is refused", dof_is_checked),
 ];
 
 fn row_is_complete(context: &mut Context) -> Result<(), String> {

@@ -76,6 +76,8 @@ pub struct Connected {
     pub limits: JointLimits,
     /// How far its gripper closes and opens [m], where it has one and says so.
     pub gripper_range: Option<(f64, f64)>,
+    /// A state older than this is stale, at the rate that the arm has told.
+    pub state_timeout: Duration,
 }
 
 enum Order {

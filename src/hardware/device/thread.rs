@@ -2,7 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::Ordering::{Relaxed, Release};
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Duration;
 
@@ -200,11 +200,13 @@ impl Worker {
         self.config.native_rate = self.config.native_rate.min(info.native_rate);
         self.wanted = true;
         self.connected = true;
+        self.write_errors = 0;
         self.reconnect.1 = BACK_OFF.0;
         self.plausible = 0;
         self.take_command();
         self.read(adapter);
-        Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range() })
+        let (gripper_range, state_timeout) = (adapter.get_gripper_range(), self.config.state_timeout());
+        Ok(Connected { info, limits, gripper_range, state_timeout })
     }
 
     fn connect_again(&mut self, adapter: &mut dyn ManipulatorAdapter) {
@@ -378,10 +380,11 @@ impl Worker {
         match adapter.write_stop() {
             Ok(stop) => {
                 self.stop_owed = false;
-                self.health.stop_sent.store(self.last.stop_seq, Relaxed);
                 if stop == Stop::Confirmed {
                     self.health.stop_confirmed.store(self.last.stop_seq, Relaxed);
                 }
+                // Last: whoever sees it sees the confirmation too.
+                self.health.stop_sent.store(self.last.stop_seq, Release);
             }
             Err(error) => self.not_taken(adapter, "the arm did not take the stop", &error),
         }

@@ -39,10 +39,20 @@ pub enum FaultKind {
     Truncated,
     /// The arm says that it has one joint more than it has.
     WrongDof,
+    /// The arm says that it is another model.
+    WrongModel,
+    /// Measurements stand still for `duration`, time stamps and all, while the arm goes on.
+    Frozen,
     /// The arm sinks by `amount` [rad] at its second joint when its motors are enabled.
     Sag,
     /// Joint number `joint` does not move for `duration`.
     Blocked,
+    /// The computer's CAN controller leaves the bus after too many errors.
+    BusOff,
+    /// The CAN interface has no room for what is sent.
+    NoBuffers,
+    /// The arm leads others: it sends commands instead of its state.
+    Leader,
 }
 
 /// One fault of a script.
@@ -183,6 +193,12 @@ impl FaultScript {
         Some(entry.0)
     }
 
+    /// Whether a fault of this kind with a duration is active at `now`. No strike is counted.
+    pub fn lasts(&self, kind: FaultKind, now: f64) -> bool {
+        let active = |entry: &(Fault, u32)| entry.0.kind == kind && now >= entry.0.at && !Self::over(entry, now);
+        self.entries.iter().any(|entry| entry.0.duration > 0.0 && active(entry))
+    }
+
     fn over((fault, struck): &(Fault, u32), now: f64) -> bool {
         let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
         (limit > 0 && *struck >= limit) || fault.over(now)
@@ -219,6 +235,7 @@ mod tests {
         let fault = Fault::new(FaultKind::Nan).at(1.0).lasting(2.0).times(2);
         let mut script = FaultScript::new(&[fault, Fault::new(FaultKind::Silent).lasting(0.5)]);
         assert!(script.take(FaultKind::Nan, 1.0).is_some());
+        assert!(!script.lasts(FaultKind::Nan, 0.9) && script.lasts(FaultKind::Nan, 1.0));
         assert!(script.take(FaultKind::Nan, 2.0).is_some());
         assert!(script.take(FaultKind::Nan, 2.5).is_none(), "struck twice already");
         assert!((0..100).all(|_| script.take(FaultKind::Silent, 0.4).is_some()), "no count: any number of times");

@@ -28,6 +28,11 @@ impl Gripper {
         self.target = self.position;
     }
 
+    /// Whether it is on its way.
+    pub fn moving(&self) -> bool {
+        self.position != self.target
+    }
+
     /// Lets `dt` [s] pass.
     pub fn advance(&mut self, dt: f64) {
         let reach = self.speed * dt.max(0.0);
@@ -46,7 +51,8 @@ mod tests {
         gripper.move_to(1.0);
         gripper.advance(0.1);
         assert!((gripper.position - 0.05).abs() < 1e-12);
+        assert!(gripper.moving());
         gripper.advance(10.0);
-        assert_eq!(gripper.position, 0.08);
+        assert_eq!((gripper.position, gripper.moving()), (0.08, false));
     }
 }

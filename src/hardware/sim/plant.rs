@@ -60,6 +60,8 @@ struct Joint {
     /// Time in which an ideal joint has not moved although it might have [s].
     credit: f64,
     blocked: bool,
+    /// Where it comes to rest when it falls [rad]; `None`: friction holds it.
+    rest: Option<f64>,
 }
 
 /// Up to [`MAX_DOF`] joints with their motors.
@@ -96,6 +98,7 @@ impl Plant {
             joint.velocity_max = of(&limits.velocity_max);
             joint.acceleration = of(&limits.acceleration_max);
             joint.position = of(initial).clamp(joint.lower, joint.upper);
+            joint.rest = Some(joint.lower);
         }
         Self {
             joints,
@@ -196,6 +199,15 @@ impl Plant {
         self.drive_to(Drive::Velocity, target);
     }
 
+    /// From now on the joints fall at `speed` [rad/s] when disabled, each to its place in `rest` [rad]; one without
+    /// stays where it is.
+    pub fn falls(&mut self, speed: f64, rest: &[Option<f64>]) {
+        self.fall = speed;
+        for (i, joint) in self.active_mut().iter_mut().enumerate() {
+            joint.rest = rest.get(i).copied().flatten().map(|rest| rest.clamp(joint.lower, joint.upper));
+        }
+    }
+
     /// Lets the second joint sink by `amount` [rad].
     pub fn sag(&mut self, amount: f64) {
         self.sag = amount.max(0.0);
@@ -254,9 +266,7 @@ impl Plant {
         let still = |joint: &Joint| joint.velocity == 0.0;
         self.sag <= 0.0
             && match self.drive {
-                Drive::Disabled => {
-                    self.active().iter().all(|j| still(j) && (self.fall == 0.0 || j.position <= j.lower))
-                }
+                Drive::Disabled => self.active().iter().all(|j| still(j) && (self.fall == 0.0 || j.fallen())),
                 Drive::Stop => self.active().iter().all(still),
                 Drive::Position | Drive::Servo => self.active().iter().all(|j| still(j) && j.position == j.target),
                 Drive::Velocity => self.active().iter().all(|j| still(j) && j.target == 0.0),
@@ -356,9 +366,18 @@ impl Joint {
         }
     }
 
+    fn fallen(&self) -> bool {
+        self.rest.is_none_or(|rest| self.position == rest)
+    }
+
     fn fall(&mut self, speed: f64, h: f64) {
-        self.velocity = if self.position > self.lower { -speed } else { 0.0 };
-        self.travel(h);
+        let way = self.rest.map_or(0.0, |rest| rest - self.position);
+        if way.abs() <= speed * h {
+            (self.position, self.velocity) = (self.position + way, 0.0);
+        } else {
+            self.velocity = speed.copysign(way);
+            self.travel(h);
+        }
     }
 }
 

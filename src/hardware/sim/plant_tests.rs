@@ -116,6 +116,12 @@ fn disabled_holds_with_brakes_and_falls_without() {
     assert!((falling.positions()[0] - 0.3).abs() < 1e-9);
     falling.advance(100.0);
     assert_eq!(falling.positions()[..2], [-2.0, -2.0]);
+    falling.falls(0.5, &[None, Some(1.0)]);
+    falling.advance(1.0);
+    assert!((falling.positions()[1] + 1.5).abs() < 1e-9);
+    falling.advance(100.0);
+    assert_eq!((falling.positions()[0], falling.positions()[1]), (-2.0, 1.0), "friction holds the first");
+    assert!(!falling.moving());
 }
 
 #[test]

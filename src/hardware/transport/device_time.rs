@@ -22,6 +22,10 @@ impl DeviceTime {
     pub fn translate(&mut self, device_ns: u64, arrival: Mono) -> Mono {
         let difference = i128::from(arrival.0) - i128::from(device_ns);
         let offset = match self.last {
+            // The same measurement once more is no younger for having been sent again.
+            Some((offset, before, _)) if device_ns == before => {
+                return Mono((i128::from(device_ns) + offset).clamp(0, i128::from(arrival.0)) as u64);
+            }
             Some((offset, before, then)) if device_ns >= before => {
                 let allowance = arrival.since(then).as_nanos() as f64 * DRIFT;
                 difference.min(offset + allowance as i128)
@@ -55,6 +59,17 @@ mod tests {
         time.translate(900 * MS, Mono(1000 * MS));
         assert_eq!(time.translate(0, Mono(5000 * MS)), Mono(5000 * MS));
         assert_eq!(time.translate(100 * MS, Mono(5050 * MS)), Mono(5050 * MS));
+    }
+
+    #[test]
+    fn a_measurement_that_is_sent_again_keeps_its_stamp() {
+        let mut time = DeviceTime::default();
+        let stamp = time.translate(10 * MS, Mono(1013 * MS));
+        for later in 1..1000 {
+            assert_eq!(time.translate(10 * MS, Mono((1013 + 10 * later) * MS)), stamp);
+        }
+        let next = time.translate(10_010 * MS, Mono(11_014 * MS));
+        assert!(next <= Mono(11_014 * MS) && next >= Mono(11_013 * MS), "{next:?}");
     }
 
     #[test]

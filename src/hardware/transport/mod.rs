@@ -2,4 +2,9 @@
 
 pub mod can;
 pub mod device_time;
+mod incoming;
+pub mod pty;
+pub mod serial;
 pub mod tcp;
+
+pub use incoming::Scan;

@@ -2,13 +2,14 @@
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
+use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use super::incoming::Incoming;
+pub use super::incoming::Scan;
 use crate::hardware::spec::{AdapterError, AdapterResult};
 
-/// Most bytes that may wait for the rest of their frame.
-const BUFFER: usize = 4096;
 /// A peer that acknowledges nothing for this long is gone [ms].
 const USER_TIMEOUT_MS: u32 = 1000;
 
@@ -84,25 +85,13 @@ impl std::fmt::Display for Endpoint {
     }
 }
 
-/// What stands at the front of the received bytes, as a protocol sees it.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Scan<T> {
-    /// The beginning of a frame; more bytes are needed.
-    More,
-    /// So many bytes (at least 1) are not the awaited frame.
-    Skip(usize),
-    /// The awaited frame, and how many bytes it takes.
-    Take(usize, T),
-}
-
 /// A connection over which frames go both ways.
 #[derive(Debug)]
 pub struct TcpLink {
     stream: TcpStream,
     peer: String,
-    buffer: Vec<u8>,
-    /// The received bytes that are not used up yet.
-    filled: std::ops::Range<usize>,
+    incoming: Incoming,
+    /// How long a read waits.
     timeout: Duration,
 }
 
@@ -131,7 +120,7 @@ impl TcpLink {
         };
         prepare().map_err(|e| failed(reason(&e)))?;
         let peer = format!("{device} at {endpoint}");
-        Ok(Self { stream, peer, buffer: vec![0; BUFFER], filled: 0..0, timeout })
+        Ok(Self { stream, peer, incoming: Incoming::new(), timeout })
     }
 
     /// The device and its address, for messages.
@@ -141,66 +130,60 @@ impl TcpLink {
 
     /// Sends all of `bytes`.
     pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
-        self.stream.write_all(bytes).map_err(|e| self.broken(&e))
+        self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))
     }
 
     /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
     /// a frame; it must skip what is not for it. `Timeout` leaves the connection usable; `Io` does not.
-    pub fn receive<T>(&mut self, timeout: Duration, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
-        let deadline = Instant::now() + timeout;
-        let mut left = timeout;
-        loop {
-            while !self.filled.is_empty() {
-                let bytes = self.buffer.get(self.filled.clone()).unwrap_or_default();
-                match scan(bytes) {
-                    Scan::More => break,
-                    Scan::Skip(n) => self.used(n.max(1)),
-                    Scan::Take(n, frame) => {
-                        self.used(n.max(1));
-                        return Ok(frame);
-                    }
+    pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
+        let Self { stream, peer, incoming, timeout: set } = self;
+        incoming.receive(peer, timeout, scan, |room, left| {
+            if *set != left {
+                stream.set_read_timeout(Some(left)).map_err(|e| broken(peer, &e))?;
+                *set = left;
+            }
+            match stream.read(room) {
+                Ok(0) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
+                Ok(n) => Ok(n),
+                Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
+                    Ok(0)
                 }
+                Err(e) => Err(broken(peer, &e)),
             }
-            if left.is_zero() {
-                return Err(AdapterError::Timeout(format!("{} did not answer within {timeout:?}", self.peer)));
-            }
-            self.fill(left)?;
-            left = deadline.saturating_duration_since(Instant::now());
-        }
+        })
     }
 
-    fn used(&mut self, n: usize) {
-        self.filled.start = self.filled.start.saturating_add(n).min(self.filled.end);
-    }
-
-    /// Reads what has arrived, waiting up to `timeout`; nothing when nothing arrives.
-    fn fill(&mut self, timeout: Duration) -> AdapterResult<()> {
-        if self.timeout != timeout {
-            self.stream.set_read_timeout(Some(timeout)).map_err(|e| self.broken(&e))?;
-            self.timeout = timeout;
-        }
-        self.buffer.copy_within(self.filled.clone(), 0);
-        self.filled = 0..self.filled.len();
-        let room = self.buffer.get_mut(self.filled.end..).unwrap_or_default();
-        if room.is_empty() {
-            return Err(AdapterError::Protocol(format!("{} sent a frame that is too long", self.peer)));
-        }
-        match self.stream.read(room) {
-            Ok(0) => Err(AdapterError::Io(format!("{} closed the connection", self.peer))),
-            Ok(n) => {
-                self.filled.end += n;
-                Ok(())
+    /// The next frame among what has arrived already, without waiting; `None` when there is none. `scan` as above.
+    pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
+        let Self { stream, peer, incoming, .. } = self;
+        loop {
+            if let Some(frame) = incoming.next(&mut scan) {
+                return Ok(Some(frame));
             }
-            Err(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
-                Ok(())
+            let arrived = incoming.fill(peer, |room| {
+                match rustix::net::recv(&*stream, room, rustix::net::RecvFlags::DONTWAIT) {
+                    Ok((0, _)) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
+                    Ok((n, _)) => Ok(n),
+                    Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
+                    Err(e) => Err(broken(peer, &e.into())),
+                }
+            })?;
+            if arrived == 0 {
+                return Ok(None);
             }
-            Err(e) => Err(self.broken(&e)),
         }
     }
+}
 
-    fn broken(&self, error: &std::io::Error) -> AdapterError {
-        AdapterError::Io(format!("the connection to {} broke: {}", self.peer, reason(error)))
+/// Becomes readable when something has arrived.
+impl AsFd for TcpLink {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.stream.as_fd()
     }
+}
+
+fn broken(peer: &str, error: &std::io::Error) -> AdapterError {
+    AdapterError::Io(format!("the connection to {peer} broke: {}", reason(error)))
 }
 
 /// An I/O error in plain words, without the system's number.
@@ -218,6 +201,7 @@ fn reason(error: &std::io::Error) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::incoming::BUFFER;
     use super::*;
     use std::net::TcpListener;
 

@@ -20,6 +20,8 @@ pub struct MockArm {
     dof: usize,
     device: Device,
     mode: ControlMode,
+    /// The last reading, for the fault that shows nothing newer.
+    measured: Option<JointReading>,
 }
 
 impl MockArm {
@@ -37,7 +39,13 @@ impl MockArm {
             return Err(rejected(format!("a mock arm has 1 to {MAX_DOF} joints, not {dof}")));
         }
         options.check(dof).map_err(rejected)?;
-        Ok(Self { device: Device::new(dof, &options, clock), options, dof, mode: ControlMode::Position })
+        Ok(Self {
+            device: Device::new(dof, &options, clock),
+            options,
+            dof,
+            mode: ControlMode::Position,
+            measured: None,
+        })
     }
 
     /// Lets a fault happen `fault.at` seconds from now.
@@ -136,6 +144,12 @@ impl ManipulatorAdapter for MockArm {
 
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         self.device.read()?;
+        if let Some(before) = self.measured
+            && self.device.strikes(FaultKind::Frozen).is_some()
+        {
+            *reading = before;
+            return Ok(());
+        }
         let zero = [0.0; MAX_DOF];
         let position = self.device.reported_positions();
         // Entries past dof stay zero, also when the others are NaN.
@@ -144,6 +158,7 @@ impl ManipulatorAdapter for MockArm {
         reading.velocity = self.options.velocity_feedback.then(|| self.device.plant.velocities());
         reading.effort = self.options.effort_feedback.then(|| self.device.plant.efforts());
         reading.stamp = Some(self.device.advanced_to);
+        self.measured = Some(*reading);
         Ok(())
     }
 

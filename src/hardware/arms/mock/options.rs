@@ -19,6 +19,7 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Nan,
     FaultKind::ZeroState,
     FaultKind::WrongDof,
+    FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
 ];

@@ -4,11 +4,14 @@ use std::time::Duration;
 
 use super::super::{GRIPPER_MAX, limits, protocol::DOF};
 use super::kinematics;
-use super::wire::{Frame, Report, Request, put_hello, put_report, reply, status};
+use super::wire::{self, Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
+use crate::hardware::sim::arm::Delivery;
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Drive, Plant, Tracking};
+use crate::hardware::sim::stream;
+use crate::hardware::transport::tcp::Scan;
 use crate::joint::{JointLimits, Joints};
 
 /// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
@@ -37,27 +40,6 @@ pub struct Received {
     pub status: u8,
 }
 
-/// What happens to a reply on its way.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Delivery {
-    /// It is sent.
-    Send,
-    /// It is sent so much later; nobody is served until then.
-    Stall(Duration),
-    /// It is lost.
-    Silent,
-    /// Noise goes before it.
-    Garbage,
-    /// One of its bytes is wrong.
-    Corrupt,
-    /// Only its first half is sent.
-    Truncated,
-    /// The connection ends.
-    Disconnect,
-    /// The connection ends, and there is no power for so long.
-    PowerLoss(Duration),
-}
-
 /// The controller's memory.
 pub struct Controller {
     plant: Plant,
@@ -75,6 +57,8 @@ pub struct Controller {
     powered_up: Mono,
     advanced_to: Mono,
     trace: Option<Vec<Received>>,
+    /// The last report, for the fault that shows nothing newer.
+    reported: Option<Report>,
 }
 
 impl Controller {
@@ -96,6 +80,7 @@ impl Controller {
             powered_up: now,
             advanced_to: now,
             trace: None,
+            reported: None,
         }
     }
 
@@ -148,12 +133,6 @@ impl Controller {
         self.estop_until = None;
     }
 
-    /// The client is gone: the arm stops.
-    pub fn client_gone(&mut self, now: Mono) {
-        self.advance(now);
-        self.plant.stop();
-    }
-
     /// Starts recording requests, forgetting those recorded before.
     pub fn record(&mut self) {
         self.trace = Some(Vec::new());
@@ -165,7 +144,7 @@ impl Controller {
     }
 
     /// Does what a frame asks and writes the reply into `out`.
-    pub fn handle(&mut self, frame: &Frame, now: Mono, out: &mut Vec<u8>) -> Delivery {
+    fn handle(&mut self, frame: &Frame, now: Mono, out: &mut Vec<u8>) -> Delivery {
         self.advance(now);
         if frame.request == Ok(Request::Hello) {
             self.first_hello.get_or_insert(now);
@@ -182,7 +161,9 @@ impl Controller {
         match (outcome, frame.request) {
             (Ok(()), Ok(Request::Hello)) => {
                 let dof = DOF as u8 + u8::from(self.script.take(FaultKind::WrongDof, t).is_some());
-                reply(out, frame, status, |out| put_hello(out, "YOURARM-6", dof, [2, 1, 3], "YA6-00042"));
+                let other = self.script.take(FaultKind::WrongModel, t).is_some();
+                let model = if other { "YOURARM-6L" } else { "YOURARM-6" };
+                reply(out, frame, status, |out| put_hello(out, model, dof, [2, 1, 3], "YA6-00042"));
             }
             (Ok(()), Ok(Request::GetState)) => {
                 let report = self.report(now, t);
@@ -320,6 +301,11 @@ impl Controller {
     }
 
     fn report(&mut self, now: Mono, t: f64) -> Report {
+        if let Some(old) = self.reported
+            && self.script.take(FaultKind::Frozen, t).is_some()
+        {
+            return old;
+        }
         let degrees = |values: &Joints| first(values).map(|v| v.to_degrees() as f32);
         let state = match (self.error, self.plant.enabled()) {
             (0, false) => 0,
@@ -355,7 +341,30 @@ impl Controller {
         } else if self.script.take(FaultKind::ZeroState, t).is_some() {
             report.joints = [[0.0; 6]; 3];
         }
+        self.reported = Some(report);
         report
+    }
+}
+
+impl stream::Controller for Controller {
+    fn serve(&mut self, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
+        match wire::scan(bytes) {
+            Scan::More => Scan::More,
+            Scan::Skip(n) => Scan::Skip(n),
+            Scan::Take(n, frame) => Scan::Take(n, self.handle(&frame, now, answer)),
+        }
+    }
+
+    /// The arm stops.
+    fn client_gone(&mut self, now: Mono) {
+        self.advance(now);
+        self.plant.stop();
+    }
+
+    fn turn_away(&self, bytes: &[u8], answer: &mut Vec<u8>) {
+        if let Scan::Take(_, frame) = wire::scan(bytes) {
+            reply(answer, &frame, status::BUSY, |out| out.extend([0, 0]));
+        }
     }
 }
 

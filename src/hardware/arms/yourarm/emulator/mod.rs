@@ -1,12 +1,10 @@
 //! The emulator: plays a YourArm controller on a loopback address, for `address: sim` and for tests.
 //!
-//! A thread waits for clients, another serves the one that is connected; both sleep in the kernel while nothing
-//! comes, and the joints are brought up to date when somebody asks. Like the real controller it serves one client at
-//! a time and turns a second one away.
+//! The joints are brought up to date when somebody asks. Like the real controller it serves one client at a time and
+//! turns a second one away.
 
 mod controller;
 mod kinematics;
-mod server;
 pub mod wire;
 
 use std::net::SocketAddr;
@@ -19,11 +17,11 @@ use super::protocol::{DOF, PORT};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::sim::tcp_server::TcpServer;
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
 use controller::Controller;
 pub use controller::Received;
-use server::Server;
 
 /// The faults that the emulator can play.
 const PLAYABLE: &[FaultKind] = &[
@@ -39,6 +37,8 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongDof,
+    FaultKind::WrongModel,
+    FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
 ];
@@ -55,7 +55,7 @@ pub struct SimOptions {
 
 /// A running emulator. Ends when it is dropped.
 pub struct YourArmEmulator {
-    server: Server,
+    server: TcpServer<Controller>,
 }
 
 impl YourArmEmulator {
@@ -84,9 +84,7 @@ impl YourArmEmulator {
             }
         }
         let controller = Controller::new(initial, &options.faults, MonotonicClock.now());
-        let server =
-            Server::start(controller, address).map_err(|e| rejected(format!("cannot listen at {address}: {e}")))?;
-        Ok(Self { server })
+        Ok(Self { server: TcpServer::start("yourarm", controller, address)? })
     }
 
     /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
@@ -140,5 +138,9 @@ impl Emulator for YourArmEmulator {
         check_kinds("the yourarm emulator", &[fault], PLAYABLE)?;
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.joints().0)
     }
 }

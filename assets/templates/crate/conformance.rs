@@ -1,0 +1,24 @@
+//! The conformance suite of dimos over the adapter: each check has an adapter and an emulator of its own.
+
+use dimos::hardware::conformance::{Outcome, checks, run};
+
+#[test]
+fn the_adapter_conforms() {
+    // The checks mostly wait for motion, so they run side by side.
+    let outcomes: Vec<_> = std::thread::scope(|scope| {
+        let threads: Vec<_> = checks().map(|check| (check, scope.spawn(|| run(&acme::SPEC, check, None)))).collect();
+        threads.into_iter().map(|(check, thread)| (check, thread.join().unwrap())).collect()
+    });
+    let mut failures = 0;
+    for (check, outcome) in outcomes {
+        match outcome {
+            Outcome::Passed => println!("{:32} passed", check.name),
+            Outcome::Skipped(why) => println!("{:32} does not apply: {why}", check.name),
+            Outcome::Failed(why) => {
+                failures += 1;
+                println!("{:32} FAILED: {why}\n{:32} {}", check.name, "", check.about);
+            }
+        }
+    }
+    assert!(failures == 0, "{failures} checks failed");
+}

@@ -1,0 +1,71 @@
+//! Acme, a 6-joint arm on TCP. Where a comment says `YOUR ARM`, the template is made up: put in what the vendor's manual
+//! says. In this order: `protocol.rs` and `golden.rs` (the bytes), `adapter.rs` (the units), the numbers below, and
+//! `emulator.rs` (the controller's side of the same bytes).
+
+pub mod adapter;
+pub mod emulator;
+#[cfg(test)]
+mod golden;
+pub mod protocol;
+
+use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use dimos::hardware::sim::arm::SimOptions;
+use dimos::hardware::transport::tcp::Endpoint;
+use dimos::joint::{ControlMode, JointLimits};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Number of joints.
+pub const DOF: usize = 6;
+
+// YOUR ARM: the modes that it has, and whether it has brakes that keep its pose when the motors are off.
+const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+const HOLDS_WHEN_DISABLED: bool = true;
+
+/// How often the controller measures [Hz]: asking more often brings nothing new.
+const NATIVE_RATE: f64 = 250.0; // YOUR ARM
+
+/// The row in the table of adapters: what `list-adapters` shows, and how an arm or its emulator is made.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "acme",
+    about: "Acme with 6 joints, on TCP", // YOUR ARM: which models this is for
+    level: Level::Emulated,
+    transport: "tcp",
+    dof: (DOF, DOF),
+    modes: MODES,
+    wire_units: "deg",
+    native_rate: NATIVE_RATE,
+    address: AddressForm {
+        form: "HOST[:PORT]",
+        required: true,
+        check: |address| Endpoint::parse(address, protocol::PORT).map(|endpoint| endpoint.to_string()),
+    },
+    holds_when_disabled: HOLDS_WHEN_DISABLED,
+    gripper: false,
+    options: OptionsSpec::of::<Options>(),
+    limits,
+    create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
+    emulate: Some(|config, place| Ok(Box::new(emulator::AcmeEmulator::start(config, place)?))),
+};
+
+/// The joint limits of the data sheet, in SI units.
+fn limits(_dof: usize) -> JointLimits {
+    // YOUR ARM: lowest and highest position [deg] and top speed [deg/s] of each joint, base first.
+    const DATA_SHEET: [(f64, f64, f64); DOF] = [(-170.0, 170.0, 180.0); DOF];
+    JointLimits {
+        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
+        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
+        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
+        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it empty where the sheet says nothing
+        jerk_max: vec![100.0; DOF],        // YOUR ARM [rad/s³]; the same
+    }
+}
+
+/// What a blueprint may set under `options:`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    // YOUR ARM: options of its own, each with a default: a payload, a tool, a serial number to insist on.
+    /// What the emulator does, when one stands in for the arm.
+    pub sim: SimOptions,
+}

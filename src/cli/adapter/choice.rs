@@ -1,0 +1,111 @@
+//! Which adapter, and what it is made from: the arguments that `adapter test` and `adapter emulate` share.
+
+use serde_json::{Map, Value};
+
+use super::super::exit::{Exit, Failure, Result};
+use crate::hardware::arms::ABSENT;
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
+use crate::hardware::spec::AdapterError;
+use crate::joint::MAX_DOF;
+
+/// Which arm, and how it is made.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Choice {
+    /// The adapter: a name that `dimos list-adapters` shows
+    pub name: String,
+    /// Number of joints; needed only where the adapter allows several
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=MAX_DOF as i64))]
+    pub dof: Option<u8>,
+    /// The same as --option model=MODEL
+    #[arg(long)]
+    pub model: Option<String>,
+    /// An option of the adapter, as under `options` in a blueprint: speed_scale=0.5, sim.initial_positions=[…] (repeatable)
+    #[arg(long = "option", value_name = "KEY=VALUE", value_parser = super::super::arguments::setting)]
+    pub options: Vec<(String, String)>,
+}
+
+impl Choice {
+    /// The adapter's row.
+    pub fn row(&self, registry: &Registry) -> Result<AdapterSpec> {
+        if let Some(row) = registry.get(&self.name) {
+            return Ok(*row);
+        }
+        if let Some(absent) = ABSENT.iter().find(|absent| absent.name == self.name) {
+            return Err(Failure::usage(format!("{} is not in this build", absent.name)).hint(absent.remedy));
+        }
+        let close = |name: &&&str| strsim::damerau_levenshtein(name, &self.name) <= 2;
+        let names = registry.names();
+        let failure = Failure::usage(format!("no adapter named {:?}; there are {}", self.name, names.join(", ")));
+        Err(names.iter().find(close).map_or(failure.clone(), |name| failure.hint(format!("did you mean {name}?"))))
+    }
+
+    /// The numbers of joints to try, the likeliest first.
+    pub fn dofs(&self, row: &AdapterSpec) -> Result<Vec<usize>> {
+        let (least, most) = row.dof;
+        match self.dof.map(usize::from) {
+            Some(dof) if (least..=most).contains(&dof) => Ok(vec![dof]),
+            Some(dof) => Err(Failure::usage(format!("{} has {}, not {dof}", row.name, joints(row)))),
+            // Which of them a model has, only the adapter knows.
+            None => Ok((least..=most).rev().collect()),
+        }
+    }
+
+    /// What the adapter is made from.
+    pub fn config(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
+        let mut options = Map::new();
+        let model = self.model.iter().map(|model| ("model", model.as_str()));
+        for (path, text) in self.options.iter().map(|(path, text)| (path.as_str(), text.as_str())).chain(model) {
+            let value = serde_yaml::from_str(text).map_err(|e| Failure::usage(format!("--option {path}: {e}")))?;
+            set(&mut options, path, value).map_err(Failure::usage)?;
+        }
+        let (hardware_id, address) = (self.name.clone(), address.to_owned());
+        Ok(AdapterConfig { hardware_id, address, dof, options: Value::Object(options) })
+    }
+}
+
+/// Sets an option at a path with dots.
+fn set(options: &mut Map<String, Value>, path: &str, value: Value) -> std::result::Result<(), String> {
+    match path.split_once('.') {
+        None => drop(options.insert(path.to_owned(), value)),
+        Some((first, rest)) => {
+            let inner = options.entry(first).or_insert_with(|| Value::Object(Map::new()));
+            let inner = inner.as_object_mut().ok_or(format!("--option {path}: {first} is set to something else"))?;
+            set(inner, rest, value)?;
+        }
+    }
+    Ok(())
+}
+
+/// `6 joints`, `1 to 16 joints`.
+pub fn joints(row: &AdapterSpec) -> String {
+    match row.dof {
+        (1, 1) => "1 joint".to_owned(),
+        (least, most) if least == most => format!("{least} joints"),
+        (least, most) => format!("{least} to {most} joints"),
+    }
+}
+
+/// An adapter's error as a failure: its last line may be a hint.
+pub fn failure(exit: Exit, error: &AdapterError) -> Failure {
+    let text = error.to_string();
+    match text.split_once("\nhint: ") {
+        Some((what, hint)) => Failure::new(exit, what).hint(hint),
+        None => Failure::new(exit, text),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn options_nest_by_their_dots() {
+        let mut options = Map::new();
+        for (path, value) in [("a", json!(1)), ("b.c", json!("x")), ("b.d.e", json!([1, 2]))] {
+            set(&mut options, path, value).unwrap();
+        }
+        assert_eq!(Value::Object(options.clone()), json!({"a": 1, "b": {"c": "x", "d": {"e": [1, 2]}}}));
+        assert!(set(&mut options, "a.b", json!(1)).is_err());
+    }
+}

@@ -1,0 +1,212 @@
+//! `dimos adapter emulate NAME`: an arm's emulator by itself, so that any client of the arm can be tried against it.
+
+use std::io::{self, IsTerminal};
+use std::net::IpAddr;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use serde_json::{Value, json};
+
+use super::super::arguments::duration;
+use super::super::exit::{Exit, Failure, Result};
+use super::super::follow::Signals;
+use super::super::output;
+use super::choice::{self, Choice};
+use crate::blueprint;
+use crate::hardware::registry::{AdapterSpec, Emulator, Place, Registry};
+use crate::hardware::sim::faults::Fault;
+use crate::hardware::spec::AdapterError;
+
+/// How often the joints are shown.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// Arguments of `adapter emulate`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+A fault script: at=2,kind=stall,duration=0.5 (repeatable), or a YAML or JSON file with a list of such.
+`at` counts seconds from the first client's connection. The kinds are those of `dimos schema`; an emulator names the
+ones that it can play when it is asked for another.")]
+pub struct Args {
+    #[command(flatten)]
+    pub choice: Choice,
+    /// Listen on this loopback address, at the arm's own ports [default for arms on TCP: 127.0.0.1]
+    #[arg(long, value_name = "ADDRESS", group = "place")]
+    pub bind: Option<IpAddr>,
+    /// Stand on this CAN interface: vcan0
+    #[arg(long, value_name = "INTERFACE", group = "place")]
+    pub can: Option<String>,
+    /// Stand on a new pseudo-terminal [default for arms on a serial line]
+    #[arg(long, group = "place")]
+    pub pty: bool,
+    /// What goes wrong, and when (repeatable)
+    #[arg(long, value_name = "SCRIPT")]
+    pub fault: Vec<String>,
+    /// End after this time: 10s, 500ms
+    #[arg(long, value_parser = duration)]
+    pub duration: Option<Duration>,
+    /// Print the address as a line of JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    let row = args.choice.row(registry)?;
+    let faults = args.fault.iter().map(|text| script(text)).collect::<Result<Vec<_>>>()?.concat();
+    let place = args.place(&row)?;
+    let (emulator, dof) = start(args, &row, &place)?;
+    for fault in &faults {
+        emulator.inject(*fault).map_err(Failure::usage)?;
+    }
+    let signals = Signals::watch_with_hangup();
+    announce(args, &row, dof, &emulator.address(), registry);
+    let bar = if args.json || !io::stderr().is_terminal() { ProgressBar::hidden() } else { ProgressBar::new_spinner() };
+    if let Ok(style) = ProgressStyle::with_template("SIMULATED {wide_msg}") {
+        bar.set_style(style);
+    }
+    let began = Instant::now();
+    let ended = loop {
+        if let Some(signal) = signals.last() {
+            break Exit::by_signal(signal);
+        }
+        let left = args.duration.map(|duration| duration.saturating_sub(began.elapsed()));
+        if left.is_some_and(|left| left.is_zero()) {
+            break Exit::Ok;
+        }
+        if let Some(joints) = emulator.true_positions() {
+            let degrees = joints.iter().take(dof).map(|v| format!("{:8}°", output::fixed(v.to_degrees(), 2)));
+            bar.set_message(degrees.collect::<String>());
+        }
+        std::thread::sleep(left.unwrap_or(LOOK).min(LOOK));
+    };
+    bar.finish_and_clear();
+    Ok(ended)
+}
+
+impl Args {
+    /// Where the emulator listens; by default where a client of the arm looks for it.
+    fn place(&self, row: &AdapterSpec) -> Result<Place> {
+        Ok(match (self.bind, &self.can, self.pty) {
+            (Some(address), ..) => Place::Bind(address),
+            (_, Some(interface), _) => Place::Can(interface.clone()),
+            (_, _, true) => Place::Pty,
+            _ if row.transport == "can" => {
+                let failure = Failure::usage(format!("where is the CAN bus for {}?", row.name));
+                return Err(failure.hint("--can vcan0, an interface of this computer, or --pty for a serial adapter"));
+            }
+            _ if row.transport == "serial" => Place::Pty,
+            _ => Place::Bind(IpAddr::from([127, 0, 0, 1])),
+        })
+    }
+}
+
+fn start(args: &Args, row: &AdapterSpec, place: &Place) -> Result<(Box<dyn Emulator>, usize)> {
+    let Some(emulate) = row.emulate else {
+        let failure = Failure::usage(format!("{} has no emulator", row.name));
+        return Err(failure.hint(if row.address.required {
+            "test against a real arm: `dimos adapter test` with its --address"
+        } else {
+            "it needs none: it is an arm in memory"
+        }));
+    };
+    let mut refusal = None;
+    for dof in args.choice.dofs(row)? {
+        match emulate(&args.choice.config("", dof)?, place) {
+            Ok(emulator) => return Ok((emulator, dof)),
+            Err(AdapterError::Unsupported) => {
+                return Err(Failure::usage(format!(
+                    "the emulator of {} cannot be there: it speaks {}",
+                    row.name, row.transport
+                )));
+            }
+            // With another number of joints it may be the model that was asked for.
+            Err(error @ AdapterError::Rejected(_)) => refusal = refusal.or(Some(choice::failure(Exit::Usage, &error))),
+            Err(error) => return Err(choice::failure(Exit::Hardware, &error)),
+        }
+    }
+    Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+}
+
+/// A fault script: one fault as `key=value,…`, or a file with a list.
+fn script(text: &str) -> Result<Vec<Fault>> {
+    let wrong = |what: String| Failure::usage(format!("--fault {text}: {what}"));
+    if !text.contains('=') || Path::new(text).is_file() {
+        let content = std::fs::read_to_string(text).map_err(|e| wrong(e.to_string()))?;
+        return serde_yaml::from_str(&content).map_err(|e| wrong(e.to_string()));
+    }
+    let mut fault = serde_json::Map::new();
+    for part in text.split(',') {
+        let (key, value) = part.split_once('=').ok_or_else(|| wrong(format!("{part:?} is not KEY=VALUE")))?;
+        let value: Value = serde_yaml::from_str(value).map_err(|e| wrong(e.to_string()))?;
+        if fault.insert(key.trim().to_owned(), value).is_some() {
+            return Err(wrong(format!("{key} stands there twice")));
+        }
+    }
+    serde_json::from_value(Value::Object(fault)).map(|fault| vec![fault]).map_err(|e| wrong(e.to_string()))
+}
+
+/// Says where it is and how it is reached.
+fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry: &Registry) {
+    // The arm's own port need not be said.
+    let given = match args.bind.or((row.transport == "tcp").then_some(IpAddr::from([127, 0, 0, 1]))) {
+        Some(bind) if (row.address.check)(&bind.to_string()).is_ok_and(|full| full == address) => bind.to_string(),
+        _ => address.to_owned(),
+    };
+    let command = runnable(args, row, dof, &given, registry)
+        .map(|name| format!("dimos run {name} --set hardware.arm.address={given}"));
+    if args.json {
+        output::json(&json!({
+            "event": "started",
+            "adapter": row.name,
+            "simulated": true,
+            "dof": dof,
+            "address": address,
+            "run": command,
+        }));
+        return;
+    }
+    output::line(format_args!("{} SIMULATED at {address}", row.name));
+    output::line(format_args!("  joints     {dof}"));
+    if let Some(command) = command {
+        output::line(format_args!("  reach it   {command}"));
+    }
+    let options = if row.dof.0 == row.dof.1 { String::new() } else { format!(" --dof {dof}") };
+    output::line(format_args!("  check it   dimos adapter test {} --address {given}{options}", row.name));
+    output::line(format_args!("  blueprint  adapter_type: {}, address: \"{given}\"", row.name));
+    output::note("Ctrl-C ends it");
+}
+
+/// A blueprint by a likely name that runs this arm and no other.
+fn runnable(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry: &Registry) -> Option<String> {
+    let (name, model) = (row.name, args.choice.model.as_deref().unwrap_or(row.name));
+    let names = [format!("coordinator-{model}"), format!("coordinator-{name}{dof}"), format!("coordinator-{name}")];
+    names.into_iter().find(|name| {
+        let Ok(found) = blueprint::find(name) else { return false };
+        let set = vec![format!("hardware.arm.address={address}")];
+        let loaded = blueprint::load(&found, &blueprint::Overrides { set, sim: false }, registry);
+        let fits = |arm: &blueprint::Arm| arm.adapter_type == row.name && arm.joints.len() == dof;
+        loaded.blueprint.is_some_and(|blueprint| blueprint.arms.len() == 1 && blueprint.arms.iter().all(fits))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hardware::sim::faults::FaultKind;
+
+    #[test]
+    fn fault_scripts_are_read() {
+        let one = script("at=2,kind=stall, duration=0.5").unwrap();
+        assert_eq!(one, [Fault::new(FaultKind::Stall).at(2.0).lasting(0.5)]);
+        for wrong in ["at=2", "at=2,kind=explode", "kind=stall,kind=nan", "kind=stall,5", "at=-1,kind=stall", "no/file"]
+        {
+            assert_eq!(script(wrong).unwrap_err().exit, Exit::Usage, "{wrong}");
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("faults.yaml");
+        std::fs::write(&path, "- {at: 1, kind: estop, duration: 2}\n- {at: 5, kind: disconnect}\n").unwrap();
+        let two = script(path.to_str().unwrap()).unwrap();
+        assert_eq!((two.len(), two[1].kind), (2, FaultKind::Disconnect));
+    }
+}

@@ -1,0 +1,38 @@
+//! `dimos adapter new|test|emulate`: the integration kit.
+
+mod choice;
+pub mod emulate;
+pub mod new;
+mod report;
+pub mod test;
+
+use clap::Subcommand;
+
+use super::exit::Result;
+use crate::hardware::registry::Registry;
+
+/// Arguments of `adapter`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Debug, Subcommand)]
+enum Action {
+    /// Write the start of an adapter for a new arm: it compiles, passes the conformance suite, and runs simulated
+    New(new::Args),
+    /// Check an adapter on a real arm, without moving it unless told to, or on its emulator
+    Test(test::Args),
+    /// Run an arm's emulator by itself, until Ctrl-C
+    Emulate(emulate::Args),
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    match &args.action {
+        Action::New(args) => new::run(args, registry),
+        Action::Test(args) => test::run(args, registry),
+        Action::Emulate(args) => emulate::run(args, registry),
+    }
+}

@@ -1,0 +1,79 @@
+//! The lines of `src/hardware/arms/mod.rs` that put an arm into the table.
+
+/// The text of the table's file with a module and a row more; what is wrong with it where they have no place.
+pub fn with_row(text: &str, module: &str) -> Result<String, String> {
+    let declaration = format!("pub mod {module};");
+    if text.lines().any(|line| line.trim() == declaration) {
+        return Err(format!("it has `{declaration}` already"));
+    }
+    with_entry(&with_module(text, module, &declaration)?, module)
+}
+
+/// Modules stand in alphabetical order, each after its attributes.
+fn with_module(text: &str, module: &str, declaration: &str) -> Result<String, String> {
+    let lines: Vec<&str> = text.lines().collect();
+    let named = |line: &str| line.strip_prefix("pub mod ").and_then(|rest| rest.strip_suffix(';')).map(str::to_owned);
+    let modules = || lines.iter().enumerate().filter_map(|(i, line)| named(line).map(|name| (i, name)));
+    let last = modules().next_back().ok_or("it declares no modules")?.0;
+    let at = modules().find(|(_, name)| name.as_str() > module).map_or(last + 1, |(i, _)| {
+        let attributes =
+            lines.iter().take(i).rev().take_while(|line| line.starts_with("#[") || line.starts_with("///"));
+        i - attributes.count()
+    });
+    let mut out = lines;
+    out.insert(at, declaration);
+    Ok(out.join("\n") + "\n")
+}
+
+/// The row comes last.
+fn with_entry(text: &str, module: &str) -> Result<String, String> {
+    let missing = "it has no `pub const TABLE: &[AdapterSpec] = &[ … ];`";
+    let start = text.find("pub const TABLE").ok_or(missing)?;
+    let end = start + text.get(start..).and_then(|rest| rest.find("];")).ok_or(missing)?;
+    let (before, after) = text.split_at(end);
+    let rows = before.trim_end();
+    let entry = match rows.ends_with(',') {
+        true => format!("{rows}\n    {module}::SPEC,\n"),
+        false if rows.ends_with('[') => format!("{rows}{module}::SPEC"),
+        false => format!("{rows}, {module}::SPEC"),
+    };
+    Ok(entry + after)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_of_this_checkout_takes_a_row() {
+        let text = include_str!("../../../hardware/arms/mod.rs");
+        let with = with_row(text, "acme").unwrap();
+        assert!(with.lines().any(|line| line == "pub mod acme;"));
+        assert_eq!(with.matches("acme::SPEC").count(), 1);
+        let without: String = with.replace("pub mod acme;\n", "");
+        let squeezed = |text: &str| text.split_whitespace().collect::<String>();
+        assert_eq!(squeezed(&without).replace(",acme::SPEC", "").replace("acme::SPEC,", ""), squeezed(text));
+        assert!(with_row(&with, "acme").unwrap_err().contains("already"));
+    }
+
+    #[test]
+    fn modules_keep_their_order_and_their_attributes() {
+        let text = "pub mod mock;\n#[cfg(feature = \"can\")]\npub mod piper;\n\npub const TABLE: &[AdapterSpec] = &[mock::SPEC];\n";
+        let with = with_row(text, "otto").unwrap();
+        assert!(
+            with.starts_with("pub mod mock;\npub mod otto;\n#[cfg(feature = \"can\")]\npub mod piper;\n"),
+            "{with}"
+        );
+        assert!(with.contains("&[mock::SPEC, otto::SPEC];"), "{with}");
+        assert!(with_row(text, "zorro").unwrap().contains("pub mod piper;\npub mod zorro;\n"));
+    }
+
+    #[test]
+    fn rows_on_lines_of_their_own_stay_so() {
+        let text =
+            "pub mod mock;\npub const TABLE: &[AdapterSpec] = &[\n    mock::SPEC,\n    #[cfg(x)]\n    b::SPEC,\n];\n";
+        assert!(with_row(text, "acme").unwrap().ends_with("    b::SPEC,\n    acme::SPEC,\n];\n"));
+        assert!(with_row("pub mod mock;\n", "acme").unwrap_err().contains("TABLE"));
+        assert!(with_row("", "acme").is_err());
+    }
+}

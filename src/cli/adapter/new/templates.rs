@@ -1,0 +1,178 @@
+//! The templates, and what becomes of them for an arm.
+//!
+//! They are files of a working arm named `acme` with 6 joints, which this crate's tests compile and test as they stand;
+//! an arm of another name is made by writing that name, its number of joints and its address in their place.
+
+use super::Transport;
+use super::name::Name;
+
+macro_rules! arm {
+    ($folder:literal) => {
+        [
+            ("mod.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/mod.rs"))),
+            ("adapter.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/adapter.rs"))),
+            ("protocol.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/protocol.rs"))),
+            ("golden.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/golden.rs"))),
+            ("emulator.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/emulator.rs"))),
+        ]
+    };
+}
+
+const TCP: [(&str, &str); 5] = arm!("tcp");
+const CAN: [(&str, &str); 5] = arm!("can");
+const SERIAL: [(&str, &str); 5] = arm!("serial");
+
+const BLUEPRINT: &str = include_str!("../../../../assets/templates/blueprint.yaml");
+/// What a crate has besides: its path in the crate, and its text.
+const CRATE: [(&str, &str); 5] = [
+    ("Cargo.toml", include_str!("../../../../assets/templates/crate/manifest.toml")),
+    ("README.md", include_str!("../../../../assets/templates/crate/README.md")),
+    (".gitignore", include_str!("../../../../assets/templates/crate/gitignore")),
+    ("src/main.rs", include_str!("../../../../assets/templates/crate/main.rs")),
+    ("tests/conformance.rs", include_str!("../../../../assets/templates/crate/conformance.rs")),
+];
+
+/// The arm that is to be written.
+#[derive(Debug, Clone)]
+pub struct Arm {
+    /// Its name.
+    pub name: Name,
+    /// Number of joints.
+    pub dof: u8,
+    /// How it is reached.
+    pub transport: Transport,
+}
+
+impl Arm {
+    /// The files of a crate of its own, with their paths below its folder. `dimos` is where the crate finds dimos, as
+    /// the manifest writes it: `path = "…"`.
+    pub fn own_crate(&self, dimos: &str) -> Vec<(String, String)> {
+        let sources = self.sources().iter().map(|(file, text)| {
+            let file = if *file == "mod.rs" { "lib.rs" } else { file };
+            (format!("src/{file}"), self.code(text))
+        });
+        let rest = CRATE.iter().map(|(file, text)| match file.ends_with(".rs") {
+            true => ((*file).to_owned(), self.code(text)),
+            false => ((*file).to_owned(), self.words(text).replace("DIMOS", dimos)),
+        });
+        rest.chain(sources).chain([(format!("blueprints/{}.yaml", self.blueprint()), self.words(BLUEPRINT))]).collect()
+    }
+
+    /// The new files in a checkout of dimos, with their paths below it.
+    pub fn in_tree(&self) -> Vec<(String, String)> {
+        let folder = format!("src/hardware/arms/{}", self.name.snake);
+        let sources = self.sources().iter().map(|(file, text)| {
+            let text = self.code(text).replace("dimos::", "crate::");
+            (format!("{folder}/{file}"), text)
+        });
+        sources.chain([(format!("blueprints/{}.yaml", self.blueprint()), self.words(BLUEPRINT))]).collect()
+    }
+
+    /// The name of its blueprint.
+    pub fn blueprint(&self) -> String {
+        format!("coordinator-{}", self.name.kebab)
+    }
+
+    fn sources(&self) -> &'static [(&'static str, &'static str)] {
+        match self.transport {
+            Transport::Tcp => &TCP,
+            Transport::Can => &CAN,
+            Transport::Serial => &SERIAL,
+        }
+    }
+
+    /// Rust code of this arm.
+    fn code(&self, text: &str) -> String {
+        self.written(text, &[("acme", &self.name.snake)])
+    }
+
+    /// Any other text of this arm.
+    fn words(&self, text: &str) -> String {
+        let address = match self.transport {
+            Transport::Tcp => "192.168.1.100",
+            Transport::Can => "can0",
+            Transport::Serial => "/dev/ttyUSB0",
+        };
+        let adapter_type = format!("adapter_type: {}", self.name.snake);
+        let more = [("adapter_type: acme", &*adapter_type), ("acme", &self.name.kebab), ("ADDRESS", address)];
+        self.written(text, &more)
+    }
+
+    /// The text with this arm's name and number of joints, and `more` in place of what it says.
+    fn written(&self, text: &str, more: &[(&str, &str)]) -> String {
+        let (dof, camel) = (self.dof, &self.name.camel);
+        let article = if matches!(dof, 8 | 11) { "an" } else { "a" };
+        let several = if dof == 1 { "" } else { "s" };
+        let own = [
+            ("coordinator-acme", self.blueprint()),
+            ("const DOF: usize = 6;", format!("const DOF: usize = {dof};")),
+            ("a 6-joint arm", format!("{article} {dof}-joint arm")),
+            ("with 6 joints", format!("with {dof} joint{several}")),
+            ("count: 6}", format!("count: {dof}}}")),
+            ("Acme", camel.clone()),
+        ];
+        let own = own.iter().map(|(from, to)| (*from, to.as_str()));
+        replace(text, &own.chain(more.iter().copied()).collect::<Vec<_>>())
+    }
+}
+
+/// The text with each pair's second in place of its first, in one go: what is put in is not looked at again. Where two
+/// pairs begin at the same place, the first one counts.
+fn replace(text: &str, pairs: &[(&str, &str)]) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    let next =
+        |rest: &str| pairs.iter().filter_map(|pair| rest.find(pair.0).map(|at| (at, *pair))).min_by_key(|(at, _)| *at);
+    while let Some((at, (from, to))) = next(rest) {
+        out.push_str(&rest[..at]);
+        out.push_str(to);
+        rest = &rest[at + from.len()..];
+    }
+    out + rest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn arm(name: &str, dof: u8, transport: Transport) -> Arm {
+        Arm { name: Name::parse(name).unwrap(), dof, transport }
+    }
+
+    #[test]
+    fn an_arm_like_the_template_is_the_template() {
+        for (transport, sources) in [(Transport::Tcp, TCP), (Transport::Can, CAN), (Transport::Serial, SERIAL)] {
+            let files = arm("acme", 6, transport).own_crate("path = \"x\"");
+            for (file, text) in sources {
+                let path = if file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
+                assert!(files.contains(&(path, text.to_owned())), "{file}");
+            }
+        }
+    }
+
+    #[test]
+    fn names_that_contain_the_template_s_are_put_in_once() {
+        let files = arm("acme-2", 8, Transport::Can).own_crate("git = \"x\"");
+        let text = |path: &str| &files.iter().find(|(p, _)| p == path).unwrap().1;
+        assert!(text("src/main.rs").contains("include_str!(\"../blueprints/coordinator-acme-2.yaml\")"));
+        assert!(text("src/main.rs").contains("acme_2::SPEC"));
+        assert!(text("src/lib.rs").contains("Acme2, an 8-joint arm") && text("src/lib.rs").contains("usize = 8;"));
+        assert!(text("src/lib.rs").contains("name: \"acme_2\""));
+        assert!(
+            text("Cargo.toml").contains("name = \"acme-2\"") && text("Cargo.toml").contains("dimos = { git = \"x\" }")
+        );
+        assert!(text("blueprints/coordinator-acme-2.yaml").contains("adapter_type: acme_2\n"));
+        assert!(text("README.md").contains("hardware.arm.address=can0"));
+        assert!(files.iter().all(|(_, text)| !text.contains("acme_2_2") && !text.contains("DIMOS")));
+    }
+
+    #[test]
+    fn in_the_tree_nothing_is_of_another_crate() {
+        for transport in [Transport::Tcp, Transport::Can, Transport::Serial] {
+            let files = arm("otto", 7, transport).in_tree();
+            assert_eq!(files.len(), 6);
+            let left = |text: &str| text.contains("dimos::") || text.to_lowercase().contains("acme");
+            assert!(files.iter().all(|(_, text)| !left(text)), "{transport:?}");
+        }
+    }
+}

@@ -1,0 +1,287 @@
+//! `dimos adapter test NAME`: an adapter against its arm. On a real one nothing is enabled and nothing moves, unless
+//! that is asked for; on the emulator the whole suite runs.
+
+use std::io::{self, BufRead, IsTerminal};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::super::exit::{Exit, Failure, Result};
+use super::super::follow::Signals;
+use super::super::output;
+use super::choice::{Choice, failure};
+use super::report::{Arm, Limits, Report, Row};
+use crate::hardware::conformance::{Check, Made, Subject, checks, figures, gently, run_all};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry, SIM};
+use crate::hardware::spec::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
+use crate::runtime::device_lock::{self, DeviceLock};
+
+/// For how long the state is watched.
+const WATCH: Duration = Duration::from_secs(2);
+
+/// Arguments of `adapter test`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+Without --allow-motion nothing is enabled and nothing moves. With it, after a question, each joint goes 2° to either
+side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
+Stay within reach of the arm's own E-stop button.
+
+Exit codes: 0 all passed, 1 something failed, 2 usage, 3 the arm cannot be reached.")]
+pub struct Args {
+    #[command(flatten)]
+    pub choice: Choice,
+    /// Where the arm is, as in a blueprint; `sim` for its emulator
+    #[arg(long)]
+    pub address: Option<String>,
+    /// Move each joint a little, slowly
+    #[arg(long)]
+    pub allow_motion: bool,
+    /// Do not ask before the motion
+    #[arg(long, requires = "allow_motion")]
+    pub yes: bool,
+    /// Make only the checks with this in their names
+    #[arg(long, value_name = "TEXT")]
+    pub only: Option<String>,
+    /// Write the report as Markdown
+    #[arg(long, value_name = "FILE")]
+    pub report: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// An arm to test: what its adapter is made from, and what must live as long as the test.
+struct Bench {
+    subject: Subject,
+    /// The address in full.
+    address: String,
+    _emulator: Option<Box<dyn Emulator>>,
+    _lock: Option<DeviceLock>,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    let row = args.choice.row(registry)?;
+    let chosen: Vec<&'static Check> =
+        checks().filter(|check| args.only.as_ref().is_none_or(|text| check.name.contains(text))).collect();
+    if chosen.is_empty() {
+        let names: Vec<_> = checks().map(|check| check.name).collect();
+        return Err(Failure::usage("no check has such a name").hint(names.join(", ")));
+    }
+    let signals = Signals::watch();
+    let bench = args.bench(&row)?;
+    let mut adapter = (row.create)(&bench.subject.config).map_err(|e| failure(Exit::Usage, &e))?;
+    let unreachable = |e: AdapterError| {
+        let failure = failure(Exit::Hardware, &e);
+        let hint = format!("is it powered, and is the address right ({})?", row.address.form);
+        if failure.hint.is_none() && bench.subject.real { failure.hint(hint) } else { failure }
+    };
+    adapter.connect().map_err(unreachable)?;
+    let limits = adapter.get_limits().map_err(unreachable)?;
+    let figures = figures::measure(&mut *adapter, WATCH).map_err(unreachable)?;
+    let info = adapter.get_info();
+    adapter.disconnect();
+    let checks = args.check(&bench.subject, chosen, &signals).into_iter().map(Row::of).collect();
+    let motion = match (args.allow_motion, signals.last()) {
+        (true, None) => Some(args.motion(&mut *adapter, &info, &bench, &signals)?),
+        _ => None,
+    };
+    let mut report = Report {
+        adapter: row.name.to_owned(),
+        address: bench.address.clone(),
+        simulated: bench._emulator.is_some(),
+        when: jiff::Timestamp::from_second(jiff::Timestamp::now().as_second()).unwrap_or_default().to_string(),
+        dimos: crate::VERSION,
+        arm: arm(&row, info),
+        figures: Some(figures),
+        limits: Limits::from(&limits),
+        checks,
+        passed: false,
+        motion,
+    };
+    report.passed = report.count("failed") == 0 && report.motion.as_ref().is_none_or(|motion| motion.odd.is_none());
+    args.publish(&report)?;
+    match signals.last() {
+        Some(signal) => Ok(Exit::by_signal(signal)),
+        None if report.passed => Ok(Exit::Ok),
+        None => Err(Failure::new(Exit::Failed, report.verdict())),
+    }
+}
+
+impl Args {
+    /// Finds the arm, or starts its emulator.
+    fn bench(&self, row: &AdapterSpec) -> Result<Bench> {
+        let subject = |config: AdapterConfig, real| Subject { config, real, ..Subject::emulated(row) };
+        match self.address.as_deref().map(str::trim) {
+            Some(SIM) if row.emulate.is_some() => {
+                let (emulator, config) = self.emulate(row)?;
+                let address = config.address.clone();
+                Ok(Bench { subject: subject(config, false), address, _emulator: Some(emulator), _lock: None })
+            }
+            None | Some("") if row.address.required => {
+                let failure = Failure::usage(format!("where is the arm? {} needs --address", row.name));
+                let form = row.address.form;
+                Err(failure.hint(match row.emulate {
+                    Some(_) => format!("--address {form}, or --address {SIM} for its emulator"),
+                    None => format!("--address {form}"),
+                }))
+            }
+            None | Some("" | SIM) => {
+                let config = self.made(row, "")?;
+                Ok(Bench { subject: subject(config, false), address: String::new(), _emulator: None, _lock: None })
+            }
+            Some(address) => {
+                let full = (row.address.check)(address)
+                    .map_err(|e| Failure::usage(format!("--address {address}: {e}")).hint(row.address.form))?;
+                let config = self.made(row, &full)?;
+                let lock = device_lock::take(row.name, &full).map_err(|e| {
+                    let hint = "end the run first: `dimos status` shows it, `dimos down` ends it";
+                    Failure::new(Exit::Hardware, e.to_string()).hint(hint)
+                })?;
+                Ok(Bench { subject: subject(config, true), address: full, _emulator: None, _lock: Some(lock) })
+            }
+        }
+    }
+
+    /// A configuration from which an adapter can be made.
+    fn made(&self, row: &AdapterSpec, address: &str) -> Result<AdapterConfig> {
+        let dofs = self.choice.dofs(row)?;
+        let mut refusal = None;
+        for dof in &dofs {
+            let config = self.choice.config(address, *dof)?;
+            match (row.create)(&config) {
+                Ok(_) if dofs.len() > 1 && row.address.required && address != SIM && self.choice.model.is_none() => {
+                    let what = format!("how many joints has it? {} allows {}", row.name, super::choice::joints(row));
+                    return Err(Failure::usage(what).hint(format!("--dof {dof}, say")));
+                }
+                Ok(_) => return Ok(config),
+                Err(error) => refusal = refusal.or(Some(failure(Exit::Usage, &error))),
+            }
+        }
+        Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+    }
+
+    /// Starts the emulator, and says what an adapter for it is made from.
+    fn emulate(&self, row: &AdapterSpec) -> Result<(Box<dyn Emulator>, AdapterConfig)> {
+        let mut refusal = None;
+        for dof in self.choice.dofs(row)? {
+            let mut config = self.choice.config(SIM, dof)?;
+            let emulator =
+                row.emulate.ok_or(AdapterError::Unsupported).and_then(|start| start(&config, &Place::InProcess));
+            match emulator {
+                Ok(emulator) => {
+                    config.address = emulator.address();
+                    return Ok((emulator, config));
+                }
+                Err(error) => refusal = refusal.or(Some(failure(Exit::Usage, &error))),
+            }
+        }
+        Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+    }
+
+    /// Makes the checks, showing how far it is.
+    fn check(&self, subject: &Subject, chosen: Vec<&'static Check>, signals: &Signals) -> Vec<Made> {
+        let bar = self.bar(chosen.len() as u64);
+        let made = run_all(
+            subject,
+            &chosen,
+            &|check, _| {
+                bar.set_message(check.name);
+                bar.inc(1);
+            },
+            &|| signals.last().is_some(),
+        );
+        bar.finish_and_clear();
+        made
+    }
+
+    fn bar(&self, length: u64) -> ProgressBar {
+        let seen = !self.json && io::stderr().is_terminal();
+        let bar = if seen { ProgressBar::new(length) } else { ProgressBar::hidden() };
+        if let Ok(style) = ProgressStyle::with_template("[{bar:30}] {pos}/{len} {msg}") {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        bar
+    }
+
+    /// The small slow motion.
+    fn motion(
+        &self,
+        adapter: &mut dyn ManipulatorAdapter,
+        info: &ManipulatorInfo,
+        bench: &Bench,
+        signals: &Signals,
+    ) -> Result<gently::Motion> {
+        adapter.connect().map_err(|e| failure(Exit::Hardware, &e))?;
+        let refused = gently::refusal(adapter);
+        adapter.disconnect();
+        if let Err(why) = refused {
+            let (what, hint) = why.split_once("\nhint: ").unwrap_or((&why, ""));
+            let failure = Failure::new(Exit::Failed, format!("not moved: {what}"));
+            return Err(if hint.is_empty() { failure } else { failure.hint(hint) });
+        }
+        let (model, dof) = (&info.model, info.dof);
+        if bench.subject.real && !self.yes {
+            output::note(format_args!(
+                "The motors of {model} at {} will come on. Then each of its {dof} joints goes {:.0}° to either side and \
+                 back, first +, then −, at {:.0} % of its top speed, not collision-checked.\n\
+                 Clear the space around it, keep out of it, and stay within reach of its E-stop button. Ctrl-C stops it.",
+                bench.address,
+                gently::REACH.to_degrees(),
+                100.0 * gently::SPEED,
+            ));
+            confirm(signals)?;
+        }
+        adapter.connect().map_err(|e| failure(Exit::Hardware, &e))?;
+        let quiet = self.json;
+        let motion = gently::move_gently(adapter, &|| signals.last().is_some(), &mut |what| {
+            if !quiet {
+                output::note(what);
+            }
+        });
+        adapter.disconnect();
+        Ok(motion)
+    }
+
+    fn publish(&self, report: &Report) -> Result<()> {
+        if let Some(path) = &self.report {
+            std::fs::write(path, report.markdown())
+                .map_err(|e| Failure::new(Exit::Failed, format!("{}: {e}", path.display())))?;
+        }
+        if self.json {
+            output::json(report)
+        } else {
+            report.print()
+        }
+        Ok(())
+    }
+}
+
+/// Asks, where somebody can answer.
+fn confirm(signals: &Signals) -> Result<()> {
+    if !io::stdin().is_terminal() || !io::stderr().is_terminal() {
+        return Err(Failure::usage("nobody can be asked before the motion: this is no terminal").hint("add --yes"));
+    }
+    output::note("Type yes to go on:");
+    let mut answer = String::new();
+    let read = io::stdin().lock().read_line(&mut answer);
+    if read.is_ok() && answer.trim() == "yes" && signals.last().is_none() {
+        return Ok(());
+    }
+    Err(Failure::new(Exit::Failed, "not moved: the answer was not yes"))
+}
+
+fn arm(row: &AdapterSpec, info: ManipulatorInfo) -> Arm {
+    Arm {
+        vendor: info.vendor,
+        model: info.model,
+        dof: info.dof,
+        firmware: info.firmware_version,
+        serial: info.serial_number,
+        modes: info.modes.iter().map(|mode| mode.name()).collect(),
+        wire_units: row.wire_units,
+        native_rate_hz: info.native_rate,
+        holds_when_disabled: info.holds_when_disabled,
+    }
+}

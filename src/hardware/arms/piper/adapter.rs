@@ -1,0 +1,339 @@
+//! The Piper adapter: the adapter protocol on one side, the arm's CAN frames on the other.
+//!
+//! Wire: 0.001°, 0.001 mm, 0.001 rad/s, mA. Here: rad, m, rad/s, Nm. The conversions are in this file, those of angles in
+//! `protocol.rs`.
+//!
+//! The arm sends its state by itself, 200 times a second; nothing is asked for after `connect`. It takes joint targets
+//! without a word: what it does shows in its feedback, and so enabling, clearing and stopping are confirmed by that.
+//!
+//! Nothing here takes the power from the motors but `write_enable(false)`: the arm has no brakes. So a stop is a hold
+//! where the arm is; the arm's own E-stop command can only be left by a reset that lets it fall, and is never sent.
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use super::picture::{Counts, Picture};
+use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
+use super::session::{ESTOP, Session};
+use super::wire::{Wire, WireCounts};
+use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use crate::arm::Pose;
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::registry::AdapterConfig;
+use crate::hardware::spec::{
+    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
+use crate::hardware::transport::can::CanAddress;
+use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
+
+/// How long clearing may take; drivers report every 25 ms.
+const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
+/// How long a stop waits for the joints to get slower, and what counts as standing and as slower [0.001 rad/s].
+const STOP_TIMEOUT: Duration = Duration::from_millis(20);
+const STANDSTILL: i32 = 20;
+const SLOWER: i32 = 20;
+/// So far outside its limits a joint may be sent [rad]: the coordinator keeps to the limits, and an arm that lies
+/// beyond one must find back.
+const MARGIN: f64 = 0.1;
+/// Motor torque per current [Nm/A]: joints 1 to 3, and 4 to 6.
+const TORQUE: [f64; DOF] = [1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844];
+/// Up to this firmware the arm reports a quarter of the current of its first three joints.
+const QUARTER_CURRENT: (u8, u8, u8) = (1, 8, 2);
+
+const MICRO: f64 = 1e-6;
+const MILLI: f64 = 1e-3;
+
+/// A Piper on its bus.
+pub struct PiperAdapter {
+    arm: Session,
+    options: Options,
+    mode: ControlMode,
+}
+
+impl PiperAdapter {
+    /// An adapter for the arm on the bus at `config.address`. Does not connect.
+    pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
+        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
+        if config.dof != DOF {
+            return Err(rejected(format!("piper has {DOF} joints, not {}", config.dof)));
+        }
+        let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        Ok(Self {
+            arm: Session::new(config.hardware_id.clone(), address),
+            options: config.options()?,
+            mode: ControlMode::Position,
+        })
+    }
+
+    /// What was counted since the connection was made: frames of the arm, and of the bus.
+    pub fn counts(&self) -> (Counts, WireCounts) {
+        (self.arm.picture.counts, self.arm.wire.as_ref().map(|wire| wire.counts).unwrap_or_default())
+    }
+
+    /// Speed of a planned move [%] from a fraction of the top speed.
+    fn percent(&self, velocity: f64) -> u8 {
+        (velocity * self.options.speed_scale * 100.0).round().clamp(1.0, 100.0) as u8
+    }
+
+    fn follow(&self) -> protocol::Follow {
+        match (self.mode, self.options.follow) {
+            (ControlMode::ServoPosition, Follow::Direct) => protocol::Follow::Direct,
+            _ => protocol::Follow::Smooth,
+        }
+    }
+
+    /// Makes the place where the arm is its target.
+    fn hold(&mut self) -> AdapterResult<()> {
+        self.arm.send(&protocol::joint_targets(100, self.follow(), self.arm.picture.joints))
+    }
+
+    fn velocities(&self) -> Joints {
+        joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI))
+    }
+
+    /// Torques [Nm]; `None` when the firmware, which says how to read the currents, is not known.
+    fn efforts(&self) -> Option<Joints> {
+        let quarter = self.arm.picture.firmware()? <= QUARTER_CURRENT;
+        let mut efforts = [0.0; DOF];
+        let motors = self.arm.picture.motors.iter().zip(TORQUE).enumerate();
+        for (effort, (joint, (motor, torque))) in efforts.iter_mut().zip(motors) {
+            let scale = if quarter && joint < 3 { 4.0 } else { 1.0 };
+            *effort = f64::from(motor.current) * MILLI * torque * scale;
+        }
+        Some(joints_of(&efforts))
+    }
+}
+
+/// Copies the first values; `out` has length dof.
+fn fill(out: &mut [f64], values: &[f64]) {
+    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+}
+
+impl ManipulatorAdapter for PiperAdapter {
+    // --- Lifecycle ---
+
+    fn connect(&mut self) -> AdapterResult<()> {
+        self.disconnect();
+        self.arm.connect()
+    }
+
+    fn disconnect(&mut self) {
+        self.arm.wire = None;
+    }
+
+    fn is_connected(&self) -> bool {
+        self.arm.wire.is_some()
+    }
+
+    // --- What it is ---
+
+    fn get_info(&self) -> ManipulatorInfo {
+        ManipulatorInfo {
+            vendor: "AgileX".into(),
+            model: "Piper".into(),
+            dof: DOF,
+            firmware_version: self.arm.picture.firmware().map(|(a, b, c)| format!("S-V{a}.{b}-{c}")),
+            serial_number: None,
+            native_rate: NATIVE_RATE,
+            modes: MODES,
+            holds_when_disabled: HOLDS_WHEN_DISABLED,
+            whole_state_at_once: true,
+        }
+    }
+
+    fn get_dof(&self) -> usize {
+        DOF
+    }
+
+    /// The data sheet's limits, narrowed by those that the controller has been given.
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        let mut limits = limits(DOF);
+        let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
+        let all = positions.zip(&mut limits.velocity_max).zip(&self.arm.picture.limits);
+        for (((lower, upper), speed), own) in all {
+            let Some(own) = own else { continue };
+            let decidegrees = |value: i16| (f64::from(value) / 10.0).to_radians();
+            let (low, high) = (lower.max(decidegrees(own.lower)), upper.min(decidegrees(own.upper)));
+            if low < high {
+                (*lower, *upper) = (low, high);
+            }
+            if own.speed > 0 {
+                *speed = speed.min(f64::from(own.speed) * MILLI);
+            }
+        }
+        Ok(limits)
+    }
+
+    // --- Mode ---
+
+    /// Both modes are MOVE J and differ in what stands before each target, so that nothing is sent here.
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        if !MODES.contains(&mode) {
+            return Err(AdapterError::Unsupported);
+        }
+        self.arm.known()?;
+        self.mode = mode;
+        Ok(())
+    }
+
+    fn get_control_mode(&self) -> ControlMode {
+        self.mode
+    }
+
+    // --- State ---
+
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.arm.wire.as_ref().map(Wire::fd)
+    }
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        self.arm.refresh()?;
+        fill(positions, &self.arm.picture.joints.map(radians));
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        self.arm.known()?;
+        fill(velocities, &self.velocities());
+        Ok(true)
+    }
+
+    fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
+        self.arm.known()?;
+        let known = self.efforts();
+        known.iter().for_each(|known| fill(efforts, known));
+        Ok(known.is_some())
+    }
+
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        self.arm.refresh()?;
+        *reading = JointReading {
+            stamp: Some(self.arm.picture.joints_at),
+            position: joints_of(&self.arm.picture.joints.map(radians)),
+            velocity: Some(self.velocities()),
+            effort: self.efforts(),
+        };
+        Ok(())
+    }
+
+    /// State: the arm's own (0 = in order, 1 = E-stop …); mode: who controls it (0 nobody, 1 CAN, 2 teaching …).
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        let status = self.arm.known()?.status;
+        Ok(RobotState { state: status.arm.into(), mode: status.control.into() })
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        let picture = self.arm.known()?;
+        Ok((picture.error_code(), picture.error_text())) // an empty text allocates nothing
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        Ok(self.arm.known()?.enabled())
+    }
+
+    // --- Motion ---
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        let Ok(positions) = <[f64; DOF]>::try_from(positions) else {
+            return Err(self.arm.refuse(format!("{DOF} values are needed, one per joint")));
+        };
+        for (i, (value, (lower, upper))) in positions.iter().zip(super::RANGES).enumerate() {
+            // Not finite is not inside either.
+            if !(lower - MARGIN..=upper + MARGIN).contains(value) {
+                let joint = i + 1;
+                return Err(self.arm.refuse(format!("joint {joint}: {value} rad is not within {lower} to {upper}")));
+            }
+        }
+        self.arm.may_move()?;
+        let speed = if self.mode == ControlMode::Position { self.percent(velocity) } else { 100 };
+        let joints: WireJoints = positions.map(millidegrees);
+        self.arm.send(&protocol::joint_targets(speed, self.follow(), joints))
+    }
+
+    /// Holds the arm where it is. Confirmed when its feedback shows that every joint gets slower or stands.
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
+        let before = self.arm.picture.motors.map(|motor| i32::from(motor.speed).abs());
+        if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
+            self.hold()?;
+        }
+        let sent = self.arm.picture.joints_at;
+        let slower = |picture: &Picture| {
+            let speeds = picture.motors.iter().map(|motor| i32::from(motor.speed).abs());
+            picture.joints_at > sent && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
+        };
+        Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
+    }
+
+    /// Enabling holds the arm where it is: the target is set before the motors come on, and anew when they are on.
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        if !enable {
+            self.arm.drain()?;
+            return self.arm.switch_motors(false);
+        }
+        self.arm.refresh()?;
+        self.arm.in_order()?;
+        self.arm.plausible()?;
+        self.hold()?;
+        self.arm.switch_motors(true)?;
+        self.arm.refresh()?;
+        self.hold()
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.arm.refresh()?;
+        if self.arm.picture.status.arm == ESTOP {
+            return self.arm.in_order();
+        }
+        self.arm.send(&[protocol::clear_errors()])?;
+        self.arm.picture.expect_drivers();
+        let asked = MonotonicClock.now();
+        let cleared = |p: &Picture| p.drivers_heard() && p.status_at > asked && p.error_code() == 0;
+        if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
+            return Ok(());
+        }
+        let (code, text) = (self.arm.picture.error_code(), self.arm.picture.error_text());
+        Err(AdapterError::Fault { code, text })
+    }
+
+    // --- Optional parts ---
+
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+        Ok(self.arm.known()?.pose.map(|[x, y, z, roll, pitch, yaw]| Pose {
+            xyz: [x, y, z].map(|v| f64::from(v) * MICRO),
+            rpy: [roll, pitch, yaw].map(radians),
+        }))
+    }
+
+    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
+        // Ten metres and ten turns are far beyond the arm, and far inside the wire's numbers.
+        let sensible = pose.xyz.iter().all(|v| v.abs() < 10.0) && pose.rpy.iter().all(|v| v.abs() < 62.0);
+        if !sensible {
+            return Err(self.arm.refuse("the pose is not finite, or absurd".into()));
+        }
+        self.arm.may_move()?;
+        let ([x, y, z], [roll, pitch, yaw]) =
+            (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
+        self.arm.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
+    }
+
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        let used = self.options.gripper.stroke().is_some();
+        let gripper = self.arm.known()?.gripper.filter(|_| used);
+        Ok(gripper.map(|gripper| f64::from(gripper.stroke) * MICRO))
+    }
+
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.options.gripper.stroke().map(|stroke| (0.0, stroke))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        let stroke = self.options.gripper.stroke().ok_or(AdapterError::Unsupported)?;
+        if !(0.0..=stroke).contains(&position) {
+            return Err(self.arm.refuse(format!("gripper opening {position} m is not within 0 to {stroke} m")));
+        }
+        self.arm.may_move()?;
+        let torque = (self.options.gripper_torque / MILLI).round() as u16;
+        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, torque)])
+    }
+}

@@ -1,0 +1,168 @@
+//! The emulator: plays a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface or
+//! a serial line.
+//!
+//! Like the arm it sends its state by itself, at the arm's rates (3 040 frames/s in all), whether somebody listens or
+//! not, and takes commands from whoever sends them. Its motions and its faults are in `controller.rs`, its bus and its
+//! thread in `server.rs`.
+
+mod controller;
+mod kinematics;
+mod server;
+mod wire;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+
+use super::protocol::DOF;
+use super::{GripperKind, NATIVE_RATE, Options, limits};
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::can::CanFrame;
+use crate::joint::Joints;
+use controller::Controller;
+use server::Server;
+
+/// The faults that the emulator can play on any bus.
+const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Truncated,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+    FaultKind::Leader,
+    // Only on a bus in memory; the last of the list, in that order.
+    FaultKind::Disconnect,
+    FaultKind::BusOff,
+    FaultKind::NoBuffers,
+];
+/// How many of them every bus can play.
+const ANYWHERE: usize = PLAYABLE.len() - 3;
+
+/// What the emulator does.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at power-up [rad], one per joint; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
+    pub initial_positions: Vec<f64>,
+    /// How often it sends its state, 20 to 200 [Hz]: an arm's 200, or less for a client that cannot keep up.
+    #[serde(deserialize_with = "rate")]
+    #[schemars(range(min = 20, max = 200))]
+    pub feedback_hz: f64,
+    /// Its firmware, as the arm says it.
+    pub firmware: String,
+    /// What goes wrong, and when (seconds after the first frame to the arm).
+    pub faults: Vec<Fault>,
+}
+
+impl Default for SimOptions {
+    fn default() -> Self {
+        Self {
+            initial_positions: Vec::new(),
+            feedback_hz: NATIVE_RATE,
+            firmware: "S-V1.8-5".to_owned(),
+            faults: Vec::new(),
+        }
+    }
+}
+
+fn rate<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    let value = f64::deserialize(deserializer)?;
+    if (20.0..=NATIVE_RATE).contains(&value) {
+        Ok(value)
+    } else {
+        Err(serde::de::Error::custom(format!("{value} is not between 20 and {NATIVE_RATE}")))
+    }
+}
+
+/// A running emulator. Ends when it is dropped.
+pub struct PiperEmulator {
+    server: Server,
+    playable: &'static [FaultKind],
+}
+
+impl PiperEmulator {
+    /// Starts an emulator at `place`, with the adapter's options.
+    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+        let options = config.options::<Options>()?;
+        Self::with(&options.sim, options.gripper, place)
+    }
+
+    /// Starts an emulator at `place`.
+    pub fn with(options: &SimOptions, gripper: GripperKind, place: &Place) -> AdapterResult<Self> {
+        let playable = if *place == Place::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
+        check_kinds("the piper emulator", &options.faults, playable).map_err(AdapterError::Rejected)?;
+        let rejected = |text: String| AdapterError::Rejected(format!("piper emulator: {text}"));
+        let (initial, limits) = (&options.initial_positions, limits(DOF));
+        let mut range = limits.position_lower.iter().zip(&limits.position_upper);
+        let inside = initial.iter().zip(&mut range).all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
+        if !initial.is_empty() && (initial.len() != DOF || !inside) {
+            return Err(rejected(format!("initial_positions must be {DOF} angles [rad] within the joint limits")));
+        }
+        if options.firmware.len() != 8 {
+            return Err(rejected("firmware must have 8 characters, as S-V1.8-5 has".to_owned()));
+        }
+        let controller = Controller::new(options, gripper, MonotonicClock.now());
+        Ok(Self { server: Server::start(controller, place, options.feedback_hz)?, playable })
+    }
+
+    /// True joint positions [rad] and velocities [rad/s] now.
+    pub fn joints(&self) -> (Joints, Joints) {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            controller.true_joints()
+        })
+    }
+
+    /// Whether the motors are on.
+    pub fn enabled(&self) -> bool {
+        self.server.with(|controller, _| controller.enabled())
+    }
+
+    /// How often a client has let the motors lose their power by a reset (0x150).
+    pub fn power_drops(&self) -> u64 {
+        self.server.with(|controller, _| controller.power_drops)
+    }
+
+    /// Starts to record what comes over the bus, up to 200 000 frames; forgets what was recorded before.
+    pub fn record(&self) {
+        self.server.with(|controller, _| controller.record());
+    }
+
+    /// What came over the bus since [`PiperEmulator::record`], and when.
+    pub fn trace(&self) -> Vec<(Mono, CanFrame)> {
+        self.server.with(|controller, _| controller.trace())
+    }
+
+    /// How many frames it has sent.
+    pub fn sent(&self) -> u64 {
+        self.server.sent()
+    }
+
+    /// How many frames its bus did not take.
+    pub fn not_taken(&self) -> u64 {
+        self.server.not_taken()
+    }
+}
+
+impl Emulator for PiperEmulator {
+    fn address(&self) -> String {
+        self.server.address()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        check_kinds("the piper emulator", &[fault], self.playable)?;
+        self.server.with(|controller, now| controller.inject(fault, now));
+        Ok(())
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.joints().0)
+    }
+}

@@ -1,0 +1,159 @@
+//! AgileX Piper: 6 joints and a gripper on a CAN bus. `docs/arms/piper.md` is for those who run one.
+
+pub mod adapter;
+pub mod emulator;
+#[cfg(test)]
+mod golden;
+pub mod picture;
+pub mod protocol;
+mod session;
+#[cfg(test)]
+mod tests;
+#[cfg(test)]
+mod tests_faults;
+mod wire;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+
+use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::transport::can::CanAddress;
+use crate::hardware::transport::can::address::FORMS;
+use crate::joint::{ControlMode, JointLimits};
+
+/// The modes of the arm. It has no velocity mode.
+const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition];
+
+/// How often the arm sends its positions [Hz].
+const NATIVE_RATE: f64 = 200.0;
+
+/// The arm has no brakes: without power on its motors it falls.
+const HOLDS_WHEN_DISABLED: bool = false;
+
+/// The Piper's row in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "piper",
+    about: "AgileX Piper, 6 joints and gripper",
+    level: Level::Emulated,
+    transport: "can",
+    dof: (protocol::DOF, protocol::DOF),
+    modes: MODES,
+    wire_units: "0.001 deg, 0.001 mm",
+    native_rate: NATIVE_RATE,
+    address: AddressForm {
+        form: FORMS,
+        required: true,
+        check: |address| CanAddress::parse(address).map(|address| address.to_string()),
+    },
+    holds_when_disabled: HOLDS_WHEN_DISABLED,
+    gripper: true,
+    options: OptionsSpec::of::<Options>(),
+    limits,
+    create: |config| Ok(Box::new(adapter::PiperAdapter::new(config)?)),
+    emulate: Some(|config, place| Ok(Box::new(emulator::PiperEmulator::start(config, place)?))),
+};
+
+/// Lowest and highest position of each joint [rad].
+#[expect(clippy::approx_constant, reason = "the vendor's figure for joint 2, which is not π")]
+const RANGES: [(f64, f64); protocol::DOF] =
+    [(-2.6179, 2.6179), (0.0, 3.14), (-2.967, 0.0), (-1.745, 1.745), (-1.22, 1.22), (-2.09439, 2.09439)];
+/// Highest speed [rad/s] and acceleration [rad/s²] of every joint.
+const SPEED: f64 = 3.0;
+const ACCELERATION: f64 = 5.0;
+
+/// The joint limits of the data sheet. They do not depend on `dof`: the arm has 6 joints.
+fn limits(_dof: usize) -> JointLimits {
+    JointLimits {
+        position_lower: RANGES.iter().map(|range| range.0).collect(),
+        position_upper: RANGES.iter().map(|range| range.1).collect(),
+        velocity_max: vec![SPEED; protocol::DOF],
+        acceleration_max: vec![ACCELERATION; protocol::DOF],
+        jerk_max: Vec::new(),
+    }
+}
+
+/// Which gripper is fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum GripperKind {
+    /// None, or one that is not to be used.
+    None,
+    /// Opens to 70 mm.
+    #[default]
+    Small,
+    /// Opens to 100 mm.
+    Large,
+}
+
+impl GripperKind {
+    /// Widest opening [m].
+    pub fn stroke(self) -> Option<f64> {
+        match self {
+            Self::None => None,
+            Self::Small => Some(0.070),
+            Self::Large => Some(0.100),
+        }
+    }
+}
+
+/// How streamed positions are followed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Follow {
+    /// The controller smooths the way to each set point.
+    #[default]
+    Smooth,
+    /// The controller hands each set point to the motors as it is: very stiff.
+    Direct,
+}
+
+/// What a blueprint may set of a Piper.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Scales the speed of moves that the controller plans (0–1].
+    #[serde(deserialize_with = "fraction")]
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
+    pub speed_scale: f64,
+    /// How streamed positions are followed (mode `servo_position`).
+    pub follow: Follow,
+    /// Which gripper is fitted.
+    pub gripper: GripperKind,
+    /// With how much torque the gripper closes at most (0–5] [Nm].
+    #[serde(deserialize_with = "torque")]
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 5))]
+    pub gripper_torque: f64,
+    /// What the emulator does, when one stands in for the arm.
+    pub sim: emulator::SimOptions,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            speed_scale: 1.0,
+            follow: Follow::default(),
+            gripper: GripperKind::default(),
+            gripper_torque: 1.0,
+            sim: emulator::SimOptions::default(),
+        }
+    }
+}
+
+/// A number above 0, up to 1.
+fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    above_zero(deserializer, 1.0)
+}
+
+/// A number above 0, up to 5.
+fn torque<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    above_zero(deserializer, 5.0)
+}
+
+fn above_zero<'de, D: Deserializer<'de>>(deserializer: D, most: f64) -> Result<f64, D::Error> {
+    let value = f64::deserialize(deserializer)?;
+    if value > 0.0 && value <= most {
+        Ok(value)
+    } else {
+        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most {most}")))
+    }
+}

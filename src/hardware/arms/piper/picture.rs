@@ -1,0 +1,352 @@
+//! What is known of the arm: its feedback frames put together.
+//!
+//! Positions and poses come in three frames each. A set counts when its three frames came in order and belong to one
+//! burst: never half of one measurement and half of the next.
+
+use std::time::Duration;
+
+use super::protocol::{DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text};
+use crate::clock::Mono;
+
+/// Frames of one burst arrive within less than a period of the arm.
+const BURST: Duration = Duration::from_millis(4);
+/// No joint is farther round than this [0.001°].
+const FAR: u32 = 360_000;
+/// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
+const NOT_ZERO: u32 = 5_000;
+/// All joints, as bits.
+const ALL: u8 = 0x3F;
+/// Room for the text of the firmware.
+const TEXT: usize = 128;
+
+/// Three frames that make six numbers.
+#[derive(Debug, Clone, Copy, Default)]
+struct Triple {
+    parts: [[i32; 2]; 3],
+    next: usize,
+    began: Mono,
+}
+
+impl Triple {
+    /// Takes a part; the answer is the set that it completes.
+    fn take(&mut self, part: usize, pair: [i32; 2], now: Mono) -> Option<[i32; 6]> {
+        if part == 0 {
+            self.began = now;
+        } else if part != self.next || now.since(self.began) > BURST {
+            self.next = 0;
+            return None;
+        }
+        *self.parts.get_mut(part)? = pair;
+        self.next = (part + 1) % 3;
+        let [[a, b], [c, d], [e, f]] = self.parts;
+        (self.next == 0).then_some([a, b, c, d, e, f])
+    }
+}
+
+/// What was counted since the connection was made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Frames that meant something.
+    pub decoded: u64,
+    /// Complete sets of joint positions.
+    pub sets: u64,
+    /// Frames too short, and sets that no arm can mean.
+    pub damaged: u64,
+    /// Frames of no interest.
+    pub other: u64,
+    /// Frames such as an arm sends that leads others.
+    pub leader: u64,
+}
+
+/// The arm's newest feedback. `Mono::ZERO` stands for never.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    /// Joint positions [0.001°] and when their last frame arrived.
+    pub joints: WireJoints,
+    /// When `joints` was completed.
+    pub joints_at: Mono,
+    /// x, y, z [0.001 mm], roll, pitch, yaw [0.001°].
+    pub pose: Option<[i32; 6]>,
+    /// The controller's state.
+    pub status: Status,
+    /// When `status` arrived.
+    pub status_at: Mono,
+    /// Speeds and currents.
+    pub motors: [Motor; DOF],
+    /// Voltages, temperatures, errors.
+    pub drivers: [Driver; DOF],
+    /// The gripper, once it was heard of.
+    pub gripper: Option<Gripper>,
+    /// The limits that the controller was asked for.
+    pub limits: [Option<MotorLimits>; DOF],
+    /// When somebody else last sent a command to an arm on this bus.
+    pub commanded_at: Mono,
+    /// What was counted.
+    pub counts: Counts,
+    /// Of which motors and drivers there was news, as bits: ever, and since [`Picture::expect_drivers`].
+    motors_seen: u8,
+    drivers_seen: u8,
+    joint_parts: Triple,
+    pose_parts: Triple,
+    text: [u8; TEXT],
+    text_length: usize,
+}
+
+impl Default for Picture {
+    fn default() -> Self {
+        Self {
+            joints: [0; DOF],
+            joints_at: Mono::ZERO,
+            pose: None,
+            status: Status::default(),
+            status_at: Mono::ZERO,
+            motors: Default::default(),
+            drivers: Default::default(),
+            gripper: None,
+            limits: [None; DOF],
+            commanded_at: Mono::ZERO,
+            counts: Counts::default(),
+            motors_seen: 0,
+            drivers_seen: 0,
+            joint_parts: Triple::default(),
+            pose_parts: Triple::default(),
+            text: [0; TEXT],
+            text_length: 0,
+        }
+    }
+}
+
+impl Picture {
+    /// Adds what a frame says that arrived at `now`.
+    pub fn take(&mut self, feedback: Feedback, now: Mono) {
+        match feedback {
+            Feedback::Other => return self.counts.other += 1,
+            Feedback::Damaged => return self.counts.damaged += 1,
+            Feedback::Leader => {
+                self.commanded_at = now;
+                return self.counts.leader += 1;
+            }
+            _ => self.counts.decoded += 1,
+        }
+        match feedback {
+            Feedback::Joints(part, pair) => {
+                if let Some(joints) = self.joint_parts.take(part, pair, now) {
+                    self.take_joints(joints, now);
+                }
+            }
+            Feedback::Pose(part, pair) => self.pose = self.pose_parts.take(part, pair, now).or(self.pose),
+            Feedback::Status(status) => (self.status, self.status_at) = (status, now),
+            Feedback::Gripper(gripper) => self.gripper = Some(gripper),
+            Feedback::Motor(joint, motor) => {
+                self.motors.get_mut(joint).into_iter().for_each(|to| *to = motor);
+                self.motors_seen |= 1 << joint;
+            }
+            Feedback::Driver(joint, driver) => {
+                self.drivers.get_mut(joint).into_iter().for_each(|to| *to = driver);
+                self.drivers_seen |= 1 << joint;
+            }
+            Feedback::Limits(joint, limits) => {
+                self.limits.get_mut(joint).into_iter().for_each(|to| *to = Some(limits));
+            }
+            Feedback::Firmware(piece, length) => {
+                let room = self.text.get_mut(self.text_length..).unwrap_or_default();
+                let count = length.min(room.len());
+                room.iter_mut().zip(piece.iter().take(count)).for_each(|(to, from)| *to = *from);
+                self.text_length += count;
+            }
+            Feedback::Other | Feedback::Damaged | Feedback::Leader => {}
+        }
+    }
+
+    fn take_joints(&mut self, joints: WireJoints, now: Mono) {
+        let far = joints.iter().any(|value| value.unsigned_abs() > FAR);
+        // A controller that has just started says zero before it has asked its joints.
+        let elsewhere = self.joints_at != Mono::ZERO && self.joints.iter().any(|value| value.unsigned_abs() > NOT_ZERO);
+        if far || (elsewhere && joints == [0; DOF]) {
+            return self.counts.damaged += 1;
+        }
+        (self.joints, self.joints_at) = (joints, now);
+        self.counts.sets += 1;
+    }
+
+    /// Whether everything was heard of that the reads need.
+    pub fn complete(&self) -> bool {
+        let heard = [self.joints_at, self.status_at].iter().all(|at| *at != Mono::ZERO);
+        heard && self.motors_seen == ALL && self.drivers_seen == ALL
+    }
+
+    /// Whether every motor is on.
+    pub fn enabled(&self) -> bool {
+        self.drivers.iter().all(Driver::enabled)
+    }
+
+    /// Whether every motor is off.
+    pub fn disabled(&self) -> bool {
+        !self.drivers.iter().any(Driver::enabled)
+    }
+
+    /// Forgets which drivers were heard of, to hear of each of them anew.
+    pub fn expect_drivers(&mut self) {
+        self.drivers_seen = 0;
+    }
+
+    /// Whether all drivers were heard of since [`Picture::expect_drivers`].
+    pub fn drivers_heard(&self) -> bool {
+        self.drivers_seen == ALL
+    }
+
+    /// The firmware as (1, 6, 3) for `S-V1.6-3`, once the controller has said it.
+    pub fn firmware(&self) -> Option<(u8, u8, u8)> {
+        let text = self.text.get(..self.text_length)?;
+        let start = text.windows(3).position(|window| window == b"S-V")? + 3;
+        let rest = text.get(start..start + 5)?;
+        let digit = |at: usize| rest.get(at).filter(|c| c.is_ascii_digit()).map(|c| c - b'0');
+        Some((digit(0)?, digit(2)?, digit(4)?))
+    }
+
+    // --- Errors ---
+
+    /// The first error, by weight: 1–15 and above a state of the arm, 201–206 a joint that does not answer, 101–106 a
+    /// joint beyond its limits, 3jb bit b of the driver of joint j; 0 = none.
+    pub fn error_code(&self) -> i32 {
+        let bit = |bits: u8| bits.trailing_zeros() as i32 + 1;
+        let Status { arm, limits, silent, .. } = self.status;
+        if !matches!(arm, 0 | 11..=13) {
+            return arm.into();
+        }
+        if silent != 0 {
+            return 200 + bit(silent);
+        }
+        if limits != 0 {
+            return 100 + bit(limits);
+        }
+        self.driver_errors().next().map_or(0, |(joint, bit, _)| 300 + 10 * joint as i32 + i32::from(bit))
+    }
+
+    /// All that is wrong, in words; empty when nothing is.
+    pub fn error_text(&self) -> String {
+        if self.error_code() == 0 {
+            return String::new();
+        }
+        let mut parts = Vec::new();
+        if !matches!(self.status.arm, 0 | 11..=13) {
+            parts.push(arm_text(self.status.arm).to_owned());
+        }
+        for joint in 1..=DOF {
+            let has = |bits: u8| bits & (1 << (joint - 1)) != 0;
+            if has(self.status.silent) {
+                parts.push(format!("joint {joint} does not answer"));
+            }
+            if has(self.status.limits) {
+                parts.push(format!("joint {joint} beyond its limits"));
+            }
+        }
+        parts.extend(self.driver_errors().map(|(joint, bit, driver)| {
+            let what = driver_text(bit).unwrap_or_default();
+            match bit {
+                0 => format!("joint {joint}: {what} ({:.1} V)", f64::from(driver.voltage) / 10.0),
+                1 => format!("joint {joint}: {what} ({} °C)", driver.motor_temperature),
+                3 => format!("joint {joint}: {what} ({} °C)", driver.driver_temperature),
+                _ => format!("joint {joint}: {what}"),
+            }
+        }));
+        parts.join("; ")
+    }
+
+    /// Joint (from 1), bit and driver of every error that a driver reports.
+    fn driver_errors(&self) -> impl Iterator<Item = (usize, u8, &Driver)> {
+        self.drivers.iter().enumerate().flat_map(|(i, driver)| {
+            let errors = (0..8).filter(|bit| driver.status & (1 << bit) != 0 && driver_text(*bit).is_some());
+            errors.map(move |bit| (i + 1, bit, driver))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn ms(n: u64) -> Mono {
+        Mono(1_000_000_000 + n * 1_000_000)
+    }
+
+    fn joints(picture: &mut Picture, part: usize, value: i32, at: Mono) {
+        picture.take(Feedback::Joints(part, [value, value]), at);
+    }
+
+    #[test]
+    fn a_set_is_three_frames_of_one_burst_in_order() {
+        let mut picture = Picture::default();
+        (0..3).for_each(|part| joints(&mut picture, part, 1, ms(part as u64)));
+        assert_eq!((picture.joints, picture.joints_at), ([1; 6], ms(2)));
+        // Each of the three lost in turn: no set.
+        for lost in 0..3 {
+            (0..3).filter(|part| *part != lost).for_each(|part| joints(&mut picture, part, 7, ms(10)));
+        }
+        assert_eq!(picture.joints, [1; 6]);
+        // The end of one burst and that of the next.
+        joints(&mut picture, 0, 8, ms(20));
+        joints(&mut picture, 1, 8, ms(20));
+        joints(&mut picture, 2, 9, ms(25));
+        assert_eq!((picture.joints, picture.counts.sets), ([1; 6], 1));
+        (0..3).for_each(|part| joints(&mut picture, part, -5, ms(30)));
+        assert_eq!((picture.joints, picture.joints_at), ([-5; 6], ms(30)));
+    }
+
+    #[test]
+    fn sudden_zeros_and_impossible_angles_are_not_believed() {
+        let mut picture = Picture::default();
+        let mut set = |value: i32| {
+            (0..3).for_each(|part| joints(&mut picture, part, value, ms(1)));
+            picture.joints[0]
+        };
+        assert_eq!(set(0), 0, "the first may be zero: activation looks again");
+        assert_eq!(set(40_000), 40_000);
+        assert_eq!(set(0), 40_000);
+        assert_eq!(set(400_000), 40_000);
+        assert_eq!(set(4_000), 4_000);
+        assert_eq!(set(0), 0, "close to zero, zero is plausible");
+        assert_eq!(picture.counts.damaged, 2);
+    }
+
+    #[test]
+    fn errors_have_a_code_and_all_their_words() {
+        let mut picture = Picture::default();
+        assert_eq!((picture.error_code(), picture.error_text()), (0, String::new()));
+        let hot = Driver { motor_temperature: 84, status: 0x40 | 0b10, ..Driver::default() };
+        picture.take(Feedback::Driver(2, hot), ms(0));
+        assert_eq!((picture.error_code(), picture.error_text()), (331, "joint 3: motor too hot (84 °C)".into()));
+        picture.take(Feedback::Status(Status { limits: 0b10, silent: 0b100000, ..Status::default() }), ms(0));
+        assert_eq!(picture.error_code(), 206);
+        picture.take(Feedback::Status(Status { arm: 9, limits: 0b10, ..Status::default() }), ms(0));
+        let text = "a joint is in error; joint 2 beyond its limits; joint 3: motor too hot (84 °C)";
+        assert_eq!((picture.error_code(), picture.error_text()), (9, text.into()));
+        picture.take(Feedback::Status(Status { arm: 12, ..Status::default() }), ms(0));
+        assert_eq!(picture.error_code(), 331, "being taught is no error");
+    }
+
+    #[test]
+    fn the_firmware_is_found_in_its_pieces() {
+        let mut picture = Picture::default();
+        for (piece, length) in [(b"\0H-V1.2-", 8), (b"1 S-V1.6", 8), (b"-3\0\0\0\0\0\0", 2)] {
+            assert_eq!(picture.firmware(), None);
+            picture.take(Feedback::Firmware(*piece, length), ms(0));
+        }
+        assert_eq!(picture.firmware(), Some((1, 6, 3)));
+        (0..1000).for_each(|_| picture.take(Feedback::Firmware([b'x'; 8], 8), ms(0)));
+        assert_eq!(picture.firmware(), Some((1, 6, 3)));
+    }
+
+    #[test]
+    fn it_is_complete_when_every_part_was_heard() {
+        let mut picture = Picture::default();
+        (0..3).for_each(|part| joints(&mut picture, part, 1, ms(0)));
+        picture.take(Feedback::Status(Status::default()), ms(0));
+        for joint in 0..DOF {
+            assert!(!picture.complete());
+            picture.take(Feedback::Motor(joint, Motor::default()), ms(0));
+            picture.take(Feedback::Driver(joint, Driver { status: 0x40, ..Driver::default() }), ms(0));
+        }
+        assert!(picture.complete() && picture.enabled() && !picture.disabled());
+    }
+}

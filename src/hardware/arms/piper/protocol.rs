@@ -1,0 +1,310 @@
+//! The wire format of the Piper: pure encoding and decoding, no I/O, no units but the wire's own (0.001°, 0.001 mm,
+//! 0.001 rad/s, mA, mNm). All numbers are big-endian.
+//!
+//! There is no encoder for 0x150 (stop and reset) on purpose: its stop can only be left by its reset, and its reset
+//! takes the power from the motors, so that the arm falls.
+
+use crate::hardware::transport::can::CanFrame;
+
+/// Number of joints.
+pub const DOF: usize = 6;
+
+/// One value per joint, in wire units.
+pub type WireJoints = [i32; DOF];
+
+// --- Commands ---
+
+/// How the controller brings the arm to its targets (0x151, byte 1).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum MoveMode {
+    /// Pose targets (MOVE P).
+    Pose = 0,
+    /// Joint targets (MOVE J).
+    Joint = 1,
+}
+
+/// How closely the controller follows joint targets (0x151, byte 3).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Follow {
+    /// It smooths the way to each target.
+    Smooth = 0x00,
+    /// It hands each target to the motors as it is.
+    Direct = 0xAD,
+}
+
+/// The eight bytes of a frame.
+fn frame(id: u16, data: [u8; 8]) -> CanFrame {
+    CanFrame { id, len: 8, data }
+}
+
+/// Two 32-bit numbers.
+fn pair(id: u16, first: i32, second: i32) -> CanFrame {
+    let ([a, b, c, d], [e, f, g, h]) = (first.to_be_bytes(), second.to_be_bytes());
+    frame(id, [a, b, c, d, e, f, g, h])
+}
+
+/// 0x151: control over CAN, in a move mode, at a speed [%].
+fn motion_control(mode: MoveMode, speed: u8, follow: Follow) -> CanFrame {
+    frame(0x151, [1, mode as u8, speed.min(100), follow as u8, 0, 0, 0, 0])
+}
+
+/// Joint targets [0.001°] at a speed [%]: 0x151 stands before every burst, so that a lost frame costs one burst only.
+pub fn joint_targets(speed: u8, follow: Follow, [j1, j2, j3, j4, j5, j6]: WireJoints) -> [CanFrame; 4] {
+    let mode = motion_control(MoveMode::Joint, speed, follow);
+    [mode, pair(0x155, j1, j2), pair(0x156, j3, j4), pair(0x157, j5, j6)]
+}
+
+/// A target of the end: x, y, z [0.001 mm], roll, pitch, yaw [0.001°], at a speed [%].
+pub fn pose_target(speed: u8, [x, y, z, roll, pitch, yaw]: [i32; 6]) -> [CanFrame; 4] {
+    let mode = motion_control(MoveMode::Pose, speed, Follow::Smooth);
+    [mode, pair(0x152, x, y), pair(0x153, z, roll), pair(0x154, pitch, yaw)]
+}
+
+/// Opens the gripper to a stroke [0.001 mm] with a torque of at most so much [mNm], and enables it.
+pub fn gripper_target(stroke: i32, torque: u16) -> CanFrame {
+    let ([a, b, c, d], [e, f]) = (stroke.to_be_bytes(), torque.min(5000).to_be_bytes());
+    frame(0x159, [a, b, c, d, e, f, 1, 0])
+}
+
+/// Enables or disables all motors, the gripper's too.
+pub fn enable(on: bool) -> CanFrame {
+    frame(0x471, [7, if on { 2 } else { 1 }, 0, 0, 0, 0, 0, 0])
+}
+
+/// Clears the errors of all joints and leaves everything else as it is: no zero point set, accelerations kept.
+pub fn clear_errors() -> CanFrame {
+    frame(0x475, [7, 0, 0, 0x7F, 0xFF, 0xAE, 0, 0])
+}
+
+/// Asks for the position and speed limits of a joint, counted from 1.
+pub fn ask_limits(joint: u8) -> CanFrame {
+    frame(0x472, [joint, 1, 0, 0, 0, 0, 0, 0])
+}
+
+/// Asks for the firmware's name.
+pub fn ask_firmware() -> CanFrame {
+    frame(0x4AF, [1, 0, 0, 0, 0, 0, 0, 0])
+}
+
+// --- Feedback ---
+
+/// What the controller says of itself (0x2A1).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Status {
+    /// Who controls the arm: 0 nobody, 1 CAN, 2 teaching …
+    pub control: u8,
+    /// The arm's state; 0 = in order.
+    pub arm: u8,
+    /// The move mode in use.
+    pub move_mode: u8,
+    /// Whether the arm is on its way to a target.
+    pub moving: bool,
+    /// Joints beyond their limits: bit 0 = joint 1.
+    pub limits: u8,
+    /// Joints that do not answer: bit 0 = joint 1.
+    pub silent: u8,
+}
+
+/// A motor, fast part (0x251–6).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Motor {
+    /// [0.001 rad/s]
+    pub speed: i16,
+    /// [mA]
+    pub current: i16,
+}
+
+/// A motor's driver, slow part (0x261–6).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Driver {
+    /// Supply [0.1 V].
+    pub voltage: u16,
+    /// Of the driver [°C].
+    pub driver_temperature: i16,
+    /// Of the motor [°C].
+    pub motor_temperature: i8,
+    /// Bits: 0 low voltage, 1 motor hot, 2 overcurrent, 3 driver hot, 4 collision, 5 driver error, 6 enabled, 7 stall.
+    pub status: u8,
+    /// From the supply [mA].
+    pub bus_current: u16,
+}
+
+impl Driver {
+    /// Whether the motor is on.
+    pub fn enabled(&self) -> bool {
+        self.status & 0x40 != 0
+    }
+}
+
+/// The gripper (0x2A8).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Gripper {
+    /// Opening [0.001 mm].
+    pub stroke: i32,
+    /// [mNm]
+    pub torque: i16,
+    /// Bits: 0 low voltage, 1 motor hot, 2 overcurrent, 3 driver hot, 4 sensor, 5 driver error, 6 enabled, 7 homed.
+    pub status: u8,
+}
+
+/// A joint's limits as the controller has them (0x473).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct MotorLimits {
+    /// [0.1°]
+    pub upper: i16,
+    /// [0.1°]
+    pub lower: i16,
+    /// [0.001 rad/s]
+    pub speed: u16,
+}
+
+/// What a frame says. Indices of joints and parts count from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Feedback {
+    /// 0x2A1
+    Status(Status),
+    /// 0x2A2–4, a third of the pose: x y, z roll, pitch yaw [0.001 mm, 0.001°].
+    Pose(usize, [i32; 2]),
+    /// 0x2A5–7, a third of the joint positions [0.001°].
+    Joints(usize, [i32; 2]),
+    /// 0x2A8
+    Gripper(Gripper),
+    /// 0x251–6
+    Motor(usize, Motor),
+    /// 0x261–6
+    Driver(usize, Driver),
+    /// 0x473
+    Limits(usize, MotorLimits),
+    /// 0x4AF: a piece of text and its length.
+    Firmware([u8; 8], usize),
+    /// What an arm sends that leads others: its own joints as commands, or feedback under shifted identifiers.
+    Leader,
+    /// A frame of the arm with too few bytes, or a number that no frame has.
+    Damaged,
+    /// Of no interest here.
+    Other,
+}
+
+/// What a frame means. Never fails: see [`Feedback::Damaged`] and [`Feedback::Other`].
+pub fn decode(frame: &CanFrame) -> Feedback {
+    let id = frame.id;
+    if let 0x151 | 0x155..=0x157 | 0x159 | 0x3A0..=0x3AF = id {
+        return Feedback::Leader;
+    }
+    if id == 0x4AF {
+        return Feedback::Firmware(frame.data, usize::from(frame.len.min(8)));
+    }
+    let [a, b, c, d, e, f, g, h] = frame.data;
+    let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
+    let from = |first: u16| usize::from(id.wrapping_sub(first));
+    let feedback = match id {
+        0x2A1 => Feedback::Status(Status {
+            control: a,
+            arm: b,
+            move_mode: c,
+            moving: e != 0,
+            limits: g & 0x3F,
+            silent: h & 0x3F,
+        }),
+        0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
+        0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
+        0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], torque: i16::from_be_bytes([e, f]), status: g }),
+        0x251..=0x256 => {
+            let motor = Motor { speed: i16::from_be_bytes([a, b]), current: i16::from_be_bytes([c, d]) };
+            Feedback::Motor(from(0x251), motor)
+        }
+        0x261..=0x266 => {
+            let driver = Driver {
+                voltage: u16::from_be_bytes([a, b]),
+                driver_temperature: i16::from_be_bytes([c, d]),
+                motor_temperature: i8::from_be_bytes([e]),
+                status: f,
+                bus_current: u16::from_be_bytes([g, h]),
+            };
+            Feedback::Driver(from(0x261), driver)
+        }
+        0x473 if (1..=6).contains(&a) => {
+            let limits = MotorLimits {
+                upper: i16::from_be_bytes([b, c]),
+                lower: i16::from_be_bytes([d, e]),
+                speed: u16::from_be_bytes([f, g]),
+            };
+            Feedback::Limits(usize::from(a) - 1, limits)
+        }
+        0x473 => Feedback::Damaged,
+        _ => return Feedback::Other,
+    };
+    if frame.len == 8 { feedback } else { Feedback::Damaged }
+}
+
+// --- Angles ---
+
+/// [rad] from [0.001°].
+pub fn radians(wire: i32) -> f64 {
+    (f64::from(wire) / 1000.0).to_radians()
+}
+
+/// [0.001°] from [rad].
+pub fn millidegrees(value: f64) -> i32 {
+    (value.to_degrees() * 1000.0).round() as i32
+}
+
+// --- Words ---
+
+/// What a state of the arm means (0x2A1, byte 1).
+pub fn arm_text(code: u8) -> &'static str {
+    match code {
+        0 => "in order",
+        1 => "E-stop",
+        2 => "no solution for the target",
+        3 => "singular pose",
+        4 => "target beyond the joint limits",
+        5 => "a joint does not answer the controller",
+        6 => "a joint's brake is not released",
+        7 => "collision",
+        8 => "too fast while being taught",
+        9 => "a joint is in error",
+        10 => "an error that the arm does not name",
+        11 => "recording a taught motion",
+        12 => "playing a taught motion",
+        13 => "pausing in a taught motion",
+        14 => "the controller is too hot",
+        15 => "the release resistor is too hot",
+        _ => "a state that the sheet does not list",
+    }
+}
+
+/// Who controls the arm (0x2A1, byte 0).
+pub fn control_text(control: u8) -> &'static str {
+    match control {
+        0 => "nobody",
+        1 => "CAN",
+        2 => "its teach button",
+        3 => "Ethernet",
+        4 => "Wi-Fi",
+        5 => "a remote control",
+        6 => "a leader arm",
+        7 => "a program of its own",
+        _ => "something that the sheet does not list",
+    }
+}
+
+/// What an error bit of a driver means (0x261–6, byte 5); `None` for bits that are no error.
+pub fn driver_text(bit: u8) -> Option<&'static str> {
+    match bit {
+        0 => Some("low voltage"),
+        1 => Some("motor too hot"),
+        2 => Some("overcurrent"),
+        3 => Some("driver too hot"),
+        4 => Some("collision"),
+        5 => Some("driver error"),
+        7 => Some("stalled"),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+#[path = "protocol_tests.rs"]
+mod tests;

@@ -1,0 +1,330 @@
+//! What goes wrong with the arm and its bus, and what the adapter makes of it. The numbers are rows of the fault table.
+
+use std::time::{Duration, Instant};
+
+use super::adapter::PiperAdapter;
+use super::emulator::PiperEmulator;
+use super::golden;
+use super::protocol::{DOF, decode};
+use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
+use crate::hardware::registry::Emulator;
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::spec::{AdapterError, ManipulatorAdapter, Stop};
+use crate::hardware::transport::can::{self, CanAddress, CanFrame, CanPort};
+use crate::joint::ControlMode;
+
+/// Somebody else on the computer's end of the bus.
+fn other(emulator: &PiperEmulator) -> Box<dyn CanPort> {
+    can::open("other", &CanAddress::parse(&emulator.address()).unwrap(), &[]).unwrap()
+}
+
+/// Waits for an error of `read_joints`.
+fn failure(arm: &mut PiperAdapter) -> AdapterError {
+    let end = Instant::now() + Duration::from_secs(10);
+    loop {
+        match read(arm) {
+            Err(error) => return error,
+            Ok(_) => assert!(Instant::now() < end, "no error within 10 s"),
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn f04_an_interface_that_goes_down_is_noticed_and_used_again() {
+    let (emulator, mut arm) = connected();
+    emulator.inject(Fault::new(FaultKind::Disconnect).lasting(0.3)).unwrap();
+    let error = failure(&mut arm).to_string();
+    assert!(error.contains("the interface went down"), "{error}");
+    assert!(!arm.is_connected());
+    assert_eq!(read(&mut arm).unwrap_err(), AdapterError::NotConnected);
+    assert!(matches!(arm.connect(), Err(AdapterError::Io(_))), "still down");
+    until("the interface", || arm.connect().is_ok());
+    assert!(farthest(&read(&mut arm).unwrap().position, &START) < 1e-4);
+}
+
+#[test]
+fn f05_silence_is_noticed_by_the_age_of_the_state() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.inject(Fault::new(FaultKind::Silent).lasting(60.0)).unwrap();
+    let error = failure(&mut arm);
+    assert!(matches!(&error, AdapterError::Timeout(text) if text.contains("no state for")), "{error}");
+    assert!(arm.is_connected(), "it may come back");
+    emulator.record();
+    assert!(matches!(arm.write_joint_positions(&START, 0.1), Err(AdapterError::Timeout(_))));
+    assert!(arm.write_stop().is_err(), "an arm is not sent back to where it was long ago");
+    assert_eq!(ids(&emulator), [0u16; 0], "nothing goes out to an arm that is silent");
+    until("the end of the connection", || read(&mut arm).is_err() && !arm.is_connected());
+    let start = Instant::now();
+    let error = arm.connect().unwrap_err().to_string();
+    assert!(error.contains("nothing was heard") && error.contains("\nhint: is the arm powered"), "{error}");
+    assert!(start.elapsed() < Duration::from_secs(3));
+}
+
+#[test]
+fn a_stall_passes() {
+    let (emulator, mut arm) = connected();
+    emulator.inject(Fault::new(FaultKind::Stall).lasting(0.5)).unwrap();
+    assert!(matches!(failure(&mut arm), AdapterError::Timeout(_)));
+    until("the end of the stall", || {
+        if !arm.is_connected() {
+            let _ = arm.connect();
+        }
+        read(&mut arm).is_ok()
+    });
+}
+
+#[test]
+fn a_leader_is_told_with_the_remedy_and_nothing_is_sent_but_questions() {
+    let (emulator, mut arm) = pair(serde_json::json!({ "sim": { "faults": [{ "kind": "leader" }] } }));
+    emulator.record();
+    let error = arm.connect().unwrap_err();
+    let AdapterError::Rejected(text) = error else { panic!("{error:?}") };
+    assert!(text.contains("this arm leads others") && text.contains("\nhint: ") && text.contains("0xFC"), "{text}");
+    assert!(!arm.is_connected());
+    assert!(ids(&emulator).iter().all(|id| [0x472, 0x4AF].contains(id)));
+    other(&emulator).send(&[golden::frame("470#FC00000000000000")]).unwrap();
+    until("a follower", || arm.connect().is_ok());
+}
+
+#[test]
+fn f12_zeros_are_no_pose_to_hold() {
+    // Zeros from the start: the arm can be read, not enabled.
+    let faults = serde_json::json!([{ "kind": "zero_state", "duration": 1000 }]);
+    let (emulator, mut arm) = pair(serde_json::json!({ "sim": { "faults": faults } }));
+    arm.connect().unwrap();
+    until("zeros", || read(&mut arm).unwrap().position == [0.0; 16]);
+    emulator.record();
+    let error = arm.activate().unwrap_err().to_string();
+    assert!(error.contains("every joint reads exactly 0") && error.contains("\nhint: "), "{error}");
+    assert_eq!(ids(&emulator), [0u16; 0]);
+    // Zeros in between: not believed.
+    let (emulator, mut arm) = connected();
+    emulator.inject(Fault::new(FaultKind::ZeroState).times(5)).unwrap();
+    for _ in 0..40 {
+        assert!(farthest(&read(&mut arm).unwrap().position, &START) < 1e-4);
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert!(arm.counts().0.damaged >= 5);
+}
+
+#[test]
+fn f12_an_arm_that_sags_holds_where_it_is_then() {
+    let (emulator, mut arm) = connected();
+    emulator.inject(Fault { amount: 0.04, ..Fault::new(FaultKind::Sag) }).unwrap();
+    activate(&emulator, &mut arm);
+    let last: Vec<CanFrame> = emulator.trace().iter().map(|(_, f)| *f).filter(|f| f.id == 0x155).collect();
+    let held = f64::from(two(last.last().unwrap())[1]).to_radians() / 1000.0;
+    assert!((held - emulator.joints().0[1]).abs() < 0.04, "{held}");
+    assert!(farthest(&emulator.joints().0, &START) < 0.05);
+}
+
+#[test]
+fn f15_f16_an_estop_is_told_and_never_reset_from_here() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    other(&emulator).send(&[golden::frame("150#0100000000000000")]).unwrap();
+    until("the E-stop", || {
+        read(&mut arm).unwrap();
+        arm.read_error().unwrap().0 == 1
+    });
+    emulator.record();
+    let refusals = [
+        arm.write_joint_positions(&START, 0.1),
+        arm.write_clear_errors(),
+        arm.write_enable(true),
+        arm.write_gripper_position(0.01),
+    ];
+    for refused in refusals {
+        let Err(AdapterError::Fault { code: 1, text }) = refused else { panic!("{refused:?}") };
+        assert!(text.starts_with("E-stop") && text.contains("\nhint: "), "{text}");
+    }
+    arm.write_stop().unwrap();
+    assert_eq!((ids(&emulator), emulator.power_drops()), (vec![], 0), "nothing was sent");
+    // Somebody resets the arm: it has fallen, and stays off until it is enabled.
+    other(&emulator).send(&[golden::frame("150#0200000000000000")]).unwrap();
+    until("the reset", || {
+        read(&mut arm).unwrap();
+        arm.read_error().unwrap().0 == 0
+    });
+    assert_eq!((emulator.power_drops(), arm.read_enabled()), (1, Ok(false)));
+}
+
+#[test]
+fn f16_what_waits_when_the_power_goes_moves_nothing_when_it_returns() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+    emulator.inject(Fault::new(FaultKind::PowerLoss).lasting(2.0)).unwrap();
+    // The coordinator goes on commanding until it hears of it.
+    let mut target = START;
+    let (mut written, mut refused) = (0, None);
+    until("the refusal", || {
+        target[0] += 0.002;
+        match arm.write_joint_positions(&target, 1.0) {
+            Ok(()) => written += 1,
+            Err(error) => refused = Some(error),
+        }
+        let _ = arm.read_joints(&mut Default::default());
+        std::thread::sleep(Duration::from_millis(8));
+        refused.is_some()
+    });
+    let text = refused.unwrap().to_string();
+    assert!(text.contains("takes no frames") || text.contains("no state"), "{written}: {text}");
+    emulator.record();
+    arm.disconnect();
+    until("power", || arm.connect().is_ok());
+    assert_eq!(arm.read_enabled(), Ok(false));
+    let stale = ids(&emulator).iter().filter(|id| (0x150..=0x15F).contains(*id)).count();
+    assert!(stale <= 12, "{stale} commands waited"); // three bursts, to an arm whose motors are off
+    std::thread::sleep(Duration::from_millis(100));
+    let lies = emulator.joints().0;
+    arm.activate().unwrap_or_else(|e| panic!("{e}"));
+    assert!(farthest(&emulator.joints().0, &lies) < 0.05, "it holds where it lies");
+    let (there, _) = emulator.joints();
+    std::thread::sleep(Duration::from_millis(200));
+    assert!(farthest(&emulator.joints().0, &there) < 0.005);
+}
+
+#[test]
+fn f17_full_queues_cost_commands_and_then_an_error() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.inject(Fault::new(FaultKind::NoBuffers)).unwrap();
+    until("one command less", || {
+        arm.write_joint_positions(&START, 0.1).unwrap();
+        read(&mut arm).unwrap();
+        arm.counts().1.not_taken == 4
+    });
+    emulator.inject(Fault::new(FaultKind::NoBuffers).lasting(0.5)).unwrap();
+    let mut error = None;
+    until("an error", || {
+        error = arm.write_joint_positions(&START, 0.1).err();
+        read(&mut arm).unwrap();
+        error.is_some()
+    });
+    let text = error.unwrap().to_string();
+    assert!(text.contains("its bus takes no frames") && text.contains("\nhint: "), "{text}");
+    assert!(arm.is_connected(), "its state still comes");
+    until("room", || {
+        read(&mut arm).unwrap();
+        arm.write_joint_positions(&START, 0.1).is_ok()
+    });
+}
+
+#[test]
+fn f17_bus_off_ends_the_connection_at_once() {
+    let (emulator, mut arm) = connected();
+    emulator.inject(Fault::new(FaultKind::BusOff)).unwrap();
+    let error = failure(&mut arm).to_string();
+    assert!(error.contains("has left the bus after too many errors\nhint: "), "{error}");
+    assert!(!arm.is_connected());
+    arm.connect().unwrap();
+}
+
+#[test]
+fn f18_noise_and_short_frames_cost_nothing_but_readings() {
+    let (emulator, mut arm) = connected();
+    for kind in [FaultKind::Garbage, FaultKind::Truncated] {
+        let before = arm.counts().0.damaged;
+        emulator.inject(Fault::new(kind)).unwrap();
+        until("the damage", || {
+            assert!(farthest(&read(&mut arm).unwrap().position, &START) < 1e-4);
+            arm.counts().0.damaged > before
+        });
+    }
+    // Random frames: nothing panics, and no pose is made of them.
+    let mut seed = 0x2545_F491_4F6C_DD1D_u64;
+    for _ in 0..200_000 {
+        seed ^= seed << 13;
+        seed ^= seed >> 7;
+        seed ^= seed << 17;
+        let _ = decode(&CanFrame { id: (seed >> 48) as u16 & 0x7FF, len: seed as u8 % 10, data: seed.to_le_bytes() });
+    }
+}
+
+#[test]
+fn f19_faults_have_code_and_text_and_are_cleared_without_a_fall() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(7)).unwrap();
+    until("the collision", || {
+        read(&mut arm).unwrap();
+        arm.read_error() == Ok((7, "collision".into()))
+    });
+    let refused = arm.write_joint_positions(&START, 0.1).unwrap_err();
+    assert_eq!(refused.to_string(), "fault 7: collision");
+    emulator.record();
+    arm.write_clear_errors().unwrap();
+    assert_eq!(emulator.trace().iter().map(|(_, f)| *f).collect::<Vec<_>>(), [golden::frame(golden::CLEAR)]);
+    assert_eq!((arm.read_error(), arm.read_enabled()), (Ok((0, String::new())), Ok(true)));
+    assert!(farthest(&emulator.joints().0, &START) < 1e-3, "it held all the time");
+    arm.write_joint_positions(&START, 0.1).unwrap();
+}
+
+#[test]
+fn modes_that_are_not_emulated_are_said_so() {
+    for frame in ["151#010400AD00000000", "151#0105320000000000", "151#0102320000000000", "15A#0000000000000000"] {
+        let (emulator, mut arm) = connected();
+        other(&emulator).send(&[golden::frame(frame)]).unwrap();
+        until("the refusal", || {
+            read(&mut arm).unwrap();
+            arm.read_error().unwrap().0 == 10
+        });
+        arm.write_clear_errors().unwrap();
+    }
+}
+
+#[test]
+fn two_commanders_do_not_take_turns() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    other(&emulator).send(&golden::MOVE_JOINTS.map(golden::frame)).unwrap();
+    until("the refusal", || {
+        let refused = arm.write_joint_positions(&START, 0.1).err();
+        refused.is_some_and(|error| error.to_string().contains("somebody else commands this arm\nhint: "))
+    });
+    assert!(arm.write_stop().is_ok(), "a stop is always sent");
+    until("the other to be gone", || {
+        read(&mut arm).unwrap();
+        arm.write_clear_errors().is_ok() && arm.write_joint_positions(&START, 0.1).is_ok()
+    });
+}
+
+#[test]
+fn an_arm_that_is_being_taught_is_left_alone() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    other(&emulator).send(&[golden::frame("150#0000010000000000")]).unwrap();
+    until("teaching", || {
+        read(&mut arm).unwrap();
+        arm.read_state().unwrap().mode == 2
+    });
+    let error = arm.write_joint_positions(&START, 0.1).unwrap_err().to_string();
+    assert!(error.contains("the arm is controlled by its teach button\nhint: "), "{error}");
+    assert_eq!(arm.read_error(), Ok((0, String::new())), "which is no error");
+}
+
+#[test]
+fn f37_a_blocked_joint_shows_in_its_positions() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.inject(Fault { joint: 1, ..Fault::new(FaultKind::Blocked).lasting(60.0) }).unwrap();
+    let mut target = START;
+    (target[0], target[5]) = (0.4, 0.3);
+    arm.write_joint_positions(&target, 1.0).unwrap();
+    until("joint 6", || (read(&mut arm).unwrap().position[5] - 0.3).abs() < 1e-4);
+    assert!((emulator.joints().0[0] - START[0]).abs() < 0.02);
+    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    assert!(emulator.inject(Fault::new(FaultKind::Panic)).is_err());
+}
+
+#[test]
+fn an_interface_that_is_missing_is_told() {
+    let mut arm = PiperAdapter::new(&config("nosuchcan7", serde_json::json!({}))).unwrap();
+    let error = arm.connect().unwrap_err().to_string();
+    assert!(error.contains("nosuchcan7") && error.contains("\nhint: "), "{error}");
+    let mut positions = [0.0; DOF];
+    assert_eq!(arm.read_joint_positions(&mut positions), Err(AdapterError::NotConnected));
+}

@@ -1,0 +1,125 @@
+//! The adapter's end of the bus: which frames it wants, what happens to those that the bus does not take, and what
+//! trouble means.
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::picture::Picture;
+use super::protocol::decode;
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
+
+/// What the arm sends, and what it would send if it led other arms (0x15x, 0x3Ax).
+const FILTERS: &[CanFilter] = &[
+    CanFilter { id: 0x2A0, mask: 0x7F0 },
+    CanFilter { id: 0x250, mask: 0x7F0 },
+    CanFilter { id: 0x260, mask: 0x7F0 },
+    CanFilter { id: 0x473, mask: 0x7FF },
+    CanFilter { id: 0x4AF, mask: 0x7FF },
+    CanFilter { id: 0x150, mask: 0x7F0 },
+    CanFilter { id: 0x3A0, mask: 0x7F0 },
+];
+/// Frames that may wait for the bus: the next command is not sent behind them. A healthy bus takes a burst in 1 ms, and
+/// what waits when the arm loses its power reaches it when the power returns.
+const MAY_WAIT: usize = 8;
+/// So many commands in a row that the bus does not take are more than a hiccup.
+const TOO_MANY: u32 = 3;
+/// Most events fetched in one go: a second's.
+const BATCH: usize = 4096;
+
+/// An open port.
+pub struct Wire {
+    port: Box<dyn CanPort>,
+    /// The arm and its bus, for messages.
+    peer: String,
+    /// Commands in a row that were not taken whole.
+    refused: u32,
+    /// What was counted.
+    pub counts: WireCounts,
+}
+
+/// What was counted since the port was opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct WireCounts {
+    /// Frames that the bus did not take.
+    pub not_taken: u64,
+    /// Times that frames from the arm were lost because they were not fetched in time.
+    pub overflows: u64,
+    /// Reports of many errors on the bus, and of others that nothing follows from.
+    pub complaints: u64,
+}
+
+impl Wire {
+    /// Opens a port at `address`.
+    pub fn open(address: &CanAddress) -> AdapterResult<Self> {
+        let port = can::open("piper", address, FILTERS)?;
+        Ok(Self { port, peer: format!("piper at {address}"), refused: 0, counts: WireCounts::default() })
+    }
+
+    /// Sends a command. One that the bus has no room for is dropped and counted: the next one replaces it. Three in a
+    /// row are an error.
+    pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
+        let taken = if self.port.waiting() > MAY_WAIT { 0 } else { self.port.send(frames)? };
+        if taken == frames.len() {
+            self.refused = 0;
+            return Ok(());
+        }
+        self.counts.not_taken += (frames.len() - taken) as u64;
+        self.refused += 1;
+        if self.refused < TOO_MANY {
+            return Ok(());
+        }
+        Err(AdapterError::Io(format!(
+            "{}: its bus takes no frames: the queue is full\nhint: nobody acknowledges: is the arm powered, plugged \
+             in, and the bus at 1 Mbit/s?",
+            self.peer
+        )))
+    }
+
+    /// Adds all that has arrived to the picture, without waiting.
+    pub fn drain(&mut self, picture: &mut Picture) -> AdapterResult<()> {
+        for _ in 0..BATCH {
+            match self.port.receive()? {
+                None => break,
+                Some(CanEvent::Frame(frame)) => picture.take(decode(&frame), MonotonicClock.now()),
+                Some(CanEvent::Trouble(trouble)) => self.suffer(trouble)?,
+            }
+        }
+        Ok(())
+    }
+
+    fn suffer(&mut self, trouble: CanTrouble) -> AdapterResult<()> {
+        let (what, hint) = match trouble {
+            CanTrouble::BusOff => (
+                "the CAN controller has left the bus after too many errors",
+                "check cable, termination and bit rate (1 Mbit/s); then set the interface down and up",
+            ),
+            CanTrouble::NoAcknowledge => {
+                ("nobody acknowledges on its bus", "is the arm powered, plugged in, and the bus at 1 Mbit/s?")
+            }
+            CanTrouble::Overflow => {
+                self.counts.overflows += 1;
+                return Ok(());
+            }
+            CanTrouble::Passive | CanTrouble::Restarted | CanTrouble::Other(_) => {
+                self.counts.complaints += 1;
+                return Ok(());
+            }
+        };
+        Err(AdapterError::Io(format!("the connection to {} broke: {what}\nhint: {hint}", self.peer)))
+    }
+
+    /// Waits until something has arrived, so long at most.
+    pub fn wait(&self, timeout: Duration) {
+        let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
+        let _ = poll(&mut [PollFd::from_borrowed_fd(self.port.fd(), PollFlags::IN)], Some(&timeout));
+    }
+
+    /// Readable when something has arrived.
+    pub fn fd(&self) -> BorrowedFd<'_> {
+        self.port.fd()
+    }
+}

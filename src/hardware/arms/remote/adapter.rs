@@ -1,0 +1,320 @@
+//! The adapter of an arm that another process serves. SI units on both sides, so nothing is converted.
+//!
+//! A command goes out in a cycle request, whose reply brings the state: one round trip a tick. The reply wakes the
+//! device thread ([`ManipulatorAdapter::state_fd`]), so a slow peer costs nothing but the age of its states.
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use super::address::Address;
+use super::protocol::{Act, Command, Description, Measured, WirePose};
+use super::session::Session;
+use super::{MODES, NATIVE_RATE, Options, limits, same_modes};
+use crate::arm::Pose;
+use crate::hardware::registry::AdapterConfig;
+use crate::hardware::spec::{
+    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
+use crate::joint::{ControlMode, JointLimits, MAX_DOF};
+
+/// Longest wait for the motors: a vendor's SDK may take its time.
+const ENABLE_TIMEOUT: Duration = Duration::from_millis(2500);
+/// Longest wait for the end of commanded motion, and for errors to be cleared.
+const END_TIMEOUT: Duration = Duration::from_millis(1000);
+
+/// An arm behind a peer.
+pub struct RemoteAdapter {
+    address: Address,
+    dof: usize,
+    session: Option<Session>,
+    mode: ControlMode,
+    assumed_enabled: bool,
+    /// What the peer of the last connection said.
+    last: Option<Description>,
+}
+
+impl RemoteAdapter {
+    /// An adapter for the peer at `config.address`. Does not connect.
+    pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
+        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
+        if !(1..=MAX_DOF).contains(&config.dof) {
+            return Err(rejected(format!("a remote arm has 1 to {MAX_DOF} joints, not {}", config.dof)));
+        }
+        config.options::<Options>()?;
+        let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        let (mode, assumed_enabled) = (ControlMode::Position, false);
+        Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })
+    }
+
+    fn session(&mut self) -> AdapterResult<&mut Session> {
+        self.session.as_mut().ok_or(AdapterError::NotConnected)
+    }
+
+    /// Does something with the session; an error ends it.
+    fn with<T>(&mut self, what: impl FnOnce(&mut Session) -> AdapterResult<T>) -> AdapterResult<T> {
+        what(self.session()?).inspect_err(|_| self.session = None)
+    }
+
+    /// Asks for an act and waits for its answer.
+    fn act(&mut self, act: &Act, patience: Duration) -> AdapterResult<()> {
+        let answer = self.with(|session| session.act(act, patience))?;
+        answer.unwrap_or_else(|| {
+            let peer = self.session.as_ref().map(Session::peer).unwrap_or_default();
+            let text = format!("{peer} has not answered {} within {patience:?}", act.method());
+            Err(AdapterError::Timeout(text))
+        })
+    }
+
+    fn late(&mut self) -> AdapterResult<Duration> {
+        self.session().map(|session| session.late())
+    }
+
+    /// Answers something of the newest state, which is of the time after the last act.
+    fn recent<T>(&mut self, of: impl FnOnce(&Measured) -> T) -> AdapterResult<T> {
+        self.with(|session| session.recent().map(|state| state.map(of)))?
+    }
+
+    fn has_part(&self, name: &str) -> bool {
+        self.session.as_ref().is_some_and(|session| session.description.parts.iter().any(|part| part == name))
+    }
+
+    /// Refuses what the arm would refuse, and sends the rest.
+    fn command(&mut self, mode: ControlMode, values: &[f64], velocity: f64) -> AdapterResult<()> {
+        if values.len() != self.dof || !values.iter().all(|value| value.is_finite()) {
+            return Err(AdapterError::Rejected(format!("{} finite values are needed, one per joint", self.dof)));
+        }
+        self.with(Session::take_up)?;
+        let (enabled, held, error) = self.recent(|state| (state.enabled, state.held, state.error))?;
+        if let Some((code @ (1.. | ..=-1), text)) = error {
+            return Err(AdapterError::Fault { code, text: text.to_string() });
+        }
+        if held {
+            return Err(AdapterError::Rejected(
+                "the process that serves the arm has stopped it: enable it anew".into(),
+            ));
+        }
+        if enabled == Some(false) {
+            return Err(AdapterError::Rejected("the motors are disabled".into()));
+        }
+        let sent = self.session()?.command(Command { mode, velocity, values });
+        // A refusal leaves the connection as it is.
+        sent.inspect_err(|error| {
+            if !matches!(error, AdapterError::Rejected(_)) {
+                self.session = None;
+            }
+        })
+    }
+}
+
+/// Copies the first values; `out` has length dof.
+fn fill(out: &mut [f64], values: &[f64]) {
+    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+}
+
+impl ManipulatorAdapter for RemoteAdapter {
+    // --- Lifecycle ---
+
+    fn connect(&mut self) -> AdapterResult<()> {
+        self.disconnect();
+        self.assumed_enabled = false;
+        let mut session = Session::open(&self.address, self.dof)?;
+        self.mode = session.recent()??.mode.unwrap_or_default();
+        session.newest()??; // asks for the next state, which then comes without being asked for
+        self.last = Some(session.description.clone());
+        self.session = Some(session);
+        Ok(())
+    }
+
+    fn disconnect(&mut self) {
+        self.session = None;
+    }
+
+    fn is_connected(&self) -> bool {
+        self.session.is_some()
+    }
+
+    fn activate(&mut self) -> AdapterResult<()> {
+        self.act(&Act::Activate, ENABLE_TIMEOUT).map(|()| self.assumed_enabled = true)
+    }
+
+    fn deactivate(&mut self) -> AdapterResult<()> {
+        self.act(&Act::Deactivate, END_TIMEOUT)
+    }
+
+    // --- What it is ---
+
+    fn get_info(&self) -> ManipulatorInfo {
+        let said = self.last.as_ref();
+        ManipulatorInfo {
+            vendor: said.map_or("unknown".into(), |d| d.info.vendor.clone()),
+            model: said.map_or("remote".into(), |d| d.info.model.clone()),
+            dof: self.dof,
+            firmware_version: said.and_then(|d| d.info.firmware_version.clone()),
+            serial_number: said.and_then(|d| d.info.serial_number.clone()),
+            native_rate: said.map_or(NATIVE_RATE, |d| d.native_rate),
+            modes: said.and_then(|d| d.modes.as_deref()).map_or(MODES, same_modes),
+            holds_when_disabled: said.and_then(|d| d.holds_when_disabled).unwrap_or(false),
+            whole_state_at_once: true,
+        }
+    }
+
+    fn get_dof(&self) -> usize {
+        self.dof
+    }
+
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        Ok(self.last.as_ref().map_or_else(|| limits(self.dof), |d| d.joint_limits()))
+    }
+
+    // --- Mode ---
+
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        self.session()?;
+        if !self.get_info().modes.contains(&mode) {
+            return Err(AdapterError::Unsupported);
+        }
+        let patience = self.late()?;
+        match self.act(&Act::Mode(mode), patience) {
+            // It is asked for again with the next command, and goes on then.
+            Err(AdapterError::Timeout(text)) => Err(AdapterError::Rejected(text)),
+            result => result.map(|()| self.mode = mode),
+        }
+    }
+
+    fn get_control_mode(&self) -> ControlMode {
+        self.mode
+    }
+
+    // --- State ---
+
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.session.as_ref().map(Session::fd)
+    }
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        let values = self.with(|session| session.fresh().map(|state| state.map(|(state, _)| state.position)))??;
+        fill(positions, &values.joints);
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        let values = self.recent(|state| state.velocity)?;
+        fill(velocities, &values.map_or([0.0; MAX_DOF], |values| values.joints));
+        Ok(values.is_some())
+    }
+
+    fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
+        let values = self.recent(|state| state.effort)?;
+        fill(efforts, &values.map_or([0.0; MAX_DOF], |values| values.joints));
+        Ok(values.is_some())
+    }
+
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        let (state, stamp) =
+            self.with(|session| session.newest().map(|s| s.map(|(state, stamp)| (*state, stamp))))??;
+        if self.session()?.after_last_act() {
+            self.mode = state.mode.unwrap_or(self.mode);
+        }
+        *reading = JointReading {
+            stamp: Some(stamp),
+            position: state.position.joints,
+            velocity: state.velocity.map(|values| values.joints),
+            effort: state.effort.map(|values| values.joints),
+        };
+        Ok(())
+    }
+
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        let codes = self.recent(|state| state.codes)?;
+        Ok(codes.map_or(RobotState::default(), |codes| RobotState { state: codes.state, mode: codes.mode }))
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        self.recent(|state| match state.error {
+            None | Some((0, _)) => (0, String::new()),
+            Some((code, text)) => (code, text.to_string()),
+        })
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        // An arm that cannot say so is what it was last made. One that its peer holds takes no command, as if its
+        // motors were off.
+        let assumed = self.assumed_enabled;
+        self.recent(|state| state.enabled.unwrap_or(assumed) && !state.held)
+    }
+
+    // --- Motion ---
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        let mode = self.mode;
+        if mode == ControlMode::Velocity && self.session.is_some() {
+            return Err(AdapterError::Rejected("joint positions in velocity mode".into()));
+        }
+        self.command(mode, positions, velocity)
+    }
+
+    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
+        let mode = self.mode;
+        self.session()?;
+        if !self.get_info().modes.contains(&ControlMode::Velocity) {
+            return Err(AdapterError::Unsupported);
+        }
+        if mode != ControlMode::Velocity {
+            return Err(AdapterError::Rejected(format!("joint velocities in {} mode", mode.name())));
+        }
+        self.command(mode, velocities, 1.0)
+    }
+
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        let patience = self.late()?;
+        self.act(&Act::Stop, patience).map(|()| Stop::Confirmed)
+    }
+
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        self.act(&Act::Enable(enable), ENABLE_TIMEOUT).map(|()| self.assumed_enabled = enable)
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.act(&Act::ClearErrors, END_TIMEOUT)
+    }
+
+    // --- Optional parts ---
+
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+        self.recent(|state| state.pose.map(WirePose::pose))
+    }
+
+    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
+        let patience = self.late()?;
+        if !self.has_part("read_cartesian_position") {
+            return Err(AdapterError::Unsupported);
+        }
+        if !pose.xyz.iter().chain(&pose.rpy).all(|value| value.is_finite()) {
+            return Err(AdapterError::Rejected("the pose is not finite".into()));
+        }
+        self.act(&Act::Cartesian(WirePose::of(pose), velocity), patience)
+    }
+
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.recent(|state| state.gripper)
+    }
+
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.last.as_ref()?.gripper_range
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        let patience = self.late()?;
+        if !self.has_part("read_gripper_position") {
+            return Err(AdapterError::Unsupported);
+        }
+        if !position.is_finite() {
+            return Err(AdapterError::Rejected(format!("a gripper opening of {position} m")));
+        }
+        self.act(&Act::Gripper(position), patience)
+    }
+
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        self.recent(|state| state.wrench)
+    }
+}

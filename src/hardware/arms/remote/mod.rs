@@ -1,0 +1,93 @@
+//! An arm that another process serves: a vendor's SDK behind a small shim, in Python (`assets/python/dimos_shim.py`)
+//! or anything that has sockets. `docs/remote-adapter.md` is the protocol.
+//!
+//! Here nothing is known of the arm before the peer has said it, so the numbers below are nominal.
+
+mod adapter;
+pub mod address;
+mod link;
+pub mod peer;
+mod protocol;
+mod session;
+#[cfg(test)]
+mod tests;
+
+use std::f64::consts::PI;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::sim::faults::Fault;
+use crate::joint::{ControlMode, JointLimits, MAX_DOF};
+use address::Address;
+
+/// All modes that the protocol knows.
+const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+
+/// How often states come at most [Hz]; the peer says how often its arm has one.
+const NATIVE_RATE: f64 = 1000.0;
+
+/// The row of remote arms in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "remote",
+    about: "an arm served by another process: a vendor's SDK behind dimos_shim.py",
+    level: Level::Conformant,
+    transport: "unix, tcp",
+    dof: (1, MAX_DOF),
+    modes: MODES,
+    wire_units: "rad, m",
+    native_rate: NATIVE_RATE,
+    address: AddressForm {
+        form: address::FORM,
+        required: true,
+        check: |address| Address::parse(address).map(|address| address.to_string()),
+    },
+    // Nobody knows before the peer is asked, and then a blueprint's default must be the careful one.
+    holds_when_disabled: false,
+    gripper: true,
+    options: OptionsSpec::of::<Options>(),
+    limits,
+    create: |config| Ok(Box::new(adapter::RemoteAdapter::new(config)?)),
+    emulate: Some(|config, place| Ok(Box::new(peer::start_emulator(config, place)?))),
+};
+
+/// Nominal limits: ±2π rad, π rad/s. The peer states the real ones.
+fn limits(dof: usize) -> JointLimits {
+    JointLimits::uniform(dof, 2.0 * PI, PI)
+}
+
+/// The subset of [`MODES`] with the same modes as `given`, whatever their order.
+fn same_modes(given: &[ControlMode]) -> &'static [ControlMode] {
+    use ControlMode::{Position, ServoPosition, Velocity};
+    const SUBSETS: [&[ControlMode]; 8] = [
+        &[],
+        &[Position],
+        &[ServoPosition],
+        &[Position, ServoPosition],
+        &[Velocity],
+        &[Position, Velocity],
+        &[ServoPosition, Velocity],
+        MODES,
+    ];
+    let bits = MODES.iter().enumerate().map(|(i, mode)| usize::from(given.contains(mode)) << i);
+    SUBSETS.get(bits.sum::<usize>()).copied().unwrap_or(MODES)
+}
+
+/// What a blueprint may set of a remote arm.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// What the peer does that stands in for the arm with `address: sim`.
+    pub sim: SimOptions,
+}
+
+/// What the simulated arm behind the protocol does.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at the start [rad], one per joint; all zero when empty.
+    pub initial_positions: Vec<f64>,
+    /// What goes wrong, and when (seconds after the first connection).
+    pub faults: Vec<Fault>,
+}

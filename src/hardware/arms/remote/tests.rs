@@ -1,0 +1,189 @@
+//! The protocol against the sheet, and the adapter against a peer over real sockets.
+
+use std::time::{Duration, Instant};
+
+use super::SPEC;
+use super::address::Address;
+use super::peer::{Peer, wire};
+use super::protocol::{self, Act, Command, Description, Reply, WirePose};
+use crate::hardware::registry::{self, AdapterConfig};
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::joint::ControlMode;
+
+/// The lines of the sheet that begin so.
+fn sheet(start: &str) -> Vec<&'static str> {
+    include_str!("../../../../docs/remote-adapter.md").lines().filter(|line| line.starts_with(start)).collect()
+}
+
+fn written(encode: impl FnOnce(&mut Vec<u8>)) -> String {
+    let mut out = vec![0xAA; 3];
+    encode(&mut out);
+    let line = String::from_utf8(out).unwrap();
+    line.strip_suffix('\n').unwrap().to_owned()
+}
+
+/// Two lines of JSON with the same content.
+fn same(a: &str, b: &str) -> bool {
+    let value = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
+    value(a) == value(b)
+}
+
+#[test]
+fn the_requests_of_the_sheet_are_these() {
+    let [hello, enable, mode, first, command] = sheet("{\"id\":")[..] else { panic!("five requests") };
+    assert!(same(hello, &written(|out| protocol::hello(1, 2, out))));
+    assert!(same(enable, &written(|out| protocol::act(2, &Act::Activate, out))));
+    assert!(same(mode, &written(|out| protocol::act(3, &Act::Mode(ControlMode::ServoPosition), out))));
+    assert_eq!(first, written(|out| protocol::cycle(4, None, out)));
+    let (values, velocity) = (&[0.1, -0.30000000000000004][..], 1.0);
+    let ours = Command { mode: ControlMode::ServoPosition, values, velocity };
+    assert_eq!(command, written(|out| protocol::cycle(5, Some(ours), out)));
+    // The double reads the same out of them, to the last bit.
+    let mut arrived = format!("{hello}\n{command}\n").into_bytes();
+    assert_eq!(wire::take(&mut arrived).unwrap().unwrap().what, "hello");
+    let request = wire::take(&mut arrived).unwrap().unwrap();
+    assert_eq!(request.command.unwrap().values, values);
+    assert_eq!((request.id, wire::take(&mut arrived)), (5, Ok(None)));
+}
+
+#[test]
+fn the_replies_of_the_sheet_are_understood() {
+    let [hello, done, refused, state] = sheet("{ \"id\":")[..] else { panic!("four replies") };
+    let description = Description::decode(hello.as_bytes(), super::MODES).unwrap();
+    assert_eq!((description.dof, description.info.model.as_str(), description.native_rate), (2, "YA2", 250.0));
+    assert_eq!(description.joint_limits().velocity_max, [2.5, 2.5]);
+    let reply = |line: &str| Reply::decode(line.as_bytes()).unwrap();
+    assert_eq!((reply(done).id, reply(done).trouble("peer")), (2, None));
+    let expected = AdapterError::Rejected("peer: write_enable() said no (error 2: collision)".to_owned());
+    assert_eq!(reply(refused).trouble("peer"), Some(expected));
+    let reply = reply(state);
+    let measured = reply.state.unwrap();
+    assert_eq!(measured.position.joints[..3], [0.1, -0.30000000000000004, 0.0]);
+    assert_eq!((measured.time, measured.enabled, measured.gripper), (81_234_567_890_123, Some(true), Some(0.04)));
+    assert_eq!(measured.pose.map(WirePose::pose).unwrap().rpy, [0.0, 1.5, -3.0]);
+    assert_eq!((measured.check(2), reply.refused), (Ok(()), None));
+    assert!(measured.check(3).unwrap_err().contains("2 values for 3 joints"));
+}
+
+#[test]
+fn what_is_no_reply_is_an_error_and_never_a_panic() {
+    for bad in ["", "{}", "[]", "null", r#"{"id":-1}"#, r#"{"id":1,"state":{}}"#, "{\"id\":1", "\u{0}\u{ff}"] {
+        assert!(Reply::decode(bad.as_bytes()).is_err(), "{bad}");
+    }
+    let state = |positions: &str| format!(r#"{{"id":1,"state":{{"time":1,"read_joint_positions":{positions}}}}}"#);
+    for bad in ["[NaN]", "[1e999]", "[null]", "[\"1\"]", "{}", &format!("[{}0]", "0,".repeat(16))] {
+        assert!(Reply::decode(state(bad).as_bytes()).is_err(), "{bad}");
+    }
+    assert!(Reply::decode(state("[1, 2]").as_bytes()).is_ok());
+    // A long text is cut where a letter ends.
+    let long = format!(r#"{{"id":1,"error":"io","text":"{}"}}"#, "ä".repeat(500));
+    let text = Reply::decode(long.as_bytes()).unwrap().text();
+    assert_eq!(text, "ä".repeat(120));
+}
+
+fn served(dof: usize) -> (Peer, Box<dyn ManipulatorAdapter>) {
+    let any_port = Address::Tcp(([127, 0, 0, 1], 0).into());
+    let peer = Peer::start(registry::create("mock", "", dof).unwrap(), &any_port).unwrap();
+    let adapter = registry::create("remote", &peer.address().to_string(), dof).unwrap();
+    (peer, adapter)
+}
+
+fn ready(adapter: &mut dyn ManipulatorAdapter, mode: ControlMode) {
+    adapter.connect().unwrap();
+    adapter.activate().unwrap();
+    adapter.set_control_mode(mode).unwrap();
+}
+
+/// Waits until `done`, for at most 10 s.
+fn until(what: &str, mut done: impl FnMut() -> bool) {
+    let end = Instant::now() + Duration::from_secs(10);
+    while !done() {
+        assert!(Instant::now() < end, "{what}: not within 10 s");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn a_reply_wakes_and_brings_what_was_commanded() {
+    let (_peer, mut arm) = served(2);
+    ready(&mut *arm, ControlMode::ServoPosition);
+    let mut reading = JointReading::default();
+    until("the set point", || {
+        arm.write_joint_positions(&[0.01, -0.02], 1.0).unwrap();
+        let mut fds = [rustix::event::PollFd::from_borrowed_fd(arm.state_fd().unwrap(), rustix::event::PollFlags::IN)];
+        let wait = rustix::event::Timespec { tv_sec: 5, tv_nsec: 0 };
+        assert_eq!(rustix::event::poll(&mut fds, Some(&wait)), Ok(1), "the reply makes the descriptor readable");
+        arm.read_joints(&mut reading).unwrap();
+        reading.position[..2] == [0.01, -0.02]
+    });
+}
+
+#[test]
+fn a_client_that_falls_silent_loses_the_arm() {
+    let (_peer, mut arm) = served(1);
+    ready(&mut *arm, ControlMode::Position);
+    arm.write_joint_positions(&[2.0], 0.1).unwrap();
+    std::thread::sleep(Duration::from_millis(1500));
+    let mut position = [0.0];
+    arm.read_joint_positions(&mut position).unwrap();
+    assert!(position[0] > 0.01 && position[0] < 1.0, "it was on its way and was stopped: {position:?}");
+    let refused = arm.write_joint_positions(&[2.0], 0.1).unwrap_err().to_string();
+    assert!(refused.contains("enable it anew"), "{refused}");
+    assert_eq!(arm.read_enabled(), Ok(false));
+    arm.activate().unwrap();
+    arm.write_joint_positions(&[2.0], 0.1).unwrap();
+    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+}
+
+#[test]
+fn refusals_come_with_the_next_command_and_stale_states_are_said() {
+    let (peer, mut arm) = served(2);
+    ready(&mut *arm, ControlMode::Position);
+    let limit = arm.get_limits().unwrap().position_upper[0];
+    assert!(limit > 6.0 && arm.get_info().model == "mock");
+    peer.inject(Fault::new(FaultKind::Silent).lasting(60.0)).unwrap();
+    let mut reading = JointReading::default();
+    until("a late reply", || matches!(arm.read_joints(&mut reading), Err(AdapterError::Timeout(_))));
+    assert!(arm.is_connected(), "late is not gone");
+    assert!(matches!(arm.write_stop(), Err(AdapterError::Timeout(_))), "nobody has confirmed");
+    until("the end", || arm.read_joints(&mut reading).is_err() && !arm.is_connected());
+}
+
+#[test]
+fn a_peer_on_a_unix_socket_is_for_its_user_and_takes_a_dead_ones_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let address = Address::Unix(folder.path().join("arm.sock"));
+    for _ in 0..2 {
+        let peer = Peer::start(registry::create("mock", "", 3).unwrap(), &address).unwrap();
+        let mut arm = registry::create("remote", &address.to_string(), 3).unwrap();
+        arm.connect().unwrap();
+        let again = Peer::start(registry::create("mock", "", 3).unwrap(), &address);
+        assert!(again.is_err(), "one that lives stays");
+        let mut second = registry::create("remote", &address.to_string(), 3).unwrap();
+        let error = second.connect().unwrap_err().to_string();
+        assert!(error.contains("serves another client already"), "{error}");
+        drop(peer);
+        drop(std::os::unix::net::UnixListener::bind(folder.path().join("arm.sock")).unwrap());
+    }
+}
+
+#[test]
+fn wrong_configurations_are_refused() {
+    let config = |address: &str, dof| AdapterConfig {
+        hardware_id: "arm".into(),
+        address: address.into(),
+        dof,
+        options: serde_json::Value::Null,
+    };
+    for (config, part) in [
+        (config("127.0.0.1:7450", 17), "1 to 16 joints, not 17"),
+        (config("192.168.1.5:7450", 6), "no authentication"),
+        (config("", 6), "has no port"),
+    ] {
+        let error = (SPEC.create)(&config).err().unwrap().to_string();
+        assert!(error.contains(part), "{error}");
+    }
+    let modes = [ControlMode::Velocity, ControlMode::Position];
+    assert_eq!(super::same_modes(&modes), [ControlMode::Position, ControlMode::Velocity]);
+}

@@ -1,0 +1,313 @@
+//! The xArm adapter: the adapter protocol on one side, a [`Session`] with the controller on the other.
+//!
+//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. Every conversion between the two is in this file.
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use super::address::Address;
+use super::connect::{connect, takes_duration};
+pub use super::control::Counts;
+use super::model::{Model, VELOCITY};
+use super::protocol::commands::{Command, WireJoints};
+use super::session::Session;
+use super::{HOLDS_WHEN_DISABLED, MODES, Options, model_of};
+use crate::arm::Pose;
+use crate::hardware::registry::AdapterConfig;
+use crate::hardware::spec::{
+    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
+use crate::joint::{ControlMode, JointLimits, joints_of};
+
+/// The controller's modes that the adapter uses.
+const PLANNED: u8 = 0;
+const SERVO: u8 = 1;
+const JOINT_VELOCITY: u8 = 4;
+
+/// What is known answers further questions for so long.
+const RECENT: Duration = Duration::from_millis(2);
+/// Accelerations of planned moves: the vendor's own defaults [rad/s², mm/s²].
+const JOINT_ACCELERATION: f64 = 8.726_646;
+const LINE_ACCELERATION: f64 = 2000.0;
+/// Slowest planned moves that the controller takes [rad/s, mm/s].
+const SLOWEST: (f64, f64) = (1e-4, 0.1);
+/// The arm stops by itself when no velocity follows for so long [s].
+const VELOCITY_TIMEOUT: f64 = 0.2;
+/// Targets of planned moves closer than this are the same [rad].
+const SAME: f64 = 1e-6;
+
+const MM_PER_M: f64 = 1000.0;
+
+/// An xArm, Lite 6 or 850 behind its control box.
+pub struct XArmAdapter {
+    address: Address,
+    model: Model,
+    options: Options,
+    session: Option<Session>,
+    /// The target of the last planned move: the controller queues moves, so the same one is not sent twice.
+    target: Option<WireJoints>,
+}
+
+impl XArmAdapter {
+    /// An adapter for the controller at `config.address`. Does not connect.
+    pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
+        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
+        let options: Options = config.options()?;
+        let model = model_of(&options, config.dof).map_err(rejected)?;
+        let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        Ok(Self { address, model, options, session: None, target: None })
+    }
+
+    /// What became of the requests on the present connection.
+    pub fn counts(&self) -> Option<Counts> {
+        self.session.as_ref().map(Session::counts)
+    }
+
+    /// Does something with the connection. One that broke is given up.
+    fn with<T>(&mut self, act: impl FnOnce(&mut Session) -> AdapterResult<T>) -> AdapterResult<T> {
+        let result = act(self.session.as_mut().ok_or(AdapterError::NotConnected)?);
+        if matches!(result, Err(AdapterError::Io(_))) {
+            self.disconnect();
+        }
+        result
+    }
+
+    /// The connection, with what has arrived lately.
+    fn recent(&mut self) -> AdapterResult<&mut Session> {
+        self.with(|session| session.update(RECENT))?;
+        self.session.as_mut().ok_or(AdapterError::NotConnected)
+    }
+
+    /// Our joint values as those of the wire.
+    fn joints(&self, values: &[f64]) -> AdapterResult<WireJoints> {
+        let dof = self.model.axes();
+        if values.len() != dof || !values.iter().all(|value| value.is_finite()) {
+            return Err(AdapterError::Rejected(format!("{dof} finite values are needed, one per joint")));
+        }
+        let mut joints = [0.0; 7];
+        joints.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+        Ok(joints)
+    }
+
+    /// Fills in values of the wire.
+    fn fill(&self, out: &mut [f64], values: &[f64; 7]) {
+        out.iter_mut().zip(values).take(self.model.axes()).for_each(|(to, value)| *to = *value);
+    }
+
+    /// Speed of a planned move, from a fraction of the top speed.
+    fn speed(&self, fraction: f64, top: f64, slowest: f64) -> f64 {
+        let fraction = if fraction.is_finite() { fraction.clamp(0.0, 1.0) } else { 0.0 };
+        (fraction * self.options.speed_scale * top).max(slowest)
+    }
+
+    /// The joints of an arm with fewer than seven.
+    fn only<const N: usize>(&self, values: &[f64; N]) -> crate::joint::Joints {
+        joints_of(values.get(..self.model.axes()).unwrap_or_default())
+    }
+}
+
+impl ManipulatorAdapter for XArmAdapter {
+    // --- Lifecycle ---
+
+    fn connect(&mut self) -> AdapterResult<()> {
+        self.disconnect();
+        self.session = Some(connect(&self.address, self.model, &self.options)?);
+        Ok(())
+    }
+
+    fn disconnect(&mut self) {
+        (self.session, self.target) = (None, None);
+    }
+
+    fn is_connected(&self) -> bool {
+        self.session.is_some()
+    }
+
+    /// Servo mode, because that is what the coordinator uses first: the way there leads through a stop.
+    fn activate(&mut self) -> AdapterResult<()> {
+        let force_torque = self.options.force_torque;
+        self.target = None;
+        self.with(|session| session.activate(SERVO, force_torque))
+    }
+
+    // --- What it is ---
+
+    fn get_info(&self) -> ManipulatorInfo {
+        let device = self.session.as_ref().map(|session| &session.device);
+        ManipulatorInfo {
+            vendor: "UFACTORY".into(),
+            model: self.model.name().into(),
+            dof: self.model.axes(),
+            firmware_version: device.map(|device| device.firmware.to_string()),
+            serial_number: device.map(|device| device.serial.clone()),
+            native_rate: self.session.as_ref().map_or(super::NATIVE_RATE, Session::rate),
+            modes: MODES,
+            holds_when_disabled: HOLDS_WHEN_DISABLED,
+            whole_state_at_once: true,
+        }
+    }
+
+    fn get_dof(&self) -> usize {
+        self.model.axes()
+    }
+
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        Ok(self.session.as_ref().map_or_else(|| self.model.limits(), |session| session.device.limits.clone()))
+    }
+
+    // --- Mode ---
+
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        let mode = match mode {
+            ControlMode::Position => PLANNED,
+            ControlMode::ServoPosition => SERVO,
+            ControlMode::Velocity => JOINT_VELOCITY,
+            _ => return Err(AdapterError::Unsupported),
+        };
+        self.target = None;
+        self.with(|session| session.set_mode(mode))
+    }
+
+    fn get_control_mode(&self) -> ControlMode {
+        // A mode that the adapter does not use has the nearest name that `set_control_mode` does not know, so that
+        // nobody takes it for one that does.
+        match self.session.as_ref().map_or(PLANNED, |session| session.motion().0.mode) {
+            PLANNED => ControlMode::Position,
+            SERVO => ControlMode::ServoPosition,
+            JOINT_VELOCITY => ControlMode::Velocity,
+            2 | 3 => ControlMode::Impedance,
+            5 => ControlMode::CartesianVelocity,
+            _ => ControlMode::Cartesian,
+        }
+    }
+
+    // --- State ---
+
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.session.as_ref().map(Session::fd)
+    }
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        self.with(|session| session.update(Duration::ZERO))?;
+        let position = self.recent()?.motion().0.position;
+        self.fill(positions, &position);
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        let velocity = self.recent()?.motion().0.velocity;
+        velocity.iter().for_each(|values| self.fill(velocities, values));
+        Ok(velocity.is_some())
+    }
+
+    fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
+        let session = self.recent()?;
+        let (torque, torques) = (session.motion().0.torque, session.device.torques);
+        if torques {
+            self.fill(efforts, &torque);
+        }
+        Ok(torques)
+    }
+
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        self.with(|session| session.update(Duration::ZERO))?;
+        let session = self.session.as_ref().ok_or(AdapterError::NotConnected)?;
+        let (motion, stamp) = session.motion();
+        *reading = JointReading {
+            stamp: Some(stamp),
+            position: self.only(&motion.position),
+            velocity: motion.velocity.map(|velocity| self.only(&velocity)),
+            effort: session.device.torques.then(|| self.only(&motion.torque)),
+        };
+        Ok(())
+    }
+
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        let (motion, _) = self.recent()?.motion();
+        Ok(RobotState { state: motion.state.into(), mode: motion.mode.into() })
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        let condition = self.recent()?.condition();
+        Ok((condition.error.into(), condition.text())) // an empty text allocates nothing
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        Ok(self.recent()?.enabled())
+    }
+
+    // --- Motion ---
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        let joints = self.joints(positions)?;
+        let mode = self.session.as_ref().ok_or(AdapterError::NotConnected)?.motion().0.mode;
+        if mode != PLANNED {
+            return self.with(|session| session.stream(SERVO, &Command::Servo(joints)));
+        }
+        let same = |target: WireJoints| target.iter().zip(&joints).all(|(a, b)| (a - b).abs() < SAME);
+        let speed = self.speed(velocity, VELOCITY, SLOWEST.0);
+        let known = self.target.is_some_and(same);
+        let command = Command::MoveJoints { joints, speed, acceleration: JOINT_ACCELERATION };
+        self.with(|session| if known { session.may_plan() } else { session.plan(&command) })?;
+        self.target = Some(joints);
+        Ok(())
+    }
+
+    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
+        let joints = self.joints(velocities)?;
+        self.with(|session| {
+            let duration = takes_duration(session.device.firmware).then_some(VELOCITY_TIMEOUT);
+            session.stream(JOINT_VELOCITY, &Command::Velocity { joints, duration })
+        })
+    }
+
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        self.target = None;
+        self.with(Session::stop)
+    }
+
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        self.target = None;
+        self.with(|session| session.enable(enable))
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.target = None;
+        self.with(Session::clear_errors)
+    }
+
+    // --- Optional parts ---
+
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+        let [x, y, z, roll, pitch, yaw] = self.recent()?.motion().0.pose;
+        Ok(Some(Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw] }))
+    }
+
+    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
+        let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz.map(|v| v * MM_PER_M), pose.rpy);
+        let pose = [x, y, z, roll, pitch, yaw];
+        if !pose.iter().all(|value| value.is_finite()) {
+            return Err(AdapterError::Rejected("the pose is not finite".into()));
+        }
+        let speed = self.speed(velocity, self.model.line_speed(), SLOWEST.1);
+        self.target = None;
+        self.with(|session| session.plan(&Command::MoveLine { pose, speed, acceleration: LINE_ACCELERATION }))
+    }
+
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(self.recent()?.gripper().opening())
+    }
+
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.options.gripper.widest().map(|widest| (0.0, widest))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        self.with(|session| session.gripper().go_to(position))
+    }
+
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        let used = self.options.force_torque;
+        Ok(self.recent()?.motion().0.wrench.filter(|_| used))
+    }
+}

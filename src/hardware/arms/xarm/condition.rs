@@ -1,0 +1,102 @@
+//! How the controller is: error, warning, motors. Register 15 alone says what the error is; everything else that hints
+//! at a change (the state byte of any response, a report, a stop that nobody asked for) only makes us ask it.
+
+use std::time::Duration;
+
+use super::errors::{error_text, servo_text};
+use super::protocol::commands::Command;
+use super::protocol::frame::{Response, Status};
+use super::protocol::report::Health;
+use crate::clock::Mono;
+
+/// The controller hears from us at least this often, which also shows that it still answers.
+const HEARTBEAT: Duration = Duration::from_millis(250);
+/// A question that is not answered within this time is asked again.
+const ASK_AGAIN: Duration = Duration::from_millis(200);
+/// Errors of the joints' servos: more about them is in another register.
+const SERVO_ERRORS: std::ops::RangeInclusive<u8> = 10..=17;
+/// Errors that mean an open E-stop line: the motors have no power.
+const POWER_CUT: std::ops::RangeInclusive<u8> = 1..=3;
+
+/// What is known of the controller's condition.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Condition {
+    /// The error; 0 = none.
+    pub error: u8,
+    /// The warning; 0 = none.
+    pub warning: u8,
+    /// Motors that are on, one bit per joint.
+    pub enabled: u8,
+    /// Error codes of the joints' servos.
+    servos: [u8; 7],
+    /// Something has changed; register 15 must say what.
+    pub changed: bool,
+    servos_changed: bool,
+    /// When it was asked, while the answer is outstanding.
+    asked: Option<Mono>,
+}
+
+impl Condition {
+    /// Whether the motors of the first `axes` joints are on.
+    pub fn all_enabled(&self, axes: usize) -> bool {
+        let all = ((1_u16 << axes) - 1) as u8;
+        self.enabled & all == all
+    }
+
+    /// Looks at the state byte of a response.
+    pub fn hint(&mut self, status: Status) {
+        self.changed |= status.error() != (self.error != 0);
+    }
+
+    /// Looks at a report.
+    pub fn report(&mut self, health: Health) {
+        self.enabled = health.enabled;
+        self.changed |= health.error != self.error || health.warning != self.warning;
+    }
+
+    /// Takes the answer to a question of [`Condition::due`].
+    pub fn take(&mut self, response: &Response) {
+        match (response.register, response.data()) {
+            (15, [error, warning, ..]) => {
+                self.servos_changed = SERVO_ERRORS.contains(error) && *error != self.error;
+                (self.error, self.warning) = (*error, *warning);
+                (self.changed, self.asked) = (false, None);
+                if POWER_CUT.contains(error) {
+                    self.enabled = 0;
+                }
+            }
+            (106, data) => {
+                let codes = data.chunks_exact(2).filter_map(|pair| pair.get(1));
+                self.servos.iter_mut().zip(codes).for_each(|(to, code)| *to = *code);
+                (self.servos_changed, self.asked) = (false, None);
+            }
+            _ => {}
+        }
+    }
+
+    /// The next question, if one is due. `last_sent`: when the controller last heard from us.
+    pub fn due(&mut self, now: Mono, last_sent: Mono) -> Option<Command> {
+        if self.asked.is_some_and(|asked| now.since(asked) < ASK_AGAIN) {
+            return None;
+        }
+        let command = if self.changed || now.since(last_sent) > HEARTBEAT {
+            Command::GetError
+        } else if self.servos_changed {
+            Command::ServoErrors
+        } else {
+            return None;
+        };
+        self.asked = Some(now);
+        Some(command)
+    }
+
+    /// What the error means; empty (and without allocation) when there is none.
+    pub fn text(&self) -> String {
+        let mut text = error_text(self.error).to_owned();
+        if SERVO_ERRORS.contains(&self.error) {
+            let failed = self.servos.iter().enumerate().filter(|(_, code)| **code != 0);
+            failed.for_each(|(i, code)| text += &format!("; joint {}: {code} {}", i + 1, servo_text(*code)));
+        }
+        text
+    }
+}

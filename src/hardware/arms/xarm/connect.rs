@@ -1,0 +1,152 @@
+//! Connecting: who is there, which reports it has, and whether what the blueprint says is true. Nothing is switched on
+//! and nothing moves.
+
+use std::time::Duration;
+
+use super::Options;
+use super::address::Address;
+use super::condition::Condition;
+use super::control::{Control, Purpose, REPLY_TIMEOUT};
+use super::gripper::Gripper;
+use super::model::{Identity, Model};
+use super::protocol::commands::Command;
+use super::protocol::frame::{Response, WATCHED};
+use super::protocol::gripper::{BAUD_INDEX, BAUD_REGISTER, GripperKind, Rtu, decode_position};
+use super::protocol::identity::{Firmware, decode_serial, decode_version};
+use super::protocol::report::{Health, Kind, Motion};
+use super::session::{Device, Session};
+use super::stream::Stream;
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::tcp::TcpLink;
+
+/// Longest time for all of it.
+const ALL: Duration = Duration::from_millis(2500);
+/// Longest wait for the connection, for the introduction, and for the first report of a kind.
+const CONNECT: Duration = Duration::from_millis(1200);
+const VERSION: Duration = Duration::from_millis(1000);
+const FIRST_REPORT: Duration = Duration::from_millis(1000);
+
+/// What is left of a time limit, at most `most`.
+fn left(until: Mono, most: Duration) -> Duration {
+    until.since(MonotonicClock.now()).min(most)
+}
+
+/// Connects to the arm at `address`, which must be a `model`.
+pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterResult<Session> {
+    let until = MonotonicClock.now().after(ALL);
+    let named = |error| name(error, address);
+    let link = TcpLink::connect("xarm", &address.control, left(until, CONNECT)).map_err(named)?;
+    let mut control = Control::new(link);
+    let version = ask(&mut control, &Command::Version, left(until, VERSION))?;
+    let (identity, firmware) = decode_version(version.data()).ok_or_else(|| {
+        AdapterError::Protocol(format!("xarm at {address}: what answers at the control port is not an xArm controller"))
+    })?;
+    verify(address, model, &identity)?;
+    if firmware.at_least(1, 8, 6) {
+        control.speak(WATCHED);
+    }
+    let serial = ask(&mut control, &Command::Serials, left(until, REPLY_TIMEOUT))?;
+    let serial = decode_serial(serial.data()).unwrap_or_else(|| identity.serial.clone());
+
+    let full = firmware.at_least(2, 1, 0);
+    let (kind, decode): (_, fn(&[u8]) -> _) =
+        if full { (Kind::Full, Motion::decode_full) } else { (Kind::Real, Motion::decode_real) };
+    let mut motion = Stream::connect(address, kind, decode, left(until, CONNECT))?;
+    let mut normal = Stream::connect(address, Kind::Normal, Health::decode, left(until, CONNECT))?;
+    let first = motion.wait(left(until, FIRST_REPORT)).map_err(no_report)?;
+    let mut condition = Condition::default();
+    condition.report(normal.wait(left(until, FIRST_REPORT)).map_err(no_report)?);
+    // Register 70 turns the torques of every report but the full one into currents.
+    let currents = !full && ask(&mut control, &Command::ReportsCurrents, REPLY_TIMEOUT)?.data().first() == Some(&1);
+    condition.take(&ask(&mut control, &Command::GetError, REPLY_TIMEOUT)?);
+    let pulses = find_gripper(&mut control, options.gripper, address)?;
+
+    let limits = identity.limits().unwrap_or_else(|| model.limits());
+    let device = Device { model, firmware, serial, limits, torques: !currents };
+    let gripper = Gripper::new(options.gripper, pulses);
+    Ok(Session::new(device, control, motion, first, normal, condition, gripper))
+}
+
+fn ask(control: &mut Control, command: &Command, timeout: Duration) -> AdapterResult<Response> {
+    control.ask(command, timeout, |_: Purpose, _| ())
+}
+
+/// Puts the address as the blueprint has it into a message about its control port.
+fn name(error: AdapterError, address: &Address) -> AdapterError {
+    let in_full = |text: String| match address.reports == super::address::REPORT_PORT {
+        true => text,
+        false => text.replace(&address.control.to_string(), &address.to_string()),
+    };
+    match error {
+        AdapterError::Io(text) => AdapterError::Io(in_full(text)),
+        AdapterError::Timeout(text) => AdapterError::Timeout(in_full(text)),
+        other => other,
+    }
+}
+
+fn no_report(error: AdapterError) -> AdapterError {
+    match error {
+        AdapterError::Timeout(text) => AdapterError::Timeout(format!("{text}: no report that can be understood came")),
+        other => other,
+    }
+}
+
+/// Says whether the other end is the arm that this adapter is for.
+fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()> {
+    let is = Model::of(found);
+    if is == Some(model) {
+        return Ok(());
+    }
+    let (axes, kind) = (found.axes, found.kind);
+    let what = match is {
+        Some(other) => format!("{} {} with {axes} joints", other.article(), other.name()),
+        None => format!("an unknown arm with {axes} joints (kind {kind})"),
+    };
+    let hint = match is {
+        Some(other) => format!("is the address right? Else set the arm's options to {{model: {}}}", other.option()),
+        None => "is the address right?".to_owned(),
+    };
+    let (name, joints) = (model.name(), model.axes());
+    Err(AdapterError::Rejected(format!(
+        "xarm at {address}: expected the model {name} with {joints} joints, found {what}\nhint: {hint}"
+    )))
+}
+
+/// Looks whether the gripper of the blueprint answers; where it is [pulses].
+fn find_gripper(control: &mut Control, kind: GripperKind, address: &Address) -> AdapterResult<Option<i32>> {
+    if kind == GripperKind::None {
+        return Ok(None);
+    }
+    let rejected =
+        |what: &str, hint: &str| Err(AdapterError::Rejected(format!("xarm at {address}: {what}\nhint: {hint}")));
+    let baud = ask(control, &Command::ReadToolBoard(BAUD_REGISTER), REPLY_TIMEOUT)?;
+    match baud.data() {
+        [_, a, b, c, d, ..] | [a, b, c, d] if i32::from_be_bytes([*a, *b, *c, *d]) == BAUD_INDEX => {}
+        _ => {
+            return rejected(
+                "the tool's RS485 does not run at 2 Mbit/s, which the gripper needs",
+                "set the tool's baud rate to 2000000 in the vendor's studio, or the arm's options to {gripper: none}",
+            );
+        }
+    }
+    let telegram = Rtu::read_position();
+    let answer = ask(control, &Command::Tool(telegram), REPLY_TIMEOUT)?;
+    match telegram.answered(answer.data()).and_then(decode_position) {
+        Some(pulses) => Ok(Some(pulses)),
+        None => rejected(
+            "no gripper answers at the tool flange",
+            "is it fitted? Without one set the arm's options to {gripper: none}",
+        ),
+    }
+}
+
+/// What the firmware can do that an older one cannot.
+pub fn takes_detection(firmware: Firmware) -> bool {
+    firmware.at_least(1, 10, 0)
+}
+
+/// Whether joint velocities can have a time after which they end.
+pub fn takes_duration(firmware: Firmware) -> bool {
+    firmware.at_least(1, 8, 0)
+}

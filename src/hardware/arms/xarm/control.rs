@@ -1,0 +1,269 @@
+//! The control connection. Requests go out without waiting for the responses to earlier ones: a set point must not
+//! wait for the answer to the set point before. Each response is matched to its request by number, whenever it comes.
+
+use std::time::Duration;
+
+use super::protocol::commands::Command;
+use super::protocol::frame::{self, Arrived, MAX_REQUEST, PRIVATE, Response, Status};
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::tcp::TcpLink;
+
+/// Most requests without response. At 250 set points a second the controller is then a quarter of a second behind.
+const WINDOW: usize = 64;
+/// A response that takes longer is late: nobody waits for it any more. The controller answers within a few ms.
+pub const REPLY_TIMEOUT: Duration = Duration::from_millis(200);
+/// A controller that answers nothing for so long, while it is asked, is gone.
+const GONE: Duration = Duration::from_millis(1000);
+
+/// Who wants the response.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// A caller waits for it.
+    Answer,
+    /// A command that moves the arm: only a refusal is of interest.
+    Motion,
+    /// It tells how the controller is.
+    Health,
+    /// It is for the gripper.
+    Gripper,
+}
+
+/// What became of requests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Requests sent.
+    pub sent: u64,
+    /// Responses that came, but late.
+    pub late: u64,
+    /// Requests whose response did not come in time.
+    pub overdue: u64,
+    /// Whole frames that answered nothing.
+    pub stray: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Pending {
+    transaction: u16,
+    register: u8,
+    purpose: Purpose,
+    sent: Mono,
+    overdue: bool,
+}
+
+/// The connection to the control port.
+pub struct Control {
+    link: TcpLink,
+    protocol: u16,
+    transaction: u16,
+    pending: [Option<Pending>; WINDOW],
+    last_sent: Mono,
+    last_response: Mono,
+    /// A motion command that was refused, until somebody hears of it.
+    refusal: Option<Status>,
+    counts: Counts,
+}
+
+impl Control {
+    /// Talks over this connection, in the plain private protocol.
+    pub fn new(link: TcpLink) -> Self {
+        let now = MonotonicClock.now();
+        Self {
+            link,
+            protocol: PRIVATE,
+            transaction: 0,
+            pending: [None; WINDOW],
+            last_sent: now,
+            last_response: now,
+            refusal: None,
+            counts: Counts::default(),
+        }
+    }
+
+    /// Speaks another protocol from now on.
+    pub fn speak(&mut self, protocol: u16) {
+        self.protocol = protocol;
+    }
+
+    /// When the last request went out.
+    pub fn last_sent(&self) -> Mono {
+        self.last_sent
+    }
+
+    /// What became of requests so far.
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    /// The refusal of an earlier motion command, told once.
+    pub fn take_refusal(&mut self) -> Option<Status> {
+        self.refusal.take()
+    }
+
+    /// Sends a request and returns at once. The response shows up in [`Control::next`].
+    pub fn post(&mut self, command: &Command, purpose: Purpose) -> AdapterResult<()> {
+        let now = MonotonicClock.now();
+        let Some(slot) = self.pending.iter_mut().find(|slot| slot.is_none()) else {
+            return Err(AdapterError::Timeout(format!(
+                "{} does not keep up: {WINDOW} requests without response",
+                self.link.peer()
+            )));
+        };
+        self.transaction = self.transaction % u16::MAX + 1;
+        let (transaction, register) = (self.transaction, command.register());
+        *slot = Some(Pending { transaction, register, purpose, sent: now, overdue: false });
+        self.last_sent = now;
+        self.counts.sent += 1;
+        let mut frame = [0; MAX_REQUEST];
+        self.link.send(command.encode(transaction, self.protocol, &mut frame))
+    }
+
+    /// Takes the next response that has arrived, without waiting, with who wanted it.
+    pub fn next(&mut self) -> AdapterResult<Option<(Purpose, Response)>> {
+        loop {
+            let (protocol, pending) = (self.protocol, &self.pending);
+            let asked = |transaction, register| find(pending, transaction, register).is_some();
+            match self.link.poll(|bytes| frame::scan(bytes, protocol, asked))? {
+                Some(Arrived::Response(response)) => {
+                    if let Some(purpose) = self.settle(&response) {
+                        return Ok(Some((purpose, response)));
+                    }
+                }
+                Some(Arrived::Stray) => self.counts.stray += 1,
+                None => {
+                    self.expire()?;
+                    return Ok(None);
+                }
+            }
+        }
+    }
+
+    /// Sends a request and waits for its response. What else arrives meanwhile is given to `other`.
+    pub fn ask(
+        &mut self,
+        command: &Command,
+        timeout: Duration,
+        mut other: impl FnMut(Purpose, &Response),
+    ) -> AdapterResult<Response> {
+        self.post(command, Purpose::Answer)?;
+        let (transaction, deadline) = (self.transaction, MonotonicClock.now().after(timeout));
+        loop {
+            let (protocol, pending) = (self.protocol, &self.pending);
+            let asked = |transaction, register| find(pending, transaction, register).is_some();
+            let left = deadline.since(MonotonicClock.now());
+            let received = self.link.receive(left, |bytes| frame::scan(bytes, protocol, asked));
+            match received {
+                Ok(Arrived::Stray) => self.counts.stray += 1,
+                Ok(Arrived::Response(response)) => match self.settle(&response) {
+                    Some(Purpose::Answer) if response.transaction == transaction => return Ok(response),
+                    Some(purpose) => other(purpose, &response),
+                    None => {}
+                },
+                Err(AdapterError::Timeout(_)) => {
+                    self.expire()?;
+                    let (peer, register) = (self.link.peer(), command.register());
+                    return Err(AdapterError::Timeout(format!(
+                        "{peer} did not answer register {register} within {timeout:?}"
+                    )));
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// Forgets the request of a response; answers who wants it, unless it is too late for that.
+    fn settle(&mut self, response: &Response) -> Option<Purpose> {
+        let at = find(&self.pending, response.transaction, response.register)?;
+        let pending = self.pending.get_mut(at)?.take()?;
+        self.last_response = MonotonicClock.now();
+        if pending.purpose == Purpose::Motion {
+            let refused = response.status.error() || response.status.not_ready() || response.status.invalid();
+            self.refusal = refused.then_some(response.status).or(self.refusal);
+        }
+        if pending.overdue {
+            self.counts.late += 1;
+            return None;
+        }
+        Some(pending.purpose)
+    }
+
+    /// Gives up waiting for what is overdue; an error when the controller has answered nothing for too long.
+    fn expire(&mut self) -> AdapterResult<()> {
+        let (now, last_response) = (MonotonicClock.now(), self.last_response);
+        for slot in &mut self.pending {
+            let Some(pending) = slot else { continue };
+            let age = now.since(pending.sent);
+            if age > REPLY_TIMEOUT && !pending.overdue {
+                pending.overdue = true;
+                self.counts.overdue += 1;
+            }
+            if age > GONE && last_response < pending.sent {
+                return Err(AdapterError::Io(format!("{} answers nothing any more", self.link.peer())));
+            }
+            if age > GONE {
+                *slot = None; // lost, while others were answered
+            }
+        }
+        Ok(())
+    }
+}
+
+fn find(pending: &[Option<Pending>], transaction: u16, register: u8) -> Option<usize> {
+    let is_it = |slot: &Option<Pending>| slot.is_some_and(|p| p.transaction == transaction && p.register == register);
+    pending.iter().position(is_it)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{Read, Write};
+    use std::net::TcpListener;
+    use std::sync::mpsc::channel;
+
+    use super::*;
+    use crate::hardware::transport::tcp::Endpoint;
+
+    #[test]
+    fn responses_are_matched_by_number_and_late_and_stray_ones_are_counted() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let (go, told) = channel();
+        std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            // Register 13, transactions 1 to 3: seven bytes each.
+            stream.read_exact(&mut [0; 21]).unwrap();
+            let answer = |transaction| [0, transaction, 0, 2, 0, 3, 13, 0, 10 + transaction];
+            for transactions in [&[9, 3][..], &[1], &[1, 2]] {
+                told.recv().unwrap();
+                transactions.iter().for_each(|t| stream.write_all(&answer(*t)).unwrap());
+            }
+            let _ = stream.read(&mut [0; 1]);
+        });
+        let endpoint = Endpoint { host: "127.0.0.1".into(), port };
+        let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
+        (0..3).for_each(|_| control.post(&Command::GetState, Purpose::Health).unwrap());
+        let next = |control: &mut Control| {
+            let end = std::time::Instant::now() + Duration::from_secs(10);
+            while std::time::Instant::now() < end {
+                if let Some((purpose, response)) = control.next().unwrap() {
+                    assert_eq!(purpose, Purpose::Health);
+                    return response;
+                }
+            }
+            panic!("no response")
+        };
+        go.send(()).unwrap();
+        assert_eq!(next(&mut control).data(), [13], "the third came first, after one to nobody");
+        go.send(()).unwrap();
+        assert_eq!(next(&mut control).data(), [11]);
+        let second = |control: &Control| control.pending.iter().flatten().map(|p| p.transaction).collect::<Vec<_>>();
+        assert_eq!(second(&control), [2]);
+        std::thread::sleep(REPLY_TIMEOUT + Duration::from_millis(10));
+        assert_eq!(control.next().unwrap().map(|_| ()), None);
+        assert_eq!(control.counts(), Counts { sent: 3, late: 0, overdue: 1, stray: 1 });
+        go.send(()).unwrap();
+        while control.counts().late == 0 {
+            assert_eq!(control.next().unwrap().map(|_| ()), None, "nobody wants it any more");
+        }
+        assert_eq!(control.counts(), Counts { sent: 3, late: 1, overdue: 1, stray: 2 });
+    }
+}

@@ -1,0 +1,241 @@
+//! The emulator: plays the control box of an xArm, Lite 6 or 850 on a loopback address, for `address: sim`, for tests,
+//! and for the vendor's own client. It serves any number of clients at once, as the real one does.
+//!
+//! ```text
+//!  server ── sockets, threads, faults of the wire
+//!   ├─▶ wire, registers ─▶ controller (modes, states, errors, joints) ─▶ plant
+//!   └─▶ report ◀── snapshot of the controller
+//! ```
+
+mod controller;
+mod kinematics;
+mod registers;
+mod report;
+mod server;
+#[cfg(test)]
+mod tests;
+mod tool;
+mod wire;
+
+use std::io;
+use std::net::{IpAddr, TcpListener};
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::address::{CONTROL_PORT, REPORT_PORT};
+use super::model::Model;
+use super::protocol::gripper::GripperKind;
+use super::protocol::identity::Firmware;
+use super::{Options, model_of};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::joint::Joints;
+use controller::Controller;
+pub use controller::Received;
+use server::Server;
+
+/// The faults that the emulator can play.
+const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Frozen,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::Nan,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Corrupt,
+    FaultKind::Truncated,
+    FaultKind::WrongDof,
+    FaultKind::WrongModel,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+];
+
+/// The report ports follow one another.
+const REPORT_PORTS: u16 = 4;
+/// Attempts to find so many free ports in a row.
+const ATTEMPTS: u32 = 200;
+
+/// What the emulator does.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at power-up [rad], one per joint; a pose amid the range when empty.
+    pub initial_positions: Vec<f64>,
+    /// Firmware version of the controller. Before 2.1.0 there is no report with velocities.
+    pub firmware: String,
+    /// What goes wrong, and when (seconds after the first connection).
+    pub faults: Vec<Fault>,
+}
+
+impl Default for SimOptions {
+    fn default() -> Self {
+        Self { initial_positions: Vec::new(), firmware: "2.5.1".into(), faults: Vec::new() }
+    }
+}
+
+/// A running emulator. Ends when it is dropped.
+pub struct XArmEmulator {
+    server: Server,
+}
+
+impl XArmEmulator {
+    /// Starts an emulator at `place` of the arm that a configuration describes.
+    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+        let options: Options = config.options()?;
+        let model = model_of(&options, config.dof).map_err(rejected)?;
+        let control = place.tcp(CONTROL_PORT)?;
+        let in_process = *place == Place::InProcess;
+        Self::listen(model, options.gripper, &options.sim, control.ip(), in_process)
+    }
+
+    fn listen(
+        model: Model,
+        gripper: GripperKind,
+        options: &SimOptions,
+        ip: IpAddr,
+        in_process: bool,
+    ) -> AdapterResult<Self> {
+        check_kinds("the xarm emulator", &options.faults, PLAYABLE).map_err(AdapterError::Rejected)?;
+        let initial = &options.initial_positions;
+        let limits = model.limits();
+        let range = limits.position_lower.iter().zip(&limits.position_upper);
+        let inside = initial.iter().zip(range).all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
+        if !initial.is_empty() && (initial.len() != model.axes() || !inside) {
+            let axes = model.axes();
+            return Err(rejected(format!("initial_positions must be {axes} angles [rad] within the joint limits")));
+        }
+        let Some(Firmware(firmware)) = Firmware::parse(&options.firmware) else {
+            return Err(rejected(format!("firmware {:?} is not a version like 2.5.1", options.firmware)));
+        };
+        let ports = Ports::bind(ip, in_process).map_err(|e| AdapterError::Io(format!("xarm emulator: {e}")))?;
+        let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now());
+        let server = Server::start(controller, ports, firmware >= [2, 1, 0])
+            .map_err(|e| rejected(format!("cannot serve: {e}")))?;
+        Ok(Self { server })
+    }
+
+    /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
+    pub fn press_estop(&self) {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            controller.press_estop();
+        });
+    }
+
+    /// Releases the E-stop button. Nothing else changes.
+    pub fn release_estop(&self) {
+        self.server.with(|controller, _| controller.release_estop());
+    }
+
+    /// True joint positions [rad] and velocities [rad/s] now.
+    pub fn joints(&self) -> (Joints, Joints) {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            controller.joints()
+        })
+    }
+
+    /// Whether all motors are on.
+    pub fn enabled(&self) -> bool {
+        self.server.with(|controller, _| controller.all_enabled())
+    }
+
+    /// The gripper's true opening now [m].
+    pub fn gripper(&self) -> f64 {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            controller.tool.opening()
+        })
+    }
+
+    /// Starts to record what comes over the wire, up to 200 000 requests; forgets what was recorded before.
+    pub fn record(&self) {
+        self.server.with(|controller, _| controller.record());
+    }
+
+    /// What came over the wire since [`XArmEmulator::record`].
+    pub fn trace(&self) -> Vec<Received> {
+        self.server.with(|controller, _| controller.trace())
+    }
+}
+
+impl Emulator for XArmEmulator {
+    fn address(&self) -> String {
+        self.server.address()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        check_kinds("the xarm emulator", &[fault], PLAYABLE)?;
+        self.server.with(|controller, now| controller.inject(fault, now));
+        Ok(())
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.joints().0)
+    }
+}
+
+fn rejected(text: String) -> AdapterError {
+    AdapterError::Rejected(format!("xarm emulator: {text}"))
+}
+
+/// The sockets that wait for clients.
+struct Ports {
+    ip: IpAddr,
+    control: TcpListener,
+    /// In the order of their ports.
+    reports: Vec<TcpListener>,
+}
+
+impl Ports {
+    /// Listens at the arm's own ports, or at free ones.
+    fn bind(ip: IpAddr, in_process: bool) -> Result<Self, String> {
+        if !in_process {
+            return Self::at(ip, CONTROL_PORT, REPORT_PORT);
+        }
+        let free = |_| {
+            let control = TcpListener::bind((ip, 0)).ok()?;
+            let reports = Self::block(ip, 0).ok()?;
+            Some(Self { ip, control, reports })
+        };
+        (0..ATTEMPTS).find_map(free).ok_or_else(|| format!("no free ports at {ip}"))
+    }
+
+    /// Listens at these ports.
+    fn at(ip: IpAddr, control: u16, reports: u16) -> Result<Self, String> {
+        let failed = |port: u16| move |e: io::Error| cannot_listen(ip, port, &e);
+        let control = TcpListener::bind((ip, control)).map_err(failed(control))?;
+        Ok(Self { ip, control, reports: Self::block(ip, reports).map_err(failed(reports))? })
+    }
+
+    fn block(ip: IpAddr, first: u16) -> io::Result<Vec<TcpListener>> {
+        let listener = TcpListener::bind((ip, first))?;
+        let first = listener.local_addr()?.port();
+        let mut all = vec![listener];
+        for offset in 1..REPORT_PORTS {
+            let port = first.checked_add(offset).ok_or(io::ErrorKind::AddrNotAvailable)?;
+            all.push(TcpListener::bind((ip, port))?);
+        }
+        Ok(all)
+    }
+}
+
+/// Why a port cannot be had, and what to do.
+fn cannot_listen(ip: IpAddr, port: u16, error: &io::Error) -> String {
+    let what = format!("cannot listen at {ip}:{port}: {error}");
+    match error.kind() {
+        io::ErrorKind::PermissionDenied => format!(
+            "{what}\nhint: allow it with `sysctl net.ipv4.ip_unprivileged_port_start={port}` as root, or give the \
+             program CAP_NET_BIND_SERVICE"
+        ),
+        io::ErrorKind::AddrInUse => format!("{what}\nhint: take another address of this computer, like 127.0.0.5"),
+        _ => what,
+    }
+}

@@ -1,0 +1,285 @@
+//! What each register of the control port does. Where the vendor's pages do not say what happens, a comment says that
+//! the choice is ours.
+
+use super::controller::{Controller, Move, QUEUE, fraction, state};
+use super::kinematics::{from_wire, to_wire};
+use super::wire::{self, Request, number, numbers, put_numbers};
+use crate::clock::Mono;
+use crate::hardware::sim::faults::FaultKind;
+use std::time::Duration;
+
+/// Warnings.
+const QUEUE_FULL: u8 = 11;
+const BAD_PARAMETER: u8 = 12;
+const UNKNOWN: u8 = 13;
+const NO_SOLUTION: u8 = 14;
+/// Errors.
+const TOOL_SILENT: u8 = 19;
+const JOINT_LIMIT: u8 = 23;
+
+/// The state byte's bit "no valid result": a command that the mode does not know (our choice).
+const INVALID: u8 = 0x08;
+/// Positions this close to a limit count as inside [rad]: the vendor's client allows as much.
+const TOLERANCE: f64 = 0.00175;
+/// The bus number of the tool flange.
+const TOOL: u8 = 9;
+
+/// Why a request is not done.
+enum Refusal {
+    /// It raises a warning.
+    Warning(u8),
+    /// It raises an error.
+    Error(u8),
+    /// The arm is not ready, or in another mode.
+    NotNow,
+}
+
+use Refusal::{Error, NotNow, Warning};
+
+impl Controller {
+    /// Does what a request asks; answers the state byte of the response in `out`.
+    pub(super) fn respond(&mut self, request: &Request<'_>, now: Mono, t: f64, out: &mut Vec<u8>) -> u8 {
+        wire::begin(out, request);
+        let mut extra = 0;
+        match self.execute(request.register, request.payload, now, t, out) {
+            Ok(()) => {}
+            Err(Warning(code)) => self.warning = code,
+            Err(Error(code)) => self.fail(code),
+            Err(NotNow) => extra = INVALID,
+        }
+        let status = self.status() | extra;
+        wire::end(out, status);
+        status
+    }
+
+    fn execute(&mut self, register: u8, data: &[u8], now: Mono, t: f64, out: &mut Vec<u8>) -> Result<(), Refusal> {
+        match (register, data) {
+            (1, _) => self.version(t, out),
+            (2, _) => {
+                let serial = &self.identity.serial;
+                out.extend(format!("{serial}C07L01\0AC1305C07L01\n\0").bytes().chain([0; 40]).take(40));
+            }
+            (5, _) => out.push(u8::from(self.settings.currents)),
+            (70, [kind]) => self.settings.currents = *kind == 1,
+            (11, [joint, on]) => self.switch(*joint, *on == 1, t),
+            (12, [wanted]) => self.set_state(*wanted),
+            (13, _) => out.push(self.reported_state()),
+            (14, _) => self.put_queue(out),
+            (15, _) => out.extend([self.error, self.warning]),
+            (16, _) => self.clear_error(),
+            (17, _) => self.warning = 0,
+            (19, [mode, ..]) if *mode <= 11 => self.set_mode(*mode),
+            (31..=34, _) => self.put_queue(out),
+            (35, _) => self.setting(|s| s.offset = numbers(data).unwrap_or(s.offset), out),
+            (36, _) => self.setting(|s| s.load = numbers(data).unwrap_or(s.load), out),
+            (37, [level @ 0..=5]) => self.setting(|s| s.sensitivity = [*level, s.sensitivity[1]], out),
+            (38, [level @ 1..=5]) => self.setting(|s| s.sensitivity = [s.sensitivity[0], *level], out),
+            (18 | 39 | 40 | 254, _) => {}
+            (253, _) => out.push(0),
+            (41, _) => put_numbers(out, to_wire(&self.pose())),
+            (42, [wanted @ 1..=3, ..]) => {
+                put_numbers(out, self.seven().map(|v| v as f32));
+                let (_, velocity) = self.joints();
+                let velocity = velocity.iter().take(7).map(|v| *v as f32);
+                (*wanted > 1).then(|| put_numbers(out, velocity));
+                (*wanted > 2).then(|| put_numbers(out, self.torques()));
+            }
+            (42, _) => put_numbers(out, self.seven().map(|v| v as f32)),
+            (43, _) => {
+                let goal = from_wire(numbers(data).ok_or(Warning(BAD_PARAMETER))?);
+                let joints = self.chain.inverse(&goal, &self.seven()).ok_or(Warning(NO_SOLUTION))?;
+                put_numbers(out, joints.map(|v| v as f32));
+            }
+            (44, _) => {
+                let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);
+                put_numbers(out, to_wire(&self.chain.forward(&joints)));
+            }
+            (45, _) => {
+                let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);
+                out.push(u8::from(!self.inside(&joints)));
+            }
+            (55, _) => put_numbers(out, self.torques()),
+            (91, _) => {
+                let pose = self.pose();
+                let (place, turn) = (pose.translation.vector * 1000.0, pose.rotation.scaled_axis());
+                put_numbers(out, place.iter().chain(turn.iter()).map(|v| *v as f32));
+            }
+            (106, _) => {
+                let failed = self.error.checked_sub(11).filter(|joint| *joint < 7);
+                out.extend((0..8).flat_map(|joint| [0, if failed == Some(joint) { 23 } else { 0 }]));
+            }
+            (124, [TOOL, telegram @ ..]) => {
+                let answer = self.tool.telegram(telegram).ok_or(Error(TOOL_SILENT))?;
+                out.extend([TOOL].into_iter().chain(answer));
+            }
+            (125, _) => out.extend([0, self.tool.error as u8]),
+            (127, [TOOL, a0, a1, ..]) => {
+                let value = number(data, 3, 0).ok_or(Warning(BAD_PARAMETER))?;
+                self.tool.write(u16::from(*a0) << 8 | u16::from(*a1), value);
+            }
+            (128, [TOOL, a0, a1]) => {
+                out.extend(self.tool.read(u16::from(*a0) << 8 | u16::from(*a1)).to_be_bytes());
+            }
+            (150 | 200, _) => put_numbers(out, if data == [1] { self.wrench().1 } else { self.wrench().0 }),
+            (201, [on]) => self.settings.wrench_on = *on == 1,
+            (202, _) => {}
+            (206, _) => self.settings.wrench_zero = self.wrench().1,
+            (21..=30 | 81, _) => self.motion(register, data, now, out)?,
+            (1..=254, _) if (11..=45).contains(&register) => return Err(Warning(BAD_PARAMETER)),
+            _ => return Err(Warning(UNKNOWN)),
+        }
+        Ok(())
+    }
+
+    fn version(&mut self, t: f64, out: &mut Vec<u8>) {
+        let axes = self.identity.axes + usize::from(self.script.take(FaultKind::WrongDof, t).is_some());
+        let another = self.script.take(FaultKind::WrongModel, t).is_some();
+        let kind = match self.identity.kind {
+            6 if another => 9, // a Lite 6
+            _ if another => 6,
+            kind => kind,
+        };
+        let ([major, minor, revision], serial) = (self.firmware, &self.identity.serial);
+        let text = format!("{axes},{kind},{serial},AC1305,v{major}.{minor}.{revision}");
+        out.extend(text.bytes().chain([0; 40]).take(40));
+    }
+
+    /// The number of commands in the queue, which real controllers put behind the state byte.
+    fn put_queue(&self, out: &mut Vec<u8>) {
+        out.extend((self.queue.len() as u16).to_be_bytes());
+    }
+
+    /// A setting that resets the system and drops to mode 0.
+    fn setting(&mut self, set: impl FnOnce(&mut super::controller::Settings), out: &mut Vec<u8>) {
+        set(&mut self.settings);
+        self.mode = 0;
+        self.halt(state::CHANGED);
+        self.put_queue(out);
+    }
+
+    fn switch(&mut self, joint: u8, on: bool, t: f64) {
+        if on && self.error != 0 {
+            return;
+        }
+        let all = ((1_u16 << self.identity.axes) - 1) as u8;
+        let which = match joint {
+            8 => all,
+            1..=7 => all & 1 << (joint - 1),
+            _ => 0,
+        };
+        self.enabled = if on { self.enabled | which } else { self.enabled & !which };
+        self.halt(if self.all_enabled() { state::CHANGED } else { state::STOPPED });
+        self.power(t);
+    }
+
+    fn set_state(&mut self, wanted: u8) {
+        match wanted {
+            0 if self.error == 0 && self.all_enabled() => {
+                if self.state == state::PAUSED
+                    && let Some(halted) = self.current.take()
+                {
+                    self.queue.push_front(halted);
+                }
+                self.state = state::STANDING;
+            }
+            3 if self.state == state::STANDING => {
+                self.state = state::PAUSED;
+                self.plant.stop();
+            }
+            4 => self.halt(state::STOPPED),
+            6 => self.halt(state::STOPPING),
+            _ => {}
+        }
+    }
+
+    fn set_mode(&mut self, mode: u8) {
+        // From one streaming mode to another while it is ready, it silently lands in mode 0.
+        let silently_0 = self.state == state::STANDING && self.mode != 0 && mode != 0 && mode != self.mode;
+        self.mode = if silently_0 { 0 } else { mode };
+        self.halt(if self.all_enabled() { state::CHANGED } else { state::STOPPED });
+    }
+
+    // --- Motion ---
+
+    fn motion(&mut self, register: u8, data: &[u8], now: Mono, out: &mut Vec<u8>) -> Result<(), Refusal> {
+        let mode = match register {
+            29 | 30 => 1,
+            81 => 4,
+            _ => 0,
+        };
+        if self.error != 0 || !self.all_enabled() || self.state != state::STANDING || self.mode != mode {
+            return Err(NotNow);
+        }
+        match register {
+            21 | 22 => {
+                let [pose @ .., speed] = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?;
+                let target = self.inverse(pose)?;
+                // The tool's way is not straight here: the joints go together (our choice).
+                self.plan(target, (f64::from(speed) / 1000.0).clamp(0.01, 1.0), out)
+            }
+            23 | 24 => {
+                let [joints @ .., speed] = numbers::<8>(data).ok_or(Warning(BAD_PARAMETER))?;
+                let mut target = joints.map(f64::from);
+                for (value, now) in target.iter_mut().zip(self.seven()) {
+                    *value = if *value == f64::INFINITY { now } else { *value };
+                }
+                self.plan(target, fraction(speed), out)
+            }
+            25 => {
+                let speed = number(data, 0, 0).ok_or(Warning(BAD_PARAMETER))?;
+                self.plan([0.0; 7], fraction(speed), out)
+            }
+            29 => {
+                let target = self.checked(numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from))?;
+                self.plant.servo(&target);
+                Ok(())
+            }
+            30 => {
+                let target = self.inverse(numbers(data).ok_or(Warning(BAD_PARAMETER))?)?;
+                let target = self.checked(target)?;
+                self.plant.servo(&target);
+                Ok(())
+            }
+            81 => {
+                let speeds = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?;
+                if !speeds.iter().all(|speed| speed.is_finite()) {
+                    return Err(Warning(BAD_PARAMETER));
+                }
+                let duration = number(data, 29, 0).filter(|duration| *duration > 0.0);
+                self.velocity_until = duration.map(|d| now.after(Duration::from_secs_f32(d.min(3600.0))));
+                self.plant.velocity(&speeds.map(f64::from));
+                Ok(())
+            }
+            _ => Err(Warning(UNKNOWN)),
+        }
+    }
+
+    fn plan(&mut self, target: [f64; 7], speed: f64, out: &mut Vec<u8>) -> Result<(), Refusal> {
+        let target = self.checked(target)?;
+        if self.queue.len() >= QUEUE {
+            return Err(Warning(QUEUE_FULL));
+        }
+        self.queue.push_back(Move { target, speed });
+        self.put_queue(out);
+        Ok(())
+    }
+
+    fn inverse(&self, pose: [f32; 6]) -> Result<[f64; 7], Refusal> {
+        if !pose.iter().all(|value| value.is_finite()) {
+            return Err(Warning(BAD_PARAMETER));
+        }
+        self.chain.inverse(&from_wire(pose), &self.seven()).ok_or(Warning(NO_SOLUTION))
+    }
+
+    fn checked(&self, target: [f64; 7]) -> Result<[f64; 7], Refusal> {
+        if !target.iter().all(|value| value.is_finite()) {
+            return Err(Warning(BAD_PARAMETER));
+        }
+        if self.inside(&target) { Ok(target) } else { Err(Error(JOINT_LIMIT)) }
+    }
+
+    fn inside(&self, joints: &[f64; 7]) -> bool {
+        let range = self.limits.position_lower.iter().zip(&self.limits.position_upper);
+        joints.iter().zip(range).all(|(q, (lower, upper))| (lower - TOLERANCE..=upper + TOLERANCE).contains(q))
+    }
+}

@@ -1,0 +1,116 @@
+//! What is at the tool flange: the tool board, and a gripper behind its RS485 that speaks Modbus-RTU.
+
+use super::super::protocol::gripper::GripperKind;
+use crate::hardware::sim::gripper::Gripper;
+
+/// Index of 2 Mbit/s among the baud rates.
+const TWO_MBIT: i32 = 11;
+/// The gripper's version, as it tells.
+const VERSION: [u16; 3] = [3, 4, 3];
+
+/// The tool flange.
+pub struct Tool {
+    kind: GripperKind,
+    gripper: Gripper,
+    baud: i32,
+    enabled: bool,
+    speed: u16,
+    /// The gripper's error.
+    pub error: u16,
+}
+
+impl Tool {
+    /// A flange with this gripper, half open.
+    pub fn new(kind: GripperKind) -> Self {
+        let gripper = Gripper::new(kind.widest().unwrap_or(0.0), 0.1);
+        Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, error: 0 }
+    }
+
+    /// Lets `dt` [s] pass.
+    pub fn advance(&mut self, dt: f64) {
+        self.gripper.advance(dt);
+    }
+
+    /// The gripper's opening [m].
+    pub fn opening(&self) -> f64 {
+        self.gripper.position
+    }
+
+    /// Reads a register of the tool board.
+    pub fn read(&self, register: u16) -> i32 {
+        if register & 0x0FFF == 0x0A0B { self.baud } else { 0 }
+    }
+
+    /// Writes a register of the tool board.
+    pub fn write(&mut self, register: u16, value: f32) {
+        if register & 0x0FFF == 0x0A0B {
+            self.baud = value as i32;
+        }
+    }
+
+    /// The answer to a telegram; `None` when nobody answers.
+    pub fn telegram(&mut self, telegram: &[u8]) -> Option<Vec<u8>> {
+        if self.kind == GripperKind::None || self.baud != TWO_MBIT {
+            return None;
+        }
+        match *telegram {
+            [8, 3, a0, a1, _, count] if count <= 16 => {
+                let first = u16::from_be_bytes([a0, a1]);
+                let registers = (0..u16::from(count)).flat_map(|i| self.holding(first + i).to_be_bytes());
+                Some([8, 3, 2 * count].into_iter().chain(registers).collect())
+            }
+            [8, 16, a0, a1, c0, c1, _, ref data @ ..] => {
+                self.set(u16::from_be_bytes([a0, a1]), data);
+                Some(vec![8, 16, a0, a1, c0, c1])
+            }
+            _ => None,
+        }
+    }
+
+    fn pulses(&self) -> i32 {
+        let millimetres = self.gripper.position * 1000.0;
+        match self.kind {
+            GripperKind::XarmG2 => ((((millimetres - 16.0) / 110.0).asin().to_degrees() + 8.33) * 18.28) as i32,
+            _ => (millimetres * 10.0).round() as i32,
+        }
+    }
+
+    fn holding(&self, register: u16) -> u16 {
+        let [high, low] = [self.pulses() >> 16, self.pulses()].map(|value| value as u16);
+        match register {
+            0x0000 => u16::from(self.gripper.moving()),
+            0x000F => self.error,
+            0x0100 => u16::from(self.enabled),
+            0x0303 => self.speed,
+            0x0702 => high,
+            0x0703 => low,
+            0x0801..=0x0803 => VERSION.get(usize::from(register - 0x0801)).copied().unwrap_or_default(),
+            _ => 0,
+        }
+    }
+
+    fn set(&mut self, register: u16, data: &[u8]) {
+        match (register, data) {
+            (0x0100, [_, on]) => self.enabled = *on == 1,
+            (0x0303, [high, low]) => self.speed = u16::from_be_bytes([*high, *low]),
+            (0x0109, _) => self.error = 0,
+            (0x0700, [a, b, c, d]) => self.go(i32::from_be_bytes([*a, *b, *c, *d])),
+            (0x0C00, [_, on, _, _, _, _, a, b, c, d]) => {
+                self.enabled |= *on == 1;
+                self.go(i32::from_be_bytes([*a, *b, *c, *d]));
+            }
+            _ => {}
+        }
+    }
+
+    fn go(&mut self, pulses: i32) {
+        if !self.enabled || self.error != 0 {
+            return;
+        }
+        let millimetres = match self.kind {
+            GripperKind::XarmG2 => (f64::from(pulses) / 18.28 - 8.33).to_radians().sin() * 110.0 + 16.0,
+            _ => f64::from(pulses) / 10.0,
+        };
+        self.gripper.move_to(millimetres / 1000.0);
+    }
+}

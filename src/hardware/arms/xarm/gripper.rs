@@ -1,0 +1,168 @@
+//! The gripper, one telegram at a time: each costs some milliseconds on the tool's bus, so nobody ever waits for one.
+//! Commands are kept until their turn, the position is asked for now and then and answered from memory.
+
+use std::time::Duration;
+
+use super::errors::gripper_text;
+use super::protocol::frame::Response;
+use super::protocol::gripper::{GripperKind, Rtu, decode_error, decode_position};
+use crate::clock::Mono;
+use crate::hardware::spec::{AdapterError, AdapterResult};
+
+/// How often the position is asked for, and how often when the gripper does not answer.
+const POLL: Duration = Duration::from_millis(100);
+const POLL_SILENT: Duration = Duration::from_millis(1000);
+/// A telegram whose answer takes longer is lost.
+const TIMEOUT: Duration = Duration::from_millis(300);
+/// So many lost telegrams in a row mean that there is no gripper.
+const SILENT_AFTER: u32 = 3;
+/// After so many positions the error is asked for.
+const ERROR_EVERY: u32 = 10;
+
+/// What a telegram was for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Step {
+    Clear,
+    Enable,
+    Mode,
+    Speed,
+    Go(i32),
+    Error,
+    Position,
+}
+
+/// What is known of the gripper and what it is to do.
+#[derive(Debug, Clone, Copy)]
+pub struct Gripper {
+    kind: GripperKind,
+    /// What it must still be told before it takes targets; `None`: nothing.
+    wake: Option<Step>,
+    wanted: Option<i32>,
+    clear: bool,
+    under_way: Option<(Step, Rtu, Mono)>,
+    pulses: Option<i32>,
+    error: u16,
+    failures: u32,
+    next_poll: Mono,
+    polls: u32,
+}
+
+impl Gripper {
+    /// A gripper that was found at `pulses`.
+    pub fn new(kind: GripperKind, pulses: Option<i32>) -> Self {
+        Self {
+            kind,
+            wake: Some(Step::Enable),
+            wanted: None,
+            clear: false,
+            under_way: None,
+            pulses,
+            error: 0,
+            failures: 0,
+            next_poll: Mono::ZERO,
+            polls: 0,
+        }
+    }
+
+    /// Its opening [m], as far as it is known.
+    pub fn opening(&self) -> Option<f64> {
+        self.pulses.map(|pulses| self.kind.opening(pulses))
+    }
+
+    /// Lets it go to an opening [m], when its turn comes.
+    pub fn go_to(&mut self, opening: f64) -> AdapterResult<()> {
+        let widest = self.kind.widest().ok_or(AdapterError::Unsupported)?;
+        if !(0.0..=widest).contains(&opening) {
+            return Err(AdapterError::Rejected(format!("the gripper opens 0 to {widest} m, not {opening} m")));
+        }
+        if self.failures >= SILENT_AFTER {
+            return Err(AdapterError::Rejected("the gripper does not answer".into()));
+        }
+        if self.error != 0 {
+            let text = format!("gripper: {}", gripper_text(self.error));
+            return Err(AdapterError::Fault { code: self.error.into(), text });
+        }
+        self.wanted = Some(self.kind.pulses(opening));
+        Ok(())
+    }
+
+    /// Clears its error, when its turn comes.
+    pub fn clear_error(&mut self) {
+        self.clear |= self.error != 0;
+    }
+
+    /// The next telegram, if one is due.
+    pub fn due(&mut self, now: Mono) -> Option<Rtu> {
+        if self.kind == GripperKind::None {
+            return None;
+        }
+        if let Some((_, _, sent)) = self.under_way {
+            if now.since(sent) < TIMEOUT {
+                return None;
+            }
+            self.failed();
+        }
+        let step = self.choose(now)?;
+        let telegram = match step {
+            Step::Clear => Rtu::clear_error(),
+            Step::Enable => Rtu::enable(),
+            Step::Mode => Rtu::position_mode(),
+            Step::Speed => Rtu::speed(),
+            Step::Go(pulses) => Rtu::go(self.kind, pulses),
+            Step::Error => Rtu::read_error(),
+            Step::Position => Rtu::read_position(),
+        };
+        self.under_way = Some((step, telegram, now));
+        Some(telegram)
+    }
+
+    fn choose(&mut self, now: Mono) -> Option<Step> {
+        let silent = self.failures >= SILENT_AFTER;
+        if self.clear && !silent {
+            return Some(Step::Clear);
+        }
+        if let Some(pulses) = self.wanted.filter(|_| !silent) {
+            return Some(self.wake.unwrap_or(Step::Go(pulses)));
+        }
+        if now < self.next_poll {
+            return None;
+        }
+        self.next_poll = now.after(if silent { POLL_SILENT } else { POLL });
+        self.polls = self.polls.wrapping_add(1);
+        Some(if self.polls.is_multiple_of(ERROR_EVERY) { Step::Error } else { Step::Position })
+    }
+
+    /// Takes the answer to the telegram under way.
+    pub fn take(&mut self, response: &Response) {
+        let Some((step, telegram, _)) = self.under_way.take() else { return };
+        let Some(data) = telegram.answered(response.data()) else { return self.failed() };
+        self.failures = 0;
+        match step {
+            Step::Clear => (self.clear, self.error, self.wake) = (false, 0, Some(Step::Enable)),
+            Step::Enable => self.wake = Some(Step::Mode),
+            Step::Mode if self.kind == GripperKind::Xarm => self.wake = Some(Step::Speed),
+            Step::Mode | Step::Speed => self.wake = None,
+            Step::Go(pulses) => {
+                self.wanted = self.wanted.filter(|wanted| *wanted != pulses);
+                self.polls = ERROR_EVERY - 1; // whether it took it shows in its error
+                self.next_poll = Mono::ZERO;
+            }
+            Step::Error => {
+                self.error = decode_error(data).unwrap_or(self.error);
+                if self.error != 0 {
+                    (self.wanted, self.wake) = (None, Some(Step::Enable));
+                }
+            }
+            Step::Position => self.pulses = decode_position(data).or(self.pulses),
+        }
+    }
+
+    fn failed(&mut self) {
+        self.under_way = None;
+        self.failures += 1;
+        if self.failures >= SILENT_AFTER {
+            // Where it is, and what it was told, is not known any more.
+            (self.pulses, self.wanted, self.wake, self.clear) = (None, None, Some(Step::Enable), false);
+        }
+    }
+}

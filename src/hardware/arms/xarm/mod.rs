@@ -1,0 +1,116 @@
+//! UFACTORY's arms behind a control box on TCP: xArm 5, 6 and 7, Lite 6, 850. `docs/arms/xarm.md` is for users.
+//!
+//! ```text
+//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched whenever they come
+//!   (SI)       (state)  ◀── stream    ports 30000 or 30003: joints; 30001: motors, error
+//!                 └── mode, condition, gripper: small machines that never wait
+//! ```
+
+pub mod adapter;
+pub mod address;
+mod condition;
+mod connect;
+mod control;
+pub mod emulator;
+pub mod errors;
+#[cfg(test)]
+mod golden;
+mod gripper;
+mod mode;
+pub mod model;
+pub mod protocol;
+mod session;
+mod stream;
+#[cfg(test)]
+mod tests;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+
+use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::joint::{ControlMode, JointLimits};
+use address::Address;
+use model::Model;
+use protocol::gripper::GripperKind;
+
+/// The modes of the arm.
+const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+
+/// How often a controller with firmware 2.1.0 or newer reports [Hz]. Older ones do 100 times a second.
+const NATIVE_RATE: f64 = 250.0;
+
+/// Whether the arm keeps its pose when its motors are off: it has brakes.
+const HOLDS_WHEN_DISABLED: bool = true;
+
+/// The row in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "xarm",
+    about: "UFACTORY xArm 5, 6, 7, Lite 6, 850",
+    level: Level::Emulated,
+    transport: "tcp",
+    dof: (5, 7),
+    modes: MODES,
+    wire_units: "rad, mm",
+    native_rate: NATIVE_RATE,
+    address: AddressForm {
+        form: "HOST[:CONTROL_PORT[:REPORT_PORT]]",
+        required: true,
+        check: |address| Address::parse(address).map(|address| address.to_string()),
+    },
+    holds_when_disabled: HOLDS_WHEN_DISABLED,
+    gripper: true,
+    options: OptionsSpec::of::<Options>(),
+    limits: |dof| Model::of_dof(dof).map_or_else(JointLimits::default, Model::limits),
+    create: |config| Ok(Box::new(adapter::XArmAdapter::new(config)?)),
+    emulate: Some(|config, place| Ok(Box::new(emulator::XArmEmulator::start(config, place)?))),
+};
+
+/// What a blueprint may set of an xArm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Which arm it is: `xarm5`, `xarm6`, `xarm7`, `lite6` or `xarm850`. By default the xArm with so many joints. An
+    /// arm that is another model is refused.
+    pub model: Option<Model>,
+    /// The gripper at the tool flange: `xarm`, `xarm_g2`, or `none`.
+    pub gripper: GripperKind,
+    /// Whether to use the force/torque sensor. It is switched on with the motors.
+    pub force_torque: bool,
+    /// Scales the speed of moves that the controller plans (0–1].
+    #[serde(deserialize_with = "fraction")]
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
+    pub speed_scale: f64,
+    /// What the emulator does, when one stands in for the arm.
+    pub sim: emulator::SimOptions,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            model: None,
+            gripper: GripperKind::None,
+            force_torque: false,
+            speed_scale: 1.0,
+            sim: emulator::SimOptions::default(),
+        }
+    }
+}
+
+/// The model that options and number of joints say; or why they do not go together.
+fn model_of(options: &Options, dof: usize) -> Result<Model, String> {
+    let model = options.model.or(Model::of_dof(dof)).ok_or_else(|| format!("no xArm has {dof} joints"))?;
+    match model.axes() {
+        axes if axes == dof => Ok(model),
+        axes => Err(format!("{} has {axes} joints, not {dof}", model.name())),
+    }
+}
+
+/// A number above 0, up to 1.
+fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    let value = f64::deserialize(deserializer)?;
+    if value > 0.0 && value <= 1.0 {
+        Ok(value)
+    } else {
+        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most 1")))
+    }
+}

@@ -1,0 +1,329 @@
+//! The adapter against the emulator: every test goes over real sockets.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use super::SPEC;
+use super::adapter::XArmAdapter;
+use super::emulator::XArmEmulator;
+use crate::arm::Pose;
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::conformance::{Outcome, Subject, checks, run_on};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::joint::ControlMode;
+
+fn config(address: &str, dof: usize, options: Value) -> AdapterConfig {
+    AdapterConfig { hardware_id: "arm".into(), address: address.into(), dof, options }
+}
+
+fn pair(dof: usize, options: Value) -> (XArmEmulator, XArmAdapter) {
+    let emulator = XArmEmulator::start(&config("", dof, options.clone()), &Place::InProcess).unwrap();
+    let adapter = XArmAdapter::new(&config(&emulator.address(), dof, options)).unwrap();
+    (emulator, adapter)
+}
+
+/// An xArm 6 with its motors on, in a mode.
+fn ready(options: Value, mode: ControlMode) -> (XArmEmulator, XArmAdapter) {
+    let (emulator, mut arm) = pair(6, options);
+    arm.connect().unwrap();
+    arm.activate().unwrap();
+    until("the mode", || set(&mut arm, mode).is_ok());
+    (emulator, arm)
+}
+
+/// Changes the mode as the device thread does: `Rejected` is asked again.
+fn set(arm: &mut XArmAdapter, mode: ControlMode) -> Result<(), AdapterError> {
+    arm.set_control_mode(mode)
+}
+
+fn read(arm: &mut XArmAdapter) -> Result<JointReading, AdapterError> {
+    let mut reading = JointReading::default();
+    arm.read_joints(&mut reading).map(|()| reading)
+}
+
+fn six(arm: &mut XArmAdapter) -> [f64; 6] {
+    *read(arm).unwrap().position.first_chunk().unwrap()
+}
+
+/// Waits until `done`, for at most 10 s.
+fn until(what: &str, mut done: impl FnMut() -> bool) {
+    let end = Instant::now() + Duration::from_secs(10);
+    while !done() {
+        assert!(Instant::now() < end, "{what}: not within 10 s");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+fn floats(payload: &[u8]) -> Vec<f32> {
+    payload.as_chunks::<4>().0.iter().map(|chunk| f32::from_le_bytes(*chunk)).collect()
+}
+
+/// The requests to a register that came since recording began.
+fn sent(emulator: &XArmEmulator, register: u8) -> Vec<Vec<u8>> {
+    let trace = emulator.trace().into_iter();
+    trace.filter(|request| request.register == register).map(|request| request.payload).collect()
+}
+
+#[test]
+fn other_models_options_and_firmwares_conform_too() {
+    for (dof, options) in [
+        (6, json!({"gripper": "xarm", "force_torque": true})),
+        (6, json!({"model": "lite6"})),
+        (5, json!({"sim": {"firmware": "1.12.10"}, "gripper": "xarm_g2"})),
+        (6, json!({"model": "xarm850", "sim": {"firmware": "1.5.20"}})),
+    ] {
+        let old = options["sim"].is_object();
+        let subject = Subject { config: config("", dof, options.clone()), ..Subject::emulated(&SPEC) };
+        // Reports before firmware 2.1.0 have no time: a measurement that is repeated cannot be told from an arm that
+        // stands still.
+        let all: Vec<_> = checks().filter(|check| !(old && check.name == "frozen_state_is_noticed")).collect();
+        // Some at a time: each has an emulator of its own that reports 250 times a second.
+        for some in all.chunks(16) {
+            std::thread::scope(|scope| {
+                let threads: Vec<_> = some.iter().map(|c| (c.name, scope.spawn(|| run_on(&subject, c).0))).collect();
+                for (name, thread) in threads {
+                    let outcome = thread.join().unwrap();
+                    assert!(!matches!(outcome, Outcome::Failed(_)), "{options} {name}: {outcome:?}");
+                }
+            });
+        }
+    }
+}
+
+#[test]
+fn si_units_and_the_vendors_units() {
+    let (emulator, mut arm) = ready(json!({"gripper": "xarm", "force_torque": true}), ControlMode::Position);
+    let info = arm.get_info();
+    assert_eq!((info.model.as_str(), info.firmware_version.as_deref(), info.dof), ("xArm 6", Some("2.5.1"), 6));
+    assert!(info.serial_number.unwrap().starts_with("XI1305C"));
+    assert_eq!(arm.get_limits().unwrap().position_lower[2].to_degrees().round(), -219.0);
+    let start = six(&mut arm);
+    let goal = start.map(|q| q + 0.1);
+    emulator.record();
+    arm.write_joint_positions(&goal, 0.5).unwrap();
+    arm.write_joint_positions(&goal, 0.5).unwrap();
+    until("arrival", || six(&mut arm).iter().zip(goal).all(|(a, b)| (a - b).abs() < 1e-5));
+    let [only] = &sent(&emulator, 23)[..] else { panic!("the same target twice is one move") };
+    let values = floats(only);
+    assert!((values[1] - goal[1] as f32).abs() < 1e-6 && (values[7] - std::f32::consts::FRAC_PI_2).abs() < 1e-6);
+    let pose = arm.read_cartesian_position().unwrap().unwrap();
+    let there = Pose { xyz: [pose.xyz[0], pose.xyz[1] + 0.03, pose.xyz[2] + 0.02], rpy: pose.rpy };
+    arm.write_cartesian_position(&there, 0.2).unwrap();
+    let values = floats(&sent(&emulator, 21)[0]);
+    assert!((values[1] - 1000.0 * there.xyz[1] as f32).abs() < 0.01 && values[6] == 200.0, "mm, mm/s: {values:?}");
+    until("the pose", || {
+        let pose = arm.read_cartesian_position().unwrap().unwrap();
+        pose.xyz.iter().zip(there.xyz).all(|(a, b)| (a - b).abs() < 1e-4)
+    });
+    let far = Pose { xyz: [5.0, 0.0, 0.0], rpy: [0.0; 3] };
+    let refused = arm.write_cartesian_position(&far, 1.0).unwrap_err();
+    assert_eq!(refused.to_string(), "xarm refuses the move: the command has no solution (14)");
+    arm.write_gripper_position(0.07).unwrap();
+    until("the gripper", || {
+        read(&mut arm).unwrap();
+        (arm.read_gripper_position().unwrap().unwrap() - 0.07).abs() < 1e-4
+    });
+    let targets = sent(&emulator, 124).into_iter().filter(|telegram| telegram.get(3..5) == Some(&[7, 0]));
+    assert_eq!(targets.map(|t| t[8..].to_vec()).collect::<Vec<_>>(), [700_i32.to_be_bytes()], "pulses, once");
+    assert!(matches!(arm.write_gripper_position(0.09), Err(AdapterError::Rejected(_))));
+    let wrench = arm.read_force_torque().unwrap().unwrap();
+    assert!((wrench[2] + 4.9).abs() < 1e-3, "{wrench:?}");
+}
+
+#[test]
+fn starting_and_stopping_asks_for_no_motion() {
+    let (emulator, mut arm) = pair(6, json!({"gripper": "xarm"}));
+    emulator.record();
+    let start = emulator.joints().0;
+    arm.connect().unwrap();
+    assert_eq!(arm.read_enabled(), Ok(false));
+    arm.activate().unwrap();
+    arm.deactivate().unwrap();
+    arm.disconnect();
+    assert_eq!(read(&mut arm), Err(AdapterError::NotConnected));
+    let trace = emulator.trace();
+    let moves: Vec<_> = trace.iter().filter(|received| received.moves()).collect();
+    assert!(moves.is_empty() && emulator.enabled(), "{moves:?}");
+    assert_eq!(emulator.joints().0, start);
+    let first = trace.first().unwrap();
+    assert_eq!((first.register, first.protocol, trace.last().unwrap().protocol), (1, 2, 3));
+}
+
+#[test]
+fn modes_change_through_a_stop_and_velocities_end() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    emulator.record();
+    until("velocity mode", || set(&mut arm, ControlMode::Velocity).is_ok());
+    assert_eq!(arm.get_control_mode(), ControlMode::Velocity);
+    let steps: Vec<_> = emulator.trace().into_iter().filter(|r| [12, 19].contains(&r.register)).collect();
+    let steps: Vec<_> = steps.iter().map(|r| (r.register, r.payload[0])).collect();
+    assert_eq!(steps, [(12, 4), (19, 4), (12, 0)], "never from one streaming mode to another while ready");
+    arm.write_joint_velocities(&[0.5, 0.0, 0.0, 0.0, 0.0, -0.5]).unwrap();
+    let start = emulator.joints().0[0];
+    until("standstill", || emulator.joints().0[0] > start + 0.01 && emulator.joints().1.iter().all(|v| *v == 0.0));
+    assert!(emulator.joints().0[0] < start + 0.5 * 0.3, "the controller ends it after 200 ms");
+    assert_eq!(&sent(&emulator, 81)[0][28..], [&[1][..], &0.2_f32.to_le_bytes()].concat());
+    assert_eq!(set(&mut arm, ControlMode::Torque), Err(AdapterError::Unsupported));
+    until("position mode", || set(&mut arm, ControlMode::Position).is_ok());
+    let far = six(&mut arm).map(|q| q - 0.5);
+    arm.write_joint_positions(&far, 0.05).unwrap();
+    until("motion", || read(&mut arm).unwrap().velocity.unwrap()[0] < -0.02);
+    assert_eq!(set(&mut arm, ControlMode::Velocity), Err(AdapterError::Rejected("the arm is moving".into())));
+    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+    let refused = arm.write_joint_positions(&far, 0.05).unwrap_err().to_string();
+    assert!(refused.ends_with("enable it again"), "{refused}");
+}
+
+#[test]
+fn set_points_do_not_wait_for_their_responses() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    let start = six(&mut arm);
+    // From the next response or report on the controller answers nothing; every set point goes out all the same.
+    emulator.inject(Fault::new(FaultKind::Silent).lasting(60.0)).unwrap();
+    let before = arm.counts().unwrap();
+    for i in 0..20 {
+        arm.write_joint_positions(&start.map(|q| q + 1e-4 * f64::from(i)), 1.0).unwrap();
+    }
+    until("the last one at the controller", || (emulator.joints().0[0] - start[0] - 0.0019).abs() < 1e-5);
+    assert_eq!(arm.counts().unwrap().sent, before.sent + 20);
+    // But not without end.
+    let refused = (0..100).find_map(|_| arm.write_joint_positions(&start, 1.0).err()).unwrap();
+    assert!(refused.to_string().contains("does not keep up"), "{refused}");
+}
+
+#[test]
+fn a_stop_by_somebody_else_is_not_overridden() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    let hold = six(&mut arm);
+    let (control, _) = emulator.address().rsplit_once(':').map(|(a, b)| (a.to_owned(), b.to_owned())).unwrap();
+    let mut studio = TcpStream::connect(control).unwrap();
+    studio.write_all(&[0, 1, 0, 2, 0, 2, 12, 4]).unwrap();
+    studio.read_exact(&mut [0; 8]).unwrap();
+    until("the stop", || {
+        read(&mut arm).unwrap();
+        arm.write_joint_positions(&hold, 1.0).is_err()
+    });
+    for _ in 0..5 {
+        let refused = set(&mut arm, ControlMode::Position).unwrap_err().to_string();
+        assert_eq!(refused, "the arm was stopped: enable it again");
+    }
+    arm.activate().unwrap();
+    arm.write_joint_positions(&hold, 1.0).unwrap();
+}
+
+#[test]
+fn errors_are_told_with_what_to_do_and_stay_until_they_are_cleared() {
+    let (emulator, mut arm) = pair(6, json!({"sim": {"faults": [{"kind": "error_code", "code": 13}]}}));
+    arm.connect().unwrap();
+    until("the servo's code", || {
+        read(&mut arm).unwrap();
+        arm.read_error().unwrap().1.contains("joint 3: 23 following error")
+    });
+    let (code, text) = arm.read_error().unwrap();
+    assert!(code == 13 && text.starts_with("the servo of joint 3 reports an error; "), "{text}");
+    assert!(matches!(arm.activate(), Err(AdapterError::Fault { code: 13, .. })));
+    assert!(!emulator.enabled());
+    arm.write_clear_errors().unwrap();
+    assert_eq!(arm.read_error(), Ok((0, String::new())));
+    arm.activate().unwrap();
+    emulator.press_estop();
+    until("the E-stop", || {
+        read(&mut arm).unwrap();
+        arm.read_error().unwrap().0 == 1
+    });
+    assert_eq!(arm.read_enabled(), Ok(false));
+    assert!(matches!(arm.write_clear_errors(), Err(AdapterError::Fault { code: 1, .. })));
+    emulator.release_estop();
+    arm.write_clear_errors().unwrap();
+    assert_eq!(arm.read_enabled(), Ok(false));
+}
+
+#[test]
+fn an_error_shows_at_once_and_refuses_set_points() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    let hold = six(&mut arm);
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(24)).unwrap();
+    let began = MonotonicClock.now();
+    until("the error", || {
+        read(&mut arm).unwrap();
+        matches!(arm.write_joint_positions(&hold, 1.0), Err(AdapterError::Fault { code: 24, .. }))
+    });
+    // A stop shows in the next report, and register 15 is asked then: nobody waits for the 5 Hz report.
+    let took = MonotonicClock.now().since(began);
+    assert!(took < Duration::from_secs(2), "{took:?}");
+}
+
+#[test]
+fn old_firmware_has_no_velocities_and_gets_no_new_parameters() {
+    let (emulator, mut arm) = pair(6, json!({"sim": {"firmware": "1.5.20"}}));
+    emulator.record();
+    arm.connect().unwrap();
+    arm.activate().unwrap();
+    assert_eq!(arm.get_info().native_rate, 100.0);
+    let reading = read(&mut arm).unwrap();
+    assert!(reading.velocity.is_none() && reading.effort.is_some() && reading.stamp.is_some());
+    until("velocity mode", || set(&mut arm, ControlMode::Velocity).is_ok());
+    arm.write_joint_velocities(&[0.0; 6]).unwrap();
+    until("the velocity", || !sent(&emulator, 81).is_empty());
+    assert_eq!(sent(&emulator, 81)[0].len(), 29, "no duration before 1.8.0");
+    assert!(sent(&emulator, 19).iter().all(|payload| payload.len() == 1));
+    assert!(emulator.trace().iter().all(|received| received.protocol == 2), "not watched before 1.8.6");
+}
+
+#[test]
+fn silence_ends_the_connection_and_a_jump_is_not_believed_at_once() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    let before = six(&mut arm);
+    emulator.inject(Fault::new(FaultKind::ZeroState)).unwrap();
+    for _ in 0..100 {
+        assert!((six(&mut arm)[1] - before[1]).abs() < 0.01, "one report of zeros");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    emulator.inject(Fault::new(FaultKind::Silent).lasting(60.0)).unwrap();
+    until("an error", || read(&mut arm).is_err());
+    assert!(!arm.is_connected());
+}
+
+#[test]
+fn a_gripper_that_is_not_there_is_said_and_one_that_falls_silent_harms_nothing() {
+    let (emulator, _) = pair(6, json!({}));
+    let mut arm = XArmAdapter::new(&config(&emulator.address(), 6, json!({"gripper": "xarm"}))).unwrap();
+    let error = arm.connect().unwrap_err().to_string();
+    assert!(error.contains("no gripper answers") && error.contains("{gripper: none}"), "{error}");
+    let (_emulator, mut arm) = ready(json!({}), ControlMode::Position);
+    assert_eq!(arm.read_gripper_position(), Ok(None));
+    assert_eq!(arm.write_gripper_position(0.01), Err(AdapterError::Unsupported));
+}
+
+#[test]
+fn a_wrong_arm_is_refused_before_anything_else_is_asked() {
+    let (emulator, mut arm) = pair(6, json!({}));
+    emulator.inject(Fault::new(FaultKind::WrongModel)).unwrap();
+    emulator.record();
+    let error = arm.connect().unwrap_err().to_string();
+    let expected = "expected the model xArm 6 with 6 joints, found a Lite 6 with 6 joints\nhint: is the address right? \
+                    Else set the arm's options to {model: lite6}";
+    assert!(error.ends_with(expected), "{error}");
+    assert_eq!(emulator.trace().len(), 1, "nothing but the version was asked");
+}
+
+#[test]
+fn wrong_configurations_are_refused() {
+    for (config, part) in [
+        (config("192.168.1.185", 8, json!({})), "arm: no xArm has 8 joints"),
+        (config("192.168.1.185", 6, json!({"model": "xarm7"})), "arm: xArm 7 has 7 joints, not 6"),
+        (config("192.168.1.185", 6, json!({"model": "xarm9"})), "xarm9"),
+        (config("192.168.1.185:502:x", 6, json!({})), "not a report port"),
+        (config("", 6, json!({})), "host is missing"),
+        (config("::1", 6, json!({"speed_scale": 0})), "is not above 0 and at most 1"),
+        (config("::1", 6, json!({"speed": 1.0})), "unknown field"),
+    ] {
+        let error = (SPEC.create)(&config).err().unwrap().to_string();
+        assert!(error.contains(part), "{error}");
+    }
+}

@@ -1,0 +1,144 @@
+//! Stopping: from every state that an arm can be in.
+
+use std::time::Duration;
+
+use super::Check;
+use super::Needs::{Faults, Motion};
+use super::context::{Context, farthest, require};
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::spec::AdapterError;
+use crate::joint::ControlMode;
+
+/// The checks of this file.
+pub const CHECKS: &[Check] = &[
+    Check::new(Motion, "stop_at_rest_is_harmless", "write_stop at rest changes nothing", stop_at_rest),
+    Check::new(Motion, "stop_ends_motion", "write_stop in a planned move brings standstill", stop_ends_motion),
+    Check::new(Motion, "stop_ends_streaming", "write_stop between set points holds the arm", stop_ends_streaming),
+    Check::new(Motion, "stop_ends_velocity", "write_stop ends a velocity at once", stop_ends_velocity),
+    Check::new(Motion, "stop_is_no_fault", "after a stop, activate and a mode are enough to move", stop_is_no_fault),
+    Check::new(Faults, "stop_in_error_is_harmless", "write_stop in error clears nothing", stop_in_error),
+];
+
+/// Speed of a planned move that is to be interrupted, as a fraction of the top speed.
+const SLOW: f64 = 0.1;
+/// Speed of a stream that is to be interrupted [rad/s].
+const SPEED: f64 = 0.1;
+/// How far an arm may still go that is stopped at `SPEED` [rad].
+const COASTING: f64 = 0.008;
+
+fn stop_at_rest(context: &mut Context) -> Result<(), String> {
+    context.connect()?;
+    let start = context.positions()?;
+    context.adapter.write_stop().map_err(|e| format!("write_stop when disabled: {e}"))?;
+    require(!context.enabled()?, || "write_stop switched the motors on".into())?;
+    context.activate()?;
+    for _ in 0..3 {
+        context.stop()?;
+    }
+    context.stays(&start, 0.005)?;
+    require(context.enabled()?, || "write_stop switched the motors off".into())
+}
+
+/// Sends the arm far away, and waits until it is on its way.
+fn set_off(context: &mut Context) -> Result<Vec<f64>, String> {
+    let start = context.positions()?;
+    let far = context.far()?;
+    context.command(&far, SLOW)?;
+    context.until("motion", |context| Ok(farthest(&context.positions()?, &start) > 0.01))?;
+    Ok(far)
+}
+
+fn stop_ends_motion(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::Position) {
+        return context.skip("it has no position mode");
+    }
+    context.ready(ControlMode::Position)?;
+    let far = set_off(context)?;
+    context.stop()?;
+    let stopped = context.standstill()?;
+    require(farthest(&stopped, &far) > 0.01, || "it went to its target all the same".into())?;
+    require(context.enabled()?, || "the motors are off".into())?;
+    context.stays(&stopped, 1e-3)
+}
+
+fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::ServoPosition) {
+        return context.skip("it has no servo mode");
+    }
+    context.ready(ControlMode::ServoPosition)?;
+    let start = context.positions()?;
+    let away = context.nearby(&start)?;
+    let point = |part: f64| -> Vec<f64> {
+        start.iter().zip(&away).map(|(a, b)| a + (SPEED * 0.4 * part).copysign(b - a)).collect()
+    };
+    for i in 1..=40 {
+        context.command(&point(f64::from(i) / 40.0), 1.0)?;
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    context.stop()?;
+    let stopped = context.standstill()?;
+    let off = farthest(&stopped, &point(1.0));
+    require(off < 0.02, || format!("it stands {off:.4} rad from where it was stopped"))?;
+    require(context.enabled()?, || "the motors are off".into())?;
+    context.stays(&stopped, 1e-3)
+}
+
+fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::Velocity) {
+        return context.skip("it has no velocity mode");
+    }
+    context.ready(ControlMode::Velocity)?;
+    let start = context.positions()?;
+    let away = context.nearby(&start)?;
+    let wanted: Vec<f64> = start.iter().zip(&away).map(|(a, b)| SPEED.copysign(b - a)).collect();
+    for _ in 0..30 {
+        context.adapter.write_joint_velocities(&wanted).map_err(|e| format!("write_joint_velocities: {e}"))?;
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let moving = farthest(&context.positions()?, &start);
+    require(moving > 0.003, || format!("0.3 s at {SPEED} rad/s moved it by {moving:.4} rad"))?;
+    context.stop()?;
+    let here = context.positions()?;
+    let stopped = context.standstill()?;
+    let coasted = farthest(&stopped, &here);
+    require(coasted < COASTING, || format!("it went on for {coasted:.4} rad after the stop"))?;
+    require(context.enabled()?, || "the motors are off".into())?;
+    context.stays(&stopped, 1e-3)
+}
+
+fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
+    if !context.row.modes.contains(&ControlMode::Position) {
+        return context.skip("it has no position mode");
+    }
+    context.ready(ControlMode::Position)?;
+    let start = context.positions()?;
+    set_off(context)?;
+    for _ in 0..3 {
+        context.stop()?;
+    }
+    context.standstill()?;
+    let error = context.error()?;
+    require(error.0 == 0, || format!("after a stop it reports error {}: {}", error.0, error.1))?;
+    context.activate()?;
+    context.set_mode(ControlMode::Position).map_err(|e| format!("set_control_mode: {e}"))?;
+    context.command(&start, 0.5)?;
+    context.until("arrival", |context| Ok(farthest(&context.positions()?, &start) < 1e-3))
+}
+
+fn stop_in_error(context: &mut Context) -> Result<(), String> {
+    if !context.prepare(Fault::new(FaultKind::ErrorCode)) {
+        return context.skip("its double cannot be in error");
+    }
+    context.ready(context.first_mode())?;
+    context.strike()?;
+    context.until("the error", |context| Ok(context.error()?.0 != 0))?;
+    let (start, error) = (context.standstill()?, context.error()?);
+    for _ in 0..3 {
+        let result = context.adapter.write_stop();
+        let fine = matches!(result, Ok(_) | Err(AdapterError::Fault { .. } | AdapterError::Rejected(_)));
+        require(fine && context.adapter.is_connected(), || format!("write_stop in error: {result:?}"))?;
+    }
+    context.stays(&start, 1e-3)?;
+    let after = context.error()?;
+    require(after == error, || format!("write_stop turned the error {error:?} into {after:?}"))
+}

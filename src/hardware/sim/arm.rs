@@ -1,0 +1,390 @@
+//! What stands behind an emulated controller, whatever its wire: joints with motors, one mode at a time, an error, an
+//! E-stop line, and a script of faults. Everything is in SI units, and time is passed in.
+
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::clock::Mono;
+use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript, check_kinds};
+use crate::hardware::sim::plant::{Drive, Plant, Tracking};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::joint::{ControlMode, JointLimits, Joints};
+
+/// How far joints are behind their set points [s].
+const LAG: f64 = 0.01;
+/// Positions this close to a limit count as inside: numbers on the wire are rounded [rad].
+const ROUNDING: f64 = 2e-5;
+/// Error code of the open E-stop line.
+pub const ESTOP: u16 = 1;
+
+/// The faults that a [`SimArm`] can play on a wire of bytes: those of the arm and those of [`SimArm::delivery`].
+pub const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::Nan,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Corrupt,
+    FaultKind::Truncated,
+    FaultKind::WrongDof,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+];
+
+/// What an emulator does: the `sim` part of an arm's options.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at power-up [rad], one per joint; a pose near the middle of the joints' ranges when empty.
+    pub initial_positions: Vec<f64>,
+    /// What goes wrong, and when (seconds after the first connection).
+    pub faults: Vec<Fault>,
+}
+
+impl SimOptions {
+    /// Refuses a pose outside `limits`, and faults that are not among `playable`. `name` is the arm's.
+    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> AdapterResult<()> {
+        check_kinds(&format!("the {name} emulator"), &self.faults, playable).map_err(AdapterError::Rejected)?;
+        let dof = limits.position_lower.len();
+        let fits = self.initial_positions.len() == dof && inside(&self.initial_positions, limits, 0.0);
+        if self.initial_positions.is_empty() || fits {
+            return Ok(());
+        }
+        let what = format!("initial_positions must be {dof} angles [rad] within the joint limits");
+        Err(AdapterError::Rejected(format!("{name} emulator: {what}")))
+    }
+}
+
+/// Why the arm does not do what it is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refusal {
+    /// The motors are off.
+    Disabled,
+    /// The arm is in another mode.
+    WrongMode,
+    /// The arm moves.
+    Moving,
+    /// A target is outside the limits.
+    OutOfRange,
+    /// The arm is in error.
+    InError,
+}
+
+/// What happens to an answer on its way.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Delivery {
+    /// It is sent.
+    Send,
+    /// It is sent so much later; nobody is served until then.
+    Stall(Duration),
+    /// It is lost.
+    Silent,
+    /// Noise goes before it.
+    Garbage,
+    /// One of its bytes is wrong.
+    Corrupt,
+    /// Only its first half is sent.
+    Truncated,
+    /// The connection ends.
+    Disconnect,
+    /// The connection ends, and there is no power for so long.
+    PowerLoss(Duration),
+}
+
+/// What an arm measures: joint positions [rad], velocities [rad/s], torques [Nm].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measured {
+    /// Joint positions [rad].
+    pub positions: Joints,
+    /// Joint velocities [rad/s].
+    pub velocities: Joints,
+    /// Joint torques [Nm].
+    pub efforts: Joints,
+}
+
+/// An arm that was just switched on: disabled, in position mode.
+pub struct SimArm {
+    plant: Plant,
+    limits: JointLimits,
+    mode: ControlMode,
+    error: u16,
+    estop_open: bool,
+    /// When the E-stop line closes by itself.
+    estop_until: Option<Mono>,
+    /// In velocity mode the arm stops when no velocity arrives for this long [s].
+    velocity_timeout: f64,
+    last_velocity: Mono,
+    script: FaultScript,
+    /// Time zero of the script.
+    first_client: Option<Mono>,
+    powered_up: Mono,
+    advanced_to: Mono,
+}
+
+impl SimArm {
+    /// An arm within `limits` that stops when no velocity arrives for `velocity_timeout` [s].
+    pub fn new(limits: &JointLimits, options: &SimOptions, velocity_timeout: f64, now: Mono) -> Self {
+        let somewhere: Vec<f64>;
+        let initial = if options.initial_positions.is_empty() {
+            somewhere = pose_of_no_symmetry(limits);
+            &somewhere
+        } else {
+            &options.initial_positions
+        };
+        Self {
+            plant: Plant::new(limits, initial, Tracking::Lag(LAG), 0.0),
+            limits: limits.clone(),
+            mode: ControlMode::Position,
+            error: 0,
+            estop_open: false,
+            estop_until: None,
+            velocity_timeout,
+            last_velocity: now,
+            script: FaultScript::new(&options.faults),
+            first_client: None,
+            powered_up: now,
+            advanced_to: now,
+        }
+    }
+
+    // --- Time and faults ---
+
+    /// Brings the joints up to `now`, and lets the faults of the arm happen that are due. Comes before anything else.
+    pub fn advance(&mut self, now: Mono) {
+        if self.plant.drive() == Drive::Velocity {
+            let timeout = self.last_velocity.seconds_since(self.advanced_to) + self.velocity_timeout;
+            if now.seconds_since(self.advanced_to) > timeout {
+                self.plant.advance(timeout);
+                self.plant.stop();
+                self.advanced_to = self.advanced_to.after(Duration::from_secs_f64(timeout.max(0.0)));
+            }
+        }
+        self.plant.advance(now.seconds_since(self.advanced_to).max(0.0));
+        self.advanced_to = now.max(self.advanced_to);
+        if self.estop_until.is_some_and(|until| now >= until) {
+            self.estop_open = false;
+            self.estop_until = None;
+        }
+        let t = self.script_time();
+        if let Some(fault) = self.script.take(FaultKind::Estop, t) {
+            self.estop_open = true;
+            self.estop_until = fault.left(t).map(|left| now.after(left));
+            self.error = ESTOP;
+            self.plant.enable(false);
+        }
+        if let Some(fault) = self.script.take(FaultKind::ErrorCode, t) {
+            self.error = fault.code;
+            self.plant.stop();
+        }
+        let blocked = self.script.take(FaultKind::Blocked, t).map(|fault| fault.joint.saturating_sub(1));
+        (0..self.dof()).for_each(|joint| self.plant.block(joint, blocked == Some(joint)));
+    }
+
+    /// A client has connected: the first one is time zero of the script.
+    pub fn client_came(&mut self) {
+        self.first_client.get_or_insert(self.advanced_to);
+    }
+
+    /// The client is gone: the arm stops.
+    pub fn client_gone(&mut self, now: Mono) {
+        self.advance(now);
+        self.plant.stop();
+    }
+
+    /// Lets a fault happen `fault.at` seconds from `now`.
+    pub fn inject(&mut self, fault: Fault, now: Mono) {
+        let t = self.first_client.map_or(0.0, |first| now.seconds_since(first));
+        self.script.inject(fault, t);
+    }
+
+    /// Whether a fault of a kind strikes now.
+    pub fn struck_by(&mut self, kind: FaultKind) -> Option<Fault> {
+        let t = self.script_time();
+        self.script.take(kind, t)
+    }
+
+    /// What the wire does to the answer that is due now.
+    pub fn delivery(&mut self) -> Delivery {
+        let t = self.script_time();
+        if let Some(fault) = self.struck_by(FaultKind::PowerLoss) {
+            let dark = fault.left(t).unwrap_or_default();
+            (self.mode, self.error) = (ControlMode::Position, 0);
+            self.powered_up = self.advanced_to.after(dark);
+            self.plant.enable(false);
+            return Delivery::PowerLoss(dark);
+        }
+        if let Some(fault) = self.struck_by(FaultKind::Stall) {
+            return Delivery::Stall(fault.left(t).unwrap_or(DEFAULT_STALL));
+        }
+        let faults = [
+            (FaultKind::Disconnect, Delivery::Disconnect),
+            (FaultKind::Silent, Delivery::Silent),
+            (FaultKind::Truncated, Delivery::Truncated),
+            (FaultKind::Corrupt, Delivery::Corrupt),
+            (FaultKind::Garbage, Delivery::Garbage),
+        ];
+        let struck = faults.iter().find(|(kind, _)| self.struck_by(*kind).is_some());
+        struck.map_or(Delivery::Send, |(_, delivery)| *delivery)
+    }
+
+    fn script_time(&self) -> f64 {
+        self.first_client.map_or(0.0, |first| self.advanced_to.seconds_since(first))
+    }
+
+    // --- What it tells ---
+
+    /// Number of joints.
+    pub fn dof(&self) -> usize {
+        self.limits.position_lower.len()
+    }
+
+    /// Number of joints that it claims to have: a fault makes it one more.
+    pub fn claimed_dof(&mut self) -> usize {
+        self.dof() + usize::from(self.struck_by(FaultKind::WrongDof).is_some())
+    }
+
+    /// What it measures; faults make it NaN or zero.
+    pub fn measured(&mut self) -> Measured {
+        let of = |value: f64| {
+            let all = [value; crate::joint::MAX_DOF];
+            Measured { positions: all, velocities: all, efforts: all }
+        };
+        if self.struck_by(FaultKind::Nan).is_some() {
+            of(f64::NAN)
+        } else if self.struck_by(FaultKind::ZeroState).is_some() {
+            of(0.0)
+        } else {
+            let plant = &self.plant;
+            Measured { positions: plant.positions(), velocities: plant.velocities(), efforts: plant.efforts() }
+        }
+    }
+
+    /// Joint positions [rad] and velocities [rad/s] as they truly are.
+    pub fn joints(&self) -> (Joints, Joints) {
+        (self.plant.positions(), self.plant.velocities())
+    }
+
+    /// Time since power-up.
+    pub fn uptime(&self) -> Duration {
+        self.advanced_to.since(self.powered_up)
+    }
+
+    /// Whether the motors are on.
+    pub fn enabled(&self) -> bool {
+        self.plant.enabled()
+    }
+
+    /// Whether a joint moves.
+    pub fn moving(&self) -> bool {
+        self.plant.moving()
+    }
+
+    /// The error; 0 = none.
+    pub fn error(&self) -> u16 {
+        self.error
+    }
+
+    /// The mode.
+    pub fn mode(&self) -> ControlMode {
+        self.mode
+    }
+
+    // --- What it is told ---
+
+    /// Changes the mode, at a standstill only.
+    pub fn set_mode(&mut self, mode: ControlMode) -> Result<(), Refusal> {
+        if mode == self.mode {
+            return Ok(());
+        }
+        if self.plant.moving() {
+            return Err(Refusal::Moving);
+        }
+        self.plant.stop();
+        self.mode = mode;
+        Ok(())
+    }
+
+    /// Switches the motors on, holding where the arm is, or off.
+    pub fn enable(&mut self, on: bool) -> Result<(), Refusal> {
+        if on && self.error != 0 {
+            return Err(Refusal::InError);
+        }
+        if on
+            && !self.plant.enabled()
+            && let Some(fault) = self.struck_by(FaultKind::Sag)
+        {
+            self.plant.sag(fault.amount);
+        }
+        self.plant.enable(on);
+        Ok(())
+    }
+
+    /// Clears the error; not while the E-stop line is open.
+    pub fn clear_error(&mut self) -> Result<(), Refusal> {
+        if self.estop_open {
+            return Err(Refusal::InError);
+        }
+        self.error = 0;
+        Ok(())
+    }
+
+    /// Decelerates to standstill; the motors stay on.
+    pub fn stop(&mut self) {
+        self.plant.stop();
+    }
+
+    /// Moves to `target` [rad] at a fraction of the top speed, in position mode.
+    pub fn move_to(&mut self, target: &[f64], speed: f64) -> Result<(), Refusal> {
+        self.may_move(ControlMode::Position)?;
+        self.within(target)?;
+        self.plant.move_to(target, speed);
+        Ok(())
+    }
+
+    /// Follows a set point [rad], in servo mode.
+    pub fn servo(&mut self, target: &[f64]) -> Result<(), Refusal> {
+        self.may_move(ControlMode::ServoPosition)?;
+        self.within(target)?;
+        self.plant.servo(target);
+        Ok(())
+    }
+
+    /// Keeps velocities [rad/s], in velocity mode.
+    pub fn velocity(&mut self, velocities: &[f64]) -> Result<(), Refusal> {
+        self.may_move(ControlMode::Velocity)?;
+        self.last_velocity = self.advanced_to;
+        self.plant.velocity(velocities);
+        Ok(())
+    }
+
+    fn may_move(&self, mode: ControlMode) -> Result<(), Refusal> {
+        match (self.error, self.plant.enabled()) {
+            (0, true) if self.mode == mode => Ok(()),
+            (0, true) => Err(Refusal::WrongMode),
+            (0, false) => Err(Refusal::Disabled),
+            _ => Err(Refusal::InError),
+        }
+    }
+
+    fn within(&self, target: &[f64]) -> Result<(), Refusal> {
+        if inside(target, &self.limits, ROUNDING) { Ok(()) } else { Err(Refusal::OutOfRange) }
+    }
+}
+
+fn inside(values: &[f64], limits: &JointLimits, margin: f64) -> bool {
+    let range = limits.position_lower.iter().zip(&limits.position_upper);
+    values.iter().zip(range).all(|(value, (lower, upper))| (lower - margin..=upper + margin).contains(value))
+}
+
+/// A pose for power-up: no joint at zero or like another, so that nothing works by accident.
+fn pose_of_no_symmetry(limits: &JointLimits) -> Vec<f64> {
+    let range = limits.position_lower.iter().zip(&limits.position_upper);
+    let part = |i: usize| 0.5 + 0.02 * (i + 1) as f64 * if i.is_multiple_of(2) { 1.0 } else { -1.0 };
+    range.enumerate().map(|(i, (lower, upper))| lower + (upper - lower) * part(i).clamp(0.1, 0.9)).collect()
+}

@@ -1,0 +1,113 @@
+//! An emulated controller on a serial line: a pseudo-terminal, which adapters open as they would open the hardware.
+
+use std::io::{Read, Write};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use super::stream::{Controller, Ending, Shared, lock};
+use crate::clock::Mono;
+use crate::hardware::registry::Place;
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::serial::Pty;
+use crate::rt::host;
+
+/// How long a fault that cuts the line keeps it cut: longer than any adapter should believe in a silent arm.
+const CUT: Duration = Duration::from_millis(800);
+/// How often the thread looks whether the emulator ends, while nothing arrives.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// A controller at the end of a line. It ends when it is dropped, and the line with it.
+pub struct SerialServer<C: Controller> {
+    shared: Arc<Shared<C, ()>>,
+    path: String,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl<C: Controller> SerialServer<C> {
+    /// A controller at `place`. `name` is the arm's, for messages.
+    pub fn start(name: &str, controller: C, place: &Place) -> AdapterResult<Self> {
+        if !matches!(place, Place::InProcess | Place::Pty) {
+            let what = format!("{name} has a serial line: its emulator is on a pseudo-terminal (--pty)");
+            return Err(AdapterError::Rejected(what));
+        }
+        let pty = Pty::open()?;
+        let path = pty.path().to_owned();
+        let shared = Arc::new(Shared::new(controller));
+        let for_thread = shared.clone();
+        let builder = std::thread::Builder::new().name(format!("{name}-sim"));
+        let thread = builder
+            .spawn(move || live(&for_thread, pty))
+            .map_err(|e| AdapterError::Io(format!("{name} emulator: {e}")))?;
+        Ok(Self { shared, path, thread: Some(thread) })
+    }
+
+    /// The line's other end: `/dev/pts/3`.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// Does something with the controller, now.
+    pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
+        self.shared.with(f)
+    }
+}
+
+impl<C: Controller> Drop for SerialServer<C> {
+    fn drop(&mut self) {
+        lock(&self.shared.line).closing = true;
+        self.shared.changed.notify_all();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The controller's thread.
+fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
+    host::enter_realtime(host::EMULATOR_PRIORITY);
+    let mut line = Line { pty, shared };
+    while !shared.closing() {
+        let silence = match shared.serve(&mut line) {
+            Ending::Closed => LOOK,
+            Ending::Cut => CUT,
+            // Starting takes its time, too.
+            Ending::Dark(time) => time.max(CUT),
+        };
+        shared.with(|controller, now| controller.client_gone(now));
+        lock(&shared.line).dark_until = Instant::now() + silence;
+        shared.wait(|line| line.dark_until);
+        // What came meanwhile was heard by nobody.
+        while line.pty.read(&mut [0; 1024], Duration::ZERO).is_ok_and(|n| n > 0) {}
+    }
+}
+
+/// The line as a stream that ends with the emulator.
+struct Line<'a, C> {
+    pty: Pty,
+    shared: &'a Shared<C, ()>,
+}
+
+impl<C: Controller> Read for Line<'_, C> {
+    fn read(&mut self, room: &mut [u8]) -> std::io::Result<usize> {
+        while !self.shared.closing() && !room.is_empty() {
+            match self.pty.read(room, LOOK) {
+                Ok(0) => {}
+                Ok(n) => return Ok(n),
+                Err(error) => return Err(std::io::Error::other(error.to_string())),
+            }
+        }
+        Ok(0)
+    }
+}
+
+impl<C> Write for Line<'_, C> {
+    /// What nobody takes is lost, as on a real line.
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.pty.write(bytes).map(|_| bytes.len()).map_err(|error| std::io::Error::other(error.to_string()))
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}

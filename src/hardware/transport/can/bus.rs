@@ -1,0 +1,267 @@
+//! A CAN bus in memory: for `--sim`, and for tests of what no kernel can be made to do on demand.
+//!
+//! A [`Bus`] stands for two things at once: the wire, and the CAN controller of the computer, with its queue of frames
+//! to be sent. Ports from [`open`] are programs on that computer, those from [`Bus::attach`] other nodes on the wire.
+//! So a test can withhold the acknowledgement, and what the programs send then stays in the queue, as with real
+//! controllers: also when the program closes its port.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+
+use super::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::rt::wake::Wake;
+
+/// Events that wait for a port at most; then they are lost, and the port hears of it.
+pub const RECEIVE_QUEUE: usize = 4096;
+/// Frames that wait for an acknowledgement at most, where a test says nothing else.
+pub const SEND_QUEUE: usize = 16;
+
+/// The buses of this process, by number.
+static BUSES: Mutex<BTreeMap<u32, Weak<Hub>>> = Mutex::new(BTreeMap::new());
+/// The number of the next bus. None is used twice, so that an address never leads to another bus than before.
+static NEXT: AtomicU32 = AtomicU32::new(1);
+
+type Hub = Mutex<State>;
+
+#[derive(Default)]
+struct State {
+    members: Vec<Member>,
+    next_member: u64,
+    /// The owner has dropped the bus.
+    gone: bool,
+    down: bool,
+    /// How often the interface went down: ports from before stay broken.
+    downs: u64,
+    /// So many frames more are not taken.
+    refuse: usize,
+    /// Nobody acknowledges; so many frames may wait.
+    withheld: Option<usize>,
+    /// Frames that wait for an acknowledgement.
+    queue: VecDeque<(u64, CanFrame)>,
+}
+
+struct Member {
+    number: u64,
+    /// Another node on the wire, not a program on this computer.
+    remote: bool,
+    filters: Vec<CanFilter>,
+    events: VecDeque<CanEvent>,
+    wake: Wake,
+}
+
+impl Member {
+    fn push(&mut self, event: CanEvent) {
+        if self.events.is_empty() {
+            self.wake.raise();
+        }
+        match self.events.len() + 1 {
+            room if room < RECEIVE_QUEUE => self.events.push_back(event),
+            // The last place is kept for the news that something was lost.
+            RECEIVE_QUEUE => self.events.push_back(CanEvent::Trouble(CanTrouble::Overflow)),
+            _ => {}
+        }
+    }
+}
+
+impl State {
+    /// Brings a frame to everybody but its sender.
+    fn deliver(&mut self, from: u64, frame: CanFrame) {
+        let wants = |member: &&mut Member| member.number != from && CanFilter::any(&member.filters, frame.id);
+        self.members.iter_mut().filter(wants).for_each(|member| member.push(CanEvent::Frame(frame)));
+    }
+
+    /// Takes a frame from a program on this computer; `false` where there is no room.
+    fn take(&mut self, from: u64, frame: CanFrame) -> bool {
+        if self.refuse > 0 {
+            self.refuse -= 1;
+            return false;
+        }
+        match self.withheld {
+            None => self.deliver(from, frame),
+            Some(limit) if self.queue.len() < limit => self.queue.push_back((from, frame)),
+            Some(_) => return false,
+        }
+        true
+    }
+
+    fn wake_all(&self) {
+        self.members.iter().for_each(|member| member.wake.raise());
+    }
+}
+
+/// A bus. It exists, and is found under its address, until this is dropped.
+pub struct Bus {
+    hub: Arc<Hub>,
+    number: u32,
+}
+
+impl Bus {
+    /// A new bus with an address of its own.
+    #[expect(clippy::new_without_default, reason = "every bus is another one")]
+    pub fn new() -> Self {
+        let hub = Arc::new(Hub::default());
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        lock(&BUSES).insert(number, Arc::downgrade(&hub));
+        Self { hub, number }
+    }
+
+    /// Where [`open`](super::open) finds it: `memory:N`.
+    pub fn address(&self) -> CanAddress {
+        CanAddress::Memory(self.number)
+    }
+
+    /// The port of another node on the wire, such as an arm: it hears every frame, and no trouble.
+    pub fn attach(&self) -> AdapterResult<BusPort> {
+        join(&self.hub, format!("memory:{}", self.number), true, &[])
+    }
+
+    /// Lets the computer's controller report trouble to the programs.
+    pub fn trouble(&self, trouble: CanTrouble) {
+        let programs = |member: &&mut Member| !member.remote;
+        lock(&self.hub).members.iter_mut().filter(programs).for_each(|m| m.push(CanEvent::Trouble(trouble)));
+    }
+
+    /// The next `frames` that programs send are not taken, as if the controller's queue were full.
+    pub fn refuse(&self, frames: usize) {
+        lock(&self.hub).refuse = frames;
+    }
+
+    /// The other nodes lose their power: nobody acknowledges, and what the programs send waits, `limit` frames at most.
+    /// What the others send is lost.
+    pub fn withhold(&self, limit: usize) {
+        let mut state = lock(&self.hub);
+        state.queue.reserve(limit);
+        state.withheld = Some(limit);
+    }
+
+    /// The other nodes are back: they hear what has waited, in order, and then whatever comes. Answers how many frames
+    /// had waited.
+    pub fn acknowledge(&self) -> usize {
+        let mut state = lock(&self.hub);
+        state.withheld = None;
+        let waited = state.queue.len();
+        while let Some((from, frame)) = state.queue.pop_front() {
+            state.deliver(from, frame);
+        }
+        waited
+    }
+
+    /// Throws away what waits for an acknowledgement; answers how many frames that were.
+    pub fn purge(&self) -> usize {
+        lock(&self.hub).queue.drain(..).count()
+    }
+
+    /// Takes the interface down, or up again. Going down breaks the ports of the programs and throws away what waits.
+    pub fn set_up(&self, up: bool) {
+        let mut state = lock(&self.hub);
+        if !up && !state.down {
+            state.downs += 1;
+            state.queue.clear();
+            state.wake_all();
+        }
+        state.down = !up;
+    }
+}
+
+impl Drop for Bus {
+    fn drop(&mut self) {
+        lock(&BUSES).remove(&self.number);
+        let mut state = lock(&self.hub);
+        state.gone = true;
+        state.wake_all();
+    }
+}
+
+/// A port on a bus in memory.
+pub struct BusPort {
+    hub: Arc<Hub>,
+    number: u64,
+    remote: bool,
+    downs: u64,
+    wake: Wake,
+    /// The device and its address, for messages.
+    peer: String,
+}
+
+/// Opens a program's port on the bus with this number.
+pub fn open(device: &str, number: u32, filters: &[CanFilter]) -> AdapterResult<BusPort> {
+    let hub = lock(&BUSES).get(&number).and_then(Weak::upgrade);
+    let address = CanAddress::Memory(number);
+    let hub = hub.ok_or_else(|| {
+        AdapterError::Io(format!("cannot reach {device} at {address}: this process has no such bus in memory"))
+    })?;
+    if lock(&hub).down {
+        return Err(AdapterError::Io(format!("cannot reach {device} at {address}: the interface is down")));
+    }
+    join(&hub, format!("{device} at {address}"), false, filters)
+}
+
+fn join(hub: &Arc<Hub>, peer: String, remote: bool, filters: &[CanFilter]) -> AdapterResult<BusPort> {
+    let wake = Wake::new().map_err(|e| AdapterError::Io(format!("cannot reach {peer}: {e}")))?;
+    let mut state = lock(hub);
+    let (number, downs) = (state.next_member, state.downs);
+    state.next_member += 1;
+    let events = VecDeque::with_capacity(RECEIVE_QUEUE);
+    state.members.push(Member { number, remote, filters: filters.to_vec(), events, wake: wake.clone() });
+    drop(state);
+    Ok(BusPort { hub: hub.clone(), number, remote, downs, wake, peer })
+}
+
+impl BusPort {
+    /// The bus, if it still works for this port.
+    fn state(&self) -> AdapterResult<MutexGuard<'_, State>> {
+        let state = lock(&self.hub);
+        let why = match &*state {
+            State { gone: true, .. } => "the bus is gone",
+            state if !self.remote && state.downs != self.downs => "the interface went down",
+            _ => return Ok(state),
+        };
+        Err(AdapterError::Io(format!("the connection to {} broke: {why}", self.peer)))
+    }
+}
+
+impl CanPort for BusPort {
+    fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
+        let mut state = self.state()?;
+        if self.remote {
+            // Where nobody acknowledges, this node has no power; where the interface is down, nobody listens.
+            if state.withheld.is_none() && !state.down {
+                frames.iter().for_each(|frame| state.deliver(self.number, *frame));
+            }
+            return Ok(frames.len());
+        }
+        Ok(frames.iter().take_while(|frame| state.take(self.number, **frame)).count())
+    }
+
+    fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
+        let mut state = self.state()?;
+        let member = state.members.iter_mut().find(|member| member.number == self.number);
+        let event = member.and_then(|member| member.events.pop_front());
+        if event.is_none() {
+            self.wake.lower();
+        }
+        Ok(event)
+    }
+
+    fn fd(&self) -> BorrowedFd<'_> {
+        self.wake.as_fd()
+    }
+
+    fn waiting(&self) -> usize {
+        lock(&self.hub).queue.iter().filter(|(from, _)| *from == self.number).count()
+    }
+}
+
+impl Drop for BusPort {
+    fn drop(&mut self) {
+        lock(&self.hub).members.retain(|member| member.number != self.number);
+    }
+}
+
+/// No code panics while it holds the lock, so a poisoned one is as good as any.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,185 @@
+//! Serial CAN adapters that speak slcan, the ASCII protocol of LAWICEL's adapters: every frame is a line, `t` with the
+//! identifier, the number of bytes and the bytes in hexadecimal digits, ended by a carriage return.
+//!
+//! Such an adapter tells of no trouble on the bus: that nobody acknowledges shows only in that nobody answers. What it
+//! replies to commands (a carriage return, or a bell for "no") is not read, since many models do not reply.
+
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+
+use rustix::io::Errno;
+
+use super::address::SLCAN_RATES;
+use super::{CanEvent, CanFilter, CanFrame, CanPort};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::incoming::{Incoming, Scan};
+use crate::hardware::transport::serial::{broken, open_line, read_line};
+
+/// Rate of the serial line [bit/s]: adapters on USB take any and ignore it.
+const BAUD: u32 = 115_200;
+/// The longest line of the protocol: an extended frame with eight bytes and a time stamp.
+pub(super) const LONGEST: usize = 32;
+/// A frame's line without its data: `tIIIL`.
+const HEAD: usize = 5;
+const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
+
+/// A port on a serial CAN adapter.
+pub struct SlcanPort {
+    line: Lines<OwnedFd>,
+    filters: Vec<CanFilter>,
+}
+
+/// Opens the serial CAN adapter at `path` and its channel with `bit_rate` [bit/s], one of [`SLCAN_RATES`].
+pub fn open(device: &str, path: &str, bit_rate: u32, filters: &[CanFilter]) -> AdapterResult<SlcanPort> {
+    let failed = |why: &str| AdapterError::Io(format!("cannot open CAN adapter {path} for {device}: {why}"));
+    let code = SLCAN_RATES.iter().position(|rate| *rate == bit_rate);
+    let code = code.ok_or_else(|| failed(&format!("slcan has no bit rate {bit_rate}")))?;
+    let mut line = Lines::new(open_line(device, path, BAUD)?, format!("{device} at {path}"));
+    // The first carriage return ends whatever another program left unfinished. Only a closed channel takes a rate.
+    if !line.put(format!("\rC\rS{code}\rO\r").as_bytes())? {
+        return Err(failed("it takes no bytes"));
+    }
+    Ok(SlcanPort { line, filters: filters.to_vec() })
+}
+
+impl CanPort for SlcanPort {
+    fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
+        self.line.put_frames(frames)
+    }
+
+    fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
+        let filters = &self.filters;
+        let wanted = |line: &[u8]| decode(line).filter(|frame| CanFilter::any(filters, frame.id));
+        let frame = self.line.next(wanted, read_line)?;
+        Ok(frame.map(CanEvent::Frame))
+    }
+
+    fn fd(&self) -> BorrowedFd<'_> {
+        self.line.fd.as_fd()
+    }
+}
+
+impl Drop for SlcanPort {
+    fn drop(&mut self) {
+        // So that the adapter does not go on talking to nobody.
+        let _ = self.line.put(b"C\r");
+    }
+}
+
+/// The line of a frame: its bytes, and how many of them count. `None` for an identifier over 11 bits.
+pub(super) fn encode(frame: &CanFrame) -> Option<([u8; LONGEST], usize)> {
+    let digit = |value: usize| DIGITS.get(value & 0xF).copied().unwrap_or(b'0');
+    let (id, bytes) = (usize::from(frame.id), frame.bytes());
+    let head = [b't', digit(id >> 8), digit(id >> 4), digit(id), digit(bytes.len())];
+    let data = bytes.iter().flat_map(|byte| [digit(usize::from(byte >> 4)), digit(usize::from(*byte))]);
+    let mut line = [0; LONGEST];
+    line.iter_mut().zip(head.into_iter().chain(data).chain([b'\r'])).for_each(|(to, from)| *to = from);
+    (id <= 0x7FF).then_some((line, HEAD + 2 * bytes.len() + 1))
+}
+
+/// The frame in a line without its end; `None` when it is something else. A time stamp behind it is left out.
+pub(super) fn decode(line: &[u8]) -> Option<CanFrame> {
+    let digit = |at: usize| char::from(*line.get(at)?).to_digit(16);
+    if line.first() != Some(&b't') {
+        return None;
+    }
+    let id = digit(1)? << 8 | digit(2)? << 4 | digit(3)?;
+    let len = digit(4)? as usize;
+    let end = HEAD + 2 * len;
+    if id > 0x7FF || len > 8 || !(line.len() == end || line.len() == end + 4) {
+        return None;
+    }
+    let mut data = [0; 8];
+    for (i, byte) in data.iter_mut().take(len).enumerate() {
+        *byte = (digit(HEAD + 2 * i)? << 4 | digit(HEAD + 2 * i + 1)?) as u8;
+    }
+    Some(CanFrame { id: id as u16, len: len as u8, data })
+}
+
+/// Lines that go both ways over a descriptor that does not wait.
+pub(super) struct Lines<F> {
+    pub(super) fd: F,
+    /// What is at the other end, for messages.
+    peer: String,
+    incoming: Incoming,
+    /// The rest of a line that was begun: it goes out before anything else.
+    rest: ([u8; LONGEST], usize),
+}
+
+impl<F: AsFd> Lines<F> {
+    pub(super) fn new(fd: F, peer: String) -> Self {
+        Self { fd, peer, incoming: Incoming::new(), rest: ([0; LONGEST], 0) }
+    }
+
+    /// Writes lines of [`LONGEST`] bytes at most altogether; `false` when there is no room. A begun line counts as
+    /// written.
+    pub(super) fn put(&mut self, bytes: &[u8]) -> AdapterResult<bool> {
+        let (rest, len) = self.rest;
+        if len > 0 {
+            let old = rest.get(..len).unwrap_or_default();
+            let n = self.write(old)?;
+            self.keep(old, n);
+            if n < len {
+                return Ok(false);
+            }
+        }
+        let n = self.write(bytes)?;
+        if n > 0 {
+            self.keep(bytes, n);
+        }
+        Ok(n > 0 || bytes.is_empty())
+    }
+
+    /// Writes frames; answers for how many there was room.
+    pub(super) fn put_frames(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
+        for (taken, frame) in frames.iter().enumerate() {
+            let Some((line, len)) = encode(frame) else {
+                return Err(AdapterError::Protocol(format!("{:#x} is no CAN identifier of 11 bits", frame.id)));
+            };
+            if !self.put(line.get(..len).unwrap_or_default())? {
+                return Ok(taken);
+            }
+        }
+        Ok(frames.len())
+    }
+
+    /// The first thing that `wanted` finds in a line, without its end, of those that have arrived. Reads once at most,
+    /// so that no flood holds the caller up.
+    pub(super) fn next<T>(
+        &mut self,
+        wanted: impl Fn(&[u8]) -> Option<T>,
+        read: impl FnOnce(&F, &str, &mut [u8]) -> AdapterResult<usize>,
+    ) -> AdapterResult<Option<T>> {
+        let Self { fd, peer, incoming, .. } = self;
+        let scan = |bytes: &[u8]| match bytes.iter().position(|b| matches!(b, b'\r' | b'\x07')) {
+            Some(end) => match bytes.get(..end).and_then(&wanted) {
+                Some(found) => Scan::Take(end + 1, found),
+                None => Scan::Skip(end + 1),
+            },
+            // No line is as long: noise, up to the next end of a line.
+            None if bytes.len() > LONGEST => Scan::Skip(bytes.len()),
+            None => Scan::More,
+        };
+        if let Some(found) = incoming.next(scan) {
+            return Ok(Some(found));
+        }
+        match incoming.fill(peer, |room| read(fd, peer, room))? {
+            0 => Ok(None),
+            _ => Ok(incoming.next(scan)),
+        }
+    }
+
+    fn write(&self, bytes: &[u8]) -> AdapterResult<usize> {
+        match rustix::io::write(&self.fd, bytes) {
+            Ok(n) => Ok(n),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            Err(e) => Err(broken(&self.peer, e)),
+        }
+    }
+
+    /// Remembers what of `bytes` is not written yet.
+    fn keep(&mut self, bytes: &[u8], written: usize) {
+        let rest = bytes.get(written..).unwrap_or_default();
+        self.rest.0.iter_mut().zip(rest).for_each(|(to, from)| *to = *from);
+        self.rest.1 = rest.len().min(LONGEST);
+    }
+}

@@ -1,0 +1,100 @@
+//! A serial CAN adapter without hardware: the far end of slcan on a pseudo-terminal, for emulators.
+//!
+//! Clients, such as this program or a vendor's SDK, open its path as they would open `/dev/ttyACM0`.
+
+use std::os::fd::{AsFd, BorrowedFd};
+use std::time::Duration;
+
+use super::slcan::{Lines, decode};
+use super::{CanAddress, CanEvent, CanFrame, CanPort};
+use crate::hardware::spec::AdapterResult;
+use crate::hardware::transport::pty::Pty;
+
+/// The adapter, and at once the port of the arm behind it: what clients send is received here.
+///
+/// Frames sent while no client has opened the channel are lost, as on a bus that nobody listens to. Dropping it looks
+/// to clients as if the adapter were unplugged.
+pub struct SlcanPty {
+    line: Lines<Pty>,
+    path: String,
+    channel_open: bool,
+}
+
+/// What a client says.
+enum Said {
+    Frame(CanFrame),
+    Command(u8, Option<u8>),
+}
+
+impl SlcanPty {
+    /// Makes a new one.
+    pub fn open() -> AdapterResult<Self> {
+        let pty = Pty::open()?;
+        let path = pty.path().to_owned();
+        Ok(Self { line: Lines::new(pty, format!("the client of {path}")), path, channel_open: false })
+    }
+
+    /// What clients open: `/dev/pts/3`.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// Where this program's adapters find it.
+    pub fn address(&self) -> CanAddress {
+        CanAddress::Slcan { path: self.path.clone(), bit_rate: super::address::BIT_RATE }
+    }
+
+    /// Whether a client has opened the channel.
+    pub fn channel_open(&self) -> bool {
+        self.channel_open
+    }
+
+    /// Does as the client says; `false` where it cannot be done.
+    fn obey(&mut self, command: u8, argument: Option<u8>) -> bool {
+        match (command, argument) {
+            (b'C', None) => self.channel_open = false,
+            // A rate is set on a closed channel only.
+            (b'S', Some(b'0'..=b'8')) if !self.channel_open => {}
+            // A second opening is no mistake: a vendor's SDK opens twice, once to send and once to receive.
+            (b'O', None) => self.channel_open = true,
+            _ => return false,
+        }
+        true
+    }
+}
+
+impl CanPort for SlcanPty {
+    fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
+        if self.channel_open { self.line.put_frames(frames) } else { Ok(frames.len()) }
+    }
+
+    fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
+        let said = |line: &[u8]| match line {
+            [b't', ..] => decode(line).map(Said::Frame),
+            [command] => Some(Said::Command(*command, None)),
+            [command, argument] => Some(Said::Command(*command, Some(*argument))),
+            [] => None,
+            [command, ..] => Some(Said::Command(*command, Some(0))),
+        };
+        while let Some(said) = self.line.next(said, |pty, _, room| pty.read(room, Duration::ZERO))? {
+            let reply: &[u8] = match said {
+                Said::Frame(frame) if self.channel_open => {
+                    self.line.put(b"z\r")?;
+                    return Ok(Some(CanEvent::Frame(frame)));
+                }
+                Said::Command(command, argument) if self.obey(command, argument) => b"\r",
+                _ => b"\x07",
+            };
+            self.line.put(reply)?;
+        }
+        Ok(None)
+    }
+
+    fn fd(&self) -> BorrowedFd<'_> {
+        self.line.fd.as_fd()
+    }
+}
+
+#[cfg(test)]
+#[path = "slcan_tests.rs"]
+mod slcan_tests;

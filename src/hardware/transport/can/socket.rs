@@ -1,0 +1,243 @@
+//! A CAN interface of the system, over a raw socket of Linux's SocketCAN.
+//!
+//! Two things bound what can go wrong while nobody acknowledges (the arm has lost its power): the socket may have
+//! [`SEND_QUEUE`] frames in the kernel's queues at a time, and [`CanPort::waiting`] tells how many there are. Closing
+//! the socket does not take them back: the kernel sends them when somebody acknowledges again. What takes them back is
+//! the interface going down (`ip link set can0 down`, a privilege), or a controller in one-shot mode.
+
+use std::io::{Error, ErrorKind};
+use std::os::fd::{AsFd, BorrowedFd};
+
+use libc::{ENETDOWN, ENOBUFS, ENODEV, can_frame};
+use rustix::net::sockopt;
+use socketcan::{CanDataFrame, CanSocket, EmbeddedFrame, Socket, SocketOptions, StandardId};
+
+use super::{CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+
+/// About how many frames of one socket may wait in the kernel to be sent.
+pub const SEND_QUEUE: usize = 16;
+/// What the kernel charges a socket for a classic frame [bytes].
+const FRAME_MEMORY: usize = 768;
+/// Asked for as the receive buffer [bytes]: a Piper fills it in about a second. The system may grant less.
+const RECEIVE_BUFFER: usize = 1 << 20;
+/// Where the kernel tells of its interfaces.
+const INTERFACES: &str = "/sys/class/net";
+/// A protocol error at this place is a missing acknowledgement (`linux/can/error.h`).
+const LOCATION_ACK: u8 = 0x19;
+
+/// A port on a CAN interface.
+pub struct SocketPort {
+    socket: CanSocket,
+    /// The device and its interface, for messages.
+    peer: String,
+    /// Why this port works no more.
+    broken: Option<AdapterError>,
+    /// Frames that the socket had no room for, as counted by the kernel.
+    lost: u32,
+}
+
+/// Opens a port on the CAN interface `name`.
+pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<SocketPort> {
+    let failed = |why: &str| AdapterError::Io(format!("cannot open CAN interface {name} for {device}: {why}"));
+    let socket = CanSocket::open(name).map_err(|e| failed(&why_not(name, &e)))?;
+    let prepare = || -> std::io::Result<()> {
+        // A frame must agree with its filter in these flags too: no extended identifiers, no remote requests.
+        let flags = libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
+        let filter = |f: &CanFilter| (u32::from(f.id), u32::from(f.mask) | flags);
+        let everything = CanFilter { id: 0, mask: 0 };
+        let wanted = if filters.is_empty() { &[everything] } else { filters };
+        socket.set_filters(&wanted.iter().map(filter).collect::<Vec<_>>())?;
+        socket.set_error_filter_accept_all()?;
+        // Programs on this computer hear each other, so that an emulator can stand in for an arm.
+        socket.set_loopback(true)?;
+        socket.set_recv_own_msgs(false)?;
+        socket.set_nonblocking(true)?;
+        // The kernel doubles both figures, to account for its own overhead.
+        sockopt::set_socket_send_buffer_size(&socket, SEND_QUEUE * FRAME_MEMORY / 2)?;
+        sockopt::set_socket_recv_buffer_size_force(&socket, RECEIVE_BUFFER)
+            .or_else(|_| sockopt::set_socket_recv_buffer_size(&socket, RECEIVE_BUFFER))?;
+        Ok(())
+    };
+    prepare().map_err(|e| failed(&e.to_string()))?;
+    // Binding to an interface that is down succeeds; the kernel leaves word of it with the socket.
+    if let Ok(Err(errno)) = sockopt::socket_error(&socket) {
+        return Err(failed(&why_not(name, &errno.into())));
+    }
+    // Without a carrier the kernel swallows what is sent, and says that it was sent.
+    if std::fs::read_to_string(format!("{INTERFACES}/{name}/carrier")).is_ok_and(|carrier| carrier.trim() == "0") {
+        return Err(failed(&format!(
+            "it has no carrier: its controller is bus-off, or the other end of a virtual pair is down\nhint: look at the \
+             wiring, the terminators and the bit rate; then ip link set {name} down; ip link set {name} up (as root)"
+        )));
+    }
+    Ok(SocketPort { socket, peer: format!("{device} at {name}"), broken: None, lost: 0 })
+}
+
+/// Why an interface cannot be opened, with the remedy.
+fn why_not(name: &str, error: &Error) -> String {
+    match error.raw_os_error() {
+        Some(ENETDOWN) => format!(
+            "the interface is down\nhint: ip link set {name} up type can bitrate 1000000 (as root; for a virtual \
+             interface: ip link set {name} up)"
+        ),
+        Some(ENODEV) if std::path::Path::new(INTERFACES).join(name).exists() => {
+            format!("it is no CAN interface\nhint: {}", others())
+        }
+        Some(ENODEV) => format!("there is no such interface\nhint: {}", others()),
+        Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
+            "this kernel has no CAN\nhint: modprobe can-raw (as root), or a kernel with CAN".to_owned()
+        }
+        _ => error.to_string(),
+    }
+}
+
+/// Names the CAN interfaces that there are.
+fn others() -> String {
+    /// `ARPHRD_CAN` of the kernel.
+    const CAN_TYPE: &str = "280";
+    let is_can = |entry: &std::fs::DirEntry| {
+        std::fs::read_to_string(entry.path().join("type")).is_ok_and(|kind| kind.trim() == CAN_TYPE)
+    };
+    let entries = std::fs::read_dir(INTERFACES).into_iter().flatten().flatten();
+    let mut names: Vec<_> =
+        entries.filter(is_can).map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    match names.as_slice() {
+        [] => "no CAN interface is there (see: ip link); plug in the CAN adapter, or load its driver".to_owned(),
+        names => format!("the CAN interfaces here are {}", names.join(", ")),
+    }
+}
+
+impl SocketPort {
+    fn usable(&self) -> AdapterResult<()> {
+        self.broken.clone().map_or(Ok(()), Err)
+    }
+
+    fn break_down(&mut self, error: &Error) -> AdapterError {
+        let why = match error.raw_os_error() {
+            Some(ENETDOWN) => "the interface went down".to_owned(),
+            Some(ENODEV | libc::ENXIO) => "the interface is gone".to_owned(),
+            _ => error.to_string(),
+        };
+        let error = AdapterError::Io(format!("the connection to {} broke: {why}", self.peer));
+        self.broken = Some(error.clone());
+        error
+    }
+
+    /// The kernel's figures about the socket: its send memory [bytes], and how many frames it had no room for.
+    fn figures(&self) -> Option<(usize, u32)> {
+        let mut bytes = [0; 9 * 4];
+        let read = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes).ok()?;
+        let figure = |index: libc::c_int| {
+            let at = index as usize * 4;
+            let word = bytes.get(..read)?.get(at..at + 4)?;
+            Some(u32::from_ne_bytes(word.try_into().ok()?))
+        };
+        Some((figure(libc::SK_MEMINFO_WMEM_ALLOC)? as usize, figure(libc::SK_MEMINFO_DROPS)?))
+    }
+}
+
+impl CanPort for SocketPort {
+    fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
+        self.usable()?;
+        for (taken, frame) in frames.iter().enumerate() {
+            let made = StandardId::new(frame.id).and_then(|id| CanDataFrame::new(id, frame.bytes()));
+            let Some(data) = made else {
+                return Err(AdapterError::Protocol(format!("{:#x} is no CAN identifier of 11 bits", frame.id)));
+            };
+            match self.socket.write_frame(&data) {
+                Ok(()) => {}
+                // The socket's own bound, and that of the interface.
+                Err(e) if e.kind() == ErrorKind::WouldBlock || e.raw_os_error() == Some(ENOBUFS) => return Ok(taken),
+                Err(e) => return Err(self.break_down(&e)),
+            }
+        }
+        Ok(frames.len())
+    }
+
+    fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
+        self.usable()?;
+        match self.socket.read_raw_frame() {
+            Ok(frame) if frame.can_id & libc::CAN_ERR_FLAG != 0 => Ok(Some(CanEvent::Trouble(trouble(&frame)))),
+            Ok(frame) => {
+                let bytes = frame.data.get(..usize::from(frame.can_dlc)).unwrap_or(&frame.data);
+                Ok(Some(CanEvent::Frame(CanFrame::new((frame.can_id & libc::CAN_SFF_MASK) as u16, bytes))))
+            }
+            Err(e) if e.kind() == ErrorKind::WouldBlock => {
+                // Now that everything is fetched: was that everything?
+                let lost = self.figures().map_or(self.lost, |(_, lost)| lost);
+                let fresh = lost != self.lost;
+                self.lost = lost;
+                Ok(fresh.then_some(CanEvent::Trouble(CanTrouble::Overflow)))
+            }
+            Err(e) if e.kind() == ErrorKind::Interrupted => Ok(None),
+            Err(e) => Err(self.break_down(&e)),
+        }
+    }
+
+    fn fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+
+    fn waiting(&self) -> usize {
+        self.figures().map_or(0, |(memory, _)| memory.div_ceil(FRAME_MEMORY))
+    }
+}
+
+/// What an error frame says. Where it says several things, the worst.
+fn trouble(frame: &can_frame) -> CanTrouble {
+    let class = frame.can_id & libc::CAN_ERR_MASK;
+    let [_, controller, _, location, ..] = frame.data;
+    let controller = |bits: libc::c_int| class & libc::CAN_ERR_CRTL != 0 && libc::c_int::from(controller) & bits != 0;
+    let no_ack = class & libc::CAN_ERR_PROT != 0 && location == LOCATION_ACK;
+    match class {
+        class if class & libc::CAN_ERR_BUSOFF != 0 => CanTrouble::BusOff,
+        class if class & libc::CAN_ERR_ACK != 0 || no_ack => CanTrouble::NoAcknowledge,
+        _ if controller(libc::CAN_ERR_CRTL_RX_PASSIVE | libc::CAN_ERR_CRTL_TX_PASSIVE) => CanTrouble::Passive,
+        _ if controller(libc::CAN_ERR_CRTL_RX_OVERFLOW | libc::CAN_ERR_CRTL_TX_OVERFLOW) => CanTrouble::Overflow,
+        class if class & libc::CAN_ERR_RESTARTED != 0 => CanTrouble::Restarted,
+        _ if controller(libc::CAN_ERR_CRTL_ACTIVE) => CanTrouble::Restarted,
+        class => CanTrouble::Other(class),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Error frames as drivers make them: class bits, then the data bytes (`linux/can/error.h`).
+    #[test]
+    fn error_frames_are_told_apart() {
+        let told = |class: u32, data: [u8; 8]| {
+            let made = socketcan::CanErrorFrame::new_error(class, &data).unwrap();
+            trouble(made.as_ref())
+        };
+        assert_eq!(told(0x40, [0; 8]), CanTrouble::BusOff);
+        assert_eq!(told(0x20, [0; 8]), CanTrouble::NoAcknowledge);
+        assert_eq!(told(0x08, [0, 0, 0, 0x19, 0, 0, 0, 0]), CanTrouble::NoAcknowledge);
+        assert_eq!(told(0x08, [0, 0, 4, 0x08, 0, 0, 0, 0]), CanTrouble::Other(0x08));
+        assert_eq!(told(0x204, [0, 0x20, 0, 0, 0, 0, 128, 0]), CanTrouble::Passive);
+        assert_eq!(told(0x204, [0, 0x10, 0, 0, 0, 0, 0, 128]), CanTrouble::Passive);
+        assert_eq!(told(0x204, [0, 0x08, 0, 0, 0, 0, 97, 0]), CanTrouble::Other(0x204), "a warning");
+        assert_eq!(told(0x04, [0, 0x01, 0, 0, 0, 0, 0, 0]), CanTrouble::Overflow);
+        assert_eq!(told(0x204, [0, 0x40, 0, 0, 0, 0, 0, 0]), CanTrouble::Restarted);
+        assert_eq!(told(0x100, [0; 8]), CanTrouble::Restarted);
+        assert_eq!(told(0x44 | 0x20, [0, 0x20, 0, 0, 0, 0, 0, 0]), CanTrouble::BusOff, "the worst of them");
+    }
+
+    #[test]
+    fn an_interface_that_is_missing_is_named() {
+        let error = open("piper", "nosuchcan7", &[]).err().unwrap().to_string();
+        assert!(error.starts_with("cannot open CAN interface nosuchcan7 for piper: "), "{error}");
+        assert!(error.contains("\nhint: "), "{error}");
+    }
+
+    #[test]
+    fn an_interface_of_another_kind_is_named() {
+        let error = open("piper", "lo", &[]).err().unwrap().to_string();
+        assert!(error.contains("\nhint: "), "{error}");
+        // Where the kernel has CAN, it says what `lo` is not; elsewhere, that it has no CAN.
+        assert!(error.contains("no CAN"), "{error}");
+    }
+}

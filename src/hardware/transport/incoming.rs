@@ -1,0 +1,92 @@
+//! Frames out of a stream of bytes, whatever the stream is.
+
+use std::ops::Range;
+use std::time::{Duration, Instant};
+
+use crate::hardware::spec::{AdapterError, AdapterResult};
+
+/// Most bytes that may wait for the rest of their frame.
+pub(super) const BUFFER: usize = 4096;
+
+/// What stands at the front of the received bytes, as a protocol sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Scan<T> {
+    /// The beginning of a frame; more bytes are needed.
+    More,
+    /// So many bytes (at least 1) are not the awaited frame.
+    Skip(usize),
+    /// The awaited frame, and how many bytes it takes.
+    Take(usize, T),
+}
+
+/// Bytes that have arrived and are not used up yet.
+#[derive(Debug)]
+pub(super) struct Incoming {
+    buffer: Vec<u8>,
+    filled: Range<usize>,
+}
+
+impl Incoming {
+    pub(super) fn new() -> Self {
+        Self { buffer: vec![0; BUFFER], filled: 0..0 }
+    }
+
+    /// The first frame that `scan` takes from what has arrived. What it skips is gone.
+    pub(super) fn next<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> Option<T> {
+        while !self.filled.is_empty() {
+            match scan(self.buffer.get(self.filled.clone()).unwrap_or_default()) {
+                Scan::More => break,
+                Scan::Skip(n) => self.used(n.max(1)),
+                Scan::Take(n, frame) => {
+                    self.used(n.max(1));
+                    return Some(frame);
+                }
+            }
+        }
+        None
+    }
+
+    /// Lets `read` put more bytes behind those that wait; it answers how many. `Protocol` when there is no room left.
+    pub(super) fn fill(
+        &mut self,
+        peer: &str,
+        read: impl FnOnce(&mut [u8]) -> AdapterResult<usize>,
+    ) -> AdapterResult<usize> {
+        self.buffer.copy_within(self.filled.clone(), 0);
+        self.filled = 0..self.filled.len();
+        let room = self.buffer.get_mut(self.filled.end..).unwrap_or_default();
+        if room.is_empty() {
+            return Err(AdapterError::Protocol(format!("{peer} sent a frame that is too long")));
+        }
+        let n = read(room)?.min(room.len());
+        self.filled.end += n;
+        Ok(n)
+    }
+
+    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the time it is given; 0 when none
+    /// have come.
+    pub(super) fn receive<T>(
+        &mut self,
+        peer: &str,
+        timeout: Duration,
+        mut scan: impl FnMut(&[u8]) -> Scan<T>,
+        mut read: impl FnMut(&mut [u8], Duration) -> AdapterResult<usize>,
+    ) -> AdapterResult<T> {
+        let deadline = Instant::now() + timeout;
+        let mut left = timeout;
+        loop {
+            if let Some(frame) = self.next(&mut scan) {
+                return Ok(frame);
+            }
+            if left.is_zero() {
+                return Err(AdapterError::Timeout(format!("{peer} did not answer within {timeout:?}")));
+            }
+            self.fill(peer, |room| read(room, left))?;
+            left = deadline.saturating_duration_since(Instant::now());
+        }
+    }
+
+    fn used(&mut self, n: usize) {
+        self.filled.start = self.filled.start.saturating_add(n).min(self.filled.end);
+    }
+}

@@ -1,0 +1,312 @@
+//! A serial line to a controller: 8 data bits, no parity, 1 stop bit, no flow control, any rate the hardware has.
+//!
+//! The line belongs to one program: a second one is refused. DTR and RTS go up when the line is opened, as the kernel
+//! always does, and stay up when it is closed: a board that restarts on a change of DTR does so on the first opening
+//! only, and not on each reconnect. Bytes from before are thrown away.
+
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock, open};
+use rustix::io::Errno;
+use rustix::termios::{
+    ControlModes, OptionalActions, QueueSelector, Termios, ioctl_tiocexcl, isatty, tcflush, tcgetattr, tcsetattr,
+};
+
+use super::incoming::Incoming;
+pub use super::incoming::Scan;
+pub use super::pty::Pty;
+use crate::hardware::spec::{AdapterError, AdapterResult};
+
+/// How far the hardware may be off the wanted rate [%]; a character of 10 bits bears about twice that.
+const RATE_TOLERANCE: u32 = 2;
+/// How serial devices are named that an arm may be at.
+const NAMES: [&str; 5] = ["ttyUSB", "ttyACM", "ttyAMA", "ttyTHS", "ttymxc"];
+
+/// A serial line over which frames go both ways.
+#[derive(Debug)]
+pub struct SerialLink {
+    line: OwnedFd,
+    peer: String,
+    incoming: Incoming,
+    /// How long a write may take.
+    timeout: Duration,
+}
+
+impl SerialLink {
+    /// Opens the serial device at `path` with `baud` [bit/s]. `device` names the arm in messages, `timeout` bounds each
+    /// write. That anybody is at the other end shows only when they answer.
+    pub fn connect(device: &str, path: &str, baud: u32, timeout: Duration) -> AdapterResult<Self> {
+        let line = open_line(device, path, baud)?;
+        Ok(Self { line, peer: format!("{device} at {path}"), incoming: Incoming::new(), timeout })
+    }
+
+    /// The device and its path, for messages.
+    pub fn peer(&self) -> &str {
+        &self.peer
+    }
+
+    /// Sends all of `bytes`: hands them to the system, that is, which sends at the line's rate. `Timeout` when it takes
+    /// them too slowly; the line stays usable.
+    pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
+        let deadline = Instant::now() + self.timeout;
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            match rustix::io::write(&self.line, rest) {
+                Ok(n) => rest = rest.get(n..).unwrap_or_default(),
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) => {
+                    let left = deadline.saturating_duration_since(Instant::now());
+                    if left.is_zero() || !wait(&self.line, PollFlags::OUT, left).map_err(|e| broken(&self.peer, e))? {
+                        let limit = self.timeout;
+                        return Err(AdapterError::Timeout(format!("{} took no bytes within {limit:?}", self.peer)));
+                    }
+                }
+                Err(e) => return Err(broken(&self.peer, e)),
+            }
+        }
+        Ok(())
+    }
+
+    /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
+    /// a frame; it must skip what is not for it. `Timeout` leaves the line usable; `Io` does not.
+    pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
+        let Self { line, peer, incoming, .. } = self;
+        incoming.receive(peer, timeout, scan, |room, left| {
+            if wait(&*line, PollFlags::IN, left).map_err(|e| broken(peer, e))? {
+                read_line(line, peer, room)
+            } else {
+                Ok(0)
+            }
+        })
+    }
+}
+
+impl AsFd for SerialLink {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.line.as_fd()
+    }
+}
+
+/// Opens a serial device for this program alone, raw, with `baud` [bit/s]. Reads and writes do not wait.
+pub(super) fn open_line(device: &str, path: &str, baud: u32) -> AdapterResult<OwnedFd> {
+    let failed = |why: String| AdapterError::Io(format!("cannot open serial device {path} for {device}: {why}"));
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let line = open(path, flags, Mode::empty()).map_err(|e| failed(why_not(e)))?;
+    if !isatty(&line) {
+        return Err(failed("it is no serial device".to_owned()));
+    }
+    // The first keeps out programs that know nothing of locks, but not root's; the second, all that ask.
+    ioctl_tiocexcl(&line).map_err(|e| failed(e.to_string()))?;
+    flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|e| failed(why_not(e)))?;
+    let prepare = || -> rustix::io::Result<u32> {
+        let mut settings = tcgetattr(&line)?;
+        make_raw(&mut settings);
+        settings.set_speed(baud)?;
+        tcsetattr(&line, OptionalActions::Now, &settings)?;
+        tcflush(&line, QueueSelector::IOFlush)?;
+        Ok(tcgetattr(&line)?.output_speed())
+    };
+    let runs_at = prepare().map_err(|e| failed(e.to_string()))?;
+    if u64::from(runs_at.abs_diff(baud)) * 100 > u64::from(baud) * u64::from(RATE_TOLERANCE) {
+        return Err(failed(format!("it cannot run at {baud} bit/s, only at {runs_at}")));
+    }
+    Ok(line)
+}
+
+/// 8N1, no flow control, no modem lines, bytes as they are; DTR stays up on closing.
+pub(super) fn make_raw(settings: &mut Termios) {
+    use ControlModes as C;
+    settings.make_raw();
+    settings.control_modes &= !(C::CSIZE | C::PARENB | C::CSTOPB | C::CRTSCTS | C::HUPCL);
+    settings.control_modes |= C::CS8 | C::CREAD | C::CLOCAL;
+}
+
+/// Reads what has arrived on a line that is readable; 0 when it is not, after all.
+pub(super) fn read_line(line: &OwnedFd, peer: &str, room: &mut [u8]) -> AdapterResult<usize> {
+    match rustix::io::read(line, room) {
+        // A line that nobody hangs up has no end.
+        Ok(0) => Err(broken(peer, Errno::IO)),
+        Ok(n) => Ok(n),
+        Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+        Err(e) => Err(broken(peer, e)),
+    }
+}
+
+/// Waits up to `timeout` until `fd` can be read from or written to, or is broken, which the next call tells.
+pub(super) fn wait(fd: impl AsFd, flags: PollFlags, timeout: Duration) -> rustix::io::Result<bool> {
+    let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos() as i64 };
+    match poll(&mut [PollFd::new(&fd, flags)], Some(&timeout)) {
+        Ok(n) => Ok(n > 0),
+        Err(Errno::INTR) => Ok(true),
+        Err(e) => Err(e),
+    }
+}
+
+/// What is told of a line that works no more.
+pub(super) fn broken(peer: &str, error: Errno) -> AdapterError {
+    let why = match error {
+        Errno::IO | Errno::NODEV | Errno::NXIO => "the serial device is gone (unplugged?)".to_owned(),
+        error => error.to_string(),
+    };
+    AdapterError::Io(format!("the connection to {peer} broke: {why}"))
+}
+
+/// Why a serial device cannot be opened, with the remedy.
+fn why_not(error: Errno) -> String {
+    match error {
+        Errno::NOENT | Errno::NODEV | Errno::NXIO => format!("there is no such device\nhint: {}", others()),
+        Errno::ACCESS | Errno::PERM => "permission denied\nhint: join the group that owns serial devices: \
+                                        sudo usermod -aG dialout $USER; then log in again"
+            .to_owned(),
+        Errno::BUSY | Errno::AGAIN => "another program uses it".to_owned(),
+        error => error.to_string(),
+    }
+}
+
+/// Names the serial devices that there are.
+fn others() -> String {
+    let entries = std::fs::read_dir("/dev").into_iter().flatten().flatten();
+    let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let mut found: Vec<_> = names.filter(|name| NAMES.iter().any(|known| name.starts_with(known))).collect();
+    found.sort();
+    match found.as_slice() {
+        [] => "no serial device is there; is it plugged in?".to_owned(),
+        found => format!(
+            "the serial devices here are {}",
+            found.iter().map(|n| format!("/dev/{n}")).collect::<Vec<_>>().join(", ")
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WAIT: Duration = Duration::from_secs(10);
+
+    fn link(pty: &Pty, baud: u32) -> SerialLink {
+        SerialLink::connect("test", pty.path(), baud, WAIT).unwrap()
+    }
+
+    /// Lines that end with `\n`.
+    fn scan(bytes: &[u8]) -> Scan<Vec<u8>> {
+        match bytes.iter().position(|b| *b == b'\n') {
+            Some(end) => Scan::Take(end + 1, bytes[..end].to_vec()),
+            None => Scan::More,
+        }
+    }
+
+    #[test]
+    fn every_byte_goes_through_as_it_is() {
+        let pty = Pty::open().unwrap();
+        let mut link = link(&pty, 115_200);
+        let bytes: Vec<u8> = (0..=255).collect();
+        link.send(&bytes).unwrap();
+        let mut got = Vec::new();
+        let mut room = [0; 100];
+        while got.len() < bytes.len() {
+            let n = pty.read(&mut room, WAIT).unwrap();
+            assert!(n > 0, "after {} bytes", got.len());
+            got.extend_from_slice(&room[..n]);
+        }
+        assert_eq!(got, bytes);
+        assert_eq!(pty.write(&bytes).unwrap(), 256);
+        let all = |bytes: &[u8]| if bytes.len() < 256 { Scan::More } else { Scan::Take(256, bytes.to_vec()) };
+        assert_eq!(link.receive(WAIT, all), Ok(bytes));
+    }
+
+    #[test]
+    fn frames_arrive_in_pieces() {
+        let pty = Pty::open().unwrap();
+        let mut link = link(&pty, 9600);
+        for piece in ["on", "e\ntw", "o\nth"] {
+            pty.write(piece.as_bytes()).unwrap();
+        }
+        assert_eq!(link.receive(WAIT, scan), Ok(b"one".to_vec()));
+        assert_eq!(link.receive(WAIT, scan), Ok(b"two".to_vec()));
+        let late = link.receive(Duration::from_millis(20), scan);
+        assert!(matches!(late, Err(AdapterError::Timeout(_))), "{late:?}");
+        pty.write(b"ree\n").unwrap();
+        assert_eq!(link.receive(WAIT, scan), Ok(b"three".to_vec()), "a timeout loses nothing");
+    }
+
+    #[test]
+    fn the_line_is_raw_and_has_any_rate() {
+        let pty = Pty::open().unwrap();
+        for baud in [9600, 57_600, 250_000, 1_000_000, 1_234_567] {
+            let link = link(&pty, baud);
+            let settings = tcgetattr(&link).unwrap();
+            assert_eq!((settings.input_speed(), settings.output_speed()), (baud, baud));
+            let modes = settings.control_modes;
+            assert!(modes.contains(ControlModes::CS8 | ControlModes::CREAD | ControlModes::CLOCAL), "{modes:?}");
+            let bad = ControlModes::PARENB | ControlModes::CSTOPB | ControlModes::CRTSCTS | ControlModes::HUPCL;
+            assert!(!modes.intersects(bad), "{modes:?}");
+        }
+    }
+
+    #[test]
+    fn a_second_program_is_refused_until_the_first_ends() {
+        let pty = Pty::open().unwrap();
+        let first = link(&pty, 9600);
+        let error = SerialLink::connect("test", pty.path(), 9600, WAIT).unwrap_err().to_string();
+        assert_eq!(error, format!("cannot open serial device {} for test: another program uses it", pty.path()));
+        drop(first);
+        link(&pty, 9600);
+    }
+
+    #[test]
+    fn bytes_from_before_the_opening_are_thrown_away() {
+        let pty = Pty::open().unwrap();
+        pty.write(b"old\n").unwrap();
+        let mut link = link(&pty, 9600);
+        pty.write(b"new\n").unwrap();
+        assert_eq!(link.receive(WAIT, scan), Ok(b"new".to_vec()));
+    }
+
+    #[test]
+    fn an_unplugged_device_is_an_io_error_both_ways() {
+        let pty = Pty::open().unwrap();
+        let mut link = link(&pty, 9600);
+        drop(pty);
+        let gone = AdapterError::Io(format!(
+            "the connection to {} broke: the serial device is gone (unplugged?)",
+            link.peer()
+        ));
+        assert_eq!(link.receive(WAIT, scan), Err(gone.clone()));
+        assert_eq!(link.send(b"x"), Err(gone));
+    }
+
+    #[test]
+    fn a_peer_that_reads_nothing_does_not_block_forever() {
+        let pty = Pty::open().unwrap();
+        let mut link = SerialLink::connect("test", pty.path(), 9600, Duration::from_millis(20)).unwrap();
+        let result = (0..1000).try_for_each(|_| link.send(&[0; 4096]));
+        assert!(matches!(result, Err(AdapterError::Timeout(_))), "{result:?}");
+    }
+
+    #[test]
+    fn an_endless_frame_is_an_error_not_a_hang() {
+        let pty = Pty::open().unwrap();
+        let mut link = link(&pty, 9600);
+        let mut feed = || {
+            pty.write(&[b'x'; 512]).unwrap();
+            link.receive::<()>(Duration::from_millis(1), |_| Scan::More)
+        };
+        let ended = |result: &AdapterResult<()>| !matches!(result, Err(AdapterError::Timeout(_)));
+        let result = (0..100).map(|_| feed()).find(ended).unwrap();
+        assert!(matches!(result, Err(AdapterError::Protocol(_))), "{result:?}");
+    }
+
+    #[test]
+    fn failures_say_what_to_do() {
+        let error = |path| SerialLink::connect("test", path, 9600, WAIT).unwrap_err().to_string();
+        let missing = error("/dev/ttyUSB77");
+        assert!(
+            missing.starts_with("cannot open serial device /dev/ttyUSB77 for test: there is no such device\nhint: ")
+        );
+        assert_eq!(error("/dev/null"), "cannot open serial device /dev/null for test: it is no serial device");
+        assert!(why_not(Errno::ACCESS).contains("\nhint: ") && why_not(Errno::ACCESS).contains("dialout"));
+    }
+}

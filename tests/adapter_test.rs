@@ -1,0 +1,170 @@
+//! `dimos adapter test` with the real binary, against emulators that note every byte they are sent.
+
+#[allow(dead_code, reason = "shared with other tests")]
+#[path = "support/program.rs"]
+mod program;
+
+use dimos::hardware::arms::yourarm::emulator::wire::Request;
+use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::hardware::registry::Emulator;
+use dimos::hardware::sim::faults::{Fault, FaultKind};
+use program::Home;
+use rustix::process::Signal;
+
+/// Pose at power-up [deg], as it goes over the wire.
+const START: [f32; 6] = [0.0, -17.188734, 34.377468, 0.0, 45.836624, 0.0];
+
+/// An arm at an address, as far as the program can tell.
+fn arm(options: &SimOptions) -> (YourArmEmulator, String) {
+    let emulator = YourArmEmulator::with(options).unwrap();
+    emulator.record();
+    let address = emulator.address();
+    (emulator, address)
+}
+
+fn requests(emulator: &YourArmEmulator) -> Vec<Request> {
+    emulator.trace().iter().map(|received| received.request).collect()
+}
+
+#[test]
+fn the_whole_suite_runs_on_the_emulator() {
+    let home = Home::new();
+    let report = home.dimos("adapter test yourarm --address sim --report r.md --json").with(0).json();
+    assert_eq!((&report["simulated"], &report["passed"]), (&true.into(), &true.into()));
+    let checks = report["checks"].as_array().unwrap();
+    let count = |outcome: &str| checks.iter().filter(|check| check["outcome"] == outcome).count();
+    assert_eq!(count("failed"), 0, "{checks:#?}");
+    assert!(count("passed") >= 45, "{checks:#?}");
+    assert!(report["figures"]["rate"].as_f64().unwrap() > 20.0);
+    assert_eq!(report["arm"]["serial"], "YA6-00042");
+    let text = std::fs::read_to_string(home.path().join("r.md")).unwrap();
+    for part in ["# yourarm SIMULATED", "0 failed", "| passed | stop_ends_motion |", "- serial: YA6-00042"] {
+        assert!(text.contains(part), "no {part:?} in\n{text}");
+    }
+    let mock = home.dimos("adapter test mock --dof 2 --only stop --json").with(0).json();
+    assert_eq!((&mock["simulated"], &mock["arm"]["dof"]), (&false.into(), &2.into()));
+}
+
+#[test]
+fn a_real_arm_is_only_read() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let ended = home.dimos(&format!("adapter test yourarm --address {address}")).with(0);
+    for part in ["yourarm at 127.0.0.1:", "firmware     2.1.3", "nothing was moved", "skipped  36 more"] {
+        assert!(ended.out.contains(part), "no {part:?} in\n{}", ended.out);
+    }
+    let asked = requests(&emulator);
+    assert!(asked.len() > 50);
+    let harmless = |request: &Request| matches!(request, Request::Hello | Request::GetState);
+    assert!(asked.iter().all(harmless), "{:?}", asked.iter().find(|request| !harmless(request)));
+}
+
+#[test]
+fn the_small_motion_stays_small_and_leaves_the_arm_as_it_was() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let line = format!("adapter test yourarm --address {address} --only row --allow-motion --yes --json");
+    let report = home.dimos(&line).with(0).json();
+    let ways = report["motion"]["ways"].as_array().unwrap();
+    assert_eq!(ways.len(), 12, "six joints in two modes: {ways:#?}");
+    for way in ways {
+        let degrees = |field: &str| way[field].as_f64().unwrap().to_degrees();
+        assert!((degrees("up") - 2.0).abs() < 0.3 && (degrees("down") + 2.0).abs() < 0.3, "{way}");
+        assert!(degrees("back").abs() < 0.3 && degrees("others") < 0.01, "{way}");
+    }
+    assert_eq!(report["motion"]["left"], "motors off, as they were found");
+    let mut moves = 0;
+    for request in requests(&emulator) {
+        let target = match request {
+            Request::MoveJoints(speed, target) => {
+                assert!(speed <= 5.001, "{speed} % of the top speed");
+                target
+            }
+            Request::ServoJoints(target) => target,
+            Request::VelocityJoints(_) | Request::MoveCartesian(..) | Request::Gripper(_) => panic!("{request:?}"),
+            _ => continue,
+        };
+        moves += 1;
+        let off: Vec<f32> = target.iter().zip(START).map(|(a, b)| (a - b).abs()).collect();
+        assert!(off.iter().all(|off| *off < 2.01), "{target:?}");
+        assert!(off.iter().filter(|off| **off > 0.01).count() <= 1, "more than one joint: {target:?}");
+    }
+    assert!(moves > 100, "{moves} moves");
+    assert!(!emulator.enabled());
+}
+
+#[test]
+fn nobody_to_ask_no_motion() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let line = format!("adapter test yourarm --address {address} --only row --allow-motion");
+    home.dimos(&line).with(2).says(&["will come on", "E-stop", "no terminal", "hint: add --yes"]);
+    assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
+    home.dimos(&format!("adapter test yourarm --address {address} --yes")).with(2);
+}
+
+#[test]
+fn an_interruption_stops_the_arm() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let test = home.start(&format!("adapter test yourarm --address {address} --only row --allow-motion --yes"));
+    test.until("joint 2 in position mode");
+    let ended = test.end(Signal::INT).with(130);
+    assert!(ended.out.contains("interrupted; stopped there"), "{}", ended.out);
+    let asked = requests(&emulator);
+    let last = asked.iter().rposition(Request::moves).unwrap();
+    assert!(asked[last..].contains(&Request::Stop), "{:?}", &asked[last..]);
+    assert!(!emulator.enabled());
+    let before = emulator.joints().0;
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    assert_eq!(emulator.joints().0, before);
+}
+
+#[test]
+fn an_error_in_motion_ends_it() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let test = home.start(&format!("adapter test yourarm --address {address} --only row --allow-motion --yes"));
+    test.until("joint 3 in position mode");
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(2)).unwrap();
+    let ended = test.wait().with(1).says(&["error: ", "the motion was ODD and was stopped"]);
+    assert!(ended.out.contains("ODD: error 2: collision detected; stopped there"), "{}", ended.out);
+    let asked = requests(&emulator);
+    let last = asked.iter().rposition(Request::moves).unwrap();
+    assert!(asked[last..].contains(&Request::Stop), "{:?}", &asked[last..]);
+}
+
+#[test]
+fn a_pose_too_near_a_limit_is_refused() {
+    let near = SimOptions { initial_positions: vec![0.0, 0.0, 149.0_f64.to_radians(), 0.0, 0.0, 0.0], faults: vec![] };
+    let (emulator, address) = arm(&near);
+    let home = Home::new();
+    let line = format!("adapter test yourarm --address {address} --only row --allow-motion --yes");
+    home.dimos(&line).with(1).says(&["joint 3 at 149.00° has 1.00° to its upper limit", "hint: bring the arm"]);
+    assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
+}
+
+#[test]
+fn what_is_wrong_is_said_with_its_exit_code() {
+    let home = Home::new();
+    let dimos = |line: &str| home.dimos(line);
+    dimos("adapter test yourarm").with(2).says(&["needs --address", "--address sim"]);
+    dimos("adapter test yuorarm --address sim").with(2).says(&["mock, yourarm", "did you mean yourarm?"]);
+    dimos("adapter test yourarm --address a:b:c").with(2).says(&["--address a:b:c", "HOST[:PORT]"]);
+    dimos("adapter test yourarm --address sim --option sped=1").with(2).says(&["unknown field `sped`"]);
+    dimos("adapter test yourarm --address sim --dof 7").with(2).says(&["6 joints, not 7"]);
+    dimos("adapter test yourarm --address sim --only xyzzy").with(2).says(&["stop_ends_motion"]);
+    dimos("adapter test yourarm --address 127.0.0.1:1").with(3).says(&["127.0.0.1:1", "hint: is it powered"]);
+
+    let (emulator, address) = arm(&SimOptions::default());
+    let run = home.run(&format!("coordinator-yourarm --no-record --set hardware.arm.address={address}"));
+    let taken = dimos(&format!("adapter test yourarm --address {address}")).with(3);
+    taken.says(&["is in use by process", "hint: end the run first"]);
+    run.end(Signal::TERM);
+    dimos(&format!("adapter test yourarm --address {address} --only row")).with(0);
+    // When the arm has been reached and its state was watched, another one answers.
+    emulator.inject(Fault::new(FaultKind::WrongModel).at(1.9).lasting(60.0)).unwrap();
+    let failed = dimos(&format!("adapter test yourarm --address {address}")).with(1).says(&["checks passed, "]);
+    assert!(failed.out.contains("connect: yourarm at 127.0.0.1"), "{}", failed.out);
+    assert!(failed.out.contains("failed   reads_agree"), "{}", failed.out);
+}
