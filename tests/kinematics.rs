@@ -1,7 +1,9 @@
 //! Frames, Jacobians and inverse kinematics of real arms; Pinocchio is the judge.
 
+#[path = "support/python.rs"]
+mod python;
 #[path = "support/shared.rs"]
-mod support;
+mod shared;
 
 use std::collections::HashMap;
 
@@ -11,13 +13,14 @@ use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::RobotModel;
 use dimos::robot::random::Random;
 use dimos::robot::urdf::from_text;
+use python::ask_python;
 use serde_json::json;
-use support::{ask_python, shared};
+use shared::shared;
 
 const ARMS: [(&str, &str); 4] = [("panda", "fer_hand"), ("xarm6", "link6"), ("xarm7", "link7"), ("piper", "link6")];
 
 fn arm(name: &str) -> Option<(std::path::PathBuf, RobotModel)> {
-    let path = shared(&format!("models/{name}/{name}.urdf"))?;
+    let path = shared(&format!("models/{name}"))?.join(format!("{name}.urdf"));
     let model = from_text(name, &std::fs::read_to_string(&path).unwrap()).unwrap();
     Some((path, model))
 }

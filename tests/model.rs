@@ -9,7 +9,6 @@ use dimos::robot::urdf::Meshes;
 use dimos::robot::{Geometry, Link, RobotModel, Source, builtin, load};
 use nalgebra::{Isometry3, Point3, Vector3};
 
-#[allow(dead_code, reason = "shared with other tests")]
 #[path = "support/shared.rs"]
 mod support;
 

@@ -3,8 +3,10 @@
 #[path = "../benches/planning/problems.rs"]
 #[allow(dead_code, reason = "shared with the benchmark")]
 mod problems;
+#[path = "support/python.rs"]
+mod python;
 #[path = "support/shared.rs"]
-mod support;
+mod shared;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -22,8 +24,9 @@ use dimos::robot::packages::Packages;
 use dimos::robot::random::Random;
 use dimos::trajectory::{Cursor, Sample, Spline};
 use problems::{Arm, Problem, Shapes, load};
+use python::ask_python;
 use serde_json::json;
-use support::{ask_python, shared};
+use shared::shared;
 
 /// The sphere model of the Panda with every 40th problem.
 fn panda() -> Option<(Arm, Vec<Problem>)> {
@@ -212,7 +215,8 @@ fn jerk_stays_within_its_limits_and_speed_scales_the_whole() {
 
 #[test]
 fn straight_lines_are_straight_and_end_where_they_must() {
-    let Some(path) = shared("models/xarm6/xarm6.urdf") else { return };
+    let Some(folder) = shared("models/xarm6") else { return };
+    let path = folder.join("xarm6.urdf");
     let model = dimos::robot::urdf::from_text("xarm6", &std::fs::read_to_string(path).unwrap()).unwrap();
     let tip = model.link_index("link6").unwrap();
     let joints = model.chain(0, tip).unwrap().into_iter().filter(|&j| model.joints[j].is_independent());

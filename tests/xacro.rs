@@ -1,7 +1,6 @@
 //! xacro against the original: every case of `../shared/xacro` must come to the same XML tree, or fail for the same
 //! cause.
 
-#[allow(dead_code, reason = "shared with other tests")]
 #[path = "support/shared.rs"]
 mod support;
 

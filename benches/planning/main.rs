@@ -1,8 +1,10 @@
 //! How long it takes to plan, over a file of problems.
 //!
 //! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR]
-//! [--level exact] [--shapes true|vamp] [--seed N] [--limit N] [--out FILE.json]`
+//! [--level exact] [--shapes true|vamp] [--seed N] [--limit N] [--out FILE.json]`; `--ik LINK --urdf FILE` and
+//! `--timing` measure those parts alone.
 
+mod parts;
 mod problems;
 
 #[path = "../support/machine.rs"]
@@ -16,8 +18,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use dimos::collision::{ExactChecker, Resolution, Stop};
+use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use dimos::planning::planner::{Plan, PlanError, PlanSettings, plan};
+use dimos::planning::timing::{TimingSettings, bounds, time};
 use problems::{Arm, Problem, Shapes, load, packages};
 use serde::Serialize;
 
@@ -54,6 +57,12 @@ struct Arguments {
     /// Where the rows go.
     #[arg(long, value_name = "FILE.json")]
     out: Option<PathBuf>,
+    /// Solve random poses of this link as well.
+    #[arg(long, value_name = "LINK")]
+    ik: Option<String>,
+    /// Time random paths as well.
+    #[arg(long)]
+    timing: bool,
     /// Given by cargo.
     #[arg(long, hide = true)]
     bench: bool,
@@ -83,6 +92,7 @@ struct Row {
     /// Processor time of this thread: what `total_us` would be on an idle machine.
     cpu_us: Option<f64>,
     looks: Option<u64>,
+    timing_us: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<String>,
 }
@@ -99,11 +109,21 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     machine::print();
-    let (Some(problems), Some(urdf)) = (&arguments.problems, &arguments.urdf) else {
-        return Err("--problems and --urdf are needed".into());
-    };
+    let nothing = arguments.problems.is_none() && arguments.ik.is_none();
+    if arguments.timing || nothing {
+        parts::timing(if arguments.quick { 5 } else { 100 }, arguments.seed)?;
+    }
+    if nothing {
+        println!("nothing else to do: --problems FILE.jsonl or --ik LINK, with --urdf FILE");
+        return Ok(());
+    }
+    let urdf = arguments.urdf.as_ref().ok_or("--urdf is needed")?;
     let began = Instant::now();
     let arm = Arm::load(urdf, arguments.srdf.as_deref(), packages(&arguments.package)?)?;
+    if let Some(tip) = &arguments.ik {
+        parts::ik(arm.model(), tip, if arguments.quick { 200 } else { 20_000 }, arguments.seed)?;
+    }
+    let Some(problems) = &arguments.problems else { return Ok(()) };
     let problems = load(problems, arguments.limit)?;
     println!("loaded    {} problems and {} in {:.0?}", problems.len(), arm.model().name, began.elapsed());
     let rows = problems.iter().map(|p| solve(&arm, p, arguments)).collect::<Result<Vec<_>, _>>()?;
@@ -124,8 +144,20 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let settings = PlanSettings { seed: arguments.seed, ..PlanSettings::default() };
     let stop = Stop::new(Some(began + Duration::from_secs_f64(arguments.timeout)), None);
     let found = plan(&mut checker, start, &[goal.to_vec()], &settings, &stop);
-    let total = began.elapsed();
-    Ok(row(problem, found, total, cpu_time().saturating_sub(cpu)))
+    let (total, cpu) = (began.elapsed(), cpu_time().saturating_sub(cpu));
+    let mut row = row(problem, found, total, cpu);
+    if let Some(path) = &row.path {
+        let bounds = bounds(kinematics.names(), kinematics.limits())?;
+        let free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &Stop::never());
+        let began = Instant::now();
+        let timed = time(kinematics.names(), path, &bounds, &TimingSettings::default(), free);
+        row.timing_us = Some(began.elapsed().as_secs_f64() * 1e6);
+        match timed {
+            Ok(timed) => row.duration_s = Some(timed.duration),
+            Err(error) => eprintln!("{} {}: {error}", row.problem, row.index),
+        }
+    }
+    Ok(row)
 }
 
 fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: Duration) -> Row {
@@ -143,6 +175,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
             duration_s: None,
             cpu_us: Some(us(cpu)),
             looks: Some(plan.looks),
+            timing_us: None,
             path: Some(plan.path),
             why: None,
         },
@@ -162,6 +195,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
                 path: None,
                 cpu_us: None,
                 looks: None,
+                timing_us: None,
                 why,
             }
         }
@@ -204,6 +238,12 @@ fn report(rows: &[Row], level: &Level) {
         );
     }
     let cpu = |q| quantile(rows.iter().filter_map(|r| r.cpu_us).collect(), q) / 1e3;
+    let timing: Vec<f64> = rows.iter().filter_map(|r| r.timing_us).map(|us| us / 1e3).collect();
+    println!(
+        "\ntiming, re-checks included: median {:.3} ms, p95 {:.3} ms",
+        quantile(timing.clone(), 0.5),
+        quantile(timing, 0.95)
+    );
     let mut looks: Vec<f64> = rows.iter().filter_map(|r| r.looks).map(|n| n as f64).collect();
     looks.sort_by(f64::total_cmp);
     println!(

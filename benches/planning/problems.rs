@@ -72,7 +72,7 @@ impl Arm {
     pub fn load(urdf: &Path, srdf: Option<&Path>, packages: Packages) -> Result<Self, Box<dyn Error>> {
         let text = fs::read_to_string(urdf).map_err(|e| format!("{}: {e}", urdf.display()))?;
         let mut tree = Tree::new();
-        let source = tree.add_source(&urdf.display().to_string(), &text);
+        let source = tree.add_source(urdf.display().to_string(), &text);
         let resolve = |uri: &str| packages.resolve(uri, urdf.parent().unwrap_or(Path::new(".")));
         let root = parse(&mut tree, source);
         let model = root.and_then(|d| read(&d.root, &mut tree, &Calls::default(), Meshes::Find, &resolve));
@@ -191,5 +191,5 @@ pub fn packages(arguments: &[String]) -> Result<Packages, Box<dyn Error>> {
 fn shared_prefix(names: &[&str]) -> usize {
     let first = names.first().copied().unwrap_or_default();
     let ends = first.match_indices(['_', '/', '-']).map(|(at, _)| at + 1);
-    ends.filter(|&end| names.iter().all(|n| n.starts_with(&first[..end]))).last().unwrap_or(0)
+    ends.filter(|&end| names.iter().all(|n| n.starts_with(&first[..end]))).max().unwrap_or(0)
 }

@@ -232,7 +232,7 @@ fn stretch(points: &mut [TrajectoryPoint], factor: f64) {
     }
 }
 
-/// Asks about the motion as it will be sampled: between four samples in each of the trajectory's segments.
+/// Asks about the motion as it will be sampled: between two samples in each of the trajectory's segments.
 fn free_throughout(
     trajectory: &JointTrajectory,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
@@ -243,7 +243,7 @@ fn free_throughout(
     let mut from: Vec<f64> = trajectory.points.first().map(|p| p.positions.clone()).unwrap_or_default();
     let mut to = from.clone();
     for pair in spline.times().windows(2) {
-        for k in [0.25, 0.5, 0.75, 1.0] {
+        for k in [0.5, 1.0] {
             spline.sample(pair[0] + (pair[1] - pair[0]) * k, &mut cursor, &mut samples);
             to.iter_mut().zip(&samples).for_each(|(q, s)| *q = s.position);
             if !free(&from, &to) {

@@ -1,40 +1,14 @@
-//! Material that lies beside the checkout, and Python tools: used where they are, else said.
+//! Test data that lies beside the checkout and is not part of it.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
-fn missing(what: &str) {
-    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{what} is missing");
-    println!("SKIPPED: {what}");
-}
-
-/// A path below `../shared`, if it is there.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let at = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared").join(path);
-    if !at.exists() {
-        missing(&format!("../shared ({path})"));
-        return None;
+/// A folder of `../shared`; `None` after saying that it is not there.
+pub fn shared(name: &str) -> Option<PathBuf> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().join("shared").join(name);
+    if folder.is_dir() {
+        return Some(folder);
     }
-    Some(at)
-}
-
-/// What a script of `tests/readers` says to some JSON; nothing where its Python packages are not installed.
-pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> Option<serde_json::Value> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = root.join(".venv/bin/python");
-    let has = Command::new(&python).args(["-c", &format!("import {module}")]).stderr(Stdio::null()).status();
-    if !has.is_ok_and(|s| s.success()) {
-        missing(&format!("Python's {module} (make test-tools)"));
-        return None;
-    }
-    let script = root.join("tests/readers").join(script);
-    let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-    let mut input = child.stdin.take().unwrap();
-    let text = question.to_string();
-    let writer = std::thread::spawn(move || input.write_all(text.as_bytes()).unwrap());
-    let output = child.wait_with_output().unwrap();
-    writer.join().unwrap();
-    assert!(output.status.success(), "the script failed");
-    Some(serde_json::from_slice(&output.stdout).unwrap())
+    println!("SKIPPED: ../shared ({name})");
+    assert!(std::env::var_os("DIMOS_NO_SKIP").is_none_or(|v| v != "1"), "../shared/{name} is not there");
+    None
 }
