@@ -20,3 +20,6 @@ mod smooth;
 pub mod timing;
 pub mod topp;
 pub mod verify;
+
+#[cfg(test)]
+mod tests;
