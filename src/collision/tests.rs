@@ -159,7 +159,7 @@ fn what_always_touches_is_named() {
 fn what_is_proven_free_is_free_between_samples() {
     let mut random = Random::new(21);
     let (mut free, mut blocked) = (0, 0);
-    for round in 0..30 {
+    for round in 0..12 {
         let mut balls = Vec::new();
         for i in 0..6 {
             let at = DVec3::new(random.between(-0.9, 0.9), random.between(-0.9, 0.9), 0.1);
@@ -171,7 +171,7 @@ fn what_is_proven_free_is_free_between_samples() {
             let mut q = || -> Vec<f64> { (0..3).map(|_| random.between(-3.0, 3.0)).collect() };
             let (a, b) = (q(), q());
             let said = checker.motion_is_free(&a, &b, &Stop::never());
-            let steps = 4000;
+            let steps = 1500;
             let mut touches = (0..=steps).filter(|k| {
                 let t = f64::from(*k) / f64::from(steps);
                 let at: Vec<f64> = a.iter().zip(&b).map(|(a, b)| a + (b - a) * t).collect();
@@ -186,7 +186,7 @@ fn what_is_proven_free_is_free_between_samples() {
             }
         }
     }
-    assert!(free > 100 && blocked > 100, "{free} {blocked}");
+    assert!(free > 40 && blocked > 40, "{free} {blocked}");
 }
 
 #[test]

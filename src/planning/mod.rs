@@ -25,3 +25,6 @@ pub mod solve;
 pub mod timing;
 pub mod topp;
 pub mod verify;
+
+#[cfg(test)]
+mod tests;
