@@ -66,7 +66,8 @@ pub fn measure(adapter: &mut dyn ManipulatorAdapter, time: Duration) -> AdapterR
         match adapter.state_fd() {
             Some(state) => {
                 sends_by_itself = true;
-                wake.wait_or_readable(state, Duration::from_millis(100));
+                // As the device thread does, which also reads when a period has passed without news.
+                wake.wait_or_readable(state, period);
             }
             None => {
                 next = next.after(period).max(MonotonicClock.now());

@@ -43,6 +43,8 @@ pub struct Session {
     owed_since: Option<Mono>,
     /// When the last command was given.
     commanded: Mono,
+    /// When the last cycle was sent.
+    asked: Mono,
     /// The number of the cycle that is not answered yet, if there is one, and the command that waits for its answer:
     /// a peer gets one cycle at a time, and then the newest command.
     cycling: u32,
@@ -152,6 +154,7 @@ impl Session {
             sequence: 1,
             owed_since,
             commanded,
+            asked: Mono::ZERO,
             cycling,
             waiting,
             act,
@@ -175,6 +178,11 @@ impl Session {
         least.max(Duration::from_secs_f64(f64::from(count) / self.description.native_rate))
     }
 
+    /// How often the arm has a new state.
+    fn period(&self) -> Duration {
+        Duration::from_secs_f64(1.0 / self.description.native_rate)
+    }
+
     fn next_number(&mut self) -> u32 {
         self.sequence = self.sequence.wrapping_add(1);
         self.owed_since.get_or_insert(MonotonicClock.now());
@@ -183,6 +191,7 @@ impl Session {
 
     /// Sends a cycle; allocates nothing.
     fn cycle(&mut self, command: Option<Command<'_>>) -> AdapterResult<()> {
+        self.asked = MonotonicClock.now();
         self.cycling = self.next_number();
         protocol::cycle(self.cycling, command, &mut self.line);
         self.link.send(&self.line)
@@ -239,7 +248,10 @@ impl Session {
             Some(since) if now.since(since) > self.late() => {
                 return Ok(Err(self.unanswered()));
             }
-            None if now.since(self.commanded) > COMMANDED => self.cycle(None)?,
+            // A reply wakes who reads: without a pace, an arm at rest would be asked as fast as its peer answers.
+            None if now.since(self.commanded) > COMMANDED && now.since(self.asked) > self.period().mul_f64(0.9) => {
+                self.cycle(None)?;
+            }
             _ => {}
         }
         Ok(self.known())
