@@ -102,7 +102,7 @@ fn max_acceleration() -> f64 {
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectEntry {
-    /// What it is.
+    /// What it is: `box: [x, y, z]`, `sphere: radius`, `cylinder: [radius, length]` [m], `mesh: FILE`, `cloud: FILE`.
     pub shape: Located<ShapeEntry>,
     /// Where its middle is, in the frame `map`.
     #[serde(default)]

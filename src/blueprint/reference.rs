@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::blueprint::json_schema::full_schema;
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
-use crate::blueprint::planner::{PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
+use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, CountedJoints, HardwareEntry, RecordingConfig, RpcConfig, TaskEntry,
 };
@@ -50,7 +50,7 @@ const fn section(title: &'static str, first: &'static str, pointer: &'static str
 const ARMS: &str = "A list of arms, merged by `hardware_id` when blueprints are included.";
 const TASKS: &str = "A list of tasks, merged by `name` when blueprints are included.";
 
-const SECTIONS: [Section; 16] = [
+const SECTIONS: [Section; 17] = [
     section("Top level", "", "", keys::<BlueprintFile>),
     section("`coordinator`", "", "/$defs/CoordinatorConfig", keys::<CoordinatorConfig>),
     section("`hardware[]`", ARMS, "/$defs/HardwareEntry", keys::<HardwareEntry>),
@@ -63,6 +63,7 @@ const SECTIONS: [Section; 16] = [
     section("`planner`", "", "/$defs/PlannerConfig", keys::<PlannerConfig>),
     section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotConfig", keys::<RobotConfig>),
     section("`planner.robots[].base_pose`", "", "/$defs/PoseEntry", keys::<PoseEntry>),
+    section("`planner.world`", "A group of obstacles by name.", "/$defs/ObjectEntry", keys::<ObjectEntry>),
     section("`view`", "", "/$defs/ViewConfig", keys::<ViewConfig>),
     section("`recording`", "", "/$defs/RecordingConfig", keys::<RecordingConfig>),
     section("`rpc`", "", "/$defs/RpcConfig", keys::<RpcConfig>),
@@ -209,7 +210,8 @@ fn kind(value: &Value, schema: &Value) -> String {
             Some(word) => format!("`{word}`"),
             None => kind(choice, schema),
         });
-        let kinds: Vec<String> = kinds.filter(|kind| !kind.is_empty()).collect();
+        let mut kinds: Vec<String> = kinds.filter(|kind| !kind.is_empty()).collect();
+        kinds.dedup();
         return kinds.join(", ");
     }
     let name = match value.get("type") {
