@@ -50,10 +50,11 @@ test-rerun: .venv/readers-installed
 	.venv/bin/rerun analytics disable
 	DIMOS_RERUN=1 cargo test --locked --test readers rerun
 
-# Compute time of a tick, cost per arm, memory, start-up, processor time; what talking to a run costs; how fast logs
+# Compute time of a tick, cost per arm, memory, start-up, processor time; the way to the wire and back; what talking to a
+# run costs; how fast logs
 # are verified.
 bench:
-	cargo bench --locked --bench control --bench rpc --bench verify
+	cargo bench --locked --bench control --bench wire --bench rpc --bench verify
 
 # Lateness of the tick beside cyclictest.
 jitter:

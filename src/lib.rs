@@ -42,9 +42,13 @@ pub mod rt;
 
 pub mod robot;
 
+pub mod collision;
+
 pub mod hardware;
 
 pub mod control;
+
+pub mod planning;
 
 pub mod rpc;
 

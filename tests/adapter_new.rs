@@ -43,7 +43,9 @@ fn cargo_test(folder: &Path) -> PathBuf {
     let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
     println!("{text}");
     assert!(output.status.success(), "cargo test in {}", folder.display());
-    assert!(!text.contains("warning:"), "it does not compile without warnings");
+    // Places in its own files have relative paths; warnings of dimos are told elsewhere.
+    let own = |line: &str| ["--> src/", "--> tests/"].iter().any(|start| line.trim_start().starts_with(start));
+    assert!(!text.lines().any(own), "it does not compile without warnings");
     programs.to_owned()
 }
 

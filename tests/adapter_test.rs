@@ -12,7 +12,7 @@ use program::Home;
 use rustix::process::Signal;
 
 /// Pose at power-up [deg], as it goes over the wire.
-const START: [f32; 6] = [0.0, -17.188734, 34.377468, 0.0, 45.836624, 0.0];
+const START: [f32; 6] = [0.0, -17.188734, 34.37747, 0.0, 45.836624, 0.0];
 
 /// An arm at an address, as far as the program can tell.
 fn arm(options: &SimOptions) -> (YourArmEmulator, String) {

@@ -147,7 +147,8 @@ fn the_reference_has_the_adapters_options() {
 #[test]
 fn an_adapter_of_another_build_is_told_with_the_way_to_get_it() {
     let absent = Absent { name: "servobot", about: "a serial arm", remedy: "build with --features servobot" };
-    let text = "hardware: [{hardware_id: arm, adapter_type: servobot, joints: {prefix: arm, count: 6}}]";
+    let text = "hardware: [{hardware_id: arm, adapter_type: servobot, joints: {prefix: arm, count: 6}}]\n\
+                tasks: [{name: t, type: trajectory, joint_names: {hardware: arm}}]\n";
     let answer = |registry: &Registry| {
         let found = Found { name: "absent".to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() };
         load_from(&SearchPath::default(), &found, &Overrides::default(), registry).render(false)

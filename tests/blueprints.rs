@@ -29,7 +29,11 @@ fn answer(name: &str) -> String {
 fn shipped_blueprints_have_no_mistakes() {
     let (builtin, fake) = (Registry::builtin(), fake_arms::registry());
     let has_arms = builtin.get("yourarm").is_some() && builtin.get("mock").is_some();
-    for name in ["coordinator-yourarm", "coordinator-mock", "coordinator-dual-mock"] {
+    let mut names = vec!["coordinator-yourarm", "coordinator-mock", "coordinator-dual-mock"];
+    if cfg!(feature = "can") {
+        names.extend(["coordinator-piper", "coordinator-piper-xarm"]);
+    }
+    for name in names {
         let adapters = if has_arms { &builtin } else { &fake };
         let loaded = load(&find(name).unwrap(), &Overrides::default(), adapters);
         assert_eq!(loaded.render(false), "", "{name}");

@@ -137,7 +137,7 @@ fn two_arms_on_two_interfaces_do_not_hear_each_other() {
             let there = |(arm, target): (&mut PiperAdapter, &[f64; 6])| {
                 arm.read_joints(&mut reading).is_ok() && near(&reading.position, target)
             };
-            arms.iter_mut().zip(&targets).map(there).fold(true, |all, one| all && one)
+            arms.iter_mut().zip(&targets).all(there)
         });
         for (emulator, target) in emulators.iter().zip(&targets) {
             assert!(near(&emulator.joints().0, target));

@@ -13,6 +13,7 @@ mod load;
 pub mod params;
 pub mod planner;
 mod planner_check;
+mod planner_files;
 mod range;
 mod reference;
 mod registry;

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::range::positive;
-use crate::yaml::{Keyed, Located, Raw, Text};
+use crate::blueprint::range::{non_negative, positive};
+use crate::yaml::{Keyed, Located, Text};
 
 /// Motion planning.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
@@ -18,16 +18,15 @@ pub struct PlannerConfig {
     pub planning_timeout: f64,
     /// The robots that are planned for.
     pub robots: Vec<Located<RobotConfig>>,
-    /// Obstacles that are there from the start, by name.
-    #[schemars(with = "serde_json::Map<String, serde_json::Value>")]
-    pub world: BTreeMap<String, Raw>,
+    /// Obstacles that are there from the start, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0, 0]}}`.
+    pub world: Keyed<Located<ObjectEntry>>,
     /// The same as the section `view`; only one of the two may be given.
     pub visualization: Option<Located<ViewConfig>>,
 }
 
 impl Default for PlannerConfig {
     fn default() -> Self {
-        Self { planning_timeout: 10.0, robots: Vec::new(), world: BTreeMap::new(), visualization: None }
+        Self { planning_timeout: 10.0, robots: Vec::new(), world: Keyed::default(), visualization: None }
     }
 }
 
@@ -37,7 +36,7 @@ impl Default for PlannerConfig {
 pub struct RobotConfig {
     /// Unique name of the robot: letters, digits, `_` and `-`.
     pub name: Located<String>,
-    /// The robot's `.urdf` or `.xacro` file.
+    /// The robot's `.urdf` or `.xacro` file, as seen from this file; or `builtin:NAME`, a description in the box.
     pub model_path: Located<String>,
     /// Folders that `package://NAME` stands for, by name.
     #[serde(default)]
@@ -97,6 +96,37 @@ fn max_velocity() -> f64 {
 
 fn max_acceleration() -> f64 {
     2.0
+}
+
+/// An obstacle.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectEntry {
+    /// What it is.
+    pub shape: Located<ShapeEntry>,
+    /// Where its middle is, in the frame `map`.
+    #[serde(default)]
+    pub pose: Located<PoseEntry>,
+    /// How much it is thickened all around [m].
+    #[serde(default, deserialize_with = "non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub padding: f64,
+}
+
+/// Shape of an obstacle: one of these. A cylinder stands along z.
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ShapeEntry {
+    /// Edge lengths x, y, z [m].
+    Box([f64; 3]),
+    /// Radius [m].
+    Sphere(f64),
+    /// Radius and length [m].
+    Cylinder([f64; 2]),
+    /// A mesh file (STL, OBJ, DAE), as seen from this file.
+    Mesh(String),
+    /// A point cloud file (PLY), as seen from this file.
+    Cloud(String),
 }
 
 /// A pose.

@@ -1,7 +1,7 @@
 //! Checks what `planner`, `view` and `assets` refer to.
 
 use crate::blueprint::arms::Found;
-use crate::blueprint::planner::{PlannerConfig, RobotConfig, ViewConfig};
+use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ShapeEntry, ViewConfig};
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{AssetEntry, JointNames, TaskEntry};
 use crate::yaml::{Diag, Keyed, Located, did_you_mean, quote};
@@ -29,15 +29,33 @@ pub(super) fn check(
                 checker.error(robot.name.at, diag.hint("give each robot a name of its own"));
             }
         }
-        pose(checker, robot);
+        pose(checker, &robot.base_pose);
         let task = task(checker, robot, tasks);
         joints(checker, robot, found, task);
         named_poses(checker, robot);
     }
+    for (name, entry) in &planner.world.0 {
+        object(checker, name, entry);
+    }
 }
 
-fn pose(checker: &mut Checker<'_>, robot: &RobotConfig) {
-    let pose = &robot.base_pose;
+/// Objects of the world: names, poses, sizes.
+fn object(checker: &mut Checker<'_>, name: &Located<String>, object: &Located<ObjectEntry>) {
+    checker.check_name(name, "object's name");
+    pose(checker, &object.pose);
+    let sizes: &[f64] = match &object.shape.value {
+        ShapeEntry::Box(size) => size,
+        ShapeEntry::Sphere(radius) => std::slice::from_ref(radius),
+        ShapeEntry::Cylinder(size) => size,
+        ShapeEntry::Mesh(_) | ShapeEntry::Cloud(_) => &[],
+    };
+    if let Some(size) = sizes.iter().find(|size| !(**size > 0.0 && size.is_finite())) {
+        let diag = Diag::error(format!("a size of the shape is {size}"));
+        checker.error(object.shape.at, diag.hint("sizes are above 0, in metres"));
+    }
+}
+
+fn pose(checker: &mut Checker<'_>, pose: &Located<PoseEntry>) {
     if pose.rpy.is_some() && pose.quat.is_some() {
         let diag = Diag::error("`rpy` and `quat` both give the orientation");
         checker.error(pose.at, diag.hint("remove one of the two"));

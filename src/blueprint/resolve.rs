@@ -4,12 +4,13 @@ use serde::Serialize;
 
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
-use crate::blueprint::planner::{PlannerConfig, ViewConfig};
+use crate::blueprint::planner::ViewConfig;
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
 };
-use crate::blueprint::{arms, planner_check, tasks};
+use crate::blueprint::{arms, planner_check, planner_files, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::planning::config::PlannerConfig;
 use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
 
 /// A blueprint without mistakes.
@@ -25,7 +26,7 @@ pub struct Blueprint {
     pub arms: Vec<Arm>,
     /// The tasks, in the blueprint's order.
     pub tasks: Vec<Task>,
-    /// Motion planning, as typed; names in it have been checked.
+    /// Motion planning. Its files have not been read yet.
     pub planner: Option<PlannerConfig>,
     /// The live view, given as `view` or as `planner.visualization`.
     pub view: Option<ViewConfig>,
@@ -182,8 +183,8 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     if let Some(planner) = &file.planner {
         planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
     }
-    let planner = file.planner.map(|p| p.value);
-    let view = file.view.or_else(|| planner.as_ref().and_then(|p| p.visualization.clone()));
+    let planner = file.planner.as_ref().map(|planner| planner_files::resolve(&checker, planner));
+    let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     Blueprint {
         name: name.value,
         description: file.description,

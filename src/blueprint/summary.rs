@@ -129,7 +129,7 @@ impl Summary {
             priority: task.priority,
             auto_start: task.auto_start,
         });
-        let robots = blueprint.planner.iter().flat_map(|p| p.robots.iter().map(|r| r.name.value.clone()));
+        let robots = blueprint.planner.iter().flat_map(|p| p.robots.iter().map(|r| r.name.clone()));
         Self {
             name: blueprint.name.clone(),
             description: blueprint.description.clone(),

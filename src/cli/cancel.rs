@@ -29,7 +29,10 @@ pub fn run(args: &Args) -> Result {
     for (task, status) in &reply.tasks {
         output::line(format_args!("{task}: {status}"));
     }
-    if reply.tasks.is_empty() {
+    if reply.planning {
+        output::line("planning: CANCELLED");
+    }
+    if reply.tasks.is_empty() && !reply.planning {
         output::note("nothing was moving");
     }
     Ok(Exit::Ok)

@@ -1,4 +1,4 @@
-//! `dimos execute FILE`: a trajectory from a file.
+//! `dimos execute`: the newest plan, or a trajectory from a file.
 
 use std::path::PathBuf;
 
@@ -6,7 +6,7 @@ use super::arguments::Target;
 use super::exit::{Exit, Result};
 use super::follow::{Signals, follow};
 use super::{output, trajectory_file};
-use crate::rpc::api::Execute;
+use crate::rpc::api::{Execute, ExecutePlan};
 
 /// Arguments of `execute`.
 #[derive(Debug, clap::Args)]
@@ -15,10 +15,13 @@ JSON: {\"joint_names\":[\"arm_joint1\"],\"points\":[{\"time_from_start\":0,\"pos
 CSV:  a header `time,arm_joint1,…` and, if wanted, `arm_joint1_vel,…`; then one point per line. s, rad, rad/s.
 The first point must be where the arm is.")]
 pub struct Args {
-    /// The trajectory: .json or .csv
-    pub file: PathBuf,
+    /// The trajectory: .json or .csv; without it the newest plan is carried out
+    pub file: Option<PathBuf>,
+    /// Carry out the plan of this number
+    #[arg(long, value_name = "N", conflicts_with = "file")]
+    pub plan: Option<u64>,
     /// The trajectory task to use; without it the one whose joints cover the file's
-    #[arg(long)]
+    #[arg(long, requires = "file")]
     pub task: Option<String>,
     /// Return when the motion has begun
     #[arg(long)]
@@ -30,15 +33,29 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let trajectory = trajectory_file::read(&args.file)?;
+    let trajectory = args.file.as_deref().map(trajectory_file::read).transpose()?;
     let mut client = args.target_run.connect()?;
-    let points = trajectory.points.len();
     let signals = (!args.no_wait).then(Signals::watch);
-    let begun = client.call(Execute { trajectory, task: args.task.clone() })?;
-    output::note(format_args!(
-        "motion {} on {}: {points} points, {:.2} s, not collision-checked",
-        begun.motion, begun.task, begun.duration
-    ));
+    let begun = match trajectory {
+        Some(trajectory) => {
+            let points = trajectory.points.len();
+            let begun = client.call(Execute { trajectory, task: args.task.clone() })?;
+            output::note(format_args!(
+                "motion {} on {}: {points} points, {:.2} s, not collision-checked",
+                begun.motion, begun.task, begun.duration
+            ));
+            begun
+        }
+        None => {
+            let begun = client.call(ExecutePlan { plan: args.plan })?;
+            let (motion, task) = (begun.motion, &begun.task);
+            output::note(format_args!(
+                "motion {motion} on {task}: {:.2} s, planned, collision-checked",
+                begun.duration
+            ));
+            begun
+        }
+    };
     match signals {
         Some(signals) => follow(&mut client, begun.motion, &begun.task, &signals, args.target_run.json),
         None => {

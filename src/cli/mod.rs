@@ -13,12 +13,16 @@ pub mod down;
 pub mod execute;
 pub mod exit;
 mod follow;
+mod goal;
 pub mod list_adapters;
 pub mod list_blueprints;
 pub mod logs;
 pub mod man;
+pub mod model;
 pub mod move_to;
 pub mod output;
+pub mod plan;
+pub mod preview;
 pub mod replay;
 pub mod run;
 pub mod run_record;
@@ -30,6 +34,7 @@ mod targets;
 pub mod task;
 mod text_log;
 mod trajectory_file;
+pub mod world;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -66,9 +71,15 @@ enum Command {
     State(state::Args),
     /// Move an arm to joint positions, and wait until it is there
     Move(move_to::Args),
-    /// Follow a trajectory from a file (JSON or CSV), and wait for its end
+    /// Plan a collision-free motion and show it; moves nothing
+    Plan(plan::Args),
+    /// Show a plan moment by moment, or write its trajectory to a file
+    Preview(preview::Args),
+    /// Carry out the newest plan, or a trajectory from a file (JSON or CSV), and wait for its end
     Execute(execute::Args),
-    /// End running motions by decelerating
+    /// The obstacles that the planner keeps clear of: list, add, move, remove, load, attach, detach
+    World(world::Args),
+    /// End running motions by decelerating, and planning
     Cancel(cancel::Args),
     /// Hold arms at once and keep them held until `arm reset`: an operational stop
     Stop(stop::Args),
@@ -90,6 +101,8 @@ enum Command {
     Check(check::Args),
     /// Print the JSON Schema of blueprints, for editors
     Schema(schema::Args),
+    /// Look into robot descriptions: joints, limits, shapes, mistakes
+    Model(model::Args),
     /// Check this computer: real time, permissions, clock, disk, CAN links
     Doctor(doctor::Args),
     /// Print completions for a shell
@@ -163,7 +176,10 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
         Command::Move(args) => move_to::run(args),
+        Command::Plan(args) => plan::run(args),
+        Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),
+        Command::World(args) => world::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Stop(args) => stop::run(args),
         Command::Arm(args) => arm::run(args),
@@ -177,6 +193,7 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
+        Command::Model(args) => model::run(args),
         Command::Schema(args) => schema::run(args, registry),
         Command::Replay(args) => {
             return match replay::run(args, registry) {

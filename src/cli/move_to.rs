@@ -1,22 +1,28 @@
-//! `dimos move ARM q…`: a direct motion to joint positions.
+//! `dimos move ARM …`: a motion to joint positions, a pose or a named pose. With a planner in the run it is planned and
+//! collision-free; without one it is direct.
 
-use super::arguments::{Target, finite, speed};
-use super::exit::{Exit, Result};
+use super::arguments::Target;
+use super::exit::{Exit, Failure, Result};
 use super::follow::{Signals, follow};
+use super::goal::{Goal, Search, has_planner, plan, show};
 use super::output;
-use crate::rpc::api::{DEFAULT_SPEED, Move};
+use crate::rpc::api::{ExecutePlan, Move};
+use crate::rpc::client::Client;
 
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The arm's hardware_id
+    /// The arm's hardware_id, which is also the robot's name in the planner
     pub arm: String,
-    /// Where its joints shall go [rad], one value per joint
-    #[arg(required = true, value_name = "POSITION", value_parser = finite, allow_negative_numbers = true)]
-    pub target: Vec<f64>,
-    /// Fraction of the velocity and acceleration limits to use, 0.1–1
-    #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
-    pub speed: f64,
+    /// Where it shall go
+    #[command(flatten)]
+    pub goal: Goal,
+    /// How to search
+    #[command(flatten)]
+    pub search: Search,
+    /// Move straight in joint space although the run has a planner: not collision-checked
+    #[arg(long, conflicts_with_all = ["pose", "named"])]
+    pub direct: bool,
     /// Return when the motion has begun
     #[arg(long)]
     pub no_wait: bool,
@@ -28,19 +34,43 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
-    let signals = (!args.no_wait).then(Signals::watch);
-    let begun = client.call(Move { arm: args.arm.clone(), target: args.target.clone(), speed: args.speed })?;
+    let signals = Signals::watch();
+    let planned = !args.direct && has_planner(&mut client)?;
+    let (motion, task, reply) =
+        if planned { plan_and_begin(args, &mut client, &signals)? } else { begin_direct(args, &mut client)? };
+    if !args.no_wait {
+        return follow(&mut client, motion, &task, &signals, args.target_run.json);
+    }
+    if args.target_run.json {
+        output::json(&reply);
+    }
+    Ok(Exit::Ok)
+}
+
+type Begun = (u64, String, serde_json::Value);
+
+fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
+    let request = args.search.plan(vec![args.goal.of(&args.arm, &args.search)]);
+    let planned = plan(client, request, signals)?;
+    if !args.target_run.json {
+        show(&planned);
+    }
+    let begun = client.call(ExecutePlan { plan: Some(planned.plan) })?;
+    output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
+    let reply = serde_json::to_value(&begun).unwrap_or_default();
+    Ok((begun.motion, begun.task, reply))
+}
+
+fn begin_direct(args: &Args, client: &mut Client) -> Result<Begun> {
+    let Some(target) = args.goal.joints() else {
+        let failure = Failure::new(Exit::Failed, "this run has no planner, which poses and names need");
+        return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
+    };
+    let begun = client.call(Move { arm: args.arm.clone(), target: target.to_vec(), speed: args.search.speed })?;
     output::note(format_args!(
         "motion {} on {}: {:.2} s, direct, not collision-checked",
         begun.motion, begun.task, begun.duration
     ));
-    match signals {
-        Some(signals) => follow(&mut client, begun.motion, &begun.task, &signals, args.target_run.json),
-        None => {
-            if args.target_run.json {
-                output::json(&begun);
-            }
-            Ok(Exit::Ok)
-        }
-    }
+    let reply = serde_json::to_value(&begun).unwrap_or_default();
+    Ok((begun.motion, begun.task, reply))
 }

@@ -7,12 +7,20 @@
 //!
 //! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
 
+pub mod builtin;
+mod joint_limits;
+pub mod kinematics;
+mod load;
 pub mod mesh;
 pub mod model;
 pub mod packages;
+pub mod random;
+pub mod srdf;
 pub mod urdf;
+pub mod xacro;
 pub mod xml;
 
+pub use load::{Loaded, Source, load};
 pub use model::{Geometry, Inertial, Joint, JointKind, Limits, Link, MeshFile, Mimic, RobotModel, Shape};
 
 /// A small generator for tests: the same numbers for the same seed.

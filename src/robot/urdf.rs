@@ -1,7 +1,7 @@
 //! URDF → [`RobotModel`]. Everything that is wrong is reported at once, each at its place; tags without meaning here
 //! (`gazebo`, `transmission`, `ros2_control` …) are passed over.
 //!
-//! Read from our own tree and not by a URDF crate, so that mistakes have places: docs/decisions/0017.
+//! Read from our own tree and not by a URDF crate, so that mistakes have places: docs/decisions/0031.
 
 mod numbers;
 mod shapes;

@@ -262,7 +262,9 @@ impl Copy<'_> {
             return Some(Node::Element(self.element(node, depth)));
         }
         if node.is_comment() {
-            return Some(Node::Comment(node.text().unwrap_or_default().to_owned(), at));
+            let text = node.text().unwrap_or_default();
+            // Line ends are one character in XML; the parser sees to that in texts only.
+            return Some(Node::Comment(text.replace("\r\n", "\n").replace('\r', "\n"), at));
         }
         let instruction = node.pi()?;
         Some(Node::Instruction(format!("{} {}", instruction.target, instruction.value.unwrap_or_default())))

@@ -13,6 +13,7 @@ pub use super::arm_api::*;
 use super::error::{Code, RpcError};
 use super::lease::Subject;
 pub use super::motion_api::*;
+pub use super::planner_api::*;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::streams::Streams;
 
@@ -62,7 +63,6 @@ macro_rules! methods {
         /// What comes back: the variant of the same name.
         #[derive(Debug, Clone, PartialEq, Serialize)]
         #[serde(untagged)]
-        #[expect(clippy::large_enum_variant, reason = "a reply is moved a few times and never kept")]
         pub enum Reply { $($(#[$doc])* $variant($reply),)* }
 
         /// Names of all methods, those that the connection itself answers at the end.
@@ -114,6 +114,28 @@ methods! {
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.
     "velocity" Velocity -> Done, check Velocity::valid;
+    /// Plans a collision-free motion. Answers when planning begins; `planning` tells how it goes. Moves nothing.
+    "plan" Plan -> PlanReply, check Plan::valid;
+    /// How planning goes, or what came of it.
+    "planning" Planning -> PlanningReport;
+    /// A plan in full: the trajectory, and the way of the end effectors.
+    "preview" Preview -> PreviewReply;
+    /// Carries out a plan. Answers when the motion begins.
+    "execute_plan" ExecutePlan -> ExecuteReply;
+    /// What the planner is and does.
+    "planner" Planner -> PlannerReport;
+    /// The objects of the planner's world.
+    "world" World -> WorldReport;
+    /// Puts an object into the world, or another one in its place.
+    "world_add" WorldAdd -> Done, check WorldAdd::valid;
+    /// Moves an object of the world.
+    "world_move" WorldMove -> Done, check WorldMove::valid;
+    /// Removes an object of the world, or all.
+    "world_remove" WorldRemove -> Done;
+    /// Lets a robot hold an object, where it is now.
+    "attach" Attach -> Done;
+    /// Lets go of an object: it stays where it is.
+    "detach" Detach -> Done;
     /// Ends the run exactly like SIGTERM: controlled. Answers before it begins.
     "shutdown" Shutdown -> Done;
 }

@@ -34,6 +34,16 @@ pub enum Code {
     UnknownSubscription,
     /// Another connection commands the arm; the refusal names it.
     LeaseHeld,
+    /// The run has no planner.
+    NoPlanner,
+    /// No such robot in the planner.
+    UnknownRobot,
+    /// No such plan, or one too long ago.
+    UnknownPlan,
+    /// No such object in the world.
+    UnknownObject,
+    /// The planner is busy with another request.
+    Planning,
     /// No trajectory task covers these joints.
     NoTrajectoryTask,
     /// The trajectory is not well-formed: empty, not increasing in time, wrong widths.

@@ -25,6 +25,8 @@ pub enum Subject<'a> {
     Task(&'a str),
     /// The arms of these joints.
     Joints(&'a [String]),
+    /// The arms that a plan moves; without a number, the newest.
+    Plan(Option<u64>),
 }
 
 /// What a request needs.
@@ -50,6 +52,10 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmEnable(a) => Need::Peace(Subject::Arm(&a.arm)),
         Request::ArmDisable(a) => Need::Peace(Subject::Arm(&a.arm)),
         Request::Status(_) | Request::State(_) | Request::Motion(_) => Need::Nothing,
+        Request::ExecutePlan(e) => Need::Lease(Subject::Plan(e.plan)),
+        Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
+        Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,
+        Request::Attach(_) | Request::Detach(_) => Need::Nothing,
         Request::Cancel(_) | Request::Stop(_) | Request::Shutdown(_) => Need::Nothing,
     }
 }

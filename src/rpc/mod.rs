@@ -21,6 +21,7 @@ pub mod error;
 mod lease;
 mod motion_api;
 pub mod place;
+mod planner_api;
 pub mod report;
 pub mod server;
 pub mod streams;

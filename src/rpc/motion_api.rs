@@ -152,6 +152,9 @@ pub struct Cancel {
 pub struct CancelReply {
     /// The status word of each task asked: `CANCELLED` or `ALREADY_STOPPED`.
     pub tasks: BTreeMap<String, String>,
+    /// Whether planning was ended.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub planning: bool,
 }
 
 /// Parameters of `servo`.

@@ -57,10 +57,12 @@ impl Service {
         if !is_asked {
             return None;
         }
-        if health.stop_confirmed.load(Ordering::Relaxed) == asked {
-            return Some(api::Confirmation::Confirmed);
+        // In this order: a stop that is sent has been confirmed before, or never is.
+        if health.stop_sent.load(Ordering::Acquire) != asked {
+            return None;
         }
-        (health.stop_sent.load(Ordering::Relaxed) == asked).then_some(api::Confirmation::SentNotConfirmed)
+        let confirmed = health.stop_confirmed.load(Ordering::Relaxed) == asked;
+        Some(if confirmed { api::Confirmation::Confirmed } else { api::Confirmation::SentNotConfirmed })
     }
 
     pub(super) async fn reset(&self, id: String) -> Result<Reply, RpcError> {

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
+use super::planning_requests::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
 use super::watchdog::Watchdog;
@@ -52,6 +53,12 @@ impl Run {
         let wall = WallOffset::take(&MonotonicClock);
         let log = log_path(blueprint, &options, &name, wall)?;
         let names = names_of(blueprint);
+        // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
+        let planner =
+            blueprint.planner.as_ref().map(PlannerPort::start).transpose().map_err(|what| StartError::Blueprint {
+                what,
+                hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
+            })?;
         let pulse = Arc::new(Pulse::default());
         let (notes, noted) = channel();
 
@@ -112,6 +119,7 @@ impl Run {
             wall,
             log: log.clone(),
             endings: endings.clone(),
+            planner,
         }));
         let notice = {
             let (service, wall) = (service.clone(), wall);

@@ -16,6 +16,7 @@ mod handle;
 mod in_process;
 mod motion_requests;
 mod motions;
+mod planning_requests;
 mod repeats;
 mod reports;
 mod service;

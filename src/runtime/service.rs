@@ -13,6 +13,7 @@ use serde_json::Value;
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::Motions;
+use super::planning_requests::PlannerPort;
 use super::repeats::Repeats;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
@@ -54,6 +55,7 @@ pub struct ServiceParts {
     pub wall: WallOffset,
     pub log: Option<PathBuf>,
     pub endings: Sender<Ending>,
+    pub planner: Option<PlannerPort>,
 }
 
 /// The run, for those who talk to it.
@@ -205,6 +207,7 @@ impl Service {
     }
 
     async fn cancel(&self, call: api::Cancel) -> Result<Reply, RpcError> {
+        let planning = call.task.is_none() && self.cancel_planning();
         let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
         let task = call.task.as_deref().map(|t| self.task_index(t)).transpose()?;
         let moves = |joints: &[u16]| arm.is_none_or(|a| joints.iter().any(|j| self.joints_of_arm(a).contains(j)));
@@ -215,7 +218,7 @@ impl Service {
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }
         }
-        Ok(Reply::Cancel(api::CancelReply { tasks }))
+        Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
     }
 
     async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
@@ -263,6 +266,17 @@ impl Service {
             Call::Motion(m) => self.motion(m.motion).map(Reply::Motion),
             Call::Move(m) => self.move_arm(m).await,
             Call::Execute(e) => self.execute(e).await,
+            Call::Plan(_)
+            | Call::Planning(_)
+            | Call::Preview(_)
+            | Call::ExecutePlan(_)
+            | Call::Planner(_)
+            | Call::World(_)
+            | Call::WorldAdd(_)
+            | Call::WorldMove(_)
+            | Call::WorldRemove(_)
+            | Call::Attach(_)
+            | Call::Detach(_) => self.planner_call(call).await,
             Call::Cancel(c) => self.cancel(c).await,
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
@@ -294,6 +308,7 @@ impl Backend for Service {
             Subject::All => true,
             Subject::Arm(id) => arm.hardware_id == id,
             Subject::Joints(joints) => joints.iter().any(|j| arm.joints.contains(j)),
+            Subject::Plan(plan) => self.joints_of_plan(plan).iter().any(|j| arm.joints.contains(j)),
             Subject::Task(name) => {
                 let range = self.joints_of_arm(*i as u16);
                 tasks.iter().any(|t| t.name == name && t.joints.iter().any(|j| range.contains(j)))

@@ -81,9 +81,10 @@ impl Backend for FakeBackend {
                     duration: e.trajectory.points.last().map_or(0.0, |p| p.time_from_start),
                 }),
                 Request::Motion(m) => Reply::Motion(self.motion(m.motion)),
-                Request::Cancel(_) => {
-                    Reply::Cancel(CancelReply { tasks: [("traj_arm".into(), "CANCELLED".into())].into() })
-                }
+                Request::Cancel(_) => Reply::Cancel(CancelReply {
+                    tasks: [("traj_arm".into(), "CANCELLED".into())].into(),
+                    planning: false,
+                }),
                 Request::Stop(_) => {
                     let how = if self.unconfirmed { Confirmation::SentNotConfirmed } else { Confirmation::Confirmed };
                     Reply::Stop(StopReply { arms: [("arm".into(), how)].into() })
@@ -99,13 +100,15 @@ impl Backend for FakeBackend {
                 Request::Servo(_) => std::future::pending().await,
                 Request::Velocity(_) => panic!("a defect of the backend"),
                 Request::Shutdown(_) => Reply::Shutdown(Done {}),
+                // The rest is the planner's.
+                _ => return Err(RpcError::new(Code::NoPlanner, "this run has no planner")),
             })
         })
     }
 
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String> {
         let is_meant = match subject {
-            Subject::All | Subject::Joints(_) => true,
+            Subject::All | Subject::Joints(_) | Subject::Plan(_) => true,
             Subject::Arm(name) => name == "arm",
             Subject::Task(name) => name == "traj_arm" || name == "t",
         };

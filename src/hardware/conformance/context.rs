@@ -11,8 +11,6 @@ use crate::joint::{ControlMode, JointLimits};
 
 /// Longest wait for something that must happen.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// How long an arm at rest may put a change of mode off.
-const MODE_LIMIT: Duration = Duration::from_secs(1);
 /// When the first fault of an arm without an emulator strikes, and how much later each further one: time since the
 /// connection [s].
 const STRIKES_AT: f64 = 1.0;
@@ -144,7 +142,7 @@ impl Context {
 
     /// Brings the arm into a mode. As to the device thread, `Rejected` means: not yet, ask again.
     pub fn set_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
-        let end = Instant::now() + MODE_LIMIT;
+        let end = Instant::now() + PATIENCE;
         loop {
             let result = self.adapter.set_control_mode(mode);
             if !matches!(result, Err(AdapterError::Rejected(_))) || Instant::now() > end {

@@ -58,16 +58,16 @@ fn wakes(context: &mut Context) -> Result<(), String> {
         return context.skip(ASKED);
     }
     let first = stamp(context)?;
-    let (mut last, mut news) = (first, 0);
+    let (mut last, mut newer) = (first, 0);
     for _ in 0..TRIES {
         await_news(context)?;
         let now = stamp(context)?;
-        news += usize::from(now > last);
+        newer += usize::from(now > last);
         last = now;
     }
     // A bus may bring one state in several frames, each of which wakes.
-    require(news >= TRIES / 20, || format!("of {TRIES} wake-ups {news} brought a new stamp"))?;
-    context.found(format!("{:.0} states a second", news as f64 / last.seconds_since(first)))
+    require(newer >= TRIES / 20, || format!("of {TRIES} wake-ups {newer} brought a new stamp"))?;
+    context.found(format!("{:.0} states a second", newer as f64 / last.seconds_since(first)))
 }
 
 fn drains(context: &mut Context) -> Result<(), String> {

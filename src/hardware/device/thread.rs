@@ -2,7 +2,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::Ordering::{Relaxed, Release};
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Duration;
 
@@ -380,10 +380,11 @@ impl Worker {
         match adapter.write_stop() {
             Ok(stop) => {
                 self.stop_owed = false;
-                self.health.stop_sent.store(self.last.stop_seq, Relaxed);
                 if stop == Stop::Confirmed {
                     self.health.stop_confirmed.store(self.last.stop_seq, Relaxed);
                 }
+                // Last: whoever sees it sees the confirmation too.
+                self.health.stop_sent.store(self.last.stop_seq, Release);
             }
             Err(error) => self.not_taken(adapter, "the arm did not take the stop", &error),
         }

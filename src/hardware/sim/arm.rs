@@ -315,10 +315,11 @@ impl SimArm {
         if on && self.error != 0 {
             return Err(Refusal::InError);
         }
-        if on && !self.plant.enabled() {
-            if let Some(fault) = self.struck_by(FaultKind::Sag) {
-                self.plant.sag(fault.amount);
-            }
+        if on
+            && !self.plant.enabled()
+            && let Some(fault) = self.struck_by(FaultKind::Sag)
+        {
+            self.plant.sag(fault.amount);
         }
         self.plant.enable(on);
         Ok(())

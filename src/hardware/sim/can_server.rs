@@ -156,7 +156,8 @@ fn live<C: CanController>(shared: &Shared<C>, mut port: Box<dyn CanPort>, period
                 });
             }
             Delivery::Disconnect => deaf_until = now + CUT,
-            Delivery::PowerLoss(time) => deaf_until = now + time,
+            // Starting takes its time, too.
+            Delivery::PowerLoss(time) => deaf_until = now + time.max(CUT),
         }
         if now >= deaf_until && port.send(&frames).is_err() {
             return;

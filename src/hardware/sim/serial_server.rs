@@ -71,7 +71,8 @@ fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
         let silence = match shared.serve(&mut line) {
             Ending::Closed => LOOK,
             Ending::Cut => CUT,
-            Ending::Dark(time) => time,
+            // Starting takes its time, too.
+            Ending::Dark(time) => time.max(CUT),
         };
         shared.with(|controller, now| controller.client_gone(now));
         lock(&shared.line).dark_until = Instant::now() + silence;

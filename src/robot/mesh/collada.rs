@@ -1,7 +1,7 @@
 //! Collada (`.dae`): the triangles of its scene, in metres.
 //!
 //! `unit` is applied. `up_axis` is not: x stays x and z stays z, as in RViz, MoveIt and Gazebo, which every robot
-//! description is made and looked at with (docs/decisions/0018).
+//! description is made and looked at with (docs/decisions/0032).
 
 use std::collections::HashMap;
 

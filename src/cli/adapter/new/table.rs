@@ -14,7 +14,7 @@ fn with_module(text: &str, module: &str, declaration: &str) -> Result<String, St
     let lines: Vec<&str> = text.lines().collect();
     let named = |line: &str| line.strip_prefix("pub mod ").and_then(|rest| rest.strip_suffix(';')).map(str::to_owned);
     let modules = || lines.iter().enumerate().filter_map(|(i, line)| named(line).map(|name| (i, name)));
-    let last = modules().last().ok_or("it declares no modules")?.0;
+    let last = modules().next_back().ok_or("it declares no modules")?.0;
     let at = modules().find(|(_, name)| name.as_str() > module).map_or(last + 1, |(i, _)| {
         let attributes =
             lines.iter().take(i).rev().take_while(|line| line.starts_with("#[") || line.starts_with("///"));

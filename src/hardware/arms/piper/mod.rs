@@ -6,6 +6,7 @@ pub mod emulator;
 mod golden;
 pub mod picture;
 pub mod protocol;
+mod session;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
@@ -53,6 +54,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
 };
 
 /// Lowest and highest position of each joint [rad].
+#[expect(clippy::approx_constant, reason = "the vendor's figure for joint 2, which is not π")]
 const RANGES: [(f64, f64); protocol::DOF] =
     [(-2.6179, 2.6179), (0.0, 3.14), (-2.967, 0.0), (-1.745, 1.745), (-1.22, 1.22), (-2.09439, 2.09439)];
 /// Highest speed [rad/s] and acceleration [rad/s²] of every joint.

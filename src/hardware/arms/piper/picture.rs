@@ -79,6 +79,8 @@ pub struct Picture {
     pub gripper: Option<Gripper>,
     /// The limits that the controller was asked for.
     pub limits: [Option<MotorLimits>; DOF],
+    /// When somebody else last sent a command to an arm on this bus.
+    pub commanded_at: Mono,
     /// What was counted.
     pub counts: Counts,
     /// Of which motors and drivers there was news, as bits: ever, and since [`Picture::expect_drivers`].
@@ -102,6 +104,7 @@ impl Default for Picture {
             drivers: Default::default(),
             gripper: None,
             limits: [None; DOF],
+            commanded_at: Mono::ZERO,
             counts: Counts::default(),
             motors_seen: 0,
             drivers_seen: 0,
@@ -119,7 +122,10 @@ impl Picture {
         match feedback {
             Feedback::Other => return self.counts.other += 1,
             Feedback::Damaged => return self.counts.damaged += 1,
-            Feedback::Leader => return self.counts.leader += 1,
+            Feedback::Leader => {
+                self.commanded_at = now;
+                return self.counts.leader += 1;
+            }
             _ => self.counts.decoded += 1,
         }
         match feedback {

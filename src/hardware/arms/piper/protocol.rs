@@ -239,6 +239,18 @@ pub fn decode(frame: &CanFrame) -> Feedback {
     if frame.len == 8 { feedback } else { Feedback::Damaged }
 }
 
+// --- Angles ---
+
+/// [rad] from [0.001°].
+pub fn radians(wire: i32) -> f64 {
+    (f64::from(wire) / 1000.0).to_radians()
+}
+
+/// [0.001°] from [rad].
+pub fn millidegrees(value: f64) -> i32 {
+    (value.to_degrees() * 1000.0).round() as i32
+}
+
 // --- Words ---
 
 /// What a state of the arm means (0x2A1, byte 1).

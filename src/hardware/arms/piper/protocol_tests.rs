@@ -61,3 +61,27 @@ fn every_error_has_words() {
     assert!((0..=7).all(|control| control_text(control) != control_text(8)));
     assert!((0..8).all(|bit| driver_text(bit).is_some() == (bit != 6)));
 }
+
+/// Prints how fast frames are read; the figure of a debug build is a lower bound.
+#[test]
+fn reading_a_second_of_frames_takes_far_less_than_a_second() {
+    use super::super::picture::Picture;
+    use crate::clock::Mono;
+    let burst: Vec<CanFrame> =
+        [golden::STATUS, golden::GRIPPER_FEEDBACK, golden::MOTOR_1, golden::MOTOR_6, golden::DRIVER_3]
+            .into_iter()
+            .chain(golden::POSE_FEEDBACK)
+            .chain(golden::JOINT_FEEDBACK)
+            .map(frame)
+            .collect();
+    let mut picture = Picture::default();
+    let began = std::time::Instant::now();
+    let rounds = 20_000;
+    for round in 0..rounds {
+        burst.iter().for_each(|frame| picture.take(decode(frame), Mono(5_000_000 * (round + 1))));
+    }
+    let seconds = began.elapsed().as_secs_f64();
+    assert_eq!(picture.counts.sets, rounds);
+    println!("{:.1} million frames/s", picture.counts.decoded as f64 / seconds / 1e6);
+    assert!(picture.counts.decoded as f64 / seconds > 30_400.0, "ten times what an arm sends");
+}

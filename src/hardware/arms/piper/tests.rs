@@ -281,7 +281,8 @@ fn limits_are_the_narrower_of_sheet_and_arm() {
         (limits.position_upper[0] - 90f64.to_radians()).abs() < 1e-9 && limits.velocity_max[0] == 1.5
     });
     let limits = arm.get_limits().unwrap();
-    assert_eq!((limits.position_lower[1], limits.position_upper[1]), (0.0, 3.14), "never wider than the sheet");
+    let joint_2 = (limits.position_lower[1], limits.position_upper[1]);
+    assert_eq!(joint_2, (sheet.position_lower[1], sheet.position_upper[1]), "never wider than the sheet");
 }
 
 #[test]

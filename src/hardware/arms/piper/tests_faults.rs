@@ -277,6 +277,22 @@ fn modes_that_are_not_emulated_are_said_so() {
 }
 
 #[test]
+fn two_commanders_do_not_take_turns() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    other(&emulator).send(&golden::MOVE_JOINTS.map(golden::frame)).unwrap();
+    until("the refusal", || {
+        let refused = arm.write_joint_positions(&START, 0.1).err();
+        refused.is_some_and(|error| error.to_string().contains("somebody else commands this arm\nhint: "))
+    });
+    assert!(arm.write_stop().is_ok(), "a stop is always sent");
+    until("the other to be gone", || {
+        read(&mut arm).unwrap();
+        arm.write_clear_errors().is_ok() && arm.write_joint_positions(&START, 0.1).is_ok()
+    });
+}
+
+#[test]
 fn an_arm_that_is_being_taught_is_left_alone() {
     let (emulator, mut arm) = connected();
     activate(&emulator, &mut arm);

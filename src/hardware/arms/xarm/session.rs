@@ -82,7 +82,10 @@ pub struct Session {
     suspect: bool,
     /// The arm has stopped, by us or by somebody else: only an activation makes it ready again.
     halted: bool,
+    /// A change of mode under way: it goes on with every report, whoever asks.
     change: Option<ModeChange>,
+    /// The mode that the last change did not reach, and why, until somebody hears of it.
+    failed: Option<(u8, &'static str)>,
     updated: Mono,
 }
 
@@ -113,6 +116,7 @@ impl Session {
             suspect: false,
             halted: true,
             change: None,
+            failed: None,
             updated: arrived,
         }
     }
@@ -171,6 +175,7 @@ impl Session {
         if MonotonicClock.now().since(self.fresh_at) > SILENCE {
             return Err(AdapterError::Io(format!("{} sent nothing new for {SILENCE:?}", self.reports.peer())));
         }
+        self.advance_change()?;
         if let Some(question) = self.known.condition.due(now, self.control.last_sent()) {
             self.control.post(&question, Purpose::Health)?;
         }
@@ -278,15 +283,10 @@ impl Session {
             self.ask(&Command::EnableForceTorque(true))?;
         }
         self.control.take_refusal();
-        self.change = Some(self.towards(mode));
-        let until = MonotonicClock.now().after(ACTIVATION_LIMIT);
-        while !self.advance_change()? {
-            if MonotonicClock.now() >= until {
-                self.change = None;
-                return Err(AdapterError::Timeout(format!("the arm is not ready within {ACTIVATION_LIMIT:?}")));
-            }
-            self.pause();
-            self.update(Duration::ZERO)?;
+        self.begin_change(mode);
+        if !self.finish_change(ACTIVATION_LIMIT)? {
+            self.change = None;
+            return Err(AdapterError::Timeout(format!("the arm is not ready within {ACTIVATION_LIMIT:?}")));
         }
         self.halted = false;
         Ok(())
@@ -294,51 +294,66 @@ impl Session {
 
     /// Brings the arm into a mode. `Rejected` while it moves, and while the change is under way: ask again.
     pub fn set_mode(&mut self, mode: u8) -> AdapterResult<()> {
-        let until = MonotonicClock.now().after(MODE_SLICE);
         self.update(Duration::ZERO)?;
         self.fault()?;
+        if self.change.is_none() {
+            let _ = self.heed_refusal(); // of a set point; but it may tell that the arm was stopped
+            self.may_be_commanded()?;
+        }
         if self.change.is_none_or(|change| change.target != mode) {
-            if self.change.is_none() {
-                let _ = self.heed_refusal(); // of a set point; but it may tell that the arm was stopped
-                self.may_be_commanded()?;
-            }
             if self.moves() {
                 return Err(AdapterError::Rejected("the arm is moving".into()));
             }
-            self.change = Some(self.towards(mode));
+            self.begin_change(mode);
         }
-        while !self.advance_change()? {
+        match self.finish_change(MODE_SLICE)? {
+            true => Ok(()),
+            false => Err(AdapterError::Rejected("the change of mode is under way".into())),
+        }
+    }
+
+    fn begin_change(&mut self, mode: u8) {
+        let detect = takes_detection(self.device.firmware);
+        self.change = Some(ModeChange::new(mode, detect, MonotonicClock.now()));
+        self.failed = None;
+    }
+
+    /// Waits for the end of the change of mode; `false` when it is still under way after `limit`.
+    fn finish_change(&mut self, limit: Duration) -> AdapterResult<bool> {
+        let until = MonotonicClock.now().after(limit);
+        self.update(Duration::ZERO)?;
+        while self.change.is_some() {
             if MonotonicClock.now() >= until {
-                return Err(AdapterError::Rejected("the change of mode is under way".into()));
+                return Ok(false);
             }
             self.pause();
             self.update(Duration::ZERO)?;
         }
-        Ok(())
-    }
-
-    fn towards(&self, mode: u8) -> ModeChange {
-        ModeChange::new(mode, takes_detection(self.device.firmware), MonotonicClock.now())
-    }
-
-    /// Goes on with the change of mode; `true` when it is done.
-    fn advance_change(&mut self) -> AdapterResult<bool> {
-        self.fault().inspect_err(|_| self.change = None)?;
-        let Some(mut change) = self.change else { return Ok(true) };
-        let next = change.advance(&self.motion, MonotonicClock.now());
-        self.change = Some(change);
-        match next {
-            Next::Send(command) => self.ask(&command).map(|_| false),
-            Next::Wait => Ok(false),
-            Next::Done => {
-                self.change = None;
-                Ok(true)
-            }
-            Next::GiveUp(why) => {
-                (self.change, self.halted) = (None, true);
-                Err(AdapterError::Protocol(format!("xarm did not change to mode {}: {why}", change.target)))
-            }
+        self.fault()?;
+        match self.failed.take() {
+            None => Ok(true),
+            Some((mode, why)) => Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}"))),
         }
+    }
+
+    /// Goes on with the change of mode, as far as the newest report allows.
+    fn advance_change(&mut self) -> AdapterResult<()> {
+        let Some(mut change) = self.change.take() else { return Ok(()) };
+        if self.known.condition.error != 0 {
+            self.halted = true;
+            return Ok(());
+        }
+        let next = change.advance(&self.motion, MonotonicClock.now());
+        match next {
+            Next::Send(command) => {
+                self.control.post(&command, Purpose::Health)?;
+                self.change = Some(change);
+            }
+            Next::Wait => self.change = Some(change),
+            Next::Done => {}
+            Next::GiveUp(why) => (self.failed, self.halted) = (Some((change.target, why)), true),
+        }
+        Ok(())
     }
 
     /// Whether the arm moves, by its own account.

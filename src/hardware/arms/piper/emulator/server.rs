@@ -298,7 +298,7 @@ impl Arm {
                 }
             }
             if done < self.out.len() {
-                if MonotonicClock.now() >= end || matches!(self.seat, Seat::Serial) {
+                if MonotonicClock.now() >= end {
                     break;
                 }
                 std::thread::sleep(Duration::from_micros(200));

@@ -114,7 +114,7 @@ impl XArmEmulator {
         let Some(Firmware(firmware)) = Firmware::parse(&options.firmware) else {
             return Err(rejected(format!("firmware {:?} is not a version like 2.5.1", options.firmware)));
         };
-        let ports = Ports::bind(ip, in_process).map_err(rejected)?;
+        let ports = Ports::bind(ip, in_process).map_err(|e| AdapterError::Io(format!("xarm emulator: {e}")))?;
         let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now());
         let server = Server::start(controller, ports, firmware >= [2, 1, 0])
             .map_err(|e| rejected(format!("cannot serve: {e}")))?;

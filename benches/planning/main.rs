@@ -1,0 +1,268 @@
+//! How long it takes to plan, over a file of problems.
+//!
+//! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR]
+//! [--level exact] [--shapes true|vamp] [--seed N] [--limit N] [--out FILE.json]`; `--ik LINK --urdf FILE` and
+//! `--timing` measure those parts alone.
+
+mod parts;
+mod problems;
+
+#[path = "../support/machine.rs"]
+#[allow(dead_code, reason = "shared with other benchmarks")]
+mod machine;
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use clap::Parser;
+use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use dimos::planning::planner::{Plan, PlanError, PlanSettings, plan};
+use dimos::planning::timing::{TimingSettings, bounds, time};
+use problems::{Arm, Problem, Shapes, load, packages};
+use serde::Serialize;
+
+#[derive(Debug, Parser)]
+#[command(name = "planning", about = "Times the planner on a file of problems")]
+struct Arguments {
+    /// Problems, one JSON record a line.
+    #[arg(long, value_name = "FILE")]
+    problems: Option<PathBuf>,
+    /// The robot.
+    #[arg(long, value_name = "FILE")]
+    urdf: Option<PathBuf>,
+    /// Pairs that may touch.
+    #[arg(long, value_name = "FILE")]
+    srdf: Option<PathBuf>,
+    /// Where `package://NAME` is.
+    #[arg(long, value_name = "NAME=DIR")]
+    package: Vec<String>,
+    /// How collisions are checked.
+    #[arg(long, default_value = "exact")]
+    level: Level,
+    /// How cylinders are taken.
+    #[arg(long, default_value = "true")]
+    shapes: Shapes,
+    /// What all randomness comes from.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Only the first N problems.
+    #[arg(long, value_name = "N")]
+    limit: Option<usize>,
+    /// How long one problem may take [s].
+    #[arg(long, default_value_t = 10.0)]
+    timeout: f64,
+    /// Where the rows go.
+    #[arg(long, value_name = "FILE.json")]
+    out: Option<PathBuf>,
+    /// Solve random poses of this link as well.
+    #[arg(long, value_name = "LINK")]
+    ik: Option<String>,
+    /// Time random paths as well.
+    #[arg(long)]
+    timing: bool,
+    /// Given by cargo.
+    #[arg(long, hide = true)]
+    bench: bool,
+    /// Do little: to see that it works.
+    #[arg(long, hide = true)]
+    quick: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Level {
+    /// Every solid against every other, in double precision; paths are proven free.
+    Exact,
+}
+
+/// What came out of one problem; nothing where it was not solved.
+#[derive(Debug, Serialize)]
+struct Row {
+    problem: String,
+    index: u64,
+    solved: bool,
+    plan_us: Option<f64>,
+    simplify_us: Option<f64>,
+    total_us: Option<f64>,
+    cost: Option<f64>,
+    duration_s: Option<f64>,
+    path: Option<Vec<Vec<f64>>>,
+    /// Processor time of this thread: what `total_us` would be on an idle machine.
+    cpu_us: Option<f64>,
+    looks: Option<u64>,
+    timing_us: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    why: Option<String>,
+}
+
+fn main() -> ExitCode {
+    match run(&Arguments::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
+    machine::print();
+    let nothing = arguments.problems.is_none() && arguments.ik.is_none();
+    if arguments.timing || nothing {
+        parts::timing(if arguments.quick { 5 } else { 100 }, arguments.seed)?;
+    }
+    if nothing {
+        println!("nothing else to do: --problems FILE.jsonl or --ik LINK, with --urdf FILE");
+        return Ok(());
+    }
+    let urdf = arguments.urdf.as_ref().ok_or("--urdf is needed")?;
+    let began = Instant::now();
+    let arm = Arm::load(urdf, arguments.srdf.as_deref(), packages(&arguments.package)?)?;
+    if let Some(tip) = &arguments.ik {
+        parts::ik(arm.model(), tip, if arguments.quick { 200 } else { 20_000 }, arguments.seed)?;
+    }
+    let Some(problems) = &arguments.problems else { return Ok(()) };
+    let problems = load(problems, arguments.limit)?;
+    println!("loaded    {} problems and {} in {:.0?}", problems.len(), arm.model().name, began.elapsed());
+    let rows = problems.iter().map(|p| solve(&arm, p, arguments)).collect::<Result<Vec<_>, _>>()?;
+    report(&rows, &arguments.level);
+    if let Some(out) = &arguments.out {
+        std::fs::write(out, serde_json::to_string(&serde_json::json!({ "rows": rows }))?)?;
+        println!("wrote     {}", out.display());
+    }
+    Ok(())
+}
+
+fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box<dyn Error>> {
+    let kinematics = Arc::new(arm.kinematics(problem)?);
+    let scene = arm.scene(&kinematics, problem, arguments.shapes)?;
+    let (start, goal) = problem.ends();
+    let (began, cpu) = (Instant::now(), cpu_time());
+    let mut checker = ExactChecker::new(scene, Resolution::default());
+    let settings = PlanSettings { seed: arguments.seed, ..PlanSettings::default() };
+    let stop = Stop::new(Some(began + Duration::from_secs_f64(arguments.timeout)), None);
+    let found = plan(&mut checker, start, &[goal.to_vec()], &settings, &stop);
+    let (total, cpu) = (began.elapsed(), cpu_time().saturating_sub(cpu));
+    let mut row = row(problem, found, total, cpu);
+    if let Some(path) = &row.path {
+        let bounds = bounds(kinematics.names(), kinematics.limits())?;
+        let free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &Stop::never());
+        let began = Instant::now();
+        let timed = time(kinematics.names(), path, &bounds, &TimingSettings::default(), free);
+        row.timing_us = Some(began.elapsed().as_secs_f64() * 1e6);
+        match timed {
+            Ok(timed) => row.duration_s = Some(timed.duration),
+            Err(error) => eprintln!("{} {}: {error}", row.problem, row.index),
+        }
+    }
+    Ok(row)
+}
+
+fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: Duration) -> Row {
+    let us = |d: Duration| d.as_secs_f64() * 1e6;
+    let (family, index) = (problem.problem.clone(), problem.index);
+    match found {
+        Ok(plan) => Row {
+            problem: family,
+            index,
+            solved: true,
+            plan_us: Some(us(total.saturating_sub(plan.shorten_time))),
+            simplify_us: Some(us(plan.shorten_time)),
+            total_us: Some(us(total)),
+            cost: Some(plan.length),
+            duration_s: None,
+            cpu_us: Some(us(cpu)),
+            looks: Some(plan.looks),
+            timing_us: None,
+            path: Some(plan.path),
+            why: None,
+        },
+        Err(error) => {
+            eprintln!("{family} {index}: {error}");
+            let why = Some(error.to_string());
+            let none = None;
+            Row {
+                problem: family,
+                index,
+                solved: false,
+                plan_us: none,
+                simplify_us: none,
+                total_us: none,
+                cost: none,
+                duration_s: none,
+                path: None,
+                cpu_us: None,
+                looks: None,
+                timing_us: None,
+                why,
+            }
+        }
+    }
+}
+
+fn report(rows: &[Row], level: &Level) {
+    let mut families: Vec<&str> = rows.iter().map(|r| r.problem.as_str()).collect();
+    families.dedup();
+    println!(
+        "\n{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}",
+        "family", "solved", "plan", "simplify", "total", "p95", "max", "cost", "duration"
+    );
+    println!(
+        "{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}",
+        format!("{level:?}").to_lowercase(),
+        "",
+        "med ms",
+        "med ms",
+        "med ms",
+        "ms",
+        "ms",
+        "med rad",
+        "med s"
+    );
+    for family in families.into_iter().chain(["all"]) {
+        let own: Vec<&Row> = rows.iter().filter(|r| family == "all" || r.problem == family).collect();
+        let of = |f: fn(&Row) -> Option<f64>, q: f64| quantile(own.iter().filter_map(|r| f(r)).collect(), q);
+        let solved = own.iter().filter(|r| r.solved).count();
+        println!(
+            "{family:<20} {:>9} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>8.2} {:>8.2}",
+            format!("{solved}/{}", own.len()),
+            of(|r| r.plan_us, 0.5) / 1e3,
+            of(|r| r.simplify_us, 0.5) / 1e3,
+            of(|r| r.total_us, 0.5) / 1e3,
+            of(|r| r.total_us, 0.95) / 1e3,
+            of(|r| r.total_us, 1.0) / 1e3,
+            of(|r| r.cost, 0.5),
+            of(|r| r.duration_s, 0.5),
+        );
+    }
+    let cpu = |q| quantile(rows.iter().filter_map(|r| r.cpu_us).collect(), q) / 1e3;
+    let timing: Vec<f64> = rows.iter().filter_map(|r| r.timing_us).map(|us| us / 1e3).collect();
+    println!(
+        "\ntiming, re-checks included: median {:.3} ms, p95 {:.3} ms",
+        quantile(timing.clone(), 0.5),
+        quantile(timing, 0.95)
+    );
+    let mut looks: Vec<f64> = rows.iter().filter_map(|r| r.looks).map(|n| n as f64).collect();
+    looks.sort_by(f64::total_cmp);
+    println!(
+        "\nprocessor time: median {:.3} ms, p95 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
+        cpu(0.5),
+        cpu(0.95),
+        cpu(1.0),
+        quantile(looks.clone(), 0.5),
+        looks.iter().sum::<f64>() / looks.len().max(1) as f64
+    );
+}
+
+fn quantile(mut values: Vec<f64>, q: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let rank = ((values.len() as f64 * q).ceil() as usize).clamp(1, values.len().max(1));
+    values.get(rank - 1).copied().unwrap_or(f64::NAN)
+}
+
+fn cpu_time() -> Duration {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+    Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
+}

@@ -1,0 +1,195 @@
+//! Planning problems from a file with one JSON record a line, and the robot they are for.
+
+use std::collections::BTreeMap;
+use std::error::Error;
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use dimos::collision::body::{MeshMode, solids};
+use dimos::collision::world::{Obstacle, Robot};
+use dimos::collision::{Scene, Solid, World};
+use dimos::robot::kinematics::Kinematics;
+use dimos::robot::model::{JointKind, RobotModel};
+use dimos::robot::packages::Packages;
+use dimos::robot::urdf::{Meshes, read};
+use dimos::robot::xml::{Calls, parse};
+use dimos::yaml::{Tree, render};
+use glamx::{DAffine3, DQuat, DVec3};
+use serde::Deserialize;
+
+/// How cylinders are taken.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Shapes {
+    /// As they are.
+    True,
+    /// As VAMP takes them: capsules, and boxes in the family `box`.
+    Vamp,
+}
+
+/// One problem.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Problem {
+    /// Its family.
+    pub problem: String,
+    /// Its number there.
+    pub index: u64,
+    joints: Vec<String>,
+    start: Vec<f64>,
+    goal: Vec<f64>,
+    obstacles: Vec<Thing>,
+}
+
+#[derive(Debug, Clone, Deserialize)]
+struct Thing {
+    name: String,
+    #[serde(rename = "type")]
+    kind: String,
+    size: Vec<f64>,
+    position: [f64; 3],
+    quat_xyzw: [f64; 4],
+}
+
+/// Reads problems, at most `limit`.
+pub fn load(path: &Path, limit: Option<usize>) -> Result<Vec<Problem>, Box<dyn Error>> {
+    let text = fs::read_to_string(path).map_err(|e| format!("{}: {e}", path.display()))?;
+    let lines = text.lines().filter(|l| !l.trim().is_empty()).take(limit.unwrap_or(usize::MAX));
+    let read = |(i, line): (usize, &str)| {
+        serde_json::from_str(line).map_err(|e| format!("{}:{}: {e}", path.display(), i + 1).into())
+    };
+    lines.enumerate().map(read).collect()
+}
+
+/// A robot read for planning.
+pub struct Arm {
+    model: Arc<RobotModel>,
+    solids: Vec<Vec<Solid>>,
+    allowed: Vec<(String, String)>,
+}
+
+impl Arm {
+    /// Reads a URDF, and the pairs that may touch from an SRDF.
+    pub fn load(urdf: &Path, srdf: Option<&Path>, packages: Packages) -> Result<Self, Box<dyn Error>> {
+        let text = fs::read_to_string(urdf).map_err(|e| format!("{}: {e}", urdf.display()))?;
+        let mut tree = Tree::new();
+        let source = tree.add_source(urdf.display().to_string(), &text);
+        let resolve = |uri: &str| packages.resolve(uri, urdf.parent().unwrap_or(Path::new(".")));
+        let root = parse(&mut tree, source);
+        let model = root.and_then(|d| read(&d.root, &mut tree, &Calls::default(), Meshes::Find, &resolve));
+        let Some(model) = model else {
+            let lines: Vec<String> = tree.diags().iter().map(|d| render(&tree, d, false)).collect();
+            return Err(lines.join("\n").into());
+        };
+        let solids = solids(&model, MeshMode::Hull)?;
+        let allowed = srdf.map(allowed_pairs).transpose()?.unwrap_or_default();
+        let known = |(a, b): &(String, String)| model.link_index(a).is_some() && model.link_index(b).is_some();
+        let allowed = allowed.into_iter().filter(known).collect();
+        Ok(Self { model: Arc::new(model), solids, allowed })
+    }
+
+    /// The model.
+    pub fn model(&self) -> &RobotModel {
+        &self.model
+    }
+
+    /// The kinematics of a problem's joints: by name, else by what remains without the prefix that all joints share,
+    /// else by an ending that only one joint has.
+    pub fn kinematics(&self, problem: &Problem) -> Result<Kinematics, Box<dyn Error>> {
+        let own: Vec<(usize, &str)> =
+            self.model.independent_joints().into_iter().map(|j| (j, self.model.joints[j].name.as_str())).collect();
+        let prefix = shared_prefix(&own.iter().map(|o| o.1).collect::<Vec<_>>());
+        let foreign = shared_prefix(&problem.joints.iter().map(String::as_str).collect::<Vec<_>>());
+        let find = |name: &String| {
+            let only = |is: &dyn Fn(&str) -> bool| match own.iter().filter(|o| is(o.1)).collect::<Vec<_>>()[..] {
+                [one] => Some(one.0),
+                _ => None,
+            };
+            let ends = |suffix: &str| only(&|o| o.ends_with(suffix));
+            only(&|o| o == name)
+                .or_else(|| only(&|o| o[prefix..] == name[foreign..]))
+                .or_else(|| name.match_indices(['_', '/', '-']).find_map(|(at, _)| ends(&name[at..])))
+                .ok_or(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
+        };
+        let joints = problem.joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
+        // Sliding joints of the others are a gripper's: it is open.
+        let open = |j: &dimos::robot::Joint| if j.kind == JointKind::Prismatic { j.limits.upper } else { 0.0 };
+        let mut rest: Vec<f64> = self.model.joints.iter().map(open).collect();
+        for (j, joint) in self.model.joints.iter().enumerate() {
+            if let Some(mimic) = joint.mimic {
+                rest[j] = mimic.multiplier * rest[mimic.leader] + mimic.offset;
+            }
+        }
+        Ok(Kinematics::new(&self.model, &joints, &rest)?)
+    }
+
+    /// The scene of a problem.
+    pub fn scene(
+        &self,
+        kinematics: &Arc<Kinematics>,
+        problem: &Problem,
+        shapes: Shapes,
+    ) -> Result<Arc<Scene>, Box<dyn Error>> {
+        let mut world = World::new();
+        world.add_robot(Robot {
+            name: String::new(),
+            model: self.model.clone(),
+            kinematics: kinematics.clone(),
+            solids: self.solids.clone(),
+            base: DAffine3::IDENTITY,
+            padding: 0.0,
+            allowed: self.allowed.clone(),
+        })?;
+        for thing in &problem.obstacles {
+            let solid = solid(thing, &problem.problem, shapes)?;
+            world.add(Obstacle { name: thing.name.clone(), solid, padding: 0.0 })?;
+        }
+        Ok(world.snapshot())
+    }
+}
+
+impl Problem {
+    /// Where it begins and should end.
+    pub fn ends(&self) -> (&[f64], &[f64]) {
+        (&self.start, &self.goal)
+    }
+}
+
+fn solid(thing: &Thing, family: &str, shapes: Shapes) -> Result<Solid, Box<dyn Error>> {
+    let turn = DQuat::from_array(thing.quat_xyzw).normalize();
+    let at = DAffine3::from_rotation_translation(turn, DVec3::from(thing.position));
+    let made = match (thing.kind.as_str(), thing.size.as_slice(), shapes) {
+        ("box", &[x, y, z], _) => Solid::cuboid(DVec3::new(x, y, z), at),
+        ("sphere", &[r], _) => Solid::sphere(r, at),
+        ("cylinder", &[r, l], Shapes::True) => Solid::cylinder(r, l, at),
+        ("cylinder", &[r, l], _) if family == "box" => Solid::cuboid(DVec3::new(2.0 * r, 2.0 * r, l), at),
+        ("cylinder", &[r, l], _) => Solid::capsule(r, l, at),
+        _ => return Err(format!("{:?} is a {:?} with sizes {:?}", thing.name, thing.kind, thing.size).into()),
+    };
+    Ok(made?)
+}
+
+/// The pairs of `disable_collisions` in an SRDF.
+fn allowed_pairs(srdf: &Path) -> Result<Vec<(String, String)>, Box<dyn Error>> {
+    let text = fs::read_to_string(srdf).map_err(|e| format!("{}: {e}", srdf.display()))?;
+    let document = roxmltree::Document::parse(&text)?;
+    let pairs = document.descendants().filter(|n| n.has_tag_name("disable_collisions"));
+    let name = |n: &roxmltree::Node, key: &str| n.attribute(key).unwrap_or_default().to_owned();
+    Ok(pairs.map(|n| (name(&n, "link1"), name(&n, "link2"))).collect())
+}
+
+/// `NAME=DIR` arguments.
+pub fn packages(arguments: &[String]) -> Result<Packages, Box<dyn Error>> {
+    let mut named = BTreeMap::new();
+    for argument in arguments {
+        let (name, folder) = argument.split_once('=').ok_or(format!("{argument:?} is not NAME=DIR"))?;
+        named.insert(name.to_owned(), folder.into());
+    }
+    Ok(Packages::named(named).with_environment())
+}
+
+/// Length of the prefix that all names share, up to a separator.
+fn shared_prefix(names: &[&str]) -> usize {
+    let first = names.first().copied().unwrap_or_default();
+    let ends = first.match_indices(['_', '/', '-']).map(|(at, _)| at + 1);
+    ends.filter(|&end| names.iter().all(|n| n.starts_with(&first[..end]))).max().unwrap_or(0)
+}

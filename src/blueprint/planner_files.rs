@@ -1,0 +1,84 @@
+//! The section `planner` as a planner takes it: paths in full, every joint with both its names.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+use crate::blueprint::planner::{
+    ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry,
+};
+use crate::blueprint::resolve::Checker;
+use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::yaml::{Located, NodeId};
+
+/// What a planner is made from. Only of use when nothing was reported.
+pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed) -> PlannerConfig {
+    PlannerConfig {
+        timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
+        robots: typed.robots.iter().map(|robot| self::robot(checker, robot)).collect(),
+        objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
+    }
+}
+
+fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> RobotConfig {
+    let joints: Vec<String> = typed.joint_names.iter().map(|name| name.value.clone()).collect();
+    let ours = |model: &String| {
+        let mapped = typed.joint_name_mapping.0.iter().find(|(_, theirs)| theirs.value == *model);
+        let prefix = typed.joint_prefix.as_ref().map_or("", |prefix| prefix.as_str());
+        mapped.map_or_else(|| format!("{prefix}{model}"), |(ours, _)| ours.value.clone())
+    };
+    RobotConfig {
+        name: typed.name.value.clone(),
+        model_path: file(checker, typed.model_path.at, &typed.model_path),
+        packages: typed.package_paths.iter().map(|(n, p)| (n.clone(), file(checker, typed.at, p))).collect(),
+        xacro_args: typed.xacro_args.iter().map(|(name, value)| (name.clone(), value.0.clone())).collect(),
+        base_pose: pose(&typed.base_pose),
+        base_link: typed.base_link.clone(),
+        end_effector_link: typed.end_effector_link.value.clone(),
+        coordinator_joints: joints.iter().map(ours).collect(),
+        joints,
+        task: typed.coordinator_task_name.as_ref().map(|name| name.value.clone()),
+        exclusions: typed.collision_exclusion_pairs.clone(),
+        max_velocity: typed.max_velocity,
+        max_acceleration: typed.max_acceleration,
+        named_poses: typed
+            .named_poses
+            .0
+            .iter()
+            .map(|(n, p)| (n.value.clone(), p.value.clone()))
+            .collect::<BTreeMap<_, _>>(),
+    }
+}
+
+fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> ObjectConfig {
+    let shape = match &entry.shape.value {
+        ShapeEntry::Box(size) => ObjectShape::Box(*size),
+        ShapeEntry::Sphere(radius) => ObjectShape::Sphere(*radius),
+        ShapeEntry::Cylinder(size) => ObjectShape::Cylinder(*size),
+        ShapeEntry::Mesh(path) => ObjectShape::Mesh(file(checker, entry.shape.at, path)),
+        ShapeEntry::Cloud(path) => ObjectShape::Cloud(file(checker, entry.shape.at, path)),
+    };
+    ObjectConfig { name: name.to_owned(), shape, pose: pose(&entry.pose), padding: entry.padding }
+}
+
+/// A path as seen from the file that names it; from here, where that file is one of those in the box.
+fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
+    if path.starts_with(crate::robot::builtin::PREFIX) {
+        return path.into();
+    }
+    let source = checker.tree.source(checker.tree.label(at).source).map(|source| Path::new(&source.name));
+    let folder = source.filter(|file| file.is_file()).and_then(Path::parent);
+    folder.unwrap_or(Path::new("")).join(path)
+}
+
+fn pose(entry: &PoseEntry) -> Isometry3<f64> {
+    let [x, y, z] = entry.xyz;
+    let rotation = match (entry.quat, entry.rpy) {
+        (Some([x, y, z, w]), _) => UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
+        (None, Some([roll, pitch, yaw])) => UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+        (None, None) => UnitQuaternion::identity(),
+    };
+    Isometry3::from_parts(Translation3::new(x, y, z), rotation)
+}

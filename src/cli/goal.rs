@@ -1,0 +1,163 @@
+//! Where a robot shall go, as it is typed, and planning the way there.
+
+use std::thread::sleep;
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::arguments::{finite, speed};
+use super::exit::{Exit, Failure, Result};
+use super::follow::Signals;
+use super::output::{self, fixed};
+use crate::rpc::api::{Cancel, DEFAULT_SPEED, Plan, PlanGoal, PlanSummary, Planner, Planning, PoseSpec};
+use crate::rpc::client::{Client, ClientError};
+use crate::rpc::{Code, RpcError};
+
+/// How often the run is asked while it plans.
+const INTERVAL: Duration = Duration::from_millis(20);
+
+/// Where a robot shall go.
+#[derive(Debug, Clone, clap::Args)]
+#[group(id = "goal", required = true, multiple = true)]
+pub struct Goal {
+    /// Where its joints shall go [rad], one value per joint
+    #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["pose", "named"])]
+    pub joints: Vec<f64>,
+    /// Where its end effector shall be: x, y, z [m] in the frame `map`; without --rpy or --quat in any orientation
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    pub pose: Option<Vec<f64>>,
+    /// The end effector's roll, pitch, yaw about fixed axes [rad]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "pose")]
+    pub rpy: Option<Vec<f64>>,
+    /// The end effector's orientation as a quaternion x, y, z, w
+    #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "pose", conflicts_with = "rpy")]
+    pub quat: Option<Vec<f64>>,
+    /// One of its named poses
+    #[arg(long, value_name = "NAME", conflicts_with = "pose")]
+    pub named: Option<String>,
+}
+
+/// How to search and how fast to go.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Search {
+    /// Fraction of the velocity and acceleration limits to use, 0.1–1
+    #[arg(long, value_name = "FRACTION", default_value_t = DEFAULT_SPEED, value_parser = speed)]
+    pub speed: f64,
+    /// Move the end effector on a straight line to --pose
+    #[arg(long, requires = "pose")]
+    pub linear: bool,
+    /// Seed of the search: the same request with the same seed gives the same plan
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub seed: u64,
+    /// Longest time to search, such as 5s; default: the blueprint's planning_timeout
+    #[arg(long, value_name = "TIME", value_parser = super::arguments::duration)]
+    pub timeout: Option<Duration>,
+}
+
+impl Goal {
+    /// The joint positions, where they are the goal.
+    pub fn joints(&self) -> Option<&[f64]> {
+        (!self.joints.is_empty()).then_some(&self.joints)
+    }
+
+    /// The goal of a robot, as the planner takes it.
+    pub fn of(&self, robot: &str, search: &Search) -> PlanGoal {
+        let pose = self.pose.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
+            xyz,
+            rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
+            quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
+        });
+        PlanGoal {
+            robot: robot.to_owned(),
+            joints: self.joints().map(<[f64]>::to_vec),
+            pose,
+            named: self.named.clone(),
+            linear: search.linear,
+        }
+    }
+}
+
+impl Search {
+    /// A request for the planner.
+    pub fn plan(&self, goals: Vec<PlanGoal>) -> Plan {
+        Plan { goals, speed: self.speed, seed: self.seed, timeout: self.timeout.map(|t| t.as_secs_f64()) }
+    }
+}
+
+/// Whether the run has a planner.
+pub fn has_planner(client: &mut Client) -> Result<bool> {
+    match client.call(Planner {}) {
+        Ok(_) => Ok(true),
+        Err(ClientError::Refused(RpcError { code: Code::NoPlanner, .. })) => Ok(false),
+        Err(e) => Err(e.into()),
+    }
+}
+
+/// A plan that was found, and its number.
+pub struct Planned {
+    /// For `preview` and `execute_plan`.
+    pub plan: u64,
+    /// How long planning took [s].
+    pub elapsed: f64,
+    /// The plan in figures.
+    pub summary: PlanSummary,
+}
+
+/// Plans and waits for it. A signal ends planning.
+pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Planned> {
+    let begun = client.call(request)?;
+    let bar = ProgressBar::new_spinner();
+    if let Ok(style) = ProgressStyle::with_template("{spinner} planning {msg}") {
+        bar.set_style(style);
+    }
+    let mut cancelled = false;
+    let report = loop {
+        let report = client.call(Planning { plan: begun.plan })?;
+        if report.state != "PLANNING" {
+            break report;
+        }
+        bar.set_message(format!("{:.1} s", report.elapsed));
+        bar.tick();
+        if signals.last().is_some() && !std::mem::replace(&mut cancelled, true) {
+            client.call(Cancel::default())?;
+        }
+        sleep(INTERVAL);
+    };
+    bar.finish_and_clear();
+    if let Some(signal) = signals.last() {
+        let failure = Failure::new(Exit::by_signal(signal), "planning was cancelled: nothing has moved");
+        return Err(failure);
+    }
+    match report.summary {
+        Some(summary) => Ok(Planned { plan: report.plan, elapsed: report.elapsed, summary }),
+        None => {
+            let why = report.error.unwrap_or_else(|| report.state.to_lowercase());
+            let failure = Failure::new(Exit::Failed, format!("no plan: {why}"));
+            Err(report.hint.into_iter().fold(failure, |failure, hint| failure.hint(hint)))
+        }
+    }
+}
+
+/// Shows a plan's figures.
+pub fn show(planned: &Planned) {
+    let s = &planned.summary;
+    output::line(format_args!(
+        "plan {}: {:.2} s, {:.3} rad long, {} waypoints, found in {:.0} ms (seed {})",
+        planned.plan,
+        s.duration,
+        s.length,
+        s.waypoints,
+        planned.elapsed * 1e3,
+        s.seed
+    ));
+    if let Some(fraction) = s.fraction.filter(|fraction| *fraction < 1.0) {
+        output::line(format_args!("  straight line: {} % of the way", fixed(fraction * 100.0, 1)));
+    }
+    match (s.clearance, &s.closest) {
+        (Some(clearance), Some([a, b])) => {
+            output::line(format_args!("  clearance {} mm, between {a} and {b}", fixed(clearance * 1e3, 1)));
+        }
+        (Some(clearance), None) => output::line(format_args!("  clearance {} mm", fixed(clearance * 1e3, 1))),
+        _ => {}
+    }
+}

@@ -1,0 +1,125 @@
+//! `dimos model …`: look into robot descriptions. Needs no run.
+
+mod check;
+mod fk;
+mod info;
+
+use std::path::PathBuf;
+
+use super::exit::{Exit, Failure, Result};
+use super::output;
+use crate::robot::urdf::Meshes;
+use crate::robot::{Loaded, RobotModel, Source, load};
+
+/// Arguments of `model`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Verb {
+    /// Show joints, limits, links, shapes and groups
+    Info(File),
+    /// Draw the tree of links and joints
+    Tree(File),
+    /// Report every mistake of a description and of the files it names
+    Check(File),
+    /// Print the URDF that an xacro file comes to
+    Expand(File),
+    /// Where a link is at joint positions
+    Fk(fk::Args),
+}
+
+/// A description, and what it needs.
+#[derive(Debug, clap::Args)]
+struct File {
+    /// A URDF or xacro file, or one in the box: builtin:xarm6
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Where a package is (repeatable); ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are looked at too
+    #[arg(long, value_name = "NAME=DIR", value_parser = pair::<'='>)]
+    package: Vec<(String, String)>,
+    /// The value of an xacro argument (repeatable)
+    #[arg(long, value_name = "NAME:=VALUE", value_parser = xacro_arg)]
+    xacro_arg: Vec<(String, String)>,
+    /// The robot's SRDF: groups, named poses, pairs of links that may touch
+    #[arg(long, value_name = "FILE")]
+    srdf: Option<PathBuf>,
+    /// The robot's joint_limits.yaml: accelerations and jerks
+    #[arg(long, value_name = "FILE")]
+    joint_limits: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// `NAME=VALUE`
+fn pair<const SIGN: char>(text: &str) -> std::result::Result<(String, String), String> {
+    match text.split_once(SIGN) {
+        Some((name, value)) if !name.is_empty() => Ok((name.to_owned(), value.to_owned())),
+        _ => Err(format!("must be NAME{SIGN}VALUE")),
+    }
+}
+
+/// `NAME:=VALUE`, as ROS users type it; `NAME=VALUE` does as well.
+fn xacro_arg(text: &str) -> std::result::Result<(String, String), String> {
+    let (name, value) = pair::<'='>(text).map_err(|_| "must be NAME:=VALUE".to_owned())?;
+    Ok((name.strip_suffix(':').unwrap_or(&name).to_owned(), value))
+}
+
+impl File {
+    fn load(&self, meshes: Meshes) -> Loaded {
+        load(&Source {
+            path: self.file.clone(),
+            packages: self.package.iter().map(|(name, folder)| (name.clone(), folder.into())).collect(),
+            xacro_args: self.xacro_arg.iter().cloned().collect(),
+            srdf: self.srdf.clone(),
+            joint_limits: self.joint_limits.clone(),
+            meshes,
+        })
+    }
+
+    /// The robot; its mistakes and warnings go to stderr.
+    fn robot(&self, meshes: Meshes) -> Result<(RobotModel, Loaded)> {
+        let mut loaded = self.load(meshes);
+        let text = loaded.render(output::colour(&std::io::stderr()));
+        if !text.is_empty() {
+            output::note(text.trim_end());
+        }
+        match loaded.model.take() {
+            Some(model) => Ok((model, loaded)),
+            None => Err(Failure::usage(format!("{} has mistakes", self.file.display()))),
+        }
+    }
+}
+
+/// Runs the verb.
+pub fn run(args: &Args) -> Result {
+    match &args.verb {
+        Verb::Info(file) => info::info(file),
+        Verb::Tree(file) => info::tree(file),
+        Verb::Check(file) => check::run(file),
+        Verb::Expand(file) => expand(file),
+        Verb::Fk(args) => fk::run(args),
+    }
+}
+
+/// Prints the URDF even of a robot that has mistakes: it helps to find them.
+fn expand(file: &File) -> Result {
+    let loaded = file.load(Meshes::Ignore);
+    let text = loaded.render(output::colour(&std::io::stderr()));
+    if !text.is_empty() {
+        output::note(text.trim_end());
+    }
+    let Some(urdf) = loaded.urdf() else {
+        return Err(Failure::usage(format!("{} cannot be expanded", file.file.display())));
+    };
+    if file.json {
+        output::json(&serde_json::json!({"urdf": urdf, "files": loaded.files}));
+    } else {
+        output::line(urdf.trim_end());
+    }
+    Ok(Exit::Ok)
+}

@@ -1,0 +1,94 @@
+//! `dimos model fk`: where a link is at joint positions.
+
+use serde_json::json;
+
+use super::File;
+use crate::cli::arguments::finite;
+use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::output;
+use crate::robot::RobotModel;
+use crate::robot::urdf::Meshes;
+use crate::yaml::did_you_mean;
+
+/// Arguments of `model fk`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "The joints are those between the two links that move on their own, in order from the base.")]
+pub struct Args {
+    #[command(flatten)]
+    file: File,
+    /// Positions of the joints [rad, or m of prismatic joints]
+    #[arg(value_name = "Q", value_parser = finite, allow_negative_numbers = true)]
+    positions: Vec<f64>,
+    /// The link to find; default: the end of the longest chain
+    #[arg(long, value_name = "NAME")]
+    link: Option<String>,
+    /// The link in whose frame to say it; default: the root
+    #[arg(long, value_name = "NAME")]
+    base: Option<String>,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args) -> Result {
+    let (robot, _) = args.file.robot(Meshes::Ignore)?;
+    let base = args.base.as_deref().map_or(Ok(0), |name| index(&robot, name))?;
+    let tip = args.link.as_deref().map_or_else(|| Ok(deepest(&robot)), |name| index(&robot, name))?;
+    let name = |link: usize| robot.links.get(link).map_or("?", |l| l.name.as_str());
+    let Some(chain) = robot.chain(base, tip) else {
+        return Err(Failure::usage(format!("`{}` does not hang below `{}`", name(tip), name(base))));
+    };
+    let moving: Vec<&str> = chain
+        .iter()
+        .filter_map(|i| robot.joints.get(*i))
+        .filter(|joint| joint.is_independent())
+        .map(|joint| joint.name.as_str())
+        .collect();
+    if moving.len() != args.positions.len() {
+        let what = format!("`{}` takes {} positions, found {}", name(tip), moving.len(), args.positions.len());
+        return Err(Failure::usage(what).hint(format!("the joints are: {}", moving.join(" "))));
+    }
+    for (joint, q) in moving.iter().zip(&args.positions) {
+        let limits = robot.joint_index(joint).and_then(|i| robot.joints.get(i)).map(|j| j.limits);
+        if let Some(limits) = limits.filter(|l| *q < l.lower || *q > l.upper) {
+            output::note(format_args!(
+                "warning: {joint} {q} is outside its limits {} to {}",
+                limits.lower, limits.upper
+            ));
+        }
+    }
+    let named = moving.iter().map(|joint| (*joint).to_owned()).zip(args.positions.iter().copied()).collect();
+    let poses = robot.link_poses(&robot.positions(&named));
+    let at = |link: usize| poses.get(link).copied().unwrap_or_default();
+    let pose = at(base).inverse() * at(tip);
+    let (xyz, (r, p, y)) = (pose.translation.vector, pose.rotation.euler_angles());
+    let q = pose.rotation.quaternion().coords;
+    if args.file.json {
+        output::json(&json!({
+            "link": name(tip), "base": name(base), "joints": moving, "positions": args.positions,
+            "xyz": xyz.as_slice(), "rpy": [r, p, y], "quat_xyzw": q.as_slice(),
+        }));
+        return Ok(Exit::Ok);
+    }
+    let row = |values: &[f64]| values.iter().map(|v| output::fixed(*v, 6)).collect::<Vec<_>>().join(" ");
+    output::line(format_args!("{} in {}", name(tip), name(base)));
+    output::line(format_args!("xyz   {}  m", row(xyz.as_slice())));
+    output::line(format_args!("rpy   {}  rad", row(&[r, p, y])));
+    output::line(format_args!("quat  {}  x y z w", row(q.as_slice())));
+    Ok(Exit::Ok)
+}
+
+fn index(robot: &RobotModel, name: &str) -> Result<usize> {
+    robot.link_index(name).ok_or_else(|| {
+        let hint = did_you_mean(name, robot.links.iter().map(|l| l.name.as_str()), "the links are");
+        Failure { hint, ..Failure::usage(format!("{} has no link `{name}`", robot.name)) }
+    })
+}
+
+/// The first link that most joints lead to.
+fn deepest(robot: &RobotModel) -> usize {
+    let mut depths = vec![0; robot.links.len()];
+    for joint in &robot.joints {
+        depths[joint.child] = depths[joint.parent] + 1;
+    }
+    let most = depths.iter().max().copied().unwrap_or(0);
+    depths.iter().position(|d| *d == most).unwrap_or(0)
+}

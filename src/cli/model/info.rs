@@ -1,0 +1,256 @@
+//! `dimos model info` and `tree`: what a robot is made of.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+use serde_json::{Value, json};
+
+use super::File;
+use crate::cli::exit::{Exit, Result};
+use crate::cli::output::{self, Table};
+use crate::robot::mesh::Mesh;
+use crate::robot::srdf::Semantics;
+use crate::robot::urdf::Meshes;
+use crate::robot::{Geometry, Joint, RobotModel, Shape};
+
+/// Runs `info`.
+pub(super) fn info(file: &File) -> Result {
+    let (robot, loaded) = file.robot(Meshes::Find)?;
+    let mut meshes = MeshCounts::default();
+    if file.json {
+        output::json(&to_json(&robot, &loaded.semantics, &mut meshes));
+        return Ok(Exit::Ok);
+    }
+    let independent = robot.independent_joints().len();
+    let (links, joints) = (robot.links.len(), robot.joints.len());
+    let root = robot.links.first().map_or("", |link| link.name.as_str());
+    output::line(format_args!(
+        "{}: {links} links, {joints} joints, {independent} of them move on their own",
+        robot.name
+    ));
+    output::line(format_args!("root: {root}"));
+    output::line("");
+    let headings = [
+        "JOINT",
+        "TYPE",
+        "PARENT → CHILD",
+        ">LOWER rad",
+        ">UPPER rad",
+        ">LOWER °",
+        ">UPPER °",
+        ">SPEED /s",
+        ">ACC /s²",
+        "NOTE",
+    ];
+    let mut table = Table::new(&headings);
+    for joint in &robot.joints {
+        table.row(joint_row(&robot, joint));
+    }
+    table.print();
+    output::line("");
+    let mut table = Table::new(&["LINK", ">MASS kg", "VISUAL", "COLLISION"]);
+    for link in &robot.links {
+        let mass = output::number(link.inertial.as_ref().map(|i| i.mass), 3);
+        let cells =
+            [link.name.clone(), mass, shapes(&link.visuals, &mut meshes), shapes(&link.collisions, &mut meshes)];
+        table.row(cells);
+    }
+    table.print();
+    print_semantics(&robot, &loaded.semantics);
+    Ok(Exit::Ok)
+}
+
+fn joint_row(robot: &RobotModel, joint: &Joint) -> Vec<String> {
+    let name = |link: usize| robot.links.get(link).map_or("?", |l| l.name.as_str());
+    let limits = &joint.limits;
+    let finite = |value: f64| Some(value).filter(|v| v.is_finite());
+    let degrees = |value: f64| finite(value).filter(|_| joint.kind.is_angle()).map(f64::to_degrees);
+    let note = match joint.mimic {
+        Some(mimic) => {
+            let leader = robot.joints.get(mimic.leader).map_or("?", |j| j.name.as_str());
+            format!("follows {leader} · {} + {}", mimic.multiplier, mimic.offset)
+        }
+        None if joint.kind.name() == "prismatic" => "metres".to_owned(),
+        None => String::new(),
+    };
+    vec![
+        joint.name.clone(),
+        joint.kind.name().to_owned(),
+        format!("{} → {}", name(joint.parent), name(joint.child)),
+        output::number(finite(limits.lower), 4),
+        output::number(finite(limits.upper), 4),
+        output::number(degrees(limits.lower), 1),
+        output::number(degrees(limits.upper), 1),
+        output::number(finite(limits.velocity), 3),
+        output::number(limits.acceleration, 3),
+        note,
+    ]
+}
+
+fn print_semantics(robot: &RobotModel, semantics: &Semantics) {
+    if *semantics == Semantics::default() {
+        return;
+    }
+    output::line("");
+    let mut table = Table::new(&["GROUP", "JOINTS"]);
+    for group in &semantics.groups {
+        table.row([group.name.clone(), joint_names(robot, semantics, &group.name).join(" ")]);
+    }
+    table.print();
+    for pose in &semantics.poses {
+        let values: Vec<String> = pose.positions.iter().map(|(joint, q)| format!("{joint} {q}")).collect();
+        output::line(format_args!("pose {} of {}: {}", pose.name, pose.group, values.join(", ")));
+    }
+    for tool in &semantics.end_effectors {
+        output::line(format_args!("end effector {}: {} on {}", tool.name, tool.group, tool.parent_link));
+    }
+    output::line(format_args!("{} pairs of links may touch", semantics.disabled.len()));
+}
+
+fn joint_names(robot: &RobotModel, semantics: &Semantics, group: &str) -> Vec<String> {
+    let joints = semantics.group_joints(robot, group).unwrap_or_default();
+    joints.iter().filter_map(|i| robot.joints.get(*i)).map(|j| j.name.clone()).collect()
+}
+
+/// Numbers of triangles; each file is read once.
+#[derive(Debug, Default)]
+struct MeshCounts(HashMap<PathBuf, Option<usize>>);
+
+impl MeshCounts {
+    fn of(&mut self, geometry: &Geometry) -> Option<usize> {
+        let Geometry::Mesh(mesh) = geometry else { return None };
+        let path = mesh.path.clone()?;
+        *self.0.entry(path).or_insert_with(|| Mesh::load(mesh).ok().map(|m| m.triangles.len()))
+    }
+}
+
+fn shapes(shapes: &[Shape], meshes: &mut MeshCounts) -> String {
+    let words: Vec<String> = shapes.iter().map(|shape| described(&shape.geometry, meshes)).collect();
+    words.join(", ")
+}
+
+fn described(geometry: &Geometry, meshes: &mut MeshCounts) -> String {
+    match geometry {
+        Geometry::Box { size } => format!("box {} × {} × {} m", size.x, size.y, size.z),
+        Geometry::Sphere { radius } => format!("sphere r {radius} m"),
+        Geometry::Cylinder { radius, length } => format!("cylinder r {radius} l {length} m"),
+        Geometry::Capsule { radius, length } => format!("capsule r {radius} l {length} m"),
+        Geometry::Mesh(mesh) => {
+            let name = mesh.uri.rsplit('/').next().unwrap_or(&mesh.uri);
+            match meshes.of(geometry) {
+                Some(triangles) => format!("{name} ({triangles} triangles)"),
+                None => format!("{name} (not read)"),
+            }
+        }
+    }
+}
+
+/// Runs `tree`.
+pub(super) fn tree(file: &File) -> Result {
+    let (robot, _) = file.robot(Meshes::Ignore)?;
+    if file.json {
+        output::json(&branch(&robot, 0));
+        return Ok(Exit::Ok);
+    }
+    output::line(robot.links.first().map_or("", |link| link.name.as_str()));
+    draw(&robot);
+    Ok(Exit::Ok)
+}
+
+/// Draws all below the root. The links stand depth first already; a line needs to know which branches go on.
+fn draw(robot: &RobotModel) {
+    // For every open level: whether more branches follow there.
+    let mut levels: Vec<(usize, bool)> = Vec::new();
+    for (i, joint) in robot.joints.iter().enumerate() {
+        while levels.last().is_some_and(|(parent, _)| *parent != joint.parent) {
+            levels.pop();
+        }
+        let more = robot.joints.iter().skip(i + 1).any(|j| j.parent == joint.parent);
+        match levels.last_mut() {
+            Some(level) => level.1 = more,
+            None => levels.push((joint.parent, more)),
+        }
+        let (_, above) = levels.split_last().unwrap_or((&(0, false), &[]));
+        let indent: String = above.iter().map(|(_, more)| if *more { "│  " } else { "   " }).collect();
+        let sign = if more { "├─" } else { "└─" };
+        let child = robot.links.get(joint.child).map_or("?", |l| l.name.as_str());
+        output::line(format_args!("{indent}{sign} {child}  ({}, {})", joint.name, joint.kind.name()));
+        levels.push((joint.child, false));
+    }
+}
+
+fn branch(robot: &RobotModel, link: usize) -> Value {
+    let below = robot.joints.iter().filter(|j| j.parent == link);
+    let children: Vec<Value> =
+        below.map(|j| json!({"joint": j.name, "type": j.kind.name(), "link": branch(robot, j.child)})).collect();
+    json!({"name": robot.links.get(link).map(|l| l.name.as_str()), "children": children})
+}
+
+fn to_json(robot: &RobotModel, semantics: &Semantics, meshes: &mut MeshCounts) -> Value {
+    let name = |link: usize| robot.links.get(link).map(|l| l.name.as_str());
+    let finite = |value: f64| Some(value).filter(|v| v.is_finite());
+    let pose = |p: &nalgebra::Isometry3<f64>| {
+        let (r, y, w) = p.rotation.euler_angles();
+        json!({"xyz": p.translation.vector.as_slice(), "rpy": [r, y, w]})
+    };
+    let joints: Vec<Value> = robot
+        .joints
+        .iter()
+        .map(|j| {
+            let mimic = j.mimic.map(|m| {
+                json!({
+                    "joint": robot.joints.get(m.leader).map(|l| l.name.as_str()),
+                    "multiplier": m.multiplier, "offset": m.offset,
+                })
+            });
+            json!({
+                "name": j.name, "type": j.kind.name(), "parent": name(j.parent), "child": name(j.child),
+                "origin": pose(&j.origin), "axis": j.axis.as_slice(), "mimic": mimic,
+                "lower": finite(j.limits.lower), "upper": finite(j.limits.upper), "velocity": finite(j.limits.velocity),
+                "effort": finite(j.limits.effort), "acceleration": j.limits.acceleration, "jerk": j.limits.jerk,
+            })
+        })
+        .collect();
+    let mut shape = |s: &Shape| {
+        let what = match &s.geometry {
+            Geometry::Box { size } => json!({"box": size.as_slice()}),
+            Geometry::Sphere { radius } => json!({"sphere": {"radius": radius}}),
+            Geometry::Cylinder { radius, length } => json!({"cylinder": {"radius": radius, "length": length}}),
+            Geometry::Capsule { radius, length } => json!({"capsule": {"radius": radius, "length": length}}),
+            Geometry::Mesh(m) => json!({"mesh": {
+                "uri": m.uri, "path": m.path, "scale": m.scale.as_slice(), "triangles": meshes.of(&s.geometry),
+            }}),
+        };
+        json!({"origin": pose(&s.origin), "geometry": what})
+    };
+    let links: Vec<Value> = robot
+        .links
+        .iter()
+        .map(|l| {
+            json!({
+                "name": l.name, "mass": l.inertial.as_ref().map(|i| i.mass),
+                "visuals": l.visuals.iter().map(&mut shape).collect::<Vec<_>>(),
+                "collisions": l.collisions.iter().map(&mut shape).collect::<Vec<_>>(),
+            })
+        })
+        .collect();
+    let groups: Vec<Value> = semantics
+        .groups
+        .iter()
+        .map(|g| json!({"name": g.name, "joints": joint_names(robot, semantics, &g.name)}))
+        .collect();
+    let poses: Vec<Value> = semantics
+        .poses
+        .iter()
+        .map(|p| {
+            let positions: serde_json::Map<String, Value> =
+                p.positions.iter().map(|(j, q)| (j.clone(), json!(q))).collect();
+            json!({"name": p.name, "group": p.group, "positions": positions})
+        })
+        .collect();
+    let disabled: Vec<Value> = semantics.disabled.iter().map(|d| json!([d.a, d.b, d.reason])).collect();
+    json!({
+        "name": robot.name, "root": name(0), "joints": joints, "links": links,
+        "groups": groups, "named_poses": poses, "disabled_collisions": disabled,
+    })
+}

@@ -1,0 +1,271 @@
+//! `dimos world`: the obstacles that the planner keeps clear of, and what the robots hold.
+
+use std::path::{Path, PathBuf};
+
+use super::arguments::{Target, finite};
+use super::exit::{Exit, Failure, Result};
+use super::output::{self, Table, fixed};
+use crate::rpc::api::{Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldMove, WorldObject, WorldRemove};
+use crate::rpc::client::Client;
+
+/// Arguments of `world`.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// What to do
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+/// What can be done with the world.
+#[derive(Debug, clap::Subcommand)]
+pub enum Command {
+    /// List the objects
+    List(ListArgs),
+    /// Add an obstacle
+    Add(AddArgs),
+    /// Move an obstacle
+    Move(MoveArgs),
+    /// Remove an obstacle, or all
+    Remove(RemoveArgs),
+    /// Add the objects of a YAML file: a map of names as under `planner.world`
+    Load(LoadArgs),
+    /// Let a robot hold an object, where it is now
+    Attach(AttachArgs),
+    /// Let go of an object: it stays where it is
+    Detach(DetachArgs),
+}
+
+/// Arguments of `world list`.
+#[derive(Debug, clap::Args)]
+pub struct ListArgs {
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// A pose as it is typed.
+#[derive(Debug, Clone, clap::Args)]
+pub struct At {
+    /// Where it is: x, y, z [m] in the frame `map`
+    #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
+    pub at: Vec<f64>,
+    /// Its roll, pitch, yaw about fixed axes [rad]
+    #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
+    pub rpy: Option<Vec<f64>>,
+}
+
+impl At {
+    fn pose(&self) -> PoseSpec {
+        let rpy = self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok());
+        PoseSpec { xyz: self.at.as_slice().try_into().unwrap_or_default(), rpy, quat: None }
+    }
+}
+
+/// Arguments of `world add`.
+#[derive(Debug, clap::Args)]
+#[command(group = clap::ArgGroup::new("shape").required(true).args(["cuboid", "sphere", "cylinder", "mesh", "cloud"]))]
+pub struct AddArgs {
+    /// A name for it; an object of the same name is replaced
+    pub name: String,
+    /// A box: edge lengths [m]
+    #[arg(long = "box", value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite)]
+    pub cuboid: Option<Vec<f64>>,
+    /// A sphere: radius [m]
+    #[arg(long, value_name = "RADIUS", value_parser = finite)]
+    pub sphere: Option<f64>,
+    /// A cylinder along z: radius and length [m]
+    #[arg(long, value_names = ["RADIUS", "LENGTH"], num_args = 2, value_parser = finite)]
+    pub cylinder: Option<Vec<f64>>,
+    /// A mesh file: STL, OBJ or DAE
+    #[arg(long, value_name = "FILE")]
+    pub mesh: Option<PathBuf>,
+    /// A point cloud file: PLY
+    #[arg(long, value_name = "FILE")]
+    pub cloud: Option<PathBuf>,
+    /// Where it is
+    #[command(flatten)]
+    pub at: At,
+    /// How much it is thickened all around [m]
+    #[arg(long, value_name = "METRES", value_parser = finite, default_value_t = 0.0)]
+    pub padding: f64,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Arguments of `world move`.
+#[derive(Debug, clap::Args)]
+pub struct MoveArgs {
+    /// The object's name
+    pub name: String,
+    /// Where it is from now on
+    #[command(flatten)]
+    pub at: At,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Arguments of `world remove`.
+#[derive(Debug, clap::Args)]
+pub struct RemoveArgs {
+    /// The object's name
+    #[arg(required_unless_present = "all")]
+    pub name: Option<String>,
+    /// Remove all objects
+    #[arg(long, conflicts_with = "name")]
+    pub all: bool,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Arguments of `world load`.
+#[derive(Debug, clap::Args)]
+pub struct LoadArgs {
+    /// The file
+    pub file: PathBuf,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Arguments of `world attach`.
+#[derive(Debug, clap::Args)]
+pub struct AttachArgs {
+    /// The object's name
+    pub name: String,
+    /// The robot that holds it
+    pub robot: String,
+    /// The link that holds it; default: the end effector's
+    #[arg(long)]
+    pub link: Option<String>,
+    /// Links that may touch it, beside that one
+    #[arg(long, value_name = "LINK")]
+    pub touch: Vec<String>,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Arguments of `world detach`.
+#[derive(Debug, clap::Args)]
+pub struct DetachArgs {
+    /// The object's name
+    pub name: String,
+    /// Which run
+    #[command(flatten)]
+    pub target_run: Target,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args) -> Result {
+    match &args.command {
+        Command::List(a) => list(&mut a.target_run.connect()?, a.target_run.json)?,
+        Command::Add(a) => {
+            let object = WorldObject {
+                name: a.name.clone(),
+                shape: shape(a)?,
+                pose: a.at.pose(),
+                padding: a.padding,
+                held_by: None,
+            };
+            a.target_run.connect()?.call(WorldAdd(object))?;
+            done(format_args!("{} is in the world", a.name), a.target_run.json);
+        }
+        Command::Move(a) => {
+            a.target_run.connect()?.call(WorldMove { name: a.name.clone(), pose: a.at.pose() })?;
+            done(format_args!("{} moved", a.name), a.target_run.json);
+        }
+        Command::Remove(a) => {
+            a.target_run.connect()?.call(WorldRemove { name: a.name.clone() })?;
+            done(format_args!("{} removed", a.name.as_deref().unwrap_or("all objects")), a.target_run.json);
+        }
+        Command::Load(a) => {
+            // The whole file is read first: a mistake in its last object changes nothing.
+            let objects = load(&a.file)?;
+            let mut client = a.target_run.connect()?;
+            for object in &objects {
+                client.call(WorldAdd(object.clone()))?;
+            }
+            done(format_args!("{} objects are in the world", objects.len()), a.target_run.json);
+        }
+        Command::Attach(a) => {
+            let (name, robot) = (a.name.clone(), a.robot.clone());
+            a.target_run.connect()?.call(Attach { name, robot, link: a.link.clone(), touch_links: a.touch.clone() })?;
+            done(format_args!("{} is held by {}", a.name, a.robot), a.target_run.json);
+        }
+        Command::Detach(a) => {
+            a.target_run.connect()?.call(Detach { name: a.name.clone() })?;
+            done(format_args!("{} stays where it is", a.name), a.target_run.json);
+        }
+    }
+    Ok(Exit::Ok)
+}
+
+fn done(what: std::fmt::Arguments<'_>, json: bool) {
+    match json {
+        true => output::json(&serde_json::json!({})),
+        false => output::line(what),
+    }
+}
+
+fn shape(args: &AddArgs) -> Result<ShapeSpec> {
+    Ok(match args {
+        AddArgs { cuboid: Some(size), .. } => ShapeSpec::Box(size.as_slice().try_into().unwrap_or_default()),
+        AddArgs { sphere: Some(radius), .. } => ShapeSpec::Sphere(*radius),
+        AddArgs { cylinder: Some(size), .. } => ShapeSpec::Cylinder(size.as_slice().try_into().unwrap_or_default()),
+        AddArgs { mesh: Some(file), .. } => ShapeSpec::Mesh(full_path(file)?),
+        AddArgs { cloud: Some(file), .. } => ShapeSpec::Cloud(full_path(file)?),
+        _ => return Err(Failure::usage("the object has no shape")),
+    })
+}
+
+/// The run may have another working folder.
+fn full_path(file: &Path) -> Result<String> {
+    let path = file.canonicalize().map_err(|e| Failure::usage(format!("{}: {e}", file.display())))?;
+    Ok(path.display().to_string())
+}
+
+/// The objects of a file. Paths in it are relative to its folder.
+fn load(file: &Path) -> Result<Vec<WorldObject>> {
+    let wrong = |what: String| Failure::usage(format!("{}: {what}", file.display()));
+    let text = std::fs::read_to_string(file).map_err(|e| wrong(e.to_string()))?;
+    let folder = file.parent().unwrap_or(Path::new(""));
+    let mut objects: std::collections::BTreeMap<String, crate::rpc::api::WorldEntry> =
+        serde_yaml::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let resolve = |path: &mut String| full_path(&folder.join(&path)).map(|full| *path = full);
+    for entry in objects.values_mut() {
+        if let ShapeSpec::Mesh(path) | ShapeSpec::Cloud(path) = &mut entry.shape {
+            resolve(path)?;
+        }
+    }
+    Ok(objects.into_iter().map(|(name, entry)| entry.named(name)).collect())
+}
+
+fn list(client: &mut Client, json: bool) -> Result<()> {
+    let world = client.call(World {})?;
+    if json {
+        output::json(&world);
+        return Ok(());
+    }
+    let mut table = Table::new(&["NAME", "SHAPE", ">SIZE m", ">X m", ">Y m", ">Z m", ">PADDING m", "HELD BY"]);
+    for object in &world.objects {
+        let (kind, size) = match &object.shape {
+            ShapeSpec::Box(size) => ("box", size.map(|v| fixed(v, 3)).join(" × ")),
+            ShapeSpec::Sphere(radius) => ("sphere", format!("r {}", fixed(*radius, 3))),
+            ShapeSpec::Cylinder([r, l]) => ("cylinder", format!("r {}, {} long", fixed(*r, 3), fixed(*l, 3))),
+            ShapeSpec::Mesh(path) => ("mesh", path.clone()),
+            ShapeSpec::Cloud(path) => ("cloud", path.clone()),
+        };
+        let [x, y, z] = object.pose.xyz.map(|v| fixed(v, 3));
+        let held = object.held_by.as_ref().map_or_else(|| "-".into(), |[robot, link]| format!("{robot} {link}"));
+        table.row([object.name.clone(), kind.into(), size, x, y, z, fixed(object.padding, 3), held]);
+    }
+    if world.objects.is_empty() {
+        output::note("the world is empty: `dimos world add` puts something into it");
+    } else {
+        table.print();
+    }
+    Ok(())
+}

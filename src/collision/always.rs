@@ -1,0 +1,59 @@
+//! Pairs of links that touch wherever the robot stands: a mistake of the description, or a pair that was meant to be
+//! excluded. They are reported by name and never left out in silence.
+
+use std::sync::Arc;
+
+use crate::robot::random::Random;
+
+use super::checker::{CollisionChecker, Resolution};
+use super::exact::ExactChecker;
+use super::report::Contact;
+use super::scene::Scene;
+
+/// A pair that touches far more often than it should.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Suspect {
+    /// The pair, as it is at home.
+    pub contact: Contact,
+    /// Whether it touches at the home configuration.
+    pub at_home: bool,
+    /// In how many of the samples it touches, 0–1.
+    pub share: f64,
+}
+
+/// The pairs that touch in (nearly) all of `samples` random configurations, or at home, the most frequent first. The
+/// same seed finds the same.
+pub fn always_touching(scene: &Arc<Scene>, home: &[f64], samples: usize, seed: u64) -> Vec<Suspect> {
+    let mut checker = ExactChecker::new(scene.clone(), Resolution::default());
+    let mut random = Random::new(seed);
+    let at_home = checker.contacts(home);
+    let mut counts = vec![];
+    for _ in 0..samples {
+        let q: Vec<f64> = scene.limits().iter().map(|l| sample(l.lower, l.upper, &mut random)).collect();
+        for contact in checker.contacts(&q) {
+            match counts.iter_mut().find(|(seen, _): &&mut (Contact, usize)| seen.pair == contact.pair) {
+                Some((_, n)) => *n += 1,
+                None => counts.push((contact, 1)),
+            }
+        }
+    }
+    let often = |n: usize| n as f64 / samples.max(1) as f64;
+    let home = |contact: &Contact| at_home.iter().find(|c| c.pair == contact.pair).cloned();
+    let mut suspects: Vec<Suspect> = counts
+        .iter()
+        .map(|(c, n)| Suspect { contact: home(c).unwrap_or(c.clone()), at_home: home(c).is_some(), share: often(*n) })
+        .filter(|s| s.at_home || s.share > 0.99)
+        .collect();
+    let missed = at_home.iter().filter(|c| !counts.iter().any(|(seen, _)| seen.pair == c.pair));
+    suspects.extend(missed.map(|c| Suspect { contact: c.clone(), at_home: true, share: 0.0 }));
+    suspects.sort_by(|a, b| b.share.total_cmp(&a.share).then(a.contact.pair.cmp(&b.contact.pair)));
+    suspects
+}
+
+/// A position between limits; joints without limits anywhere in one turn.
+pub fn sample(lower: f64, upper: f64, random: &mut Random) -> f64 {
+    let turn = std::f64::consts::PI;
+    let low = if lower.is_finite() { lower } else { upper.min(turn) - 2.0 * turn };
+    let high = if upper.is_finite() { upper } else { low + 2.0 * turn };
+    random.between(low, high)
+}

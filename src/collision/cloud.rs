@@ -1,0 +1,133 @@
+//! A point cloud as a tree of boxes around points: an obstacle of many small balls.
+
+use glamx::{DAffine3, DVec3};
+
+use super::pairs::point::local;
+
+/// Points in a leaf.
+const LEAF: usize = 8;
+
+/// Points, sorted so that each node of the tree is a range of them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Cloud {
+    points: Vec<DVec3>,
+    /// A binary heap of boxes (lowest, highest corner): node `i` has children `2i + 1` and `2i + 2`.
+    boxes: Vec<(DVec3, DVec3)>,
+    depth: u32,
+}
+
+impl Cloud {
+    /// A tree of points [m]; points that are not finite are left out, `None` when none remain.
+    pub fn new(points: impl IntoIterator<Item = DVec3>) -> Option<Self> {
+        let mut points: Vec<DVec3> = points.into_iter().filter(|p| p.is_finite()).collect();
+        if points.is_empty() {
+            return None;
+        }
+        let depth = points.len().div_ceil(LEAF).next_power_of_two().trailing_zeros();
+        let mut boxes = vec![(DVec3::ZERO, DVec3::ZERO); (2 << depth) - 1];
+        split(&mut points, 0, &mut boxes);
+        Some(Self { points, boxes, depth })
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether there are no points: never.
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// The points [m], in the cloud's frame.
+    pub fn points(&self) -> &[DVec3] {
+        &self.points
+    }
+
+    /// Lowest and highest corner of the box around all points.
+    pub fn bounds(&self) -> (DVec3, DVec3) {
+        self.boxes[0]
+    }
+
+    /// Whether `test` holds for any point within `reach` of a ball; points are given in the common frame.
+    pub fn any_within(
+        &self,
+        frame: &DAffine3,
+        ball: DVec3,
+        radius: f64,
+        reach: f64,
+        mut test: impl FnMut(DVec3) -> bool,
+    ) -> bool {
+        let center = local(ball, frame);
+        self.visit(0, 0..self.points.len(), &mut |node, points| {
+            let near = |p: DVec3, limit: f64| p.length_squared() <= limit * limit;
+            if let Some((low, high)) = node {
+                return near(center - center.clamp(low, high), radius + reach);
+            }
+            points.iter().any(|p| near(*p - center, radius + reach) && test(frame.transform_point3(*p)))
+        })
+    }
+
+    /// The least `distance` of a point, and the point, in the common frame. The other thing lies within a ball.
+    pub fn nearest(
+        &self,
+        frame: &DAffine3,
+        ball: DVec3,
+        radius: f64,
+        mut distance: impl FnMut(DVec3) -> f64,
+    ) -> (f64, DVec3) {
+        let center = local(ball, frame);
+        let mut best = (f64::INFINITY, frame.transform_point3(self.points[0]));
+        self.visit(0, 0..self.points.len(), &mut |node, points| {
+            if let Some((low, high)) = node {
+                return (center - center.clamp(low, high)).length() - radius < best.0;
+            }
+            for p in points {
+                if (*p - center).length() - radius < best.0 {
+                    let p = frame.transform_point3(*p);
+                    let d = distance(p);
+                    if d < best.0 {
+                        best = (d, p);
+                    }
+                }
+            }
+            false
+        });
+        best
+    }
+
+    /// Walks the tree: `see` is asked about each box whether to go in, and about each leaf's points whether to end.
+    fn visit(
+        &self,
+        node: usize,
+        range: std::ops::Range<usize>,
+        see: &mut impl FnMut(Option<(DVec3, DVec3)>, &[DVec3]) -> bool,
+    ) -> bool {
+        if range.is_empty() || !see(Some(self.boxes[node]), &[]) {
+            return false;
+        }
+        if 2 * node + 1 >= self.boxes.len() {
+            return see(None, &self.points[range]);
+        }
+        let middle = range.start + range.len() / 2;
+        self.visit(2 * node + 1, range.start..middle, see) || self.visit(2 * node + 2, middle..range.end, see)
+    }
+}
+
+/// Sorts points into halves along the longest side, down to the leaves.
+fn split(points: &mut [DVec3], node: usize, boxes: &mut [(DVec3, DVec3)]) {
+    let low = points.iter().copied().fold(DVec3::INFINITY, DVec3::min);
+    let high = points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
+    boxes[node] = (low, high);
+    if 2 * node + 1 >= boxes.len() {
+        return;
+    }
+    let axis = (high - low).max_position();
+    let middle = points.len() / 2;
+    if !points.is_empty() {
+        points.select_nth_unstable_by(middle.min(points.len() - 1), |a, b| a[axis].total_cmp(&b[axis]));
+    }
+    let (left, right) = points.split_at_mut(middle);
+    split(left, 2 * node + 1, boxes);
+    split(right, 2 * node + 2, boxes);
+}

@@ -1,0 +1,325 @@
+//! The exact checker: every solid against every other, in double precision, with balls around links to rule out most.
+
+use std::sync::Arc;
+
+use glamx::{DAffine3, DVec3};
+
+use crate::robot::model::Limits;
+
+use super::checker::{CollisionChecker, Resolution, Stop};
+use super::motion::Pieces;
+use super::pairs::general::nearest;
+use super::pairs::{self, Placed, point};
+use super::report::{Contact, Pair};
+use super::scene::{LinkShape, Scene};
+use super::shape::Core;
+
+/// What there is to say about two things and a margin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Gap {
+    /// Farther apart than the margin.
+    Far,
+    /// Within the margin.
+    Close,
+    /// Touching.
+    Touch,
+}
+
+/// Checks configurations and motions of one scene. Once its buffers have grown it allocates nothing.
+#[derive(Debug, Clone)]
+pub struct ExactChecker {
+    pub(super) scene: Arc<Scene>,
+    pub(super) resolution: Resolution,
+    frames: Vec<DAffine3>,
+    /// The pairs that are checked, those of the links that move most first. Indices of pairs are indices in here.
+    pub(super) pairs: Vec<Pair>,
+    /// Index of a pair of links among the scene's, beside `pairs`.
+    pub(super) link_pairs: Vec<usize>,
+    /// Pairs of things that never move and touch: no configuration is free.
+    pub(super) always: Option<Pair>,
+    /// What touched last: likely to touch again.
+    pub(super) witness: Option<usize>,
+    pub(super) pieces: Pieces,
+    pub(super) looks: u64,
+}
+
+impl ExactChecker {
+    /// A checker of a scene.
+    pub fn new(scene: Arc<Scene>, resolution: Resolution) -> Self {
+        let frames = scene.frames();
+        let moves = |pair: &Pair| match *pair {
+            Pair::Links(a, b) => scene.links[a].moves || scene.links[b].moves,
+            Pair::Obstacle(link, _) => scene.links[link].moves,
+        };
+        let (mut pairs, still): (Vec<Pair>, Vec<Pair>) = scene.all_pairs().partition(moves);
+        let link_pair = |pair: &Pair| match *pair {
+            Pair::Links(a, b) => scene.pairs.iter().position(|p| (p.a, p.b) == (a, b)).unwrap_or_default(),
+            Pair::Obstacle(..) => 0,
+        };
+        // Links far from the base move most; obstacles are met more often than other links.
+        let order = |pair: &Pair| match *pair {
+            Pair::Obstacle(link, o) => (0, usize::MAX - link, o),
+            Pair::Links(a, b) => (1, usize::MAX - b, a),
+        };
+        pairs.sort_by_key(order);
+        let link_pairs = pairs.iter().map(link_pair).collect();
+        let pieces = Pieces::new(scene.dof(), pairs.len());
+        let mut made = Self {
+            frames,
+            pairs,
+            link_pairs,
+            resolution,
+            always: None,
+            witness: None,
+            pieces,
+            looks: 0,
+            scene: scene.clone(),
+        };
+        made.place(&vec![0.0; scene.dof()]);
+        made.always = still.into_iter().find(|pair| made.gap(*pair, 0.0) == Gap::Touch);
+        made
+    }
+
+    /// The scene it checks.
+    pub fn scene(&self) -> &Arc<Scene> {
+        &self.scene
+    }
+
+    /// Moves all frames to a configuration.
+    pub(super) fn place(&mut self, q: &[f64]) {
+        self.looks += 1;
+        self.scene.forward(q, &mut self.frames);
+    }
+
+    /// How far two things are apart where they stand now.
+    pub(super) fn gap(&self, pair: Pair, margin: f64) -> Gap {
+        match pair {
+            Pair::Links(a, b) => self.gap_of_links(a, b, margin),
+            Pair::Obstacle(link, obstacle) => self.gap_to_obstacle(link, obstacle, margin),
+        }
+    }
+
+    fn center(&self, link: &LinkShape) -> DVec3 {
+        self.frames[link.frame].transform_point3(link.ball.0)
+    }
+
+    fn gap_to_obstacle(&self, link: usize, obstacle: usize, margin: f64) -> Gap {
+        let (link, standing) = (&self.scene.links[link], &self.scene.obstacles[obstacle]);
+        let (guard, half) = &standing.guard;
+        let extra = standing.solid.radius + margin;
+        let reach = link.ball.1 + extra;
+        if outside(self.center(link), guard, *half) > reach * reach {
+            return Gap::Far;
+        }
+        let frame = &self.frames[link.frame];
+        let mut worst = Gap::Far;
+        for solid in &link.solids {
+            let radii = solid.radius + standing.solid.radius;
+            if let Core::Point = solid.core {
+                // The obstacle's box first: it is all there is to know about most obstacles, and about all that are far.
+                let center = frame.transform_point3(solid.frame.translation);
+                let squared = outside(center, guard, *half);
+                if squared > radii * radii {
+                    let reach = radii + margin;
+                    worst = if squared <= reach * reach { Gap::Close } else { worst };
+                    continue;
+                }
+                if standing.boxy {
+                    return Gap::Touch;
+                }
+            }
+            let placed = solid.place(frame);
+            match tell(&placed, &standing.placed(), radii, margin) {
+                Gap::Touch => return Gap::Touch,
+                Gap::Close => worst = Gap::Close,
+                Gap::Far => {}
+            }
+        }
+        worst
+    }
+
+    fn gap_of_links(&self, a: usize, b: usize, margin: f64) -> Gap {
+        let (first, second) = (&self.scene.links[a], &self.scene.links[b]);
+        let (center, radius) = (self.center(second), second.ball.1);
+        let reach = first.ball.1 + radius + margin;
+        if self.center(first).distance_squared(center) > reach * reach {
+            return Gap::Far;
+        }
+        let (f, g) = (&self.frames[first.frame], &self.frames[second.frame]);
+        let mut worst = Gap::Far;
+        for one in &first.solids {
+            let placed = one.place(f);
+            if let Placed::Point(p) = placed {
+                let reach = one.radius + radius + margin;
+                if p.distance_squared(center) > reach * reach {
+                    continue;
+                }
+            }
+            for two in &second.solids {
+                if let (Placed::Point(p), Core::Point) = (placed, &two.core) {
+                    let squared = p.distance_squared(g.transform_point3(two.frame.translation));
+                    let (radii, reach) = (one.radius + two.radius, one.radius + two.radius + margin);
+                    if squared <= radii * radii {
+                        return Gap::Touch;
+                    }
+                    worst = if squared <= reach * reach { Gap::Close } else { worst };
+                    continue;
+                }
+                match tell(&placed, &two.place(g), one.radius + two.radius, margin) {
+                    Gap::Touch => return Gap::Touch,
+                    Gap::Close => worst = Gap::Close,
+                    Gap::Far => {}
+                }
+            }
+        }
+        worst
+    }
+
+    fn contact(&self, pair: Pair) -> Option<Contact> {
+        let scene = &*self.scene;
+        let (l, name) = match pair {
+            Pair::Links(a, b) => (a, &scene.links[b].name),
+            Pair::Obstacle(l, o) => (l, &scene.obstacles[o].name),
+        };
+        let link = &scene.links[l];
+        let mut best: Option<Contact> = None;
+        let mut see = |one: &super::Solid, other: &Placed, radius: f64| {
+            let found = nearest(&one.place(&self.frames[link.frame]), other);
+            let distance = found.distance - one.radius - radius;
+            if best.as_ref().is_none_or(|b| distance < b.distance) {
+                let towards = (found.b - found.a).normalize_or_zero() * found.distance.signum();
+                let (on_link, on_other) = (found.a + towards * one.radius, found.b - towards * radius);
+                let (link, other) = (link.name.clone(), name.clone());
+                best = Some(Contact { pair, link, other, distance, on_link, on_other });
+            }
+        };
+        for one in &link.solids {
+            match pair {
+                Pair::Links(_, b) => {
+                    let LinkShape { solids, frame, .. } = &scene.links[b];
+                    solids.iter().for_each(|two| see(one, &two.place(&self.frames[*frame]), two.radius));
+                }
+                Pair::Obstacle(_, o) => see(one, &scene.obstacles[o].placed(), scene.obstacles[o].solid.radius),
+            }
+        }
+        best
+    }
+
+    /// A lower bound of a pair's distance, from the balls around the links.
+    fn least_distance(&self, pair: Pair) -> f64 {
+        let ball = |l: usize| (self.center(&self.scene.links[l]), self.scene.links[l].ball.1);
+        match pair {
+            Pair::Links(a, b) => ball(a).0.distance(ball(b).0) - ball(a).1 - ball(b).1,
+            Pair::Obstacle(l, o) => {
+                let standing = &self.scene.obstacles[o];
+                outside(ball(l).0, &standing.guard.0, standing.guard.1).sqrt() - standing.solid.radius - ball(l).1
+            }
+        }
+    }
+}
+
+/// How far two cores are apart beyond their radii.
+fn tell(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
+    use Placed::{Cylinder, Point, Segment};
+    let closed_form = matches!(
+        (a, b),
+        (Point(_), Point(_) | Segment(..) | Placed::Box(..) | Cylinder(..))
+            | (Segment(..), Point(_) | Segment(..) | Placed::Box(..))
+            | (Placed::Box(..), Point(_) | Segment(..))
+            | (Cylinder(..), Point(_))
+    );
+    if closed_form {
+        return match pairs::distance(a, b) - radii {
+            d if d <= 0.0 => Gap::Touch,
+            d if d <= margin => Gap::Close,
+            _ => Gap::Far,
+        };
+    }
+    if pairs::gap(a, b) > radii + margin {
+        Gap::Far
+    } else if pairs::within(a, b, radii) {
+        Gap::Touch
+    } else if margin > 0.0 && pairs::within(a, b, radii + margin) {
+        Gap::Close
+    } else {
+        Gap::Far
+    }
+}
+
+/// Squared distance of a point from a box.
+fn outside(p: DVec3, frame: &DAffine3, half: DVec3) -> f64 {
+    (point::local(p, frame).abs() - half).max(DVec3::ZERO).length_squared()
+}
+
+impl Scene {
+    /// Every pair that must not touch.
+    pub fn all_pairs(&self) -> impl Iterator<Item = Pair> + '_ {
+        let obstacle = move |l: usize| {
+            let checked = move |o: &usize| !self.allowed[l][*o];
+            (0..self.obstacles.len()).filter(checked).map(move |o| Pair::Obstacle(l, o))
+        };
+        let links = self.pairs.iter().map(|p| Pair::Links(p.a, p.b));
+        (0..self.links.len()).flat_map(obstacle).chain(links)
+    }
+}
+
+impl CollisionChecker for ExactChecker {
+    fn dof(&self) -> usize {
+        self.scene.dof()
+    }
+
+    fn limits(&self) -> &[Limits] {
+        self.scene.limits()
+    }
+
+    fn resolution(&self) -> Resolution {
+        self.resolution
+    }
+
+    fn is_free(&mut self, q: &[f64]) -> bool {
+        self.first_contact(q).is_none()
+    }
+
+    fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.prove(from, to, stop)
+    }
+
+    fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {
+        if self.always.is_some() {
+            return self.always;
+        }
+        self.place(q);
+        let touches = |i: &usize| self.gap(self.pairs[*i], 0.0) == Gap::Touch;
+        let found = self.witness.filter(touches).or_else(|| (0..self.pairs.len()).find(touches));
+        self.witness = found.or(self.witness);
+        found.map(|i| self.pairs[i])
+    }
+
+    fn clearance(&mut self, q: &[f64]) -> Option<Contact> {
+        self.place(q);
+        let mut best: Option<Contact> = None;
+        // Only of what a motion can change: a base on its table is always as close.
+        for pair in self.pairs.clone() {
+            if best.as_ref().is_none_or(|b| self.least_distance(pair) < b.distance)
+                && let Some(contact) = self.contact(pair)
+                && best.as_ref().is_none_or(|b| contact.distance < b.distance)
+            {
+                best = Some(contact);
+            }
+        }
+        best
+    }
+
+    fn contacts(&mut self, q: &[f64]) -> Vec<Contact> {
+        self.place(q);
+        let scene = self.scene.clone();
+        let touching = scene.all_pairs().filter(|pair| self.gap(*pair, 0.0) == Gap::Touch);
+        let mut contacts: Vec<Contact> = touching.filter_map(|pair| self.contact(pair)).collect();
+        contacts.sort_by(|a, b| a.distance.total_cmp(&b.distance));
+        contacts
+    }
+
+    fn looks(&self) -> u64 {
+        self.looks
+    }
+}

@@ -1,0 +1,30 @@
+//! What touches what: robots and obstacles as solids, immutable snapshots of a world, and checkers that planners ask.
+//!
+//! ```text
+//!  RobotModel ─▶ body ─┐
+//!  obstacles ──────────┴▶ World ──snapshot──▶ Arc<Scene> ──▶ ExactChecker: CollisionChecker
+//! ```
+//!
+//! A snapshot never changes, so perception, planning and a view each keep the one they work with, and nobody waits.
+
+pub mod always;
+pub mod body;
+pub mod checker;
+pub mod cloud;
+pub mod exact;
+mod motion;
+pub mod pairs;
+pub mod ply;
+pub mod report;
+pub mod scene;
+pub mod shape;
+pub mod world;
+
+pub use checker::{CollisionChecker, Resolution, Stop};
+pub use exact::ExactChecker;
+pub use scene::Scene;
+pub use shape::Solid;
+pub use world::World;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,142 @@
+//! Any two cores, through parry: GJK for convex ones, a tree of triangles for meshes, a tree of points for clouds.
+//! Also the closest points of a pair, and how deep two cores overlap: asked for explanations, not while planning.
+
+use glamx::{DAffine3, DPose3, DQuat, DVec3};
+use parry3d_f64::query::gjk::{self, CsoPoint, GJKResult, VoronoiSimplex};
+use parry3d_f64::query::{self, ClosestPoints};
+use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shape, SupportMap};
+
+use super::super::shape::Placed;
+
+/// What two cores have nearest to each other.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Nearest {
+    /// Distance of the cores [m]; negative: how far they must be moved apart.
+    pub distance: f64,
+    /// On or in the first core, in the common frame [m].
+    pub a: DVec3,
+    /// On or in the second core.
+    pub b: DVec3,
+}
+
+/// Distance of two cores [m], 0 where they overlap.
+pub fn distance(a: &Placed, b: &Placed) -> f64 {
+    if let Some((cloud, other)) = cloud_and_other(a, b) {
+        let (ball, radius) = other.ball();
+        return cloud.0.nearest(cloud.1, ball, radius, |p| super::distance(&Placed::Point(p), other)).0;
+    }
+    if holds(a, b) || holds(b, a) {
+        return 0.0;
+    }
+    with_shape(a, |pa, sa| with_shape(b, |pb, sb| query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance)))
+}
+
+/// Whether two cores are within `reach` [m] of each other.
+pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
+    if let Some((cloud, other)) = cloud_and_other(a, b) {
+        let (ball, radius) = other.ball();
+        return cloud.0.any_within(cloud.1, ball, radius, reach, |p| super::within(&Placed::Point(p), other, reach));
+    }
+    if holds(a, b) || holds(b, a) {
+        return true;
+    }
+    with_shape(a, |pa, sa| {
+        with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
+            (Some(ma), Some(mb)) => convex_within(&pa.inv_mul(pb), ma, mb, reach),
+            // What parry cannot tell counts as touching. Its closest points are not asked: for a box and a triangle
+            // they are not always the closest.
+            _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance) <= reach,
+        })
+    })
+}
+
+/// GJK ends as soon as it knows on which side of `reach` the distance lies.
+fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f64) -> bool {
+    let direction = pose.translation.try_normalize().unwrap_or(DVec3::X);
+    let mut simplex = VoronoiSimplex::new();
+    simplex.reset(CsoPoint::from_shapes(pose, a, b, direction));
+    match gjk::closest_points(pose, a, b, reach.max(0.0), false, &mut simplex) {
+        GJKResult::Intersection | GJKResult::Proximity(_) => true,
+        GJKResult::ClosestPoints(p, q, _) => p.distance(q) <= reach,
+        GJKResult::NoIntersection(_) => false,
+    }
+}
+
+/// The closest points of two cores, or how deep they overlap.
+pub fn nearest(a: &Placed, b: &Placed) -> Nearest {
+    if let Some((cloud, other)) = cloud_and_other(a, b) {
+        let (ball, radius) = other.ball();
+        let (_, p) = cloud.0.nearest(cloud.1, ball, radius, |p| super::distance(&Placed::Point(p), other));
+        let found = nearest(&Placed::Point(p), other);
+        let swapped = !matches!(a, Placed::Cloud(..));
+        return if swapped { Nearest { a: found.b, b: found.a, ..found } } else { found };
+    }
+    let inside = holds(a, b) || holds(b, a);
+    with_hull(a, |pa, sa| {
+        with_hull(b, |pb, sb| {
+            let touching = |at: DVec3| Nearest { distance: 0.0, a: at, b: at };
+            match query::closest_points(pa, sa, pb, sb, f64::MAX) {
+                Ok(ClosestPoints::WithinMargin(p, q)) => {
+                    let sign = if inside { -1.0 } else { 1.0 };
+                    Nearest { distance: sign * p.distance(q), a: p, b: q }
+                }
+                Ok(ClosestPoints::Intersecting) => match query::contact(pa, sa, pb, sb, 0.0) {
+                    Ok(Some(c)) => Nearest { distance: c.dist.min(0.0), a: c.point1, b: c.point2 },
+                    _ => touching(a.ball().0),
+                },
+                _ => touching(a.ball().0),
+            }
+        })
+    })
+}
+
+type CloudRef<'a> = (&'a super::super::cloud::Cloud, &'a DAffine3);
+
+fn cloud_and_other<'a>(a: &'a Placed<'a>, b: &'a Placed<'a>) -> Option<(CloudRef<'a>, &'a Placed<'a>)> {
+    match (a, b) {
+        (Placed::Cloud(f, c), other) | (other, Placed::Cloud(f, c)) => Some(((*c, f), other)),
+        _ => None,
+    }
+}
+
+/// Whether a closed mesh holds the middle of the other core: a surface alone would not touch what is inside it.
+fn holds(mesh: &Placed, other: &Placed) -> bool {
+    let Placed::Mesh(frame, mesh) = mesh else { return false };
+    mesh.is_closed() && mesh.holds(super::point::local(other.ball().0, frame))
+}
+
+fn pose(frame: &DAffine3) -> DPose3 {
+    DPose3 { rotation: DQuat::from_mat3(&frame.matrix3), translation: frame.translation }
+}
+
+fn with_shape<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R {
+    match placed {
+        Placed::Point(p) => f(&DPose3 { rotation: DQuat::IDENTITY, translation: *p }, &Ball::new(0.0)),
+        Placed::Segment(a, b) => f(&DPose3::IDENTITY, &Segment::new(*a, *b)),
+        Placed::Box(frame, half) => f(&pose(frame), &Cuboid::new(*half)),
+        Placed::Cylinder(frame, half, radius) => {
+            // parry's cylinders stand along y.
+            let mut upright = pose(frame);
+            upright.rotation *= DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+            f(&upright, &Cylinder::new(*half, *radius))
+        }
+        Placed::Hull(frame, hull) => f(&pose(frame), hull.polyhedron()),
+        Placed::Mesh(frame, mesh) => f(&pose(frame), mesh.surface()),
+        Placed::Cloud(frame, _) => f(&pose(frame), &Ball::new(0.0)),
+    }
+}
+
+/// The same with boxes as hulls: parry's closest points of boxes are not always the closest.
+fn with_hull<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R {
+    if let Placed::Box(frame, half) = placed {
+        let corner = |i: u8| {
+            let sign = |bit: u8| if i >> bit & 1 == 0 { -1.0 } else { 1.0 };
+            *half * DVec3::new(sign(0), sign(1), sign(2))
+        };
+        let corners: Vec<DVec3> = (0..8).map(corner).collect();
+        if let Some(hull) = ConvexPolyhedron::from_convex_hull(&corners) {
+            return f(&pose(frame), &hull);
+        }
+    }
+    with_shape(placed, f)
+}

@@ -1,0 +1,332 @@
+//! A snapshot of a world, laid out for checking: links as solids on moving frames, the pairs that matter, obstacles
+//! where they stand. Never changes.
+
+use std::sync::Arc;
+
+use glamx::{DAffine3, DVec3};
+
+use crate::robot::kinematics::Kinematics;
+use crate::robot::model::{Limits, RobotModel};
+
+use super::shape::{Core, Placed, Solid};
+use super::world::{Robot, World};
+
+/// A link, or an object that is held, with what it needs to be checked.
+#[derive(Debug, Clone)]
+pub struct LinkShape {
+    /// Its name; with its robot's before it where that has one.
+    pub name: String,
+    /// Index of the frame that carries it.
+    pub(super) frame: usize,
+    /// Its solids in that frame, padding included in their radii.
+    pub(super) solids: Vec<Solid>,
+    /// A ball around all of them, in that frame.
+    pub(super) ball: (DVec3, f64),
+    /// Whether it moves at all.
+    pub(super) moves: bool,
+    /// For each joint, how far a point of it moves at most [m/rad or m/m].
+    pub(super) levers: Vec<f64>,
+}
+
+/// Two links that must not touch.
+#[derive(Debug, Clone)]
+pub struct LinkPair {
+    /// Index of the first.
+    pub a: usize,
+    /// Index of the second.
+    pub b: usize,
+    /// For each joint, how far they move relative to each other at most [m/rad or m/m].
+    pub(super) levers: Vec<f64>,
+}
+
+/// An obstacle where it stands.
+#[derive(Debug, Clone)]
+pub struct StandingObstacle {
+    /// Its name.
+    pub name: String,
+    /// What and where it is; padding is included in its radius.
+    pub(super) solid: Solid,
+    /// A box around its core.
+    pub(super) guard: (DAffine3, DVec3),
+    /// Whether that box is the core itself: for boxes, capsules and spheres.
+    pub(super) boxy: bool,
+}
+
+impl StandingObstacle {
+    pub(super) fn placed(&self) -> Placed<'_> {
+        let frame = self.solid.frame;
+        match &self.solid.core {
+            Core::Point => Placed::Point(frame.translation),
+            Core::Segment { half } => {
+                let along = frame.matrix3.z_axis * *half;
+                Placed::Segment(frame.translation - along, frame.translation + along)
+            }
+            Core::Box { half } => Placed::Box(frame, *half),
+            Core::Cylinder { half, radius } => Placed::Cylinder(frame, *half, *radius),
+            Core::Hull(hull) => Placed::Hull(frame, hull),
+            Core::Mesh(mesh) => Placed::Mesh(frame, mesh),
+            Core::Cloud(cloud) => Placed::Cloud(frame, cloud),
+        }
+    }
+}
+
+/// A robot of a scene: where its joints and frames stand among those of all.
+#[derive(Debug, Clone)]
+pub struct SceneRobot {
+    /// Its name.
+    pub name: String,
+    /// Its description.
+    pub model: Arc<RobotModel>,
+    /// Its joints.
+    pub kinematics: Arc<Kinematics>,
+    /// Where its root stands in the world.
+    pub base: DAffine3,
+    /// Index of its first joint in a configuration.
+    pub first_joint: usize,
+    pub(super) first_frame: usize,
+}
+
+/// A world as it was when the snapshot was taken.
+#[derive(Debug, Clone, Default)]
+pub struct Scene {
+    pub(super) robots: Vec<SceneRobot>,
+    pub(super) links: Vec<LinkShape>,
+    pub(super) pairs: Vec<LinkPair>,
+    pub(super) obstacles: Vec<StandingObstacle>,
+    /// `allowed[link][obstacle]`
+    pub(super) allowed: Vec<Vec<bool>>,
+    pub(super) limits: Vec<Limits>,
+    joint_names: Vec<String>,
+    pub(super) frames: usize,
+}
+
+/// What tells links apart while pairs are made: robot, link index in its model, body, and whether it is held.
+struct Origin {
+    robot: usize,
+    link: usize,
+    body: usize,
+    reach: f64,
+    held: Option<usize>,
+}
+
+impl Scene {
+    pub(super) fn of(world: &World) -> Self {
+        let mut scene = Self::default();
+        let mut origins = Vec::new();
+        for robot in world.robots() {
+            scene.robots.push(SceneRobot {
+                name: robot.name.clone(),
+                model: robot.model.clone(),
+                kinematics: robot.kinematics.clone(),
+                base: robot.base,
+                first_joint: scene.limits.len(),
+                first_frame: scene.frames,
+            });
+            scene.limits.extend_from_slice(robot.kinematics.limits());
+            let full = |name: &String| full_name(&robot.name, name);
+            scene.joint_names.extend(robot.kinematics.names().iter().map(full));
+            scene.frames += robot.kinematics.bodies();
+        }
+        for (r, robot) in world.robots().iter().enumerate() {
+            for (l, solids) in robot.solids.iter().enumerate() {
+                let name = robot.model.links.get(l).map_or("", |link| &link.name);
+                scene.add_link(&mut origins, name, (r, l), robot, solids, robot.padding, None);
+            }
+        }
+        for (h, held) in world.held().iter().enumerate() {
+            let Some(robot) = world.robots().get(held.robot) else { continue };
+            let Some(link) = robot.model.link_index(&held.link) else { continue };
+            let padding = held.padding.max(robot.padding);
+            scene.add_link(&mut origins, &held.name, (held.robot, link), robot, &held.solids, padding, Some(h));
+        }
+        scene.make_pairs(world, &origins);
+        scene.obstacles = world.obstacles().iter().map(stand).collect();
+        let names: Vec<&str> = scene.obstacles.iter().map(|o| o.name.as_str()).collect();
+        let row = |link: &LinkShape| names.iter().map(|o| world.is_allowed(&link.name, o)).collect();
+        scene.allowed = scene.links.iter().map(row).collect();
+        scene
+    }
+
+    #[allow(clippy::too_many_arguments, reason = "one caller per kind of link")]
+    fn add_link(
+        &mut self,
+        origins: &mut Vec<Origin>,
+        name: &str,
+        (r, link): (usize, usize),
+        robot: &Robot,
+        solids: &[Solid],
+        padding: f64,
+        held: Option<usize>,
+    ) {
+        let Some(own) = self.robots.get(r).filter(|_| !solids.is_empty()) else { return };
+        let kinematics = &robot.kinematics;
+        let (body, place) = (kinematics.body_of(link), kinematics.place_of(link));
+        let carry = |s: &Solid| Solid { core: s.core.clone(), radius: s.radius + padding, frame: place * s.frame };
+        let solids: Vec<Solid> = solids.iter().map(carry).collect();
+        let ball = ball_around(&solids);
+        let reach = ball.0.length() + ball.1;
+        let mut levers = vec![0.0; self.limits.len()];
+        add_levers(kinematics, own.first_joint, kinematics.levers(body, reach), &mut levers);
+        let name = full_name(&robot.name, name);
+        let frame = own.first_frame + body;
+        self.links.push(LinkShape { name, frame, solids, ball, moves: body != 0, levers });
+        origins.push(Origin { robot: r, link, body, reach, held });
+    }
+
+    fn make_pairs(&mut self, world: &World, origins: &[Origin]) {
+        for (b, second) in origins.iter().enumerate() {
+            for (a, first) in origins[..b].iter().enumerate() {
+                if may_touch(world, first, second) {
+                    continue;
+                }
+                let mut levers = vec![0.0; self.limits.len()];
+                for (one, other) in [(first, second), (second, first)] {
+                    let Some(robot) = self.robots.get(one.robot) else { continue };
+                    // What carries both does not move them relative to each other.
+                    let both = |body: usize| {
+                        one.robot == other.robot && robot.kinematics.ancestors(other.body).any(|o| o == body)
+                    };
+                    let mut own = robot.kinematics.levers(one.body, one.reach);
+                    own.retain(|(body, _)| !both(*body));
+                    add_levers(&robot.kinematics, robot.first_joint, own, &mut levers);
+                }
+                self.pairs.push(LinkPair { a, b, levers });
+            }
+        }
+    }
+
+    /// Number of joints in a configuration.
+    pub fn dof(&self) -> usize {
+        self.limits.len()
+    }
+
+    /// Limits of the joints.
+    pub fn limits(&self) -> &[Limits] {
+        &self.limits
+    }
+
+    /// Names of the joints, with their robot's before them where that has one.
+    pub fn joint_names(&self) -> &[String] {
+        &self.joint_names
+    }
+
+    /// The robots.
+    pub fn robots(&self) -> &[SceneRobot] {
+        &self.robots
+    }
+
+    /// Links with solids, and held objects.
+    pub fn links(&self) -> &[LinkShape] {
+        &self.links
+    }
+
+    /// The pairs of links that must not touch.
+    pub fn pairs(&self) -> &[LinkPair] {
+        &self.pairs
+    }
+
+    /// The obstacles.
+    pub fn obstacles(&self) -> &[StandingObstacle] {
+        &self.obstacles
+    }
+
+    /// A buffer for [`Scene::forward`].
+    pub fn frames(&self) -> Vec<DAffine3> {
+        vec![DAffine3::IDENTITY; self.frames]
+    }
+
+    /// Fills in the frames of all bodies of all robots, in the world's frame.
+    pub fn forward(&self, q: &[f64], frames: &mut [DAffine3]) {
+        for robot in &self.robots {
+            let own = q.get(robot.first_joint..).unwrap_or_default();
+            let bodies = frames.get_mut(robot.first_frame..robot.first_frame + robot.kinematics.bodies());
+            robot.kinematics.forward_from(&robot.base, own, bodies.unwrap_or_default());
+        }
+    }
+}
+
+fn full_name(robot: &str, name: &str) -> String {
+    if robot.is_empty() { name.to_owned() } else { format!("{robot}/{name}") }
+}
+
+fn add_levers(kinematics: &Kinematics, first_joint: usize, own: Vec<(usize, f64)>, levers: &mut [f64]) {
+    for (body, lever) in own {
+        if let Some((variable, factor)) = kinematics.drive(body) {
+            levers[first_joint + variable] += lever * factor.abs();
+        }
+    }
+}
+
+/// Whether two links are never checked against each other: welded together, neighbours, allowed by name, or held.
+fn may_touch(world: &World, a: &Origin, b: &Origin) -> bool {
+    if a.robot != b.robot {
+        return false;
+    }
+    let Some(robot) = world.robots().get(a.robot) else { return true };
+    let held = |x: &Origin| x.held.and_then(|h| world.held().get(h));
+    let name = |x: &Origin| robot.model.links.get(x.link).map_or("", |l| l.name.as_str());
+    let touches = |x: &Origin, other: &str| held(x).is_some_and(|h| h.touch_links.iter().any(|t| t == other));
+    if a.held.is_some() || b.held.is_some() {
+        return a.body == b.body || touches(a, name(b)) || touches(b, name(a));
+    }
+    let parent = |x: &Origin| robot.model.parent_joint(x.link).map(|j| j.parent);
+    let neighbours = parent(a) == Some(b.link) || parent(b) == Some(a.link);
+    let is = |(x, y): &(String, String)| (x == name(a) && y == name(b)) || (x == name(b) && y == name(a));
+    a.body == b.body || neighbours || robot.allowed.iter().any(is)
+}
+
+fn stand(obstacle: &super::world::Obstacle) -> StandingObstacle {
+    let mut solid = obstacle.solid.clone();
+    solid.radius += obstacle.padding;
+    let mut standing =
+        StandingObstacle { name: obstacle.name.clone(), guard: (solid.frame, DVec3::ZERO), boxy: true, solid };
+    standing.guard = match &standing.solid.core {
+        Core::Point => (standing.solid.frame, DVec3::ZERO),
+        Core::Segment { half } => (standing.solid.frame, DVec3::new(0.0, 0.0, *half)),
+        Core::Box { half } => (standing.solid.frame, *half),
+        _ => {
+            standing.boxy = false;
+            standing.placed().guard().unwrap_or(standing.guard)
+        }
+    };
+    standing
+}
+
+/// A small ball around solids (Ritter's way: from two far points, grown where needed).
+fn ball_around(solids: &[Solid]) -> (DVec3, f64) {
+    let mut balls: Vec<(DVec3, f64)> = Vec::new();
+    for solid in solids {
+        let at = |p: DVec3| (solid.frame.transform_point3(p), solid.radius);
+        let corners = |half: DVec3| {
+            [-1.0, 1.0].map(|x| [-1.0, 1.0].map(|y| [-1.0, 1.0].map(|z| half * DVec3::new(x, y, z)))).concat().concat()
+        };
+        match &solid.core {
+            Core::Hull(hull) => balls.extend(hull.polyhedron().points().iter().map(|p| at(*p))),
+            Core::Mesh(mesh) => balls.extend(mesh.surface().vertices().iter().map(|p| at(*p))),
+            Core::Cloud(cloud) => balls.extend(cloud.points().iter().map(|p| at(*p))),
+            Core::Box { half } => balls.extend(corners(*half).into_iter().map(at)),
+            Core::Cylinder { half, radius } => {
+                balls.extend([-*half, *half].map(|z| (at(DVec3::Z * z).0, solid.radius + radius)))
+            }
+            Core::Segment { half } => balls.extend([-*half, *half].map(|z| at(DVec3::Z * z))),
+            Core::Point => balls.push(at(DVec3::ZERO)),
+        }
+    }
+    let farthest = |from: DVec3| {
+        let by =
+            |a: &&(DVec3, f64), b: &&(DVec3, f64)| (a.0.distance(from) + a.1).total_cmp(&(b.0.distance(from) + b.1));
+        balls.iter().max_by(by).copied().unwrap_or((DVec3::ZERO, 0.0))
+    };
+    let a = farthest(balls.first().map_or(DVec3::ZERO, |b| b.0));
+    let b = farthest(a.0);
+    let direction = (b.0 - a.0).normalize_or_zero();
+    let (mut center, mut radius) = ((a.0 - direction * a.1 + b.0 + direction * b.1) * 0.5, 0.0);
+    // Move towards the farthest one in ever smaller steps: close to the smallest ball, and always around all.
+    for k in 1..=64 {
+        let far = farthest(center);
+        center += (far.0 - center) * (1.0 / f64::from(k + 1)).min(0.3);
+    }
+    let far = farthest(center);
+    radius = f64::max(radius, far.0.distance(center) + far.1);
+    (center, radius)
+}

@@ -1,0 +1,275 @@
+//! Solids: everything within a radius of a core. A sphere is a point with a radius, a capsule a segment with one, and
+//! padding is more radius: so a few pairs of cores are all that needs a distance.
+
+use std::sync::Arc;
+
+use glamx::{DAffine3, DVec3};
+use parry3d_f64::shape::{ConvexPolyhedron, TriMesh, TriMeshFlags};
+
+use super::cloud::Cloud;
+
+/// Why a shape cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ShapeError {
+    /// A length is zero, negative or not finite.
+    #[error("{0} must be positive and finite, not {1}")]
+    Length(&'static str, f64),
+    /// A mesh has no triangles, or names vertices that it does not have.
+    #[error("the mesh cannot be used: {0}")]
+    Mesh(String),
+    /// The points span no volume.
+    #[error("{0} points span no volume: no convex hull")]
+    Flat(usize),
+    /// A pose is not finite.
+    #[error("the pose is not finite")]
+    Pose,
+}
+
+/// What a solid is within a radius of, in its own frame.
+#[derive(Debug, Clone)]
+pub enum Core {
+    /// The origin.
+    Point,
+    /// A piece of the z axis, from -half to half [m].
+    Segment {
+        /// Half length [m].
+        half: f64,
+    },
+    /// A box about the origin.
+    Box {
+        /// Half extents [m].
+        half: DVec3,
+    },
+    /// A cylinder about the origin, along z.
+    Cylinder {
+        /// Half length [m].
+        half: f64,
+        /// Radius [m].
+        radius: f64,
+    },
+    /// The convex hull of points.
+    Hull(Arc<Hull>),
+    /// A surface of triangles; solid when it is closed.
+    Mesh(Arc<Mesh>),
+    /// Points.
+    Cloud(Arc<Cloud>),
+}
+
+/// A convex hull with the box around it.
+#[derive(Debug, Clone)]
+pub struct Hull {
+    polyhedron: ConvexPolyhedron,
+    middle: DVec3,
+    half: DVec3,
+}
+
+impl Hull {
+    /// The hull of points [m].
+    pub fn new(points: &[DVec3]) -> Result<Self, ShapeError> {
+        let flat = ShapeError::Flat(points.len());
+        if points.iter().any(|p| !p.is_finite()) {
+            return Err(ShapeError::Mesh("a vertex is not finite".into()));
+        }
+        let polyhedron = ConvexPolyhedron::from_convex_hull(points).ok_or(flat)?;
+        let (middle, half) = bounds(polyhedron.points().iter().copied());
+        Ok(Self { polyhedron, middle, half })
+    }
+
+    /// What parry computes with.
+    pub fn polyhedron(&self) -> &ConvexPolyhedron {
+        &self.polyhedron
+    }
+}
+
+/// A triangle mesh with the box around it.
+#[derive(Debug, Clone)]
+pub struct Mesh {
+    surface: TriMesh,
+    closed: bool,
+    middle: DVec3,
+    half: DVec3,
+}
+
+impl Mesh {
+    /// A surface from vertices [m] and triangles.
+    pub fn new(vertices: Vec<DVec3>, triangles: Vec<[u32; 3]>) -> Result<Self, ShapeError> {
+        let bad = |why: &str| ShapeError::Mesh(why.to_owned());
+        if vertices.iter().any(|v| !v.is_finite()) {
+            return Err(bad("a vertex is not finite"));
+        }
+        if triangles.iter().flatten().any(|&i| i as usize >= vertices.len()) {
+            return Err(bad("a triangle names a vertex that does not exist"));
+        }
+        let (middle, half) = bounds(vertices.iter().copied());
+        let merge = TriMeshFlags::MERGE_DUPLICATE_VERTICES | TriMeshFlags::DELETE_DEGENERATE_TRIANGLES;
+        let mut surface = TriMesh::with_flags(vertices, triangles, merge).map_err(|e| bad(&e.to_string()))?;
+        let closed =
+            is_closed(surface.indices()) && surface.set_flags(surface.flags() | TriMeshFlags::ORIENTED).is_ok();
+        Ok(Self { surface, closed, middle, half })
+    }
+
+    /// What parry computes with.
+    pub fn surface(&self) -> &TriMesh {
+        &self.surface
+    }
+
+    /// Whether it has an inside: every edge has one triangle on each side.
+    pub fn is_closed(&self) -> bool {
+        self.closed
+    }
+
+    /// Whether a point in its own frame is inside.
+    pub fn holds(&self, p: DVec3) -> bool {
+        use parry3d_f64::query::PointQuery;
+        (p - self.middle).abs().cmple(self.half).all() && self.surface.contains_local_point(p)
+    }
+}
+
+fn is_closed(triangles: &[[u32; 3]]) -> bool {
+    let mut edges: Vec<(u32, u32)> = triangles.iter().flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)]).collect();
+    edges.sort_unstable();
+    let twice = edges.windows(2).any(|pair| pair[0] == pair[1]);
+    !twice && edges.iter().all(|&(a, b)| edges.binary_search(&(b, a)).is_ok())
+}
+
+/// Middle and half extents of the box around points.
+pub fn bounds(points: impl Iterator<Item = DVec3>) -> (DVec3, DVec3) {
+    let start = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+    let (low, high) = points.fold(start, |(low, high), p| (low.min(p), high.max(p)));
+    ((low + high) * 0.5, (high - low) * 0.5)
+}
+
+/// Everything within `radius` of a core that stands at `frame`.
+#[derive(Debug, Clone)]
+pub struct Solid {
+    /// What it is within a radius of.
+    pub core: Core,
+    /// Distance from the core to the surface [m].
+    pub radius: f64,
+    /// The core's frame.
+    pub frame: DAffine3,
+}
+
+fn positive(what: &'static str, x: f64) -> Result<f64, ShapeError> {
+    if x > 0.0 && x.is_finite() { Ok(x) } else { Err(ShapeError::Length(what, x)) }
+}
+
+impl Solid {
+    fn of(core: Core, radius: f64, frame: DAffine3) -> Result<Self, ShapeError> {
+        if frame.is_finite() { Ok(Self { core, radius, frame }) } else { Err(ShapeError::Pose) }
+    }
+
+    /// A box with these full extents [m].
+    pub fn cuboid(size: DVec3, frame: DAffine3) -> Result<Self, ShapeError> {
+        for x in size.to_array() {
+            positive("each side of a box", x)?;
+        }
+        Self::of(Core::Box { half: size * 0.5 }, 0.0, frame)
+    }
+
+    /// A sphere [m].
+    pub fn sphere(radius: f64, frame: DAffine3) -> Result<Self, ShapeError> {
+        Self::of(Core::Point, positive("the radius of a sphere", radius)?, frame)
+    }
+
+    /// A cylinder along z with this full length [m].
+    pub fn cylinder(radius: f64, length: f64, frame: DAffine3) -> Result<Self, ShapeError> {
+        let radius = positive("the radius of a cylinder", radius)?;
+        Self::of(Core::Cylinder { half: positive("the length of a cylinder", length)? * 0.5, radius }, 0.0, frame)
+    }
+
+    /// A capsule along z; `length` is that between the middles of its half spheres [m].
+    pub fn capsule(radius: f64, length: f64, frame: DAffine3) -> Result<Self, ShapeError> {
+        let half = positive("the length of a capsule", length)? * 0.5;
+        Self::of(Core::Segment { half }, positive("the radius of a capsule", radius)?, frame)
+    }
+
+    /// The convex hull of points [m].
+    pub fn hull(points: &[DVec3], frame: DAffine3) -> Result<Self, ShapeError> {
+        Self::of(Core::Hull(Arc::new(Hull::new(points)?)), 0.0, frame)
+    }
+
+    /// A mesh.
+    pub fn mesh(mesh: Arc<Mesh>, frame: DAffine3) -> Result<Self, ShapeError> {
+        Self::of(Core::Mesh(mesh), 0.0, frame)
+    }
+
+    /// A cloud of balls of one radius [m].
+    pub fn cloud(cloud: Arc<Cloud>, radius: f64, frame: DAffine3) -> Result<Self, ShapeError> {
+        Self::of(Core::Cloud(cloud), positive("the radius of a cloud's points", radius)?, frame)
+    }
+
+    /// The core where it stands when the frame that carries it stands at `carrier`.
+    pub fn place(&self, carrier: &DAffine3) -> Placed<'_> {
+        let frame = || *carrier * self.frame;
+        match &self.core {
+            Core::Point => Placed::Point(carrier.transform_point3(self.frame.translation)),
+            Core::Segment { half } => {
+                let middle = carrier.transform_point3(self.frame.translation);
+                let along = carrier.transform_vector3(self.frame.matrix3.z_axis * *half);
+                Placed::Segment(middle - along, middle + along)
+            }
+            Core::Box { half } => Placed::Box(frame(), *half),
+            Core::Cylinder { half, radius } => Placed::Cylinder(frame(), *half, *radius),
+            Core::Hull(hull) => Placed::Hull(frame(), hull),
+            Core::Mesh(mesh) => Placed::Mesh(frame(), mesh),
+            Core::Cloud(cloud) => Placed::Cloud(frame(), cloud),
+        }
+    }
+
+    /// A ball around it, in the frame that carries it: middle and radius [m].
+    pub fn ball(&self) -> (DVec3, f64) {
+        let (middle, radius) = self.place(&DAffine3::IDENTITY).ball();
+        (middle, radius + self.radius)
+    }
+}
+
+/// A core where it stands, in the frame of the query.
+#[derive(Debug, Clone, Copy)]
+pub enum Placed<'a> {
+    /// A point.
+    Point(DVec3),
+    /// The ends of a segment.
+    Segment(DVec3, DVec3),
+    /// Frame and half extents of a box.
+    Box(DAffine3, DVec3),
+    /// Frame, half length and radius of a cylinder along z.
+    Cylinder(DAffine3, f64, f64),
+    /// A hull and its frame.
+    Hull(DAffine3, &'a Hull),
+    /// A mesh and its frame.
+    Mesh(DAffine3, &'a Mesh),
+    /// A cloud and its frame.
+    Cloud(DAffine3, &'a Cloud),
+}
+
+impl Placed<'_> {
+    /// A box around it, for all that have a frame of their own: its frame and half extents.
+    pub fn guard(&self) -> Option<(DAffine3, DVec3)> {
+        let around = |f: &DAffine3, middle: DVec3, half: DVec3| {
+            let frame = DAffine3 { matrix3: f.matrix3, translation: f.transform_point3(middle) };
+            Some((frame, half))
+        };
+        match self {
+            Self::Point(_) | Self::Segment(..) => None,
+            Self::Box(f, half) => Some((*f, *half)),
+            Self::Cylinder(f, half, radius) => Some((*f, DVec3::new(*radius, *radius, *half))),
+            Self::Hull(f, hull) => around(f, hull.middle, hull.half),
+            Self::Mesh(f, mesh) => around(f, mesh.middle, mesh.half),
+            Self::Cloud(f, cloud) => {
+                let (low, high) = cloud.bounds();
+                around(f, (low + high) * 0.5, (high - low) * 0.5)
+            }
+        }
+    }
+
+    /// A ball around it: middle and radius [m].
+    pub fn ball(&self) -> (DVec3, f64) {
+        match self {
+            Self::Point(p) => (*p, 0.0),
+            Self::Segment(a, b) => ((*a + *b) * 0.5, a.distance(*b) * 0.5),
+            Self::Cylinder(f, half, radius) => (f.translation, half.hypot(*radius)),
+            _ => self.guard().map_or((DVec3::ZERO, f64::INFINITY), |(f, half)| (f.translation, half.length())),
+        }
+    }
+}

@@ -1,0 +1,199 @@
+//! Worlds and the exact checker.
+
+use std::sync::Arc;
+
+use glamx::{DAffine3, DVec3};
+
+use super::always::always_touching;
+use super::body::{MeshMode, solids};
+use super::checker::{CollisionChecker, Resolution, Stop};
+use super::exact::ExactChecker;
+use super::report::Pair;
+use super::shape::Solid;
+use super::world::{Attached, Obstacle, Robot, World, WorldError};
+use crate::robot::kinematics::Kinematics;
+use crate::robot::random::Random;
+use crate::robot::urdf::from_text;
+
+/// Three links in a plane, each a capsule-like box of 0.4 m.
+const ARM: &str = r#"<robot name="arm"><link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+<link name="l1"><collision><origin xyz="0.2 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision></link>
+<link name="l2"><collision><origin xyz="0.2 0 0" rpy="0 1.5707963 0"/><geometry><cylinder radius="0.03" length="0.4"/></geometry></collision></link>
+<link name="l3"><collision><origin xyz="0.15 0 0"/><geometry><sphere radius="0.05"/></geometry></collision></link>
+<joint name="j1" type="revolute"><parent link="base"/><child link="l1"/><origin xyz="0 0 0.1"/><axis xyz="0 0 1"/><limit lower="-3.1" upper="3.1" velocity="1" effort="1"/></joint>
+<joint name="j2" type="revolute"><parent link="l1"/><child link="l2"/><origin xyz="0.4 0 0"/><axis xyz="0 0 1"/><limit lower="-3.1" upper="3.1" velocity="1" effort="1"/></joint>
+<joint name="j3" type="revolute"><parent link="l2"/><child link="l3"/><origin xyz="0.4 0 0"/><axis xyz="0 0 1"/><limit lower="-3.1" upper="3.1" velocity="1" effort="1"/></joint></robot>"#;
+
+fn arm(name: &str, base: DVec3) -> Robot {
+    let model = from_text("arm.urdf", ARM).unwrap();
+    Robot {
+        name: name.into(),
+        kinematics: Arc::new(Kinematics::whole(&model).unwrap()),
+        solids: solids(&model, MeshMode::Hull).unwrap(),
+        model: Arc::new(model),
+        base: DAffine3::from_translation(base),
+        padding: 0.0,
+        allowed: vec![],
+    }
+}
+
+fn ball(name: &str, at: DVec3, radius: f64) -> Obstacle {
+    let solid = Solid::sphere(radius, DAffine3::from_translation(at)).unwrap();
+    Obstacle { name: name.into(), solid, padding: 0.0 }
+}
+
+fn checker(world: &World) -> ExactChecker {
+    ExactChecker::new(world.snapshot(), Resolution::default())
+}
+
+fn one_arm(obstacles: &[Obstacle]) -> World {
+    let mut world = World::new();
+    world.add_robot(arm("", DVec3::ZERO)).unwrap();
+    obstacles.iter().for_each(|o| world.add(o.clone()).unwrap());
+    world
+}
+
+#[test]
+fn contacts_say_who_and_how_deep() {
+    let world = one_arm(&[ball("post", DVec3::new(0.95, 0.08, 0.1), 0.05)]);
+    let mut checker = checker(&world);
+    let contacts = checker.contacts(&[0.0; 3]);
+    assert_eq!(contacts.len(), 1, "{contacts:?}");
+    assert_eq!((contacts[0].link.as_str(), contacts[0].other.as_str()), ("l3", "post"));
+    assert!((contacts[0].distance + 0.02).abs() < 1e-9);
+    assert_eq!(contacts[0].to_string(), "link \"l3\" is 20.0 mm deep in obstacle \"post\"");
+    assert!(!checker.is_free(&[0.0; 3]) && checker.is_free(&[-1.0, 0.0, 0.0]));
+    // The other links are farther from it than this one.
+    let near = checker.clearance(&[-0.1, 0.0, 0.0]).unwrap();
+    assert!(near.distance > 0.0 && near.other == "post", "{near}");
+    assert!((near.on_link.distance(near.on_other) - near.distance).abs() < 1e-9);
+}
+
+#[test]
+fn padding_allowance_and_snapshots_hold() {
+    let post = ball("post", DVec3::new(0.95, 0.11, 0.1), 0.05);
+    let mut world = one_arm(std::slice::from_ref(&post));
+    let before = world.snapshot();
+    assert!(checker(&world).is_free(&[0.0; 3]));
+    world.put(Obstacle { padding: 0.02, ..post.clone() }).unwrap();
+    assert!(!checker(&world).is_free(&[0.0; 3]));
+    assert!(ExactChecker::new(before, Resolution::default()).is_free(&[0.0; 3]));
+    world.allow("l3", "post");
+    assert!(checker(&world).is_free(&[0.0; 3]));
+    assert_eq!(world.add(post.clone()), Err(WorldError::Taken("post".into())));
+    assert_eq!(world.remove("wall").map(|o| o.name), Err(WorldError::Unknown("wall".into())));
+    world.move_to("post", DAffine3::from_translation(DVec3::new(0.3, 0.0, 0.1))).unwrap();
+    assert!(!checker(&world).is_free(&[0.0; 3]));
+    assert!(world.put(Obstacle { padding: f64::NAN, ..post }).is_err());
+}
+
+#[test]
+fn neighbours_may_touch_and_others_may_not() {
+    let mut checker = checker(&one_arm(&[]));
+    assert!(checker.is_free(&[0.0; 3]));
+    // Folded back onto itself: the end over the first link.
+    assert_eq!(checker.first_contact(&[0.0, 3.05, 3.05]), Some(Pair::Links(1, 3)));
+    let mut world = World::new();
+    world
+        .add_robot(Robot {
+            allowed: vec![("l3".into(), "l1".into()), ("base".into(), "l3".into()), ("base".into(), "l2".into())],
+            ..arm("", DVec3::ZERO)
+        })
+        .unwrap();
+    assert!(self::checker(&world).is_free(&[0.0, 3.05, 3.05]));
+}
+
+#[test]
+fn two_robots_see_each_other() {
+    let mut world = World::new();
+    world.add_robot(arm("left", DVec3::ZERO)).unwrap();
+    world.add_robot(arm("right", DVec3::new(1.5, 0.0, 0.0))).unwrap();
+    assert!(world.add_robot(arm("left", DVec3::ZERO)).is_err());
+    let mut checker = checker(&world);
+    assert_eq!(checker.dof(), 6);
+    assert_eq!(checker.scene().joint_names()[3], "right/j1");
+    let away = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+    assert!(checker.is_free(&away));
+    let towards = [0.0, 0.0, 0.0, 3.1, 0.0, 0.0];
+    let contacts = checker.contacts(&towards);
+    assert!(contacts.iter().any(|c| c.link.starts_with("left/") && c.other.starts_with("right/")), "{contacts:?}");
+}
+
+#[test]
+fn held_objects_move_along_and_touch_what_they_may() {
+    let mut world = one_arm(&[ball("post", DVec3::new(1.2, 0.0, 0.1), 0.05)]);
+    assert!(checker(&world).is_free(&[0.0; 3]));
+    let rod =
+        Solid::cuboid(DVec3::new(0.4, 0.02, 0.02), DAffine3::from_translation(DVec3::new(0.2, 0.0, 0.0))).unwrap();
+    let held = Attached {
+        name: "rod".into(),
+        robot: 0,
+        link: "l3".into(),
+        solids: vec![rod],
+        touch_links: vec!["l2".into()],
+        padding: 0.0,
+    };
+    world.attach(held.clone()).unwrap();
+    assert_eq!(checker(&world).contacts(&[0.0; 3])[0].link, "rod");
+    assert!(checker(&world).is_free(&[0.5, 0.0, 0.0]));
+    assert!(world.attach(held).is_err());
+    world.detach("rod").unwrap();
+    assert!(checker(&world).is_free(&[0.0; 3]));
+}
+
+#[test]
+fn what_always_touches_is_named() {
+    let mut robot = arm("", DVec3::ZERO);
+    robot.solids[2].push(Solid::sphere(0.2, DAffine3::from_translation(DVec3::new(-0.4, 0.0, 0.0))).unwrap());
+    let mut world = World::new();
+    world.add_robot(robot).unwrap();
+    let suspects = always_touching(&world.snapshot(), &[0.0; 3], 200, 7);
+    assert_eq!((suspects[0].contact.link.as_str(), suspects[0].contact.other.as_str()), ("base", "l2"));
+    assert!(suspects[0].at_home);
+    assert_eq!(suspects, always_touching(&world.snapshot(), &[0.0; 3], 200, 7));
+    assert!(always_touching(&one_arm(&[]).snapshot(), &[0.0; 3], 200, 7).is_empty());
+}
+
+/// A motion that is called free is free at ten times any sampling's density; one that is called blocked touches.
+#[test]
+fn what_is_proven_free_is_free_between_samples() {
+    let mut random = Random::new(21);
+    let (mut free, mut blocked) = (0, 0);
+    for round in 0..12 {
+        let mut balls = Vec::new();
+        for i in 0..6 {
+            let at = DVec3::new(random.between(-0.9, 0.9), random.between(-0.9, 0.9), 0.1);
+            // Thin posts slip between the samples of a coarse check.
+            balls.push(ball(&format!("post{i}"), at, random.between(0.002, 0.03)));
+        }
+        let mut checker = checker(&one_arm(&balls));
+        for _ in 0..40 {
+            let mut q = || -> Vec<f64> { (0..3).map(|_| random.between(-3.0, 3.0)).collect() };
+            let (a, b) = (q(), q());
+            let said = checker.motion_is_free(&a, &b, &Stop::never());
+            let steps = 1500;
+            let mut touches = (0..=steps).filter(|k| {
+                let t = f64::from(*k) / f64::from(steps);
+                let at: Vec<f64> = a.iter().zip(&b).map(|(a, b)| a + (b - a) * t).collect();
+                !checker.is_free(&at)
+            });
+            if said {
+                free += 1;
+                assert_eq!(touches.next(), None, "round {round}: {a:?} {b:?}");
+            } else {
+                blocked += 1;
+                assert!(touches.next().is_some(), "round {round}: {a:?} {b:?}");
+            }
+        }
+    }
+    assert!(free > 40 && blocked > 40, "{free} {blocked}");
+}
+
+#[test]
+fn a_stop_ends_a_proof() {
+    let mut checker = checker(&one_arm(&[ball("post", DVec3::new(0.95, 0.5, 0.1), 0.05)]));
+    let flag = Arc::new(std::sync::atomic::AtomicBool::new(true));
+    let stop = Stop::new(None, Some(flag));
+    assert!(!checker.motion_is_free(&[0.0; 3], &[-1.0, 0.0, 0.0], &stop) && stop.is_cancelled());
+    assert!(checker.motion_is_free(&[0.0; 3], &[-1.0, 0.0, 0.0], &Stop::never()));
+}

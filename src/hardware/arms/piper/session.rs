@@ -1,0 +1,251 @@
+//! The adapter's dealings with the arm, apart from units: what arrives is taken up, silence is noticed, and what may be
+//! sent is decided by what the arm says of itself.
+
+use std::time::Duration;
+
+use super::limits;
+use super::picture::Picture;
+use super::protocol::{self, DOF, radians};
+use super::wire::Wire;
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::transport::can::{CanAddress, CanFrame};
+
+/// Longest waits for the first whole state, and then for what was asked.
+const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
+const ANSWER_TIMEOUT: Duration = Duration::from_millis(300);
+/// What has arrived within this time need not be looked for again: the arm's period.
+const RECENT: Duration = Duration::from_millis(5);
+/// A state older than this is no state: a living arm sends one every 5 ms; the rest is for a busy host.
+const SILENCE: Duration = Duration::from_millis(150);
+/// After this long without a state the connection is given up: the arm has lost its power.
+const LOST: Duration = Duration::from_millis(400);
+/// Enabling and disabling are asked for again and again, as the vendor does, and for so long.
+const REPEAT: Duration = Duration::from_millis(10);
+const ENABLE_TIMEOUT: Duration = Duration::from_millis(1000);
+/// The E-stop among the arm's states.
+pub const ESTOP: u8 = 1;
+/// So far outside its limits a joint may lie and still be enabled [rad].
+const PLAUSIBLE: f64 = 0.2;
+
+/// An arm on its bus, connected or not.
+pub struct Session {
+    /// The arm's name in the blueprint, for messages.
+    hardware_id: String,
+    address: CanAddress,
+    /// The open port, while connected.
+    pub wire: Option<Wire>,
+    /// What is known of the arm.
+    pub picture: Picture,
+    /// When what had arrived was last taken up.
+    drained_at: Mono,
+}
+
+impl Session {
+    /// A session with the arm on the bus at `address`. Does not connect.
+    pub fn new(hardware_id: String, address: CanAddress) -> Self {
+        Self { hardware_id, address, wire: None, picture: Picture::default(), drained_at: Mono::ZERO }
+    }
+
+    /// Opens the port and waits for a whole state. Only asks.
+    pub fn connect(&mut self) -> AdapterResult<()> {
+        self.picture = Picture::default();
+        self.wire = Some(Wire::open(&self.address)?);
+        let introduced = self.introduce();
+        if introduced.is_err() {
+            self.wire = None;
+        }
+        introduced
+    }
+
+    // --- The wire ---
+
+    /// Takes up what has arrived. A broken wire ends the session.
+    pub fn drain(&mut self) -> AdapterResult<()> {
+        let wire = self.wire.as_mut().ok_or(AdapterError::NotConnected)?;
+        self.drained_at = MonotonicClock.now();
+        let result = wire.drain(&mut self.picture);
+        if result.is_err() {
+            self.wire = None;
+        }
+        result
+    }
+
+    /// Sends a command.
+    pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
+        self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
+    }
+
+    /// Takes up feedback until `done` says so; `false` when the time is over.
+    pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Picture) -> bool) -> AdapterResult<bool> {
+        let end = MonotonicClock.now().after(timeout);
+        loop {
+            self.drain()?;
+            let left = end.since(MonotonicClock.now());
+            if done(&self.picture) || left.is_zero() {
+                return Ok(done(&self.picture));
+            }
+            if let Some(wire) = &self.wire {
+                wire.wait(left);
+            }
+        }
+    }
+
+    /// Takes up what has arrived; an error when the newest positions are too old to act on.
+    pub fn refresh(&mut self) -> AdapterResult<()> {
+        self.drain()?;
+        let age = MonotonicClock.now().since(self.picture.joints_at);
+        if age <= SILENCE {
+            return Ok(());
+        }
+        // The same words each time, so that they are told once.
+        if age > LOST {
+            self.wire = None;
+            let text =
+                format!("the connection to piper at {} broke: no state for {} ms", self.address, LOST.as_millis());
+            return Err(AdapterError::Io(text));
+        }
+        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, SILENCE.as_millis())))
+    }
+
+    /// The picture, for reads that mostly follow one of the joints and then answer from memory.
+    pub fn known(&mut self) -> AdapterResult<&Picture> {
+        if self.wire.is_none() {
+            return Err(AdapterError::NotConnected);
+        }
+        if MonotonicClock.now().since(self.drained_at) > RECENT {
+            self.drain()?;
+        }
+        Ok(&self.picture)
+    }
+
+    /// Waits for a whole state, then for what was asked.
+    fn introduce(&mut self) -> AdapterResult<()> {
+        let mut questions = [protocol::ask_firmware(); DOF + 1];
+        questions.iter_mut().zip(1..).take(DOF).for_each(|(frame, joint)| *frame = protocol::ask_limits(joint));
+        self.send(&questions)?;
+        if !self.watch(CONNECT_TIMEOUT, Picture::complete)? {
+            return Err(self.why_not());
+        }
+        let answered = |p: &Picture| p.firmware().is_some() && p.limits.iter().all(Option::is_some);
+        if !self.watch(ANSWER_TIMEOUT / 2, answered)? {
+            self.send(&questions)?;
+            self.watch(ANSWER_TIMEOUT / 2, answered)?; // what stays unanswered is known from the data sheet
+        }
+        Ok(())
+    }
+
+    /// Why there is no whole state.
+    fn why_not(&self) -> AdapterError {
+        let (address, counts) = (&self.address, self.picture.counts);
+        if self.picture.joints_at != Mono::ZERO {
+            return AdapterError::Timeout(format!("piper at {address}: some of its motors send no state"));
+        }
+        if counts.leader > 0 {
+            return AdapterError::Rejected(format!(
+                "piper at {address}: this arm leads others: it sends commands instead of its state\nhint: make it a \
+                 follower with the vendor's SDK, MasterSlaveConfig(0xFC, 0, 0, 0), and switch it off and on"
+            ));
+        }
+        let heard = match counts.other + counts.damaged + counts.decoded {
+            0 => "nothing was heard".to_owned(),
+            n => format!("only {n} other frames were heard"),
+        };
+        AdapterError::Timeout(format!(
+            "no state from piper at {address} within {} ms: {heard}\nhint: is the arm powered, plugged in, and the bus \
+             at 1 Mbit/s? An arm that was set to lead others sends none: MasterSlaveConfig(0xFC, 0, 0, 0) of the \
+             vendor's SDK makes it a follower",
+            CONNECT_TIMEOUT.as_millis()
+        ))
+    }
+
+    // --- What may be done ---
+
+    /// A refusal of our own.
+    pub fn refuse(&self, why: String) -> AdapterError {
+        AdapterError::Rejected(format!("{}: {why}", self.hardware_id))
+    }
+
+    /// An error unless the arm is in order and listens to nobody but us.
+    pub fn in_order(&self) -> AdapterResult<()> {
+        let code = self.picture.error_code();
+        if code != 0 {
+            let mut text = self.picture.error_text();
+            if self.picture.status.arm == ESTOP {
+                text.push_str(
+                    "\nhint: the arm leaves its E-stop only by a reset that takes the power from its motors: hold it, \
+                     then switch it off and on",
+                );
+            }
+            return Err(AdapterError::Fault { code, text });
+        }
+        if MonotonicClock.now().since(self.picture.commanded_at) < SILENCE {
+            return Err(self.refuse(
+                "somebody else commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
+                    .into(),
+            ));
+        }
+        match self.picture.status.control {
+            0 | 1 => Ok(()),
+            other => Err(self.refuse(format!(
+                "the arm is controlled by {}\nhint: end that at the arm; where it does not let go, hold it and switch \
+                 it off and on",
+                protocol::control_text(other)
+            ))),
+        }
+    }
+
+    /// An error unless the arm may be told to move.
+    pub fn may_move(&mut self) -> AdapterResult<()> {
+        self.refresh()?;
+        self.in_order()?;
+        if self.picture.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
+    }
+
+    /// An error when the measured pose cannot be true: holding there would be a jump.
+    pub fn plausible(&self) -> AdapterResult<()> {
+        if self.picture.joints == [0; DOF] {
+            return Err(self.refuse(
+                "every joint reads exactly 0, as from a controller that has not measured yet: not enabled\nhint: if \
+                 the arm truly lies there, move a joint a little by hand"
+                    .into(),
+            ));
+        }
+        let limits = limits(DOF);
+        let range = limits.position_lower.iter().zip(&limits.position_upper);
+        for (i, (wire, (lower, upper))) in self.picture.joints.iter().zip(range).enumerate() {
+            let value = radians(*wire);
+            if !(lower - PLAUSIBLE..=upper + PLAUSIBLE).contains(&value) {
+                let joint = i + 1;
+                return Err(self.refuse(format!(
+                    "joint {joint} reads {value:.3} rad, outside its range of {lower} to {upper}: not enabled\nhint: \
+                     move it back by hand, or set its zero point anew with the vendor's tool"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Asks for the motors to be on or off until they say that they are.
+    pub fn switch_motors(&mut self, on: bool) -> AdapterResult<()> {
+        let switched = |p: &Picture| p.drivers_heard() && if on { p.enabled() } else { p.disabled() };
+        let end = MonotonicClock.now().after(ENABLE_TIMEOUT);
+        self.picture.expect_drivers();
+        while MonotonicClock.now() < end {
+            self.send(&[protocol::enable(on)])?;
+            if self.watch(REPEAT, switched)? {
+                return Ok(());
+            }
+        }
+        let wrong = |(_, driver): &(usize, &protocol::Driver)| driver.enabled() != on;
+        let joints: Vec<String> =
+            (1..).zip(&self.picture.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
+        Err(AdapterError::Timeout(format!(
+            "{}: the motors of joints {} do not go {} within {} ms",
+            self.hardware_id,
+            joints.join(", "),
+            if on { "on" } else { "off" },
+            ENABLE_TIMEOUT.as_millis()
+        )))
+    }
+}

@@ -1,0 +1,166 @@
+//! A joint path with rounded corners: a curve `q(s)` with continuous curvature that stays within a stated deviation of
+//! the straight path.
+//!
+//! Between straight pieces the direction turns by a smooth step `σ(x) = 3x² − 2x³`: `q'(s) = u₁ + (u₂ − u₁)·σ`, for
+//! `s` from `−L` to `L` around the corner. So `q` is of fourth degree, meets both lines with equal position, direction
+//! and curvature, and passes the corner at a distance of `3/16·L·|u₂ − u₁|`.
+
+use super::path::{Path, distance, tidy};
+
+/// A piece of a curve: a polynomial of fourth degree for every joint.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Piece {
+    /// Length of its parameter [rad].
+    pub length: f64,
+    /// Coefficients of ascending powers, per joint; lines have two that count.
+    pub coefficients: Vec<[f64; 5]>,
+    /// Whether it is a corner.
+    pub bends: bool,
+    /// The corner's index in the path; of a line, that of its end.
+    pub corner: usize,
+}
+
+/// A point of a curve: position, and its first three derivatives by the parameter.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Jet {
+    /// Position [rad].
+    pub q: f64,
+    /// First derivative.
+    pub d1: f64,
+    /// Second derivative [1/rad].
+    pub d2: f64,
+    /// Third derivative [1/rad²].
+    pub d3: f64,
+}
+
+impl Piece {
+    /// One joint at parameter `s` from the piece's start [rad].
+    pub fn at(&self, joint: usize, s: f64) -> Jet {
+        let [c0, c1, c2, c3, c4] = self.coefficients[joint];
+        Jet {
+            q: c0 + s * (c1 + s * (c2 + s * (c3 + s * c4))),
+            d1: c1 + s * (2.0 * c2 + s * (3.0 * c3 + s * 4.0 * c4)),
+            d2: 2.0 * c2 + s * (6.0 * c3 + s * 12.0 * c4),
+            d3: 6.0 * c3 + s * 24.0 * c4,
+        }
+    }
+}
+
+/// A run of pieces between two rests.
+pub type Curve = Vec<Piece>;
+
+/// The curves of a path. At corner `i` (an inner configuration) the curve stays within `deviation[i]` [rad, Euclidean]
+/// of the path; a corner with none is reached exactly and rested at, which ends one curve and begins the next.
+pub fn curves(path: &[Vec<f64>], deviation: &[f64]) -> Vec<Curve> {
+    let mut curves = Vec::new();
+    let mut curve: Curve = Vec::new();
+    // What the last corner has taken of the line at hand.
+    let mut taken = 0.0;
+    for (i, line) in path.windows(2).enumerate() {
+        let (a, b) = (&line[0], &line[1]);
+        let whole = distance(a, b);
+        let corner = path.get(i + 2).map(|next| Corner::new(a, b, next, deviation.get(i + 1).copied().unwrap_or(0.0)));
+        let used = corner.as_ref().map_or(0.0, |c| c.half);
+        let direction = direction(a, b);
+        let straight = whole - taken - used;
+        if straight > 1e-9 * whole {
+            let start = |(x, u): (&f64, &f64)| [x + u * taken, *u, 0.0, 0.0, 0.0];
+            let coefficients = a.iter().zip(&direction).map(start).collect();
+            curve.push(Piece { length: straight, coefficients, bends: false, corner: i + 1 });
+        }
+        match corner {
+            Some(corner) if corner.half > 0.0 => {
+                curve.push(corner.piece(b, i + 1));
+                taken = corner.half;
+            }
+            _ => {
+                taken = 0.0;
+                curves.extend((!curve.is_empty()).then(|| std::mem::take(&mut curve)));
+            }
+        }
+    }
+    curves
+}
+
+struct Corner {
+    u1: Vec<f64>,
+    u2: Vec<f64>,
+    /// What it takes of the lines on both sides [rad].
+    half: f64,
+}
+
+impl Corner {
+    fn new(a: &[f64], b: &[f64], c: &[f64], deviation: f64) -> Self {
+        let (u1, u2) = (direction(a, b), direction(b, c));
+        let turn = distance(&u1, &u2);
+        let room = 0.5 * distance(a, b).min(distance(b, c));
+        // A reversal cannot be rounded: the curve would stand still in it.
+        let half =
+            if turn > 1.99 || deviation <= 0.0 { 0.0 } else { (16.0 * deviation / (3.0 * turn.max(1e-9))).min(room) };
+        Self { u1, u2, half }
+    }
+
+    fn piece(&self, middle: &[f64], corner: usize) -> Piece {
+        let l = self.half;
+        let coefficient = |((m, u1), u2): ((&f64, &f64), &f64)| {
+            let turn = u2 - u1;
+            // ∫σ with x = s / 2L: 2L·(x³ − x⁴/2).
+            [m - u1 * l, *u1, 0.0, turn / (4.0 * l * l), -turn / (16.0 * l * l * l)]
+        };
+        let coefficients = middle.iter().zip(&self.u1).zip(&self.u2).map(coefficient).collect();
+        Piece { length: 2.0 * l, coefficients, bends: true, corner }
+    }
+}
+
+fn direction(a: &[f64], b: &[f64]) -> Vec<f64> {
+    let length = distance(a, b).max(f64::MIN_POSITIVE);
+    a.iter().zip(b).map(|(x, y)| (y - x) / length).collect()
+}
+
+/// A path fit for curves: nothing repeated.
+pub fn prepared(path: &[Vec<f64>]) -> Path {
+    tidy(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::robot::random::Random;
+
+    #[test]
+    fn curves_are_smooth_and_keep_to_the_path() {
+        let mut random = Random::new(5);
+        for _ in 0..50 {
+            let path: Path = (0..6).map(|_| (0..4).map(|_| random.between(-1.0, 1.0)).collect()).collect();
+            let all = curves(&path, &[0.05; 6]);
+            let curve: Curve = all.concat();
+            if all.len() > 1 {
+                continue;
+            }
+            for pair in curve.windows(2) {
+                for j in 0..4 {
+                    let (end, start) = (pair[0].at(j, pair[0].length), pair[1].at(j, 0.0));
+                    assert!((end.q - start.q).abs() < 1e-9, "{end:?} {start:?}");
+                    assert!((end.d1 - start.d1).abs() < 1e-9 && (end.d2 - start.d2).abs() < 1e-6);
+                }
+            }
+            for piece in curve.iter().filter(|p| p.bends) {
+                let middle: Vec<f64> = (0..4).map(|j| piece.at(j, piece.length / 2.0).q).collect();
+                assert!(distance(&middle, &path[piece.corner]) <= 0.05 + 1e-9);
+            }
+            let last = curve.last().unwrap();
+            let end: Vec<f64> = (0..4).map(|j| last.at(j, last.length).q).collect();
+            assert!(distance(&end, &path[5]) < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_corner_without_deviation_is_a_rest() {
+        let path = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![1.0, 1.0]];
+        assert_eq!(curves(&path, &[0.0; 3]).len(), 2);
+        assert_eq!(curves(&path, &[0.1; 3]).len(), 1);
+        // So is a reversal.
+        let back = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![0.5, 0.0]];
+        assert_eq!(curves(&back, &[0.1; 3]).len(), 2);
+    }
+}

@@ -1,0 +1,82 @@
+//! What a planner is made from: names and files, as a blueprint resolves them. Plain data.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use nalgebra::Isometry3;
+
+/// A planner.
+#[derive(Debug, Clone, Default)]
+pub struct PlannerConfig {
+    /// The longest time that one request may search.
+    pub timeout: Duration,
+    /// The robots that are planned for.
+    pub robots: Vec<RobotConfig>,
+    /// What is in the world from the start.
+    pub objects: Vec<ObjectConfig>,
+}
+
+/// A robot that is planned for.
+#[derive(Debug, Clone)]
+pub struct RobotConfig {
+    /// Its name, unique in the planner.
+    pub name: String,
+    /// Its `.urdf` or `.xacro` file, or `builtin:NAME`.
+    pub model_path: PathBuf,
+    /// Folders that `package://NAME` stands for.
+    pub packages: BTreeMap<String, PathBuf>,
+    /// Arguments of the xacro file.
+    pub xacro_args: BTreeMap<String, String>,
+    /// Where its base link stands in the frame `map`.
+    pub base_pose: Isometry3<f64>,
+    /// The link that stands there.
+    pub base_link: String,
+    /// The link that pose goals are for.
+    pub end_effector_link: String,
+    /// The joints that are planned for, as the model names them, base first.
+    pub joints: Vec<String>,
+    /// The coordinator's names of the same joints.
+    pub coordinator_joints: Vec<String>,
+    /// The trajectory task that executes its motions.
+    pub task: Option<String>,
+    /// Pairs of links that may touch.
+    pub exclusions: Vec<(String, String)>,
+    /// Highest joint speed, on top of the model's limits [rad/s].
+    pub max_velocity: f64,
+    /// Highest joint acceleration, on top of the model's limits [rad/s²].
+    pub max_acceleration: f64,
+    /// Poses with a name: a position for each of `joints` [rad].
+    pub named_poses: BTreeMap<String, Vec<f64>>,
+}
+
+/// An object in the world.
+#[derive(Debug, Clone)]
+pub struct ObjectConfig {
+    /// Its name, unique in the world.
+    pub name: String,
+    /// What it is.
+    pub shape: ObjectShape,
+    /// Where it is, in the frame `map`.
+    pub pose: Isometry3<f64>,
+    /// How much it is thickened all around [m].
+    pub padding: f64,
+}
+
+/// What an object is. Every shape's frame is at its middle; a cylinder stands along z.
+#[derive(Debug, Clone, PartialEq)]
+pub enum ObjectShape {
+    /// Edge lengths [m].
+    Box([f64; 3]),
+    /// Radius [m].
+    Sphere(f64),
+    /// Radius and length [m].
+    Cylinder([f64; 2]),
+    /// A mesh file: STL, OBJ, DAE; triangle by triangle.
+    Mesh(PathBuf),
+    /// A point cloud file: PLY. Each point is a ball of the radius [`CLOUD_RADIUS`].
+    Cloud(PathBuf),
+}
+
+/// How thick the points of a cloud are [m].
+pub const CLOUD_RADIUS: f64 = 0.01;

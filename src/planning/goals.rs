@@ -1,0 +1,97 @@
+//! From what robots shall do to configurations that do it.
+
+use super::cartesian::{LineSettings, straight_line};
+use super::ik::{Ik, IkSettings};
+use super::path::Path;
+use super::setup::PlannedRobot;
+use super::solve::{Failure, Goal, Stage};
+use crate::collision::{CollisionChecker, Stop};
+use crate::robot::kinematics::frame;
+use glamx::DAffine3;
+
+/// Different solutions that are looked for when one robot goes to a pose.
+const SOLUTIONS: usize = 8;
+/// Attempts to find them.
+const ATTEMPTS: usize = 200;
+/// How closely a pose goal is reached [m, rad].
+const CLOSE: f64 = 1e-5;
+/// A straight line that ends so close to its end is whole.
+const WHOLE: f64 = 1.0 - 1e-9;
+
+/// Configurations of all moving robots that are goals of the search. Where a robot goes to a pose there are several,
+/// found without regard to what touches: the search passes over those that do, and says which.
+pub(super) fn configurations(
+    stage: &Stage<'_>,
+    wanted: &[(usize, Goal)],
+    seed: u64,
+    stop: &Stop,
+) -> Result<Path, Failure> {
+    // One list of configurations per robot; a combination of one from each is a goal of all.
+    let mut all: Path = vec![Vec::new()];
+    let mut first = 0;
+    for (robot, index) in stage.robots.iter().zip(&stage.indices) {
+        let own = stage.start.get(first..first + robot.joints.len()).unwrap_or_default().to_vec();
+        first += robot.joints.len();
+        let goal = wanted.iter().find(|(wanted, _)| wanted == index).map(|(_, goal)| goal);
+        let several = match goal {
+            Some(Goal::Joints(values)) => vec![values.clone()],
+            Some(Goal::Pose(pose)) => {
+                let settings = IkSettings { seed, ..reach() };
+                reached(robot, &frame(pose), &own, &settings, stop)?
+            }
+            Some(Goal::Place(place)) => {
+                let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
+                reached(robot, &target, &own, &IkSettings { seed, position_only: true, ..reach() }, stop)?
+            }
+            Some(Goal::Line(_)) | None => vec![own],
+        };
+        all = all.iter().flat_map(|before| several.iter().map(move |own| [&before[..], own].concat())).collect();
+        all.truncate(SOLUTIONS * SOLUTIONS);
+    }
+    Ok(all)
+}
+
+fn reach() -> IkSettings {
+    IkSettings { position: CLOSE, rotation: CLOSE, attempts: ATTEMPTS, solutions: SOLUTIONS, ..IkSettings::default() }
+}
+
+fn reached(
+    robot: &PlannedRobot,
+    target: &DAffine3,
+    near: &[f64],
+    settings: &IkSettings,
+    stop: &Stop,
+) -> Result<Path, Failure> {
+    let in_root = robot.body.base.inverse() * *target;
+    let mut ik = Ik::new(&robot.body.kinematics, robot.end_effector);
+    ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
+        let what = format!("{}: {failure}", robot.config.name);
+        Failure { cancelled: stop.is_cancelled(), ..Failure::new(what) }
+            .hint("poses are of the link `end_effector_link`, in metres and radians, in the frame `map`")
+    })
+}
+
+/// The straight line of the only moving robot's end effector, as far as it goes; the part that it is of the whole.
+pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Result<(Path, f64), Failure> {
+    let Some(robot) = stage.robots.first().copied() else { return Err(Failure::new("no robot moves")) };
+    let in_root = robot.body.base.inverse() * *target;
+    let kinematics = robot.body.kinematics.clone();
+    let (checker, start) = (&mut stage.checker, stage.start.clone());
+    let contacts = checker.contacts(&start);
+    if let Some(contact) = contacts.first() {
+        return Err(Failure::new(format!("the start collides: {contact}")));
+    }
+    let line = straight_line(&kinematics, robot.end_effector, &start, &in_root, &LineSettings::default(), |a, b| {
+        checker.motion_is_free(a, b, stop)
+    });
+    if stop.is_cancelled() {
+        return Err(Failure { cancelled: true, ..Failure::new("cancelled") });
+    }
+    if line.fraction >= WHOLE {
+        return Ok((line.path, 1.0));
+    }
+    let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
+    let part = 100.0 * line.fraction;
+    Err(Failure::new(format!("only {part:.1} % of the straight line can be done{reason}"))
+        .hint("leave --linear out to go there any way that is free, or choose a nearer pose"))
+}

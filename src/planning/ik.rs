@@ -1,0 +1,253 @@
+//! Inverse kinematics: joints for a pose of a link. Damped least squares from a seed, then from random
+//! configurations, until enough solutions are found. Never gives a configuration that is not one: what it returns
+//! reaches the pose to the tolerances, inside the limits, and is valid as the caller says; if not, it says what was
+//! missing.
+
+use glamx::{DAffine3, DVec3};
+
+use crate::collision::checker::Stop;
+use crate::robot::kinematics::Kinematics;
+use crate::robot::kinematics::jacobian::{Column, cholesky, gram, solve as solve_gram};
+use crate::robot::kinematics::step::rotation_between;
+use crate::robot::random::Random;
+
+use super::path::distance;
+
+/// How solutions are looked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct IkSettings {
+    /// Largest distance from the position asked for [m].
+    pub position: f64,
+    /// Largest angle from the orientation asked for [rad].
+    pub rotation: f64,
+    /// Whether any orientation will do.
+    pub position_only: bool,
+    /// Attempts: the first from the seed, the others from random configurations.
+    pub attempts: usize,
+    /// Steps of an attempt.
+    pub steps: usize,
+    /// Different solutions to look for: more cost more, and the nearest of them comes first.
+    pub solutions: usize,
+    /// What all randomness comes from.
+    pub seed: u64,
+}
+
+impl Default for IkSettings {
+    fn default() -> Self {
+        Self { position: 1e-6, rotation: 1e-6, position_only: false, attempts: 100, steps: 60, solutions: 1, seed: 0 }
+    }
+}
+
+/// Why no solution was found.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{}", self.said())]
+pub struct IkFailure {
+    /// Distance from the position asked for, of the best attempt [m].
+    pub position: f64,
+    /// Angle from the orientation asked for, of the best attempt [rad].
+    pub rotation: f64,
+    /// The best attempt's configuration.
+    pub best: Vec<f64>,
+    /// The joint whose limit kept it from coming closer, by index and name.
+    pub limit: Option<(usize, String)>,
+    /// Solutions that reach the pose, but that the caller did not accept.
+    pub rejected: usize,
+    /// Attempts that were made.
+    pub attempts: usize,
+    /// Whether it was stopped before all attempts were made.
+    pub stopped: bool,
+}
+
+impl IkFailure {
+    fn said(&self) -> String {
+        let n = self.attempts;
+        if self.rejected > 0 {
+            return format!("{} configurations reach the pose, but every one collides ({n} attempts)", self.rejected);
+        }
+        let missing = format!("{:.1} mm and {:.2}°", self.position * 1e3, self.rotation.to_degrees());
+        let limit = self.limit.as_ref().map(|(_, joint)| format!("; the limit of joint {joint:?} is in the way"));
+        let stopped = if self.stopped { ", then it was stopped" } else { "" };
+        format!(
+            "the pose is not reached: {missing} are missing after {n} attempts{stopped}{}",
+            limit.unwrap_or_default()
+        )
+    }
+}
+
+/// Solves for poses of one link; keeps its buffers.
+#[derive(Debug, Clone)]
+pub struct Ik<'a> {
+    kinematics: &'a Kinematics,
+    link: usize,
+    frames: Vec<DAffine3>,
+    columns: Vec<Column>,
+    q: Vec<f64>,
+    motion: Vec<f64>,
+}
+
+/// How far a configuration is from a pose.
+#[derive(Debug, Clone, Copy)]
+struct Miss {
+    linear: DVec3,
+    angular: DVec3,
+}
+
+impl Miss {
+    fn squared(&self) -> f64 {
+        self.linear.length_squared() + self.angular.length_squared()
+    }
+}
+
+impl<'a> Ik<'a> {
+    /// For a link (index in the model).
+    pub fn new(kinematics: &'a Kinematics, link: usize) -> Self {
+        let n = kinematics.dof();
+        let (frames, columns) = (kinematics.frames(), vec![[0.0; 6]; n]);
+        Self { kinematics, link, frames, columns, q: vec![0.0; n], motion: vec![0.0; n] }
+    }
+
+    /// Configurations in which the link stands at `target` (in the root's frame), the nearest to `near` first. Those
+    /// that are not `valid` are passed over. The same settings give the same solutions.
+    pub fn solve(
+        &mut self,
+        target: &DAffine3,
+        near: &[f64],
+        settings: &IkSettings,
+        mut valid: impl FnMut(&[f64]) -> bool,
+        stop: &Stop,
+    ) -> Result<Vec<Vec<f64>>, IkFailure> {
+        let mut random = Random::new(settings.seed);
+        let mut found: Vec<Vec<f64>> = Vec::new();
+        let mut failure = IkFailure {
+            position: f64::INFINITY,
+            rotation: f64::INFINITY,
+            best: near.to_vec(),
+            limit: None,
+            rejected: 0,
+            attempts: 0,
+            stopped: false,
+        };
+        let mut best = f64::INFINITY;
+        while failure.attempts < settings.attempts.max(1) && found.len() < settings.solutions.max(1) {
+            if failure.attempts > 0 && stop.is_over() {
+                failure.stopped = true;
+                break;
+            }
+            self.start(near, failure.attempts > 0, &mut random);
+            failure.attempts += 1;
+            let miss = self.descend(target, settings);
+            if settings_met(&miss, settings) {
+                self.unwind(near);
+                let new = !found.iter().any(|q| distance(q, &self.q) < 1e-3);
+                if new && valid(&self.q) {
+                    found.push(self.q.clone());
+                } else if new {
+                    failure.rejected += 1;
+                }
+            } else if miss.squared() < best {
+                best = miss.squared();
+                (failure.position, failure.rotation) = (miss.linear.length(), miss.angular.length());
+                failure.best.clone_from(&self.q);
+            }
+        }
+        if found.is_empty() {
+            failure.limit = self.limit_in_the_way(target, &failure.best, settings);
+            return Err(failure);
+        }
+        found.sort_by(|a, b| distance(near, a).total_cmp(&distance(near, b)));
+        Ok(found)
+    }
+
+    /// One attempt from a configuration that is near a solution; `None` when it does not come to one.
+    pub fn follow(&mut self, target: &DAffine3, from: &[f64], settings: &IkSettings) -> Option<Vec<f64>> {
+        self.q.clear();
+        self.q.extend_from_slice(from);
+        let miss = self.descend(target, settings);
+        settings_met(&miss, settings).then(|| self.q.clone())
+    }
+
+    /// The link's frame at a configuration.
+    pub fn pose(&mut self, q: &[f64]) -> DAffine3 {
+        self.kinematics.forward(q, &mut self.frames);
+        self.kinematics.link_frame(self.link, &self.frames)
+    }
+
+    /// The joint that stands at its limit and would go farthest beyond it to come closer to a pose.
+    pub fn limit_in_the_way(&mut self, target: &DAffine3, q: &[f64], settings: &IkSettings) -> Option<(usize, String)> {
+        self.q.clear();
+        self.q.extend_from_slice(q);
+        let miss = self.miss(target, settings);
+        self.aim(&miss, 1e-4, settings);
+        let limits = self.kinematics.limits();
+        let beyond = |j: usize| (q[j] + self.motion[j] - limits[j].upper).max(limits[j].lower - q[j] - self.motion[j]);
+        let at_limit = |j: &usize| q[*j] >= limits[*j].upper - 1e-6 || q[*j] <= limits[*j].lower + 1e-6;
+        let joints = (0..q.len()).filter(at_limit).filter(|j| beyond(*j) > 0.0);
+        joints.max_by(|a, b| beyond(*a).total_cmp(&beyond(*b))).map(|j| (j, self.kinematics.names()[j].clone()))
+    }
+
+    fn start(&mut self, near: &[f64], random_start: bool, random: &mut Random) {
+        self.q.resize(near.len(), 0.0);
+        for ((q, l), near) in self.q.iter_mut().zip(self.kinematics.limits()).zip(near) {
+            *q = match random_start {
+                true => crate::collision::always::sample(l.lower, l.upper, random),
+                false => near.max(l.lower).min(l.upper),
+            };
+        }
+    }
+
+    fn miss(&mut self, target: &DAffine3, settings: &IkSettings) -> Miss {
+        self.kinematics.forward(&self.q, &mut self.frames);
+        let at = self.kinematics.link_frame(self.link, &self.frames);
+        let angular = if settings.position_only { DVec3::ZERO } else { rotation_between(&at.matrix3, &target.matrix3) };
+        Miss { linear: target.translation - at.translation, angular }
+    }
+
+    /// The damped step towards a pose, into `motion`; frames must be those of `q`.
+    fn aim(&mut self, miss: &Miss, damping: f64, settings: &IkSettings) {
+        self.kinematics.jacobian(self.link, &self.frames, &mut self.columns);
+        if settings.position_only {
+            self.columns.iter_mut().for_each(|c| c[3..].fill(0.0));
+        }
+        let (l, a) = (miss.linear, miss.angular);
+        let x = cholesky(&gram(&self.columns, damping)).map(|c| solve_gram(&c, &[l.x, l.y, l.z, a.x, a.y, a.z]));
+        for (motion, column) in self.motion.iter_mut().zip(&self.columns) {
+            *motion = x.map_or(0.0, |x| column.iter().zip(&x).map(|(a, b)| a * b).sum());
+        }
+    }
+
+    /// Goes down from `q` until the pose is reached or there is no progress; returns what is missing.
+    fn descend(&mut self, target: &DAffine3, settings: &IkSettings) -> Miss {
+        let mut miss = self.miss(target, settings);
+        let (mut best, mut idle) = (miss.squared(), 0);
+        for _ in 0..settings.steps {
+            if settings_met(&miss, settings) || idle > 6 {
+                break;
+            }
+            // Much damping far away, none to speak of close by: there the last digits come at once.
+            self.aim(&miss, 0.02 * miss.squared() + 1e-9, settings);
+            let longest = self.motion.iter().fold(0.0, |most: f64, m| most.max(m.abs()));
+            let scale = if longest > 0.7 { 0.7 / longest } else { 1.0 };
+            for ((q, m), l) in self.q.iter_mut().zip(&self.motion).zip(self.kinematics.limits()) {
+                *q = (*q + m * scale).max(l.lower).min(l.upper);
+            }
+            miss = self.miss(target, settings);
+            idle = if miss.squared() < 0.9 * best { 0 } else { idle + 1 };
+            best = best.min(miss.squared());
+        }
+        miss
+    }
+
+    /// Turns joints without limits by whole turns, to be near.
+    fn unwind(&mut self, near: &[f64]) {
+        let turn = std::f64::consts::TAU;
+        for ((q, near), l) in self.q.iter_mut().zip(near).zip(self.kinematics.limits()) {
+            if l.lower.is_infinite() && l.upper.is_infinite() {
+                *q += ((near - *q) / turn).round() * turn;
+            }
+        }
+    }
+}
+
+fn settings_met(miss: &Miss, settings: &IkSettings) -> bool {
+    miss.linear.length() <= settings.position && miss.angular.length() <= settings.rotation
+}

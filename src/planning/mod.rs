@@ -1,0 +1,30 @@
+//! From a start and a goal to a motion: search, shortening, timing. Pure computation: no thread, no clock besides the
+//! deadline it is given, the same seed gives the same path.
+//!
+//! ```text
+//!  pose ─▶ ik ─▶ goals ─▶ planner: straight line │ rrt_connect ─▶ shortcut ─▶ path
+//!                                                                             │
+//!                                 JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
+//! ```
+
+pub mod blend;
+pub mod cartesian;
+pub mod config;
+pub mod desk;
+mod goals;
+pub mod ik;
+pub mod nearest;
+pub mod path;
+pub mod planner;
+pub mod rrt_connect;
+pub mod sampler;
+pub mod setup;
+pub mod shortcut;
+mod smooth;
+pub mod solve;
+pub mod timing;
+pub mod topp;
+pub mod verify;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,243 @@
+//! One plan: from a start to the nearest goal that can be reached, as a path that is free at the checker's resolution.
+
+use std::time::{Duration, Instant};
+
+use crate::collision::checker::{CollisionChecker, Stop};
+use crate::collision::report::Contact;
+use crate::robot::random::Random;
+
+use super::path::{Path, between, distance, length};
+use super::rrt_connect::{Ended, RrtSettings, SearchCount, search};
+use super::sampler::Sampler;
+use super::shortcut::{ShortcutSettings, shorten};
+
+/// How a plan is made.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlanSettings {
+    /// What all randomness comes from.
+    pub seed: u64,
+    /// How the search goes.
+    pub search: RrtSettings,
+    /// How the path is shortened.
+    pub shortcut: ShortcutSettings,
+    /// A start may be this far outside its limits [rad or m]: the motion first brings it back.
+    pub limit_tolerance: f64,
+    /// A start may overlap by this depth [m]: the motion first brings it out.
+    pub contact_tolerance: f64,
+}
+
+impl Default for PlanSettings {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            search: RrtSettings::default(),
+            shortcut: ShortcutSettings::default(),
+            limit_tolerance: 0.02,
+            contact_tolerance: 0.003,
+        }
+    }
+}
+
+/// A path and how it was found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plan {
+    /// Configurations to be joined by straight lines, from the start to one of the goals.
+    pub path: Path,
+    /// Its length [rad].
+    pub length: f64,
+    /// Whether the straight line was free.
+    pub straight: bool,
+    /// The seed it came from.
+    pub seed: u64,
+    /// What the search did.
+    pub count: SearchCount,
+    /// Configurations that were looked at.
+    pub looks: u64,
+    /// Time to find a path.
+    pub search_time: Duration,
+    /// Time to shorten it.
+    pub shorten_time: Duration,
+}
+
+/// Why there is no plan.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum PlanError {
+    /// A configuration has the wrong number of joints, or one that is not finite.
+    #[error("the {0} is no configuration of {1} joints with finite positions")]
+    Shape(&'static str, usize),
+    /// No goal is given.
+    #[error("no goal is given")]
+    NoGoal,
+    /// A position is outside its limits.
+    #[error("joint {joint} of the {which} is at {position:.4}, outside {lower:.4} to {upper:.4}")]
+    Outside {
+        /// "start" or "goal".
+        which: &'static str,
+        /// Index of the joint.
+        joint: usize,
+        /// Where it is [rad or m].
+        position: f64,
+        /// Lowest position.
+        lower: f64,
+        /// Highest position.
+        upper: f64,
+    },
+    /// Something touches.
+    #[error("the {which} collides: {}", said(.contacts))]
+    Collides {
+        /// "start" or "goal".
+        which: &'static str,
+        /// What touches, the deepest first.
+        contacts: Vec<Contact>,
+    },
+    /// The time is up.
+    #[error("no path found in time, after {} samples and {} nodes", .0.samples, .0.nodes)]
+    Timeout(SearchCount),
+    /// Somebody cancelled it.
+    #[error("cancelled")]
+    Cancelled,
+    /// The search used up its samples or nodes.
+    #[error("no path found with {} samples and {} nodes", .0.samples, .0.nodes)]
+    Exhausted(SearchCount),
+}
+
+fn said(contacts: &[Contact]) -> String {
+    let first: Vec<String> = contacts.iter().take(3).map(Contact::to_string).collect();
+    let more = contacts.len().saturating_sub(3);
+    first.join("; ") + &if more > 0 { format!("; and {more} more") } else { String::new() }
+}
+
+/// Plans from `start` to one of `goals`, the nearest first. The same checker, settings and goals give the same path, as
+/// long as time does not run out.
+pub fn plan<C: CollisionChecker>(
+    checker: &mut C,
+    start: &[f64],
+    goals: &[Vec<f64>],
+    settings: &PlanSettings,
+    stop: &Stop,
+) -> Result<Plan, PlanError> {
+    let began = Instant::now();
+    let looked = checker.looks();
+    let lead = lead_in(checker, start, settings, stop)?;
+    let from = lead.last().map_or(start, Vec::as_slice).to_vec();
+    let goals = usable_goals(checker, &from, goals)?;
+    let straight = goals.iter().find(|goal| checker.motion_is_free(&from, goal, stop));
+    let mut count = SearchCount::default();
+    let found = match straight {
+        Some(goal) => vec![from.clone(), goal.clone()],
+        None => {
+            let mut sampler = Sampler::new(checker.limits(), &from, settings.seed);
+            let (found, made) = search(checker, &from, &goals, &settings.search, &mut sampler, stop);
+            count = made;
+            found.map_err(|ended| match ended {
+                Ended::Stopped if stop.is_cancelled() => PlanError::Cancelled,
+                Ended::Stopped => PlanError::Timeout(count),
+                Ended::Exhausted => PlanError::Exhausted(count),
+            })?
+        }
+    };
+    let search_time = began.elapsed();
+    let mut path = shorten(checker, &found, &settings.shortcut, settings.seed, stop);
+    path.splice(..1, lead);
+    Ok(Plan {
+        length: length(&path),
+        path,
+        straight: straight.is_some(),
+        seed: settings.seed,
+        count,
+        looks: checker.looks() - looked,
+        search_time,
+        shorten_time: began.elapsed() - search_time,
+    })
+}
+
+/// The way from the start to a configuration inside the limits where nothing touches: the start alone, mostly.
+fn lead_in<C: CollisionChecker>(
+    checker: &mut C,
+    start: &[f64],
+    settings: &PlanSettings,
+    stop: &Stop,
+) -> Result<Path, PlanError> {
+    check_shape(checker, "start", start)?;
+    let mut lead = vec![start.to_vec()];
+    let inside = clamped(checker, start);
+    for (joint, (&position, &clamped)) in start.iter().zip(&inside).enumerate() {
+        if (position - clamped).abs() > settings.limit_tolerance {
+            return Err(outside(checker, "start", joint, position));
+        }
+    }
+    if inside != start {
+        lead.push(inside.clone());
+    }
+    if checker.is_free(&inside) {
+        return Ok(lead);
+    }
+    let contacts = checker.contacts(&inside);
+    let depth = contacts.first().map_or(0.0, |c| -c.distance);
+    match (depth <= settings.contact_tolerance).then(|| way_out(checker, &inside, depth, settings.seed, stop)).flatten()
+    {
+        Some(free) => {
+            lead.push(free);
+            Ok(lead)
+        }
+        None => Err(PlanError::Collides { which: "start", contacts }),
+    }
+}
+
+/// A free configuration close by that is reached without going deeper.
+fn way_out<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed: u64, stop: &Stop) -> Option<Vec<f64>> {
+    let mut random = Random::new(seed);
+    let mut at = from.to_vec();
+    for k in 0..200 {
+        if stop.is_over() {
+            return None;
+        }
+        let size = 0.01 + 0.1 * f64::from(k) / 200.0;
+        let moved: Vec<f64> = from.iter().map(|x| x + random.between(-size, size)).collect();
+        let to = clamped(checker, &moved);
+        let deeper =
+            |checker: &mut C, q: &[f64]| checker.contacts(q).first().is_some_and(|c| -c.distance > depth + 1e-4);
+        let mut passes = |part: f64| {
+            between(from, &to, part, &mut at);
+            !deeper(checker, &at)
+        };
+        if (1..=8).all(|i| passes(f64::from(i) / 8.0)) && checker.is_free(&to) {
+            return Some(to);
+        }
+    }
+    None
+}
+
+/// The goals that are inside the limits and free, the nearest first; if there are none, why.
+fn usable_goals<C: CollisionChecker>(checker: &mut C, from: &[f64], goals: &[Vec<f64>]) -> Result<Path, PlanError> {
+    let mut usable: Path = Vec::new();
+    let mut why = PlanError::NoGoal;
+    for goal in goals {
+        check_shape(checker, "goal", goal)?;
+        let inside = clamped(checker, goal);
+        let far = goal.iter().zip(&inside).position(|(a, b)| (a - b).abs() > 1e-6);
+        if let Some(joint) = far {
+            why = outside(checker, "goal", joint, goal[joint]);
+        } else if !checker.is_free(&inside) {
+            why = PlanError::Collides { which: "goal", contacts: checker.contacts(&inside) };
+        } else {
+            usable.push(inside);
+        }
+    }
+    usable.sort_by(|a, b| distance(from, a).total_cmp(&distance(from, b)));
+    if usable.is_empty() { Err(why) } else { Ok(usable) }
+}
+
+fn check_shape<C: CollisionChecker>(checker: &C, which: &'static str, q: &[f64]) -> Result<(), PlanError> {
+    let fine = q.len() == checker.dof() && q.iter().all(|x| x.is_finite());
+    if fine { Ok(()) } else { Err(PlanError::Shape(which, checker.dof())) }
+}
+
+fn clamped<C: CollisionChecker>(checker: &C, q: &[f64]) -> Vec<f64> {
+    q.iter().zip(checker.limits()).map(|(x, l)| x.max(l.lower).min(l.upper)).collect()
+}
+
+fn outside<C: CollisionChecker>(checker: &C, which: &'static str, joint: usize, position: f64) -> PlanError {
+    let limits = checker.limits()[joint];
+    PlanError::Outside { which, joint, position, lower: limits.lower, upper: limits.upper }
+}

@@ -1,0 +1,181 @@
+//! From a planner's configuration to robots and a world that can be planned in: descriptions read, joints and links
+//! found, shapes made.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use glamx::DVec3;
+
+use super::config::{CLOUD_RADIUS, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::timing::DEFAULT_ACCELERATION;
+use crate::collision::always::always_touching;
+use crate::collision::body::{MeshMode, of_mesh, solids};
+use crate::collision::cloud::Cloud;
+use crate::collision::world::{Obstacle, Robot, World};
+use crate::collision::{Solid, ply};
+use crate::robot::kinematics::{Kinematics, frame};
+use crate::robot::mesh::Mesh;
+use crate::robot::model::{Limits, RobotModel};
+use crate::robot::{Source, load};
+
+/// Poses that are looked at for pairs of links that always touch.
+const SAMPLES: usize = 200;
+/// Links that touch in more than this part of the poses are taken to touch always.
+const ALWAYS: f64 = 0.99;
+
+/// A robot that can be planned for.
+#[derive(Debug, Clone)]
+pub struct PlannedRobot {
+    /// What it was made from.
+    pub config: RobotConfig,
+    /// Its description, with the configuration's limits on top of its own.
+    pub model: Arc<RobotModel>,
+    /// Indices of the planned joints in the model.
+    pub joints: Vec<usize>,
+    /// Index of the link that pose goals are for.
+    pub end_effector: usize,
+    /// Limits of the planned joints.
+    pub limits: Vec<Limits>,
+    /// As it stands in the world, with all its planned joints.
+    pub body: Robot,
+}
+
+/// Robots and the world around them.
+#[derive(Debug, Clone)]
+pub struct Setup {
+    /// The robots, in the configuration's order.
+    pub robots: Vec<PlannedRobot>,
+    /// The world as it is at the start. Its robots are those above, in the same order.
+    pub world: World,
+    /// Pairs of links that touch in every pose, with their robot's name; they are not checked.
+    pub always_touching: Vec<(String, [String; 2])>,
+}
+
+impl Setup {
+    /// Reads everything. An error says which robot or object, and all that is wrong with its description.
+    pub fn load(config: &PlannerConfig) -> Result<Self, String> {
+        let mut world = World::new();
+        let mut robots = Vec::new();
+        for robot in &config.robots {
+            let made = PlannedRobot::load(robot).map_err(|e| format!("robot {:?}: {e}", robot.name))?;
+            world.add_robot(made.body.clone()).map_err(|e| format!("robot {:?}: {e}", robot.name))?;
+            robots.push(made);
+        }
+        for object in &config.objects {
+            let added = obstacle(object).and_then(|o| world.add(o).map_err(|e| e.to_string()));
+            added.map_err(|e| format!("object {:?} of the world: {e}", object.name))?;
+        }
+        let mut setup = Self { robots, world, always_touching: Vec::new() };
+        setup.leave_out_what_always_touches();
+        Ok(setup)
+    }
+
+    /// The robot of a name.
+    pub fn robot(&self, name: &str) -> Option<usize> {
+        self.robots.iter().position(|robot| robot.config.name == name)
+    }
+
+    /// Pairs of links that touch in every pose can only be what the description means: checking them would forbid
+    /// every motion. They are told by name, never left out in silence.
+    fn leave_out_what_always_touches(&mut self) {
+        for index in 0..self.robots.len() {
+            let mut alone = World::new();
+            // Added once already, so it can be added again. Without its name before them, links have their own names.
+            let _ = alone.add_robot(Robot { name: String::new(), ..self.robots[index].body.clone() });
+            let home = self.robots[index].neutral();
+            let always = always_touching(&alone.snapshot(), &home, SAMPLES, 0);
+            for suspect in always.into_iter().filter(|suspect| suspect.share > ALWAYS) {
+                let pair = (suspect.contact.link, suspect.contact.other);
+                self.always_touching.push((self.robots[index].config.name.clone(), [pair.0.clone(), pair.1.clone()]));
+                self.robots[index].body.allowed.push(pair);
+            }
+        }
+        self.world = self.world.with_robots(self.robots.iter().map(|robot| robot.body.clone()).collect());
+    }
+}
+
+impl PlannedRobot {
+    fn load(config: &RobotConfig) -> Result<Self, String> {
+        let source = Source {
+            path: config.model_path.clone(),
+            packages: config.packages.clone(),
+            xacro_args: config.xacro_args.clone(),
+            ..Source::default()
+        };
+        let mut model = load(&source).into_model()?;
+        let joints = config.joints.iter().map(|name| joint(&model, name)).collect::<Result<Vec<_>, _>>()?;
+        for &index in &joints {
+            if let Some(joint) = model.joints.get_mut(index) {
+                let own = joint.limits.acceleration.unwrap_or(DEFAULT_ACCELERATION.max(config.max_acceleration));
+                joint.limits.velocity = joint.limits.velocity.min(config.max_velocity);
+                joint.limits.acceleration = Some(own.min(config.max_acceleration));
+            }
+        }
+        let link = |name: &str| {
+            let names = model.links.iter().map(|link| link.name.as_str());
+            let hint = || crate::yaml::did_you_mean(name, names, "its links").unwrap_or_default();
+            model.link_index(name).ok_or_else(|| format!("there is no link {name:?}; {}", hint()))
+        };
+        let (base, end_effector) = (link(&config.base_link)?, link(&config.end_effector_link)?);
+        let solids = solids(&model, MeshMode::Hull).map_err(|e| e.to_string())?;
+        let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
+        let limits = kinematics.limits().to_vec();
+        let rest = model.positions(&HashMap::new());
+        let base_in_model = model.link_poses(&rest).get(base).copied().unwrap_or_default();
+        let model = Arc::new(model);
+        let body = Robot {
+            name: config.name.clone(),
+            model: model.clone(),
+            kinematics: Arc::new(kinematics),
+            solids,
+            base: frame(&(config.base_pose * base_in_model.inverse())),
+            padding: 0.0,
+            allowed: config.exclusions.clone(),
+        };
+        for (name, pose) in &config.named_poses {
+            let outside = pose.iter().zip(&limits).position(|(q, l)| !(l.lower..=l.upper).contains(q));
+            if let Some(at) = outside {
+                return Err(format!("the named pose {name:?} is outside the limits of {}", config.joints[at]));
+            }
+        }
+        Ok(Self { config: config.clone(), model, joints, end_effector, limits, body })
+    }
+
+    /// A pose in the middle of things: zero, or where zero is outside the limits the nearest that is inside.
+    fn neutral(&self) -> Vec<f64> {
+        self.limits.iter().map(|l| 0.0_f64.max(l.lower).min(l.upper)).collect()
+    }
+
+    /// The robot as it stands in the world while it does not move: no joint of it is planned.
+    pub fn standing(&self, positions: &[f64]) -> Result<Robot, String> {
+        let named = self.config.joints.iter().cloned().zip(positions.iter().copied()).collect();
+        let rest = self.model.positions(&named);
+        let kinematics = Kinematics::new(&self.model, &[], &rest).map_err(|e| e.to_string())?;
+        Ok(Robot { kinematics: Arc::new(kinematics), ..self.body.clone() })
+    }
+}
+
+fn joint(model: &RobotModel, name: &str) -> Result<usize, String> {
+    let names = model.joints.iter().map(|joint| joint.name.as_str());
+    let hint = || crate::yaml::did_you_mean(name, names, "its joints").unwrap_or_default();
+    model.joint_index(name).ok_or_else(|| format!("there is no joint {name:?}; {}", hint()))
+}
+
+/// An obstacle from its description. Reads its file, where it has one.
+pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
+    let at = frame(&object.pose);
+    let solid = match &object.shape {
+        ObjectShape::Box(size) => Solid::cuboid(DVec3::from_array(*size), at),
+        ObjectShape::Sphere(radius) => Solid::sphere(*radius, at),
+        ObjectShape::Cylinder([radius, length]) => Solid::cylinder(*radius, *length, at),
+        ObjectShape::Mesh(path) => of_mesh(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, MeshMode::Triangles, at),
+        ObjectShape::Cloud(path) => {
+            let data = std::fs::read(path).map_err(|e| format!("{}: {e}", path.display()))?;
+            let points = ply::read(&data).map_err(|e| format!("{}: {e}", path.display()))?;
+            let cloud = Cloud::new(points).ok_or_else(|| format!("{}: no points", path.display()))?;
+            Solid::cloud(Arc::new(cloud), CLOUD_RADIUS, at)
+        }
+    };
+    let solid = solid.map_err(|e| e.to_string())?;
+    Ok(Obstacle { name: object.name.clone(), solid, padding: object.padding })
+}

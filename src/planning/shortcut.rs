@@ -1,0 +1,83 @@
+//! Shorter paths: corners are left out where the straight way is free, then cut between random points.
+
+use crate::collision::checker::{CollisionChecker, Stop};
+use crate::robot::random::Random;
+
+use super::path::{Path, between, distance, length, tidy};
+
+/// How much is tried.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ShortcutSettings {
+    /// Random cuts that are tried.
+    pub tries: usize,
+    /// Ends after this many tries in a row without a gain.
+    pub patience: usize,
+    /// A cut must save at least this part of the path.
+    pub gain: f64,
+}
+
+impl Default for ShortcutSettings {
+    fn default() -> Self {
+        Self { tries: 100, patience: 25, gain: 1e-3 }
+    }
+}
+
+/// Shortens a path; every new edge is checked. Edges that stay are as they were. The same seed
+/// gives the same path; when it is stopped, what was reached so far is returned.
+pub fn shorten<C: CollisionChecker>(
+    checker: &mut C,
+    path: &[Vec<f64>],
+    settings: &ShortcutSettings,
+    seed: u64,
+    stop: &Stop,
+) -> Path {
+    let mut path = leave_out(checker, path, stop);
+    let mut random = Random::new(seed);
+    let mut idle = 0;
+    for _ in 0..settings.tries {
+        if path.len() < 3 || idle >= settings.patience || stop.is_over() {
+            break;
+        }
+        let whole = length(&path);
+        let (s, t) = (random.unit() * whole, random.unit() * whole);
+        let (a, b) = (point_at(&path, s.min(t)), point_at(&path, s.max(t)));
+        idle += 1;
+        let saved = (s - t).abs() - distance(&a.1, &b.1);
+        if a.0 == b.0 || saved < settings.gain * whole || !checker.motion_is_free(&a.1, &b.1, stop) {
+            continue;
+        }
+        let mut shorter: Path = path[..=a.0].to_vec();
+        shorter.extend([a.1, b.1]);
+        shorter.extend_from_slice(&path[b.0 + 1..]);
+        path = tidy(&shorter);
+        idle = 0;
+    }
+    leave_out(checker, &path, stop)
+}
+
+/// From each configuration on, goes straight to the farthest one that can be reached so.
+fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], stop: &Stop) -> Path {
+    let mut kept: Path = path.first().cloned().into_iter().collect();
+    let mut at = 0;
+    while at + 1 < path.len() {
+        let next = (at + 2..path.len()).rev().find(|&to| checker.motion_is_free(&path[at], &path[to], stop));
+        at = next.unwrap_or(at + 1);
+        kept.push(path[at].clone());
+    }
+    kept
+}
+
+/// The point at a length along a path, and the edge it lies on.
+fn point_at(path: &[Vec<f64>], at: f64) -> (usize, Vec<f64>) {
+    let mut rest = at;
+    for (edge, pair) in path.windows(2).enumerate() {
+        let step = distance(&pair[0], &pair[1]);
+        if rest <= step || edge + 2 == path.len() {
+            let mut q = pair[0].clone();
+            between(&pair[0], &pair[1], if step > 0.0 { (rest / step).min(1.0) } else { 0.0 }, &mut q);
+            return (edge, q);
+        }
+        rest -= step;
+    }
+    (0, path.first().cloned().unwrap_or_default())
+}

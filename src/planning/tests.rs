@@ -1,0 +1,136 @@
+//! The planner on a point in the plane, written against the checker's trait alone, and on an arm that starts touching.
+
+use std::sync::Arc;
+
+use glamx::{DAffine3, DVec3};
+
+use super::path::{distance, length};
+use super::planner::{PlanError, PlanSettings, plan};
+use crate::collision::body::{MeshMode, solids};
+use crate::collision::checker::{CollisionChecker, Resolution, Stop};
+use crate::collision::report::{Contact, Pair};
+use crate::collision::world::{Obstacle, Robot, World};
+use crate::collision::{ExactChecker, Solid};
+use crate::robot::kinematics::Kinematics;
+use crate::robot::model::Limits;
+use crate::robot::random::Random;
+use crate::robot::urdf::from_text;
+
+/// A point among round obstacles: middle and radius each.
+struct Plane {
+    limits: [Limits; 2],
+    posts: Vec<([f64; 2], f64)>,
+    looks: u64,
+}
+
+impl Plane {
+    fn new(posts: Vec<([f64; 2], f64)>) -> Self {
+        Self { limits: [Limits { lower: -1.0, upper: 1.0, ..Limits::NONE }; 2], posts, looks: 0 }
+    }
+}
+
+impl CollisionChecker for Plane {
+    fn dof(&self) -> usize {
+        2
+    }
+    fn limits(&self) -> &[Limits] {
+        &self.limits
+    }
+    fn resolution(&self) -> Resolution {
+        Resolution::default()
+    }
+    fn is_free(&mut self, q: &[f64]) -> bool {
+        self.looks += 1;
+        self.posts.iter().all(|(c, r)| distance(c, q) > *r)
+    }
+    fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        self.looks += 1;
+        let near = |c: &[f64; 2]| {
+            let d = [to[0] - from[0], to[1] - from[1]];
+            let t = ((c[0] - from[0]) * d[0] + (c[1] - from[1]) * d[1]) / (d[0] * d[0] + d[1] * d[1]).max(1e-300);
+            let t = t.clamp(0.0, 1.0);
+            distance(c, &[from[0] + d[0] * t, from[1] + d[1] * t])
+        };
+        !stop.is_over() && self.posts.iter().all(|(c, r)| near(c) > *r)
+    }
+    fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {
+        (!self.is_free(q)).then_some(Pair::Obstacle(0, 0))
+    }
+    fn clearance(&mut self, _: &[f64]) -> Option<Contact> {
+        None
+    }
+    fn contacts(&mut self, _: &[f64]) -> Vec<Contact> {
+        Vec::new()
+    }
+    fn looks(&self) -> u64 {
+        self.looks
+    }
+}
+
+#[test]
+fn every_edge_of_every_plan_is_free_the_joining_one_too() {
+    let mut random = Random::new(1);
+    let mut searched = 0;
+    for seed in 0..200 {
+        let posts =
+            (0..12).map(|_| ([random.between(-0.8, 0.8), random.between(-0.8, 0.8)], random.between(0.02, 0.2)));
+        let mut plane = Plane::new(posts.collect());
+        let (start, goals) = ([-0.95, -0.95], [vec![0.95, 0.95], vec![0.95, -0.9]]);
+        let settings = PlanSettings { seed, ..PlanSettings::default() };
+        let found = plan(&mut plane, &start, &goals, &settings, &Stop::never()).unwrap();
+        assert_eq!(found.path, plan(&mut plane, &start, &goals, &settings, &Stop::never()).unwrap().path);
+        assert!(found.path.windows(2).all(|e| plane.motion_is_free(&e[0], &e[1], &Stop::never())));
+        assert!(goals.contains(found.path.last().unwrap()) && (found.length - length(&found.path)).abs() < 1e-12);
+        searched += usize::from(!found.straight);
+    }
+    assert!(searched > 20, "{searched}");
+}
+
+#[test]
+fn a_search_without_a_way_ends_at_its_caps() {
+    // The goal is walled in by a ring of posts that overlap.
+    let ring = (0..40).map(|k| f64::from(k) * std::f64::consts::TAU / 40.0);
+    let mut plane = Plane::new(ring.map(|a| ([0.3 * a.cos(), 0.3 * a.sin()], 0.04)).collect());
+    let mut settings = PlanSettings::default();
+    settings.search.max_samples = 5000;
+    let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());
+    assert!(matches!(found, Err(PlanError::Exhausted(count)) if count.samples == 5000), "{found:?}");
+    settings.search.max_nodes = 50;
+    let found = plan(&mut plane, &[-0.9, -0.9], &[vec![0.0, 0.0]], &settings, &Stop::never());
+    assert!(
+        matches!(found, Err(PlanError::Exhausted(count)) if count.nodes >= 50 && count.samples < 5000),
+        "{found:?}"
+    );
+}
+
+#[test]
+fn a_start_that_touches_a_little_is_left_and_a_deep_one_is_said() {
+    let text = r#"<robot name="r"><link name="base"/><link name="l"><collision><origin xyz="0.5 0 0"/>
+<geometry><sphere radius="0.05"/></geometry></collision></link><joint name="j" type="revolute"><parent link="base"/>
+<child link="l"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1" effort="1"/></joint></robot>"#;
+    let model = Arc::new(from_text("r.urdf", text).unwrap());
+    let mut world = World::new();
+    let robot = Robot {
+        name: String::new(),
+        kinematics: Arc::new(Kinematics::whole(&model).unwrap()),
+        solids: solids(&model, MeshMode::Hull).unwrap(),
+        model,
+        base: DAffine3::IDENTITY,
+        padding: 0.0,
+        allowed: vec![],
+    };
+    world.add_robot(robot).unwrap();
+    let mut from = |overlap: f64| {
+        let at = DAffine3::from_translation(DVec3::new(0.5, 0.1 - overlap, 0.0));
+        let solid = Solid::sphere(0.05, at).unwrap();
+        world.put(Obstacle { name: "post".into(), solid, padding: 0.0 }).unwrap();
+        let mut checker = ExactChecker::new(world.snapshot(), Resolution::default());
+        plan(&mut checker, &[0.0], &[vec![-1.0]], &PlanSettings::default(), &Stop::never())
+    };
+    let found = from(0.002).unwrap();
+    assert_eq!(found.path[0], [0.0]);
+    assert!(found.path.len() == 3 && found.path[1][0] < 0.0, "{:?}", found.path);
+    assert!(from(-0.01).unwrap().straight);
+    let error = from(0.01).unwrap_err();
+    assert!(error.to_string().contains("10.0 mm deep in obstacle \"post\""), "{error}");
+}

@@ -1,0 +1,256 @@
+//! From a path to a trajectory: rounded corners, the fastest speeds that the limits allow, and a check of what comes
+//! out.
+//!
+//! Without jerk limits the trajectory's points are those of the grid the speeds were found on: on lines the cubic
+//! between two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a window of
+//! time, which keeps the curve and bounds the jerk, and the points are taken at even times.
+
+use crate::robot::model::Limits;
+use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryError, TrajectoryPoint};
+
+use super::blend::{Curve, curves};
+use super::path::{Path, tidy};
+use super::smooth::averaged;
+use super::topp::{GridPoint, JointBound, parameterize};
+use super::verify::{Excess, excess};
+
+/// How a path becomes a trajectory.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TimingSettings {
+    /// How far corners may be cut [rad, Euclidean over all joints]; 0: the motion rests at every corner.
+    pub deviation: f64,
+    /// Part of the full speed, above 0 and at most 1: the same motion, so much slower.
+    pub speed: f64,
+}
+
+impl Default for TimingSettings {
+    fn default() -> Self {
+        Self { deviation: 0.05, speed: 1.0 }
+    }
+}
+
+/// Acceleration of joints that state none [rad/s² or m/s²].
+pub const DEFAULT_ACCELERATION: f64 = 2.0;
+
+/// A trajectory, and what it came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Timed {
+    /// The trajectory.
+    pub trajectory: JointTrajectory,
+    /// Its length in time [s].
+    pub duration: f64,
+    /// How far each corner was cut [rad]; 0 where the motion rests.
+    pub deviation: Vec<f64>,
+    /// How much of its limits the motion uses at most, measured on the trajectory's spline.
+    pub excess: Excess,
+}
+
+/// Why a path has no timing.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum TimingError {
+    /// There is no motion.
+    #[error("the path does not move")]
+    NoMotion,
+    /// A value is not finite, or a configuration has the wrong number of joints.
+    #[error("configuration {0} of the path is no configuration of {1} joints with finite positions")]
+    Shape(usize, usize),
+    /// A joint has no usable limit.
+    #[error("joint {0:?} needs a positive and finite limit of {1}")]
+    Limit(String, &'static str),
+    /// The part of the speed is out of range.
+    #[error("the speed must be above 0 and at most 1, not {0}")]
+    Speed(f64),
+    /// The motion would touch something.
+    #[error("the timed motion is not free between {0:.3} s and {1:.3} s")]
+    NotFree(f64, f64),
+    /// What came out is no trajectory.
+    #[error(transparent)]
+    Trajectory(#[from] TrajectoryError),
+}
+
+/// The bounds of joints: those stated, [`DEFAULT_ACCELERATION`] where no acceleration is, no jerk limit where none is.
+pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, TimingError> {
+    let bound = |(name, l): (&String, &Limits)| {
+        let acceleration = l.acceleration.unwrap_or(DEFAULT_ACCELERATION);
+        let jerk = l.jerk.unwrap_or(f64::INFINITY);
+        for (what, x) in [("velocity", l.velocity), ("acceleration", acceleration)] {
+            if x <= 0.0 || !x.is_finite() {
+                return Err(TimingError::Limit(name.clone(), what));
+            }
+        }
+        if jerk <= 0.0 || jerk.is_nan() {
+            return Err(TimingError::Limit(name.clone(), "jerk"));
+        }
+        Ok(JointBound { velocity: l.velocity, acceleration, jerk })
+    };
+    names.iter().zip(limits).map(bound).collect()
+}
+
+/// Times a path. `free` says whether the straight line between two configurations is free: rounded corners that are
+/// not are rounded less, at last not at all, and the whole timed motion is asked about at the end.
+pub fn time(
+    names: &[String],
+    path: &[Vec<f64>],
+    bounds: &[JointBound],
+    settings: &TimingSettings,
+    mut free: impl FnMut(&[f64], &[f64]) -> bool,
+) -> Result<Timed, TimingError> {
+    let dof = names.len();
+    let bad = |q: &Vec<f64>| q.len() != dof || q.iter().any(|x| !x.is_finite());
+    if let Some(at) = path.iter().position(bad) {
+        return Err(TimingError::Shape(at, dof));
+    }
+    if !(settings.speed > 0.0 && settings.speed <= 1.0) {
+        return Err(TimingError::Speed(settings.speed));
+    }
+    let path = tidy(path);
+    if path.len() < 2 || bounds.len() != dof {
+        return Err(TimingError::NoMotion);
+    }
+    let mut deviation = vec![settings.deviation.max(0.0); path.len()];
+    round_corners(&path, &mut deviation, &mut free);
+    let mut timed = emit(names, &path, bounds, deviation, settings.speed)?;
+    if free_throughout(&timed.trajectory, &mut free).is_err() {
+        // Between the points the trajectory is not exactly the curve. Without rounding it is.
+        timed = emit(names, &path, bounds, vec![0.0; path.len()], settings.speed)?;
+        free_throughout(&timed.trajectory, &mut free)?;
+    }
+    Ok(timed)
+}
+
+/// Makes rounded corners sharper until they are free.
+fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64], &[f64]) -> bool) {
+    let (mut from, mut to) = (path[0].clone(), path[0].clone());
+    for _ in 0..8 {
+        let mut blocked = Vec::new();
+        for piece in curves(path, deviation).iter().flatten().filter(|p| p.bends) {
+            let mut passes = |k: usize| {
+                let s = piece.length * k as f64 / 8.0;
+                std::mem::swap(&mut from, &mut to);
+                to.iter_mut().enumerate().for_each(|(j, q)| *q = piece.at(j, s).q);
+                k == 0 || free(&from, &to)
+            };
+            if !(0..=8).all(&mut passes) {
+                blocked.push(piece.corner);
+            }
+        }
+        if blocked.is_empty() {
+            return;
+        }
+        for corner in blocked {
+            deviation[corner] = if deviation[corner] > 2e-3 { deviation[corner] * 0.4 } else { 0.0 };
+        }
+    }
+}
+
+fn emit(
+    names: &[String],
+    path: &Path,
+    bounds: &[JointBound],
+    deviation: Vec<f64>,
+    speed: f64,
+) -> Result<Timed, TimingError> {
+    let jerky = bounds.iter().any(|b| b.jerk.is_finite());
+    let mut points: Vec<TrajectoryPoint> = Vec::new();
+    let mut excess = Excess::default();
+    for curve in curves(path, &deviation) {
+        let grid = parameterize(&curve, bounds);
+        let (own, used) =
+            if jerky { averaged(names, &curve, &grid, bounds) } else { on_grid(names, &curve, &grid, bounds) }?;
+        excess = excess.max(used);
+        let start = points.last().map_or(0.0, |p| p.time_from_start);
+        let skip = usize::from(!points.is_empty());
+        points.extend(own.into_iter().skip(skip).map(|mut p| {
+            p.time_from_start += start;
+            p
+        }));
+    }
+    // The ends are those of the path, to the last bit.
+    if let (Some(first), Some(last)) = (points.first_mut(), path.first()) {
+        first.positions.clone_from(last);
+    }
+    if let (Some(end), Some(goal)) = (points.last_mut(), path.last()) {
+        end.positions.clone_from(goal);
+    }
+    stretch(&mut points, 1.0 / speed);
+    let trajectory = JointTrajectory { joint_names: names.to_vec(), points };
+    let excess = excess.stretched(1.0 / speed);
+    let duration = trajectory.points.last().map_or(0.0, |p| p.time_from_start);
+    Ok(Timed { trajectory, duration, deviation, excess })
+}
+
+/// The points of the grid itself, slowed down by what their cubics exceed.
+fn on_grid(
+    names: &[String],
+    curve: &Curve,
+    grid: &[GridPoint],
+    bounds: &[JointBound],
+) -> Result<(Vec<TrajectoryPoint>, Excess), TimingError> {
+    let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(grid.len());
+    let last = grid.len().saturating_sub(1);
+    for (i, g) in grid.iter().enumerate() {
+        // Points closer than this say nothing that their neighbours do not.
+        let near = |p: &TrajectoryPoint| g.time - p.time_from_start < 2e-4;
+        if points.len() > 1 && points.last().is_some_and(near) {
+            if i < last {
+                continue;
+            }
+            points.pop();
+        }
+        let (piece, speed) = (&curve[g.piece], g.x.sqrt());
+        let jets = (0..names.len()).map(|j| piece.at(j, g.at));
+        let (positions, velocities) = jets.map(|jet| (jet.q, jet.d1 * speed)).unzip();
+        points.push(TrajectoryPoint { time_from_start: g.time, positions, velocities, accelerations: Vec::new() });
+    }
+    let excess = slow_down(names, &mut points, bounds)?;
+    Ok((points, excess))
+}
+
+/// Stretches points in time so that their spline keeps all bounds; returns what it then uses of them.
+pub(super) fn slow_down(
+    names: &[String],
+    points: &mut Vec<TrajectoryPoint>,
+    bounds: &[JointBound],
+) -> Result<Excess, TimingError> {
+    let trajectory = JointTrajectory { joint_names: names.to_vec(), points: std::mem::take(points) };
+    let found = excess(&trajectory, bounds)?;
+    *points = trajectory.points;
+    let factor = match found.slower() {
+        slower if slower > 1.0 => slower * (1.0 + 1e-9),
+        _ => 1.0,
+    };
+    stretch(points, factor);
+    Ok(found.stretched(factor))
+}
+
+/// The same motion, slower by a factor.
+fn stretch(points: &mut [TrajectoryPoint], factor: f64) {
+    for p in points {
+        p.time_from_start *= factor;
+        p.velocities.iter_mut().for_each(|v| *v /= factor);
+        p.accelerations.iter_mut().for_each(|a| *a /= factor * factor);
+    }
+}
+
+/// Asks about the motion as it will be sampled: between two samples in each of the trajectory's segments.
+fn free_throughout(
+    trajectory: &JointTrajectory,
+    free: &mut impl FnMut(&[f64], &[f64]) -> bool,
+) -> Result<(), TimingError> {
+    let spline = Spline::new(trajectory)?;
+    let mut cursor = Cursor::default();
+    let mut samples = vec![Sample::default(); spline.joints()];
+    let mut from: Vec<f64> = trajectory.points.first().map(|p| p.positions.clone()).unwrap_or_default();
+    let mut to = from.clone();
+    for pair in spline.times().windows(2) {
+        for k in [0.5, 1.0] {
+            spline.sample(pair[0] + (pair[1] - pair[0]) * k, &mut cursor, &mut samples);
+            to.iter_mut().zip(&samples).for_each(|(q, s)| *q = s.position);
+            if !free(&from, &to) {
+                return Err(TimingError::NotFree(pair[0], pair[1]));
+            }
+            std::mem::swap(&mut from, &mut to);
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,255 @@
+//! Forward kinematics, Jacobians and one damped step, for a choice of joints, without allocation.
+//!
+//! A model is compiled once: everything that fixed joints weld together becomes one *body*, joints outside the choice
+//! stand still at a given position, followers follow, and each body's frame is turned so that its joint moves about
+//! or along z. A query then is one frame per moving joint; links are constant offsets from bodies.
+//!
+//! All frames are in the frame of the model's root link.
+
+pub mod jacobian;
+pub mod step;
+
+use glamx::{DAffine3, DMat3, DQuat, DVec3};
+use nalgebra::Isometry3;
+
+use crate::robot::model::{Joint, JointKind, Limits, RobotModel};
+
+/// What moves a body relative to its parent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Motion {
+    /// Turns about z.
+    Turn,
+    /// Slides along z.
+    Slide,
+}
+
+/// Several links that move as one.
+#[derive(Debug, Clone, PartialEq)]
+struct Body {
+    parent: usize,
+    /// Frame at joint position zero, in the parent body's frame; z is the joint's axis.
+    origin: DAffine3,
+    motion: Motion,
+    /// `position = multiplier · q[variable] + offset`.
+    variable: usize,
+    multiplier: f64,
+    offset: f64,
+}
+
+/// Why kinematics cannot be made of a model.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum KinematicsError {
+    /// A joint has no position of its own.
+    #[error("joint {0:?} does not move on its own: it is {1}")]
+    NotIndependent(String, &'static str),
+    /// A joint is chosen twice.
+    #[error("joint {0:?} is chosen twice")]
+    Twice(String),
+    /// There is no such joint.
+    #[error("the robot has no joint number {0}")]
+    NoJoint(usize),
+}
+
+/// The kinematics of some joints of a robot; the others stand still.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Kinematics {
+    names: Vec<String>,
+    limits: Vec<Limits>,
+    kinds: Vec<JointKind>,
+    /// `bodies[0]` is the root and has no joint: only its place counts.
+    bodies: Vec<Body>,
+    /// For every link of the model: its body, and its frame in the body's frame.
+    links: Vec<(usize, DAffine3)>,
+}
+
+impl Kinematics {
+    /// Compiles a model for the independent joints `joints` (indices in the model, in the order of the
+    /// configuration `q`); all others stand at `rest` (positions of all joints, see [`RobotModel::positions`]).
+    pub fn new(model: &RobotModel, joints: &[usize], rest: &[f64]) -> Result<Self, KinematicsError> {
+        for (i, &j) in joints.iter().enumerate() {
+            let joint = model.joints.get(j).ok_or(KinematicsError::NoJoint(j))?;
+            if !joint.is_independent() {
+                let why = if joint.is_movable() { "a follower" } else { "fixed" };
+                return Err(KinematicsError::NotIndependent(joint.name.clone(), why));
+            }
+            if joints[..i].contains(&j) {
+                return Err(KinematicsError::Twice(joint.name.clone()));
+            }
+        }
+        let mut made = Self {
+            names: joints.iter().map(|&j| model.joints[j].name.clone()).collect(),
+            limits: joints.iter().map(|&j| model.joints[j].limits).collect(),
+            kinds: joints.iter().map(|&j| model.joints[j].kind).collect(),
+            bodies: vec![Body {
+                parent: 0,
+                origin: DAffine3::IDENTITY,
+                motion: Motion::Turn,
+                variable: 0,
+                multiplier: 0.0,
+                offset: 0.0,
+            }],
+            links: vec![(0, DAffine3::IDENTITY)],
+        };
+        for (j, joint) in model.joints.iter().enumerate() {
+            made.add(j, joint, joints, rest.get(j).copied().unwrap_or(0.0));
+        }
+        Ok(made)
+    }
+
+    /// The kinematics of all independent joints.
+    pub fn whole(model: &RobotModel) -> Result<Self, KinematicsError> {
+        Self::new(model, &model.independent_joints(), &[])
+    }
+
+    fn add(&mut self, j: usize, joint: &Joint, joints: &[usize], rest: f64) {
+        let (parent, place) = self.links[joint.parent];
+        let (leader, multiplier, offset) = joint.mimic.map_or((j, 1.0, 0.0), |m| (m.leader, m.multiplier, m.offset));
+        let variable = joints.iter().position(|&chosen| chosen == leader);
+        let Some(variable) = variable.filter(|_| joint.is_movable()) else {
+            self.links.push((parent, place * frame(&joint.transform(rest))));
+            return;
+        };
+        let axis = DVec3::new(joint.axis.x, joint.axis.y, joint.axis.z);
+        let turned = DAffine3::from_quat(DQuat::from_rotation_arc(DVec3::Z, axis));
+        let motion = if joint.kind.is_angle() { Motion::Turn } else { Motion::Slide };
+        let origin = place * frame(&joint.origin) * turned;
+        self.bodies.push(Body { parent, origin, motion, variable, multiplier, offset });
+        self.links.push((self.bodies.len() - 1, DAffine3::from_mat3(turned.matrix3.transpose())));
+    }
+
+    /// Number of joints in a configuration.
+    pub fn dof(&self) -> usize {
+        self.names.len()
+    }
+
+    /// Names of the joints, in the order of a configuration.
+    pub fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// Limits of the joints.
+    pub fn limits(&self) -> &[Limits] {
+        &self.limits
+    }
+
+    /// What each joint lets its child do.
+    pub fn kinds(&self) -> &[JointKind] {
+        &self.kinds
+    }
+
+    /// Number of bodies, the root included: the length of a buffer of frames.
+    pub fn bodies(&self) -> usize {
+        self.bodies.len()
+    }
+
+    /// Number of links of the model.
+    pub fn links(&self) -> usize {
+        self.links.len()
+    }
+
+    /// A buffer for [`Kinematics::forward`].
+    pub fn frames(&self) -> Vec<DAffine3> {
+        vec![DAffine3::IDENTITY; self.bodies.len()]
+    }
+
+    /// Fills in the frame of every body at configuration `q` [rad or m], with the root at `base`.
+    pub fn forward_from(&self, base: &DAffine3, q: &[f64], frames: &mut [DAffine3]) {
+        if let Some(root) = frames.first_mut() {
+            *root = *base;
+        }
+        for (b, body) in self.bodies.iter().enumerate().skip(1) {
+            let at = body.multiplier * q.get(body.variable).copied().unwrap_or(0.0) + body.offset;
+            let Some(parent) = frames.get(body.parent).copied() else { return };
+            let Some(frame) = frames.get_mut(b) else { return };
+            let turn = parent.matrix3 * body.origin.matrix3;
+            let place = parent.matrix3 * body.origin.translation + parent.translation;
+            *frame = match body.motion {
+                Motion::Turn => {
+                    let (sin, cos) = at.sin_cos();
+                    let (x, y) = (turn.x_axis, turn.y_axis);
+                    let matrix3 = DMat3::from_cols(x * cos + y * sin, y * cos - x * sin, turn.z_axis);
+                    DAffine3 { matrix3, translation: place }
+                }
+                Motion::Slide => DAffine3 { matrix3: turn, translation: place + turn.z_axis * at },
+            };
+        }
+    }
+
+    /// Fills in the frame of every body at configuration `q` [rad or m].
+    pub fn forward(&self, q: &[f64], frames: &mut [DAffine3]) {
+        self.forward_from(&DAffine3::IDENTITY, q, frames);
+    }
+
+    /// The frame of a link, from frames of bodies.
+    pub fn link_frame(&self, link: usize, frames: &[DAffine3]) -> DAffine3 {
+        let (body, offset) = self.links.get(link).copied().unwrap_or((0, DAffine3::IDENTITY));
+        frames.get(body).copied().unwrap_or(DAffine3::IDENTITY) * offset
+    }
+
+    /// The body that a link belongs to.
+    pub fn body_of(&self, link: usize) -> usize {
+        self.links.get(link).map_or(0, |l| l.0)
+    }
+
+    /// A link's frame in the frame of its body.
+    pub fn place_of(&self, link: usize) -> DAffine3 {
+        self.links.get(link).map_or(DAffine3::IDENTITY, |l| l.1)
+    }
+
+    /// The bodies on the way from a body up to the root, the root itself left out.
+    pub fn ancestors(&self, body: usize) -> impl Iterator<Item = usize> + '_ {
+        let up = |b: &usize| self.bodies.get(*b).map(|body| body.parent).filter(|p| *p != 0);
+        std::iter::successors(Some(body).filter(|b| *b != 0), up)
+    }
+
+    /// How a body depends on the configuration: the joint's index in `q` and the factor it is followed with.
+    pub fn drive(&self, body: usize) -> Option<(usize, f64)> {
+        self.bodies.get(body).filter(|_| body != 0).map(|b| (b.variable, b.multiplier))
+    }
+
+    /// For one joint's unit of motion, an upper bound of how far a point of a body can move: `reach` is the distance
+    /// of the point from the body's origin [m]. Holds at every configuration within the limits; one entry per body on
+    /// the way up, as (body, factor), the factor in metres per radian or metres per metre.
+    pub fn levers(&self, body: usize, reach: f64) -> Vec<(usize, f64)> {
+        let mut levers = Vec::new();
+        let mut radius = reach;
+        let mut next: Option<DVec3> = None;
+        for b in self.ancestors(body) {
+            let own = &self.bodies[b];
+            // About its own axis a point moves by its distance from that axis, not from the origin on it.
+            let across = next.map_or(radius, |p| (p.x * p.x + p.y * p.y).sqrt() + radius);
+            levers.push((b, if own.motion == Motion::Turn { across } else { 1.0 }));
+            let along = next.map_or(0.0, |p| p.length());
+            let slide = if own.motion == Motion::Slide { self.travel(own) } else { 0.0 };
+            radius += along + slide;
+            next = Some(own.origin.translation);
+        }
+        levers
+    }
+
+    /// The farthest that a sliding body stands from its origin, within its limits.
+    fn travel(&self, body: &Body) -> f64 {
+        let limits = &self.limits[body.variable];
+        let at = |q: f64| (body.multiplier * q + body.offset).abs();
+        at(limits.lower).max(at(limits.upper))
+    }
+}
+
+/// A pose as rotation matrix and translation.
+pub fn frame(pose: &Isometry3<f64>) -> DAffine3 {
+    let (t, r) = (pose.translation.vector, pose.rotation.to_rotation_matrix());
+    let column = |c: usize| DVec3::new(r[(0, c)], r[(1, c)], r[(2, c)]);
+    DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: DVec3::new(t.x, t.y, t.z) }
+}
+
+/// A rotation matrix and translation as a pose.
+pub fn pose(frame: &DAffine3) -> Isometry3<f64> {
+    let (m, t) = (&frame.matrix3, frame.translation);
+    let column = |v: DVec3| nalgebra::Vector3::new(v.x, v.y, v.z);
+    let basis = [column(m.x_axis), column(m.y_axis), column(m.z_axis)];
+    let rotation = nalgebra::Rotation3::from_basis_unchecked(&basis);
+    Isometry3::from_parts(column(t).into(), nalgebra::UnitQuaternion::from_rotation_matrix(&rotation))
+}
+
+#[cfg(test)]
+mod tests;

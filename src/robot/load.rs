@@ -1,0 +1,181 @@
+//! A description on disk, or one of those in the box → the robot, and everything that is wrong with it.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde_json::json;
+
+use crate::robot::model::RobotModel;
+use crate::robot::packages::{Packages, absolute};
+use crate::robot::srdf::{self, Semantics};
+use crate::robot::urdf::{self, Meshes};
+use crate::robot::xml::{self, Calls, Document};
+use crate::robot::{builtin, joint_limits, xacro};
+use crate::yaml::{Diag, Label, Report, Severity, Tree, render};
+
+/// Which description to read, and how.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Source {
+    /// A URDF or xacro file, or `builtin:NAME`.
+    pub path: PathBuf,
+    /// Folders of packages by name; those that ROS's environment variables show are found too.
+    pub packages: BTreeMap<String, PathBuf>,
+    /// Values of `xacro:arg`s.
+    pub xacro_args: BTreeMap<String, String>,
+    /// The robot's SRDF, which may be xacro too.
+    pub srdf: Option<PathBuf>,
+    /// The robot's `joint_limits.yaml`.
+    pub joint_limits: Option<PathBuf>,
+    /// What to do about mesh files.
+    pub meshes: Meshes,
+}
+
+impl Source {
+    /// A description without arguments.
+    pub fn new(path: impl Into<PathBuf>) -> Self {
+        Self { path: path.into(), ..Self::default() }
+    }
+}
+
+/// A description that was read.
+#[derive(Debug, Default)]
+pub struct Loaded {
+    tree: Tree,
+    /// The robot; `None` when there are mistakes.
+    pub model: Option<RobotModel>,
+    /// What its SRDF says; empty where there is none.
+    pub semantics: Semantics,
+    /// The expanded URDF.
+    pub document: Option<Document>,
+    /// Every file that was read, the first one first. Empty for those in the box.
+    pub files: Vec<PathBuf>,
+}
+
+impl Loaded {
+    /// All mistakes as text.
+    pub fn render(&self, colour: bool) -> String {
+        self.tree.diags().iter().map(|diag| render(&self.tree, diag, colour) + "\n").collect()
+    }
+
+    /// All mistakes as data.
+    pub fn reports(&self) -> Vec<Report> {
+        self.tree.diags().iter().map(|diag| diag.located(&self.tree)).collect()
+    }
+
+    /// Number of warnings.
+    pub fn warnings(&self) -> usize {
+        self.tree.diags().iter().filter(|d| d.severity == Severity::Warning).count()
+    }
+
+    /// Whether anything must be put right.
+    pub fn has_errors(&self) -> bool {
+        self.tree.has_errors()
+    }
+
+    /// Adds a mistake that showed later, in a file that the description names.
+    pub fn report(&mut self, diag: Diag) {
+        self.tree.report(diag);
+    }
+
+    /// The expanded URDF as text.
+    pub fn urdf(&self) -> Option<String> {
+        self.document.as_ref().map(Document::to_text)
+    }
+
+    /// The robot, or all mistakes as text.
+    pub fn into_model(self) -> Result<RobotModel, String> {
+        let text = self.render(false);
+        self.model.ok_or(text)
+    }
+
+    /// The mistakes for `--json`.
+    pub fn to_json(&self) -> serde_json::Value {
+        json!({"valid": !self.has_errors() && self.model.is_some(), "problems": self.reports()})
+    }
+}
+
+/// Reads a description: expanded if it is xacro, completed by its SRDF and limits, with every mistake that it has.
+pub fn load(source: &Source) -> Loaded {
+    let mut loaded = Loaded::default();
+    let packages = Packages::named(source.packages.clone()).with_environment();
+    let Some((document, calls)) = expanded(&source.path, source, &packages, true, &mut loaded) else { return loaded };
+    let folder = absolute(&source.path).parent().map(Path::to_owned).unwrap_or_default();
+    let resolve = |uri: &str| packages.resolve(uri, &folder);
+    let mut model = urdf::read(&document.root, &mut loaded.tree, &calls, source.meshes, &resolve);
+    loaded.document = Some(document);
+    if let Some(robot) = &mut model {
+        if let Some(path) = &source.srdf
+            && let Some((document, calls)) = expanded(path, source, &packages, false, &mut loaded)
+        {
+            loaded.semantics = srdf::read(&document.root, robot, &mut loaded.tree, &calls).unwrap_or_default();
+        }
+        if let Some(path) = &source.joint_limits
+            && let Some(text) = text_of(path, &mut loaded)
+        {
+            let id = loaded.tree.add_source(path.display().to_string(), text);
+            joint_limits::apply(&mut loaded.tree, id, robot);
+        }
+    }
+    loaded.model = model.filter(|_| !loaded.tree.has_errors());
+    loaded
+}
+
+/// An XML file, expanded if it is xacro. Only the main one minds arguments without effect.
+fn expanded(
+    path: &Path,
+    source: &Source,
+    packages: &Packages,
+    main: bool,
+    loaded: &mut Loaded,
+) -> Option<(Document, Calls)> {
+    let text = text_of(path, loaded)?;
+    let id = loaded.tree.add_source(path.display().to_string(), text);
+    let document = xml::parse(&mut loaded.tree, id)?;
+    if xacro::is_xacro(path, &document) {
+        let expansion = xacro::expand(&mut loaded.tree, path, document, packages, &source.xacro_args)?;
+        loaded.files.extend(expansion.files.into_iter().skip(1));
+        for (name, near) in expansion.unknown_args.into_iter().filter(|_| main) {
+            let what = format!("no xacro:arg is named `{name}`: the argument has no effect");
+            let diag = Diag::warning(what).at(Label::start_of(id));
+            loaded.tree.report(diag.maybe_hint(near.map(|near| format!("did you mean `{near}`?"))));
+        }
+        return Some((expansion.document, expansion.calls));
+    }
+    for name in source.xacro_args.keys().filter(|_| main) {
+        let what = format!("the argument `{name}` has no effect: the description is no xacro");
+        loaded.tree.report(Diag::warning(what).at(Label::start_of(id)));
+    }
+    Some((document, Calls::default()))
+}
+
+/// The text of a file, or of a robot in the box.
+fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
+    if let Some(robot) = path.to_str().and_then(|name| name.strip_prefix(builtin::PREFIX)) {
+        if let Some(text) = builtin::text(robot) {
+            return Some(text.to_owned());
+        }
+        let hint = crate::yaml::did_you_mean(robot, builtin::NAMES.iter().copied(), "there are");
+        loaded.tree.report(Diag::error(format!("no robot in the box is named `{robot}`")).maybe_hint(hint));
+        return None;
+    }
+    let refused = |what: String| format!("{}: {what}", path.display());
+    let read = || {
+        let size = fs::metadata(path).map_err(|e| refused(e.to_string()))?.len();
+        if size > xml::MAX_BYTES as u64 {
+            return Err(refused(format!("the file is larger than {} MiB", xml::MAX_BYTES >> 20)));
+        }
+        let bytes = fs::read(path).map_err(|e| refused(e.to_string()))?;
+        String::from_utf8(bytes).map_err(|_| refused("bytes that are not UTF-8".to_owned()))
+    };
+    match read() {
+        Ok(text) => {
+            loaded.files.push(absolute(path));
+            Some(text)
+        }
+        Err(what) => {
+            loaded.tree.report(Diag::error(what));
+            None
+        }
+    }
+}

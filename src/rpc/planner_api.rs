@@ -1,0 +1,401 @@
+//! Parameters and replies of the methods of the planner. Like motions, plans are numbered: `plan` answers when planning
+//! begins, `planning` tells how it goes.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::api::{MIN_SPEED, finite};
+use super::motion_api::{DEFAULT_SPEED, Trajectory};
+
+/// A pose in the frame `map`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PoseSpec {
+    /// x, y, z [m].
+    pub xyz: [f64; 3],
+    /// Roll, pitch, yaw about fixed axes [rad].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rpy: Option<[f64; 3]>,
+    /// A quaternion x, y, z, w, in place of `rpy`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub quat: Option<[f64; 4]>,
+}
+
+impl PoseSpec {
+    fn valid(&self, field: &str) -> Result<(), String> {
+        finite(&format!("{field}.xyz"), &self.xyz)?;
+        finite(&format!("{field}.rpy"), &self.rpy.unwrap_or_default())?;
+        let quat = self.quat.unwrap_or([0.0, 0.0, 0.0, 1.0]);
+        finite(&format!("{field}.quat"), &quat)?;
+        let length = quat.iter().map(|v| v * v).sum::<f64>().sqrt();
+        match (self.rpy, self.quat) {
+            (Some(_), Some(_)) => Err(format!("{field} has both rpy and quat")),
+            (_, Some(_)) if !(0.99..=1.01).contains(&length) => {
+                Err(format!("{field}.quat has the length {length}, and must have 1"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Where one robot shall go: exactly one of `joints`, `pose`, `named`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlanGoal {
+    /// The robot's name in the planner.
+    pub robot: String,
+    /// Joint positions [rad], in the order of the robot's `joint_names`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joints: Option<Vec<f64>>,
+    /// Where its end effector shall be; without `rpy` and `quat` only the position counts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pose: Option<PoseSpec>,
+    /// One of its named poses.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub named: Option<String>,
+    /// Whether the end effector goes to `pose` on a straight line.
+    #[serde(default)]
+    pub linear: bool,
+}
+
+/// Parameters of `plan`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Plan {
+    /// Where the robots shall go, one entry each. The others stay where they are.
+    pub goals: Vec<PlanGoal>,
+    /// Fraction of the velocity and acceleration limits to use, 0.1–1.
+    #[serde(default = "default_speed")]
+    pub speed: f64,
+    /// Seed of the search; the same request from the same state with the same seed gives the same plan.
+    #[serde(default)]
+    pub seed: u64,
+    /// The longest time to search [s]; default: the blueprint's `planning_timeout`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub timeout: Option<f64>,
+}
+
+fn default_speed() -> f64 {
+    DEFAULT_SPEED
+}
+
+impl Plan {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        if self.goals.is_empty() {
+            return Err("goals is empty".into());
+        }
+        for (index, goal) in self.goals.iter().enumerate() {
+            let field = format!("goals[{index}]");
+            if self.goals.iter().take(index).any(|other| other.robot == goal.robot) {
+                return Err(format!("{field}: {} has a goal already", goal.robot));
+            }
+            let given = [goal.joints.is_some(), goal.pose.is_some(), goal.named.is_some()];
+            if given.iter().filter(|given| **given).count() != 1 {
+                return Err(format!("{field} must have one of joints, pose, named"));
+            }
+            if goal.linear && goal.pose.is_none() {
+                return Err(format!("{field}: linear needs a pose"));
+            }
+            finite(&format!("{field}.joints"), goal.joints.as_deref().unwrap_or_default())?;
+            goal.pose.map_or(Ok(()), |pose| pose.valid(&format!("{field}.pose")))?;
+        }
+        if !(MIN_SPEED..=1.0).contains(&self.speed) {
+            return Err(format!("speed is {}, and must be within {MIN_SPEED}–1", self.speed));
+        }
+        match self.timeout {
+            Some(timeout) if !(timeout > 0.0 && timeout <= 3600.0) => {
+                Err(format!("timeout is {timeout}, and must be above 0 and at most 3600 s"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Planning that began.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PlanReply {
+    /// The plan's number, for `planning`, `preview` and `execute_plan`.
+    pub plan: u64,
+}
+
+/// Parameters of `planning`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Planning {
+    /// The plan's number.
+    pub plan: u64,
+}
+
+/// How planning goes, or what came of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PlanningReport {
+    /// The plan's number.
+    pub plan: u64,
+    /// `PLANNING`, `PLANNED`, `FAILED`, `CANCELLED`.
+    pub state: String,
+    /// How long it has taken so far, or took [s].
+    pub elapsed: f64,
+    /// Why there is no plan, in a sentence.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+    /// What to do about that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hint: Option<String>,
+    /// The plan.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub summary: Option<PlanSummary>,
+}
+
+/// A plan in figures.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PlanSummary {
+    /// The coordinator's joints that it moves.
+    pub joints: Vec<String>,
+    /// Where it starts [rad].
+    pub start: Vec<f64>,
+    /// Where it ends [rad].
+    pub goal: Vec<f64>,
+    /// Corners of the path, its ends included.
+    pub waypoints: usize,
+    /// Length of the path in joint space [rad].
+    pub length: f64,
+    /// How long the motion takes [s].
+    pub duration: f64,
+    /// Smallest distance to an obstacle or between links that are checked [m], where there is anything to be near to.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clearance: Option<f64>,
+    /// The two that come closest.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub closest: Option<[String; 2]>,
+    /// Of a straight line, the part that can be done (0–1].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fraction: Option<f64>,
+    /// Seed of the search.
+    pub seed: u64,
+    /// Time for inverse kinematics, search, shortcuts, timing, checking [s].
+    pub times: BTreeMap<String, f64>,
+}
+
+/// Parameters of `preview`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Preview {
+    /// The plan's number; without it the newest plan.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<u64>,
+}
+
+/// A plan in full.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PreviewReply {
+    /// The plan's number.
+    pub plan: u64,
+    /// The plan in figures.
+    pub summary: PlanSummary,
+    /// The motion, with the coordinator's joint names.
+    pub trajectory: Trajectory,
+    /// For each robot, where its end effector is at each point of the trajectory: x, y, z [m] in the frame `map`.
+    pub end_effectors: BTreeMap<String, Vec<[f64; 3]>>,
+}
+
+/// Parameters of `execute_plan`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ExecutePlan {
+    /// The plan's number; without it the newest plan.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<u64>,
+}
+
+/// Parameters of `planner`: none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Planner {}
+
+/// What the planner is and does.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PlannerReport {
+    /// `IDLE`, `PLANNING`, `EXECUTING`, `COMPLETED`, `FAULT`.
+    pub state: String,
+    /// Why it is in `FAULT`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+    /// The robots that are planned for.
+    pub robots: Vec<RobotReport>,
+    /// Number of the newest plan.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<u64>,
+    /// Link pairs that touch in every pose and are therefore not checked, by robot.
+    pub always_touching: BTreeMap<String, Vec<[String; 2]>>,
+}
+
+/// A robot that is planned for.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct RobotReport {
+    /// Its name.
+    pub name: String,
+    /// The link that pose goals are for.
+    pub end_effector_link: String,
+    /// The coordinator's joints, in the order of joint goals.
+    pub joints: Vec<String>,
+    /// Lowest and highest positions [rad].
+    pub limits: Vec<[f64; 2]>,
+    /// The task that executes its motions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub task: Option<String>,
+    /// Its named poses [rad].
+    pub named_poses: BTreeMap<String, Vec<f64>>,
+}
+
+/// Shape of an obstacle. Every shape's frame is at its middle; a cylinder stands along z.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum ShapeSpec {
+    /// Edge lengths x, y, z [m].
+    Box([f64; 3]),
+    /// Radius [m].
+    Sphere(f64),
+    /// Radius and length [m].
+    Cylinder([f64; 2]),
+    /// A mesh file (STL, OBJ, DAE), as an absolute path.
+    Mesh(String),
+    /// A point cloud file (PLY), as an absolute path.
+    Cloud(String),
+}
+
+impl ShapeSpec {
+    fn valid(&self) -> Result<(), String> {
+        let sizes: &[f64] = match self {
+            Self::Box(size) => size,
+            Self::Sphere(radius) => std::slice::from_ref(radius),
+            Self::Cylinder(size) => size,
+            Self::Mesh(path) | Self::Cloud(path) if path.starts_with('/') => &[],
+            Self::Mesh(path) | Self::Cloud(path) => return Err(format!("{path:?} is not an absolute path")),
+        };
+        match sizes.iter().find(|size| !(**size > 0.0 && size.is_finite())) {
+            Some(size) => Err(format!("a size of the shape is {size}, and must be above 0")),
+            None => Ok(()),
+        }
+    }
+}
+
+/// An object of the world.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorldObject {
+    /// Its name.
+    pub name: String,
+    /// What it is.
+    pub shape: ShapeSpec,
+    /// Where it is; of an attached object, in the frame of the link that holds it.
+    #[serde(default)]
+    pub pose: PoseSpec,
+    /// How much it is thickened all around [m].
+    #[serde(default)]
+    pub padding: f64,
+    /// The robot and the link that hold it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub held_by: Option<[String; 2]>,
+}
+
+/// Parameters of `world_add`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct WorldAdd(pub WorldObject);
+
+impl WorldAdd {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        let Self(object) = self;
+        if object.name.is_empty() || object.held_by.is_some() {
+            return Err("an object needs a name, and is held by `attach` only".into());
+        }
+        if !(0.0..=1.0).contains(&object.padding) {
+            return Err(format!("padding is {}, and must be within 0–1 m", object.padding));
+        }
+        object.shape.valid()?;
+        object.pose.valid("pose")
+    }
+}
+
+/// An object as it stands under its name, in a blueprint's `planner.world` and in files.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorldEntry {
+    /// What it is.
+    pub shape: ShapeSpec,
+    /// Where it is, in the frame `map`.
+    #[serde(default)]
+    pub pose: PoseSpec,
+    /// How much it is thickened all around [m].
+    #[serde(default)]
+    pub padding: f64,
+}
+
+impl WorldEntry {
+    /// The object of that name.
+    pub fn named(self, name: String) -> WorldObject {
+        WorldObject { name, shape: self.shape, pose: self.pose, padding: self.padding, held_by: None }
+    }
+}
+
+/// Parameters of `world`: none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct World {}
+
+/// The world that is planned in.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct WorldReport {
+    /// Its objects, by name.
+    pub objects: Vec<WorldObject>,
+}
+
+/// Parameters of `world_move`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorldMove {
+    /// The object's name.
+    pub name: String,
+    /// Where it is from now on.
+    pub pose: PoseSpec,
+}
+
+impl WorldMove {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        self.pose.valid("pose")
+    }
+}
+
+/// Parameters of `world_remove`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WorldRemove {
+    /// The object's name; without it, all objects go.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+}
+
+/// Parameters of `attach`: from now on the robot holds the object where it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Attach {
+    /// The object's name.
+    pub name: String,
+    /// The robot that holds it.
+    pub robot: String,
+    /// The link that holds it; default: the end effector's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<String>,
+    /// Links that may touch it, beside that one.
+    #[serde(default)]
+    pub touch_links: Vec<String>,
+}
+
+/// Parameters of `detach`: the object stays where it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Detach {
+    /// The object's name.
+    pub name: String,
+}
