@@ -128,7 +128,7 @@ fn an_error_in_motion_ends_it() {
     test.until("joint 3 in position mode");
     emulator.inject(Fault::new(FaultKind::ErrorCode).code(2)).unwrap();
     let ended = test.wait().with(1).says(&["error: ", "the motion was ODD and was stopped"]);
-    assert!(ended.out.contains("ODD: error 2: collision detected; stopped there"), "{}", ended.out);
+    assert!(ended.out.contains("2: collision detected; stopped there"), "{}", ended.out);
     let asked = requests(&emulator);
     let last = asked.iter().rposition(Request::moves).unwrap();
     assert!(asked[last..].contains(&Request::Stop), "{:?}", &asked[last..]);

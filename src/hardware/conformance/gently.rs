@@ -45,6 +45,8 @@ const PERIOD: Duration = Duration::from_micros(2500);
 /// Looks from one set point of a stream to the next. Looking only when one has just been sent would always see the
 /// joint in the same part of its step.
 const LOOKS: u32 = 4;
+/// Set points go on by no more than this time at once [s].
+const LONGEST_STEP: f64 = 0.01;
 /// What the integral of a joint's velocity may be, as a fraction of its way: less where this program had to wait for a
 /// processor and missed the fast part, but never of the other sign, and never as much as degrees for radians.
 const HONEST: std::ops::Range<f64> = -0.3..5.0;
@@ -257,10 +259,15 @@ impl Gently<'_> {
         }
         let began = MonotonicClock.now();
         let (mut seen, mut last) = (Seen::default(), None);
+        let (mut streamed, mut before_this) = (0.0, began);
         let (mut still, mut point) = (0, if stream { from } else { to });
         for look in 0_u32.. {
-            let past = MonotonicClock.now().seconds_since(began);
-            let part = (past / time).min(1.0);
+            let now = MonotonicClock.now();
+            let past = now.seconds_since(began);
+            // A pause of this program must not become a jump of the set points.
+            streamed += now.seconds_since(before_this).min(LONGEST_STEP);
+            before_this = now;
+            let part = (streamed / time).min(1.0);
             if stream && look % LOOKS == 0 {
                 point = from + (to - from) * (0.5 - 0.5 * (part * std::f64::consts::PI).cos());
                 self.adapter.write_joint_positions(&self.target(joint, point), 1.0)?;
