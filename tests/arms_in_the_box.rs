@@ -139,6 +139,26 @@ fn a_piper_that_cannot_be_reached_or_leads_is_told_in_one_line() {
 
 #[test]
 #[cfg(feature = "can")]
+fn a_piper_in_its_e_stop_is_told_with_one_hint_and_not_said_to_hold() {
+    let home = Home::new();
+    let piper = |faults: &str| {
+        format!(
+            "include: [coordinator-piper]\nhardware: [{{hardware_id: arm, options: {{sim: {{faults: [{faults}]}}}}}}]\n"
+        )
+    };
+    home.write("stopped.yaml", &piper("{kind: estop}"));
+    let refused = home.dimos("run stopped.yaml --sim --no-record").with(3);
+    let refused =
+        refused.says(&["cannot be enabled: fault 1: E-stop", "hint: the arm leaves its E-stop only by a reset"]);
+    assert_eq!(refused.err.matches("hint: ").count(), 1, "{}", refused.err);
+    home.write("stops.yaml", &piper("{kind: estop, at: 1.0}"));
+    let run = home.run("stops.yaml --sim --no-record");
+    eventually("its motors are off", || home.status()["arms"][0]["enabled"] == false);
+    run.end(Signal::INT).with(130).says(&["arm: motors are off; it does not hold its pose"]);
+}
+
+#[test]
+#[cfg(feature = "can")]
 fn a_piper_has_no_velocity_mode_and_check_says_so() {
     let home = Home::new();
     home.write(
@@ -182,6 +202,26 @@ fn what_is_wrong_with_an_xarm_is_one_line_and_exit_3() {
     home.write("model.yaml", &with_faults("{kind: wrong_model}"));
     let said = ["expected the model xArm 6 with 6 joints, found a", "hint: is the address right?", "{model: lite6}"];
     home.dimos(&format!("run model.yaml {simulated}")).with(3).says(&said);
+}
+
+#[test]
+fn an_xarm_that_is_disabled_is_not_at_fault() {
+    let home = Home::new();
+    let run = home.run("coordinator-xarm6 --sim --no-record");
+    // Its controller tells five times a second which motors are on.
+    assert_eq!(home.dimos("arm disable arm").with(0).out, "arm: disabled\n");
+    assert_eq!(home.status()["arms"][0]["cause"], Value::Null);
+    assert_eq!(home.dimos("arm enable arm").with(0).out, "arm: ready\n");
+    home.dimos("arm disable arm").with(0);
+    run.end(Signal::INT).with(130).says(&["arm: motors are off; it keeps its pose"]);
+}
+
+#[test]
+fn options_that_do_not_fit_the_joints_have_a_hint_of_their_own() {
+    let home = Home::new();
+    home.write("seven.yaml", &with_faults("").replace("{sim", "{model: xarm7, sim"));
+    let said = home.dimos("run seven.yaml --no-record").with(3);
+    said.says(&["xArm 7 has 7 joints, not 6", "hint: see `hardware.arm.joints`"]);
 }
 
 /// A blueprint of an xArm 6 whose emulator has these faults.

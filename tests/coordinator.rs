@@ -3,7 +3,7 @@
 #[path = "support/rig.rs"]
 mod rig;
 
-use dimos::arm::VelocitySource;
+use dimos::arm::{Link, VelocitySource};
 use dimos::control::config::*;
 use dimos::control::request::Request;
 use dimos::joint::ControlMode;
@@ -211,6 +211,27 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
         assert_eq!(rig.phase(0), Phase::Ready);
         assert_eq!(rig.events.len(), before + 1, "told of Ready, and of nothing else");
     }
+}
+
+#[test]
+fn an_arm_that_is_being_disabled_or_enabled_may_be_silent_meanwhile() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    assert_eq!(rig.ask(Request::Park { arm: 0 }), Outcome::Accepted);
+    rig.run_for(0.6);
+    rig.arms[0].silent = true; // its device thread waits for the motors
+    rig.run_for(0.5);
+    assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "no fault, and nothing is sent");
+    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::StartStateUnavailable(0), "not on an old state");
+    (rig.arms[0].silent, rig.arms[0].enabled) = (false, false);
+    rig.run(3);
+    assert_eq!(rig.phase(0), Phase::Disabled);
+
+    let mut rig = Rig::one_arm(one(trajectory()));
+    rig.ask(Request::Park { arm: 0 });
+    rig.run_for(0.6);
+    rig.arms[0].link = Link::Faulted;
+    rig.run(3);
+    assert_eq!((rig.phase(0), rig.samples[0].cause), (Phase::Held, Cause::LinkLost), "a broken connection is a fault");
 }
 
 #[test]

@@ -64,7 +64,7 @@ fn a_gripper_opens_and_closes_as_far_as_it_goes() {
         assert_eq!(said, format!("arm: gripper to {metres:.4} m\n"));
         eventually(word, || (opening() - metres).abs() < 1e-3);
     }
-    home.dimos("arm gripper bare open").with(1).says(&["bare does not say how far its gripper goes"]);
+    home.dimos("arm gripper bare open").with(1).says(&["bare has no gripper, or does not say how far it goes"]);
     home.dimos("arm gripper rarm close").with(2).says(&["[UNKNOWN_ARM]", "did you mean `arm`?"]);
     for wrong in ["ajar", "nan", ""] {
         home.dimos(&format!("arm gripper arm {wrong}")).with(2);

@@ -75,7 +75,7 @@ impl Opening {
             // The run says what is wrong with the name.
             None => Ok(0.0),
             Some(_) => {
-                let what = format!("{arm} does not say how far its gripper goes");
+                let what = format!("{arm} has no gripper, or does not say how far it goes");
                 Err(Failure::new(Exit::Failed, what).hint(format!("give it in metres: dimos arm gripper {arm} 0.04")))
             }
         }

@@ -57,6 +57,16 @@ pub fn at_exit(arm: &ArmReport) -> &'static str {
     }
 }
 
+/// What became of the arm's motor power, now that the run is over. The report is the last one before its end.
+pub fn after_exit(arm: &ArmReport) -> &'static str {
+    match (arm.link.as_str(), arm.enabled, arm.holds_when_disabled) {
+        ("down" | "faulted", ..) => "it could not be reached: its motors are as they were",
+        (_, false, true) => "motors are off; it keeps its pose",
+        (_, false, false) => "motors are off; it does not hold its pose",
+        (_, true, _) => at_exit(arm),
+    }
+}
+
 /// One real-time measure; where it was not granted, a second line says how to get it.
 pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
     if measure.granted {
@@ -77,6 +87,8 @@ mod tests {
             adapter: "yourarm".into(),
             address: "sim".into(),
             simulated: true,
+            link: "up".into(),
+            enabled: true,
             phase: "ready".into(),
             on_exit: on_exit.into(),
             holds_when_disabled,
@@ -108,5 +120,12 @@ run coordinator-yourarm  SIMULATED  (pid 42, dimos 0.1.0)
   socket     /run/dimos.sock
 Ctrl-C ends it, controlled. In a second terminal: dimos status";
         assert_eq!(text(&report, Path::new("/run/dimos.sock"), IN_A_TERMINAL).join("\n"), expected);
+
+        assert_eq!(after_exit(&arm("hold", false)), "motors stay on and hold the pose");
+        let off = |holds| after_exit(&ArmReport { enabled: false, ..arm("hold", holds) });
+        assert_eq!(off(false), "motors are off; it does not hold its pose", "as after its own E-stop");
+        assert_eq!(off(true), "motors are off; it keeps its pose");
+        let lost = ArmReport { link: "faulted".into(), ..arm("disable", true) };
+        assert_eq!(after_exit(&lost), "it could not be reached: its motors are as they were");
     }
 }

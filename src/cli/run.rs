@@ -157,6 +157,7 @@ fn keep_up(
     if !json {
         terminal.note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
     }
+    let report = run.status();
     let ended = run.stop();
     say_goodbye(terminal, &report, &ending, &ended, json);
     let exit = match &ending {
@@ -214,7 +215,7 @@ fn say_goodbye(terminal: &Terminal, report: &StatusReport, ending: &Ending, ende
         terminal.note(format_args!("warning: {trouble}"));
     }
     for arm in &report.arms {
-        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
+        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
     }
     match &ended.log {
         Some(log) => terminal.note(format_args!("run {} ended; its log: {}", report.run, log.display())),

@@ -62,8 +62,11 @@ impl Failsafe {
             Phase::Disabled | Phase::Held => {}
             Phase::Standby if !state.enabled && fresh => self.enter(Phase::Disabled, Cause::None, now),
             Phase::Standby => {
-                // A self-held arm is at rest already; `enable` takes it over again.
-                if let Some(cause) = trouble(state, fresh).filter(|c| *c != Cause::HeartbeatLost) {
+                // A self-held arm is at rest already; `enable` takes it over again. One that is being enabled or
+                // disabled keeps its device thread busy, and its states wait: nobody moves it meanwhile, `ready`
+                // asks for a fresh one, and a connection that breaks is told as such.
+                let passes = |cause: &Cause| matches!(cause, Cause::HeartbeatLost | Cause::Stale);
+                if let Some(cause) = trouble(state, fresh).filter(|cause| !passes(cause)) {
                     self.enter(Phase::Held, cause, now);
                 }
             }

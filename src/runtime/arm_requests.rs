@@ -132,6 +132,9 @@ async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
 }
 
 fn refused(arm: &str, what: &str, error: &AdapterError) -> RpcError {
-    RpcError::new(Code::DeviceRefused, format!("{arm} {what}: {error}"))
-        .hint("see the arm's own panel or manual; `dimos status` shows its link and error")
+    let text = format!("{arm} {what}: {error}");
+    // An adapter that knows what to do says so in a line of its own.
+    let general = "see the arm's own panel or manual; `dimos status` shows its link and error";
+    let (text, hint) = text.split_once("\nhint: ").unwrap_or((&text, general));
+    RpcError::new(Code::DeviceRefused, text).hint(hint)
 }

@@ -10,6 +10,7 @@ use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
+use crate::hardware::spec::AdapterError;
 use crate::joint::JointLimits;
 use crate::rt::beat::Beat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
@@ -62,7 +63,7 @@ pub fn bring_up(
     let mut slots = Slots::default();
     for (index, arm) in blueprint.arms.iter().enumerate() {
         let config = configure(arm, &mut arms)?;
-        let adapter = (arm.adapter.create)(&config).map_err(|e| hardware(arm, &e))?;
+        let adapter = (arm.adapter.create)(&config).map_err(|e| unfit(arm, &e))?;
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
         let note = note.clone();
@@ -114,7 +115,7 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     };
     match arm.adapter.emulate {
         Some(emulate) if arm.address == SIM => {
-            let emulator = emulate(&config, &Place::InProcess).map_err(|e| hardware(arm, &e))?;
+            let emulator = emulate(&config, &Place::InProcess).map_err(|e| unfit(arm, &e))?;
             config.address = emulator.address();
             arms._emulators.push(emulator);
         }
@@ -133,22 +134,33 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     Ok(config)
 }
 
-fn hardware(arm: &Arm, error: &dyn std::fmt::Display) -> StartError {
-    let text = error.to_string();
-    // An adapter that knows what to do says so in a line of its own.
-    let (what, hint) = match text.split_once("\nhint: ") {
+/// What is wrong, and what to do: an adapter that knows says so in a line of its own.
+fn with_hint(text: &str, otherwise: String) -> (String, String) {
+    match text.split_once("\nhint: ") {
         Some((what, hint)) => (what.to_owned(), hint.to_owned()),
-        None if arm.adapter.emulate.is_some() => {
-            let id = &arm.hardware_id;
-            let hint = format!(
-                "is it powered, and is `hardware.{id}.address` right ({})? To try without it: --sim",
-                arm.adapter.address.form
-            );
-            (text, hint)
-        }
-        None => (text, format!("see `hardware.{}` in the blueprint", arm.hardware_id)),
+        None => (text.to_owned(), otherwise),
+    }
+}
+
+/// What the blueprint says of an arm does not go together: nobody was asked yet, so nobody needs power.
+fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
+    if !matches!(error, AdapterError::Rejected(_)) {
+        return hardware(arm, error);
+    }
+    let id = &arm.hardware_id;
+    let general = format!("see `hardware.{id}.joints` and `hardware.{id}.options` in the blueprint");
+    let (what, hint) = with_hint(&error.to_string(), general);
+    StartError::Hardware { arm: id.clone(), what, hint }
+}
+
+fn hardware(arm: &Arm, error: &AdapterError) -> StartError {
+    let (id, form) = (&arm.hardware_id, arm.adapter.address.form);
+    let general = match arm.adapter.emulate {
+        Some(_) => format!("is it powered, and is `hardware.{id}.address` right ({form})? To try without it: --sim"),
+        None => format!("see `hardware.{id}` in the blueprint"),
     };
-    StartError::Hardware { arm: arm.hardware_id.clone(), what, hint }
+    let (what, hint) = with_hint(&error.to_string(), general);
+    StartError::Hardware { arm: id.clone(), what, hint }
 }
 
 /// The arm's own limits, narrowed by the blueprint, with defaults where neither says anything.
@@ -206,14 +218,12 @@ impl Arms {
         let answers: Vec<_> = which.filter_map(|i| Some((i, self.devices.get(i)?.activate()))).collect();
         for (i, answer) in answers {
             if let (Err(e), Some(arm)) = (answer.wait(ENABLE_LIMIT), blueprint.arms.get(i)) {
-                return Err(StartError::Hardware {
-                    arm: arm.hardware_id.clone(),
-                    what: format!("cannot be enabled: {e}"),
-                    hint: format!(
-                        "clear the arm's own error, or start without motors: --set hardware.{}.auto_enable=false",
-                        arm.hardware_id
-                    ),
-                });
+                let id = &arm.hardware_id;
+                let general = format!(
+                    "clear the arm's own error, or start without motors: --set hardware.{id}.auto_enable=false"
+                );
+                let (what, hint) = with_hint(&format!("cannot be enabled: {e}"), general);
+                return Err(StartError::Hardware { arm: id.clone(), what, hint });
             }
         }
         Ok(())

@@ -65,7 +65,7 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     terminal.flush();
     say_goodbye(&result, &ended, args.json);
     for arm in report.arms.iter().filter(|_| !args.json) {
-        output::note(format_args!("{}: {}", arm.hardware_id, banner::at_exit(arm)));
+        output::note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
     }
     result.map(|_| Exit::Ok).or_else(|end| match end {
         End::Failed(failure) => Err(failure),

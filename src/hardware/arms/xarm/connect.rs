@@ -104,7 +104,13 @@ fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()
         None => format!("an unknown arm with {axes} joints (kind {kind})"),
     };
     let hint = match is {
-        Some(other) => format!("is the address right? Else set the arm's options to {{model: {}}}", other.option()),
+        Some(other) if axes == model.axes() => {
+            format!("is the address right? Else set the arm's options to {{model: {}}}", other.option())
+        }
+        Some(other) => {
+            let option = other.option();
+            format!("is the address right? Else give the arm {axes} joints, and options of {{model: {option}}}")
+        }
         None => "is the address right?".to_owned(),
     };
     let (name, joints) = (model.name(), model.axes());

@@ -103,6 +103,9 @@ impl Control {
     /// Sends a request and returns at once. The response shows up in [`Control::next`].
     pub fn post(&mut self, command: &Command, purpose: Purpose) -> AdapterResult<()> {
         let now = MonotonicClock.now();
+        if purpose == Purpose::Answer {
+            self.make_room();
+        }
         let Some(slot) = self.pending.iter_mut().find(|slot| slot.is_none()) else {
             return Err(AdapterError::Timeout(format!(
                 "{} does not keep up: {WINDOW} requests without response",
@@ -116,6 +119,16 @@ impl Control {
         self.counts.sent += 1;
         let mut frame = [0; MAX_REQUEST];
         self.link.send(command.encode(transaction, self.protocol, &mut frame))
+    }
+
+    /// What somebody waits for goes out, however far behind the controller is: it may be a stop. The response to the
+    /// oldest request is then nobody's.
+    fn make_room(&mut self) {
+        if self.pending.iter().all(Option::is_some)
+            && let Some(oldest) = self.pending.iter_mut().min_by_key(|slot| slot.map(|pending| pending.sent))
+        {
+            *oldest = None;
+        }
     }
 
     /// Takes the next response that has arrived, without waiting, with who wanted it.
@@ -265,5 +278,29 @@ mod tests {
             assert_eq!(control.next().unwrap().map(|_| ()), None, "nobody wants it any more");
         }
         assert_eq!(control.counts(), Counts { sent: 3, late: 1, overdue: 1, stray: 2 });
+    }
+
+    #[test]
+    fn a_stop_goes_out_to_a_controller_that_is_far_behind() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let server = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            stream.read_exact(&mut [0; 7 * WINDOW]).unwrap();
+            let mut stop = [0; 8];
+            stream.read_exact(&mut stop).unwrap();
+            let [t0, t1, .., register, _] = stop;
+            stream.write_all(&[t0, t1, 0, 2, 0, 2, register, 0]).unwrap();
+            stop
+        });
+        let endpoint = Endpoint { host: "127.0.0.1".into(), port };
+        let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
+        (0..WINDOW).for_each(|_| control.post(&Command::GetState, Purpose::Motion).unwrap());
+        let full = control.post(&Command::GetState, Purpose::Motion).unwrap_err();
+        assert!(full.to_string().contains("does not keep up"), "{full}");
+        let answer =
+            control.ask(&Command::SetState(super::super::protocol::commands::STOP), Duration::from_secs(5), |_, _| ());
+        assert_eq!(answer.map(|response| response.register), Ok(12));
+        assert_eq!(server.join().unwrap()[6..], [12, 4]);
     }
 }

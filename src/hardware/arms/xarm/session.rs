@@ -242,11 +242,14 @@ impl Session {
 
     /// Switches all motors on or off, and sees it.
     pub fn enable(&mut self, on: bool) -> AdapterResult<()> {
-        self.check_error().or_else(|error| if on { Err(error) } else { Ok(()) })?;
+        if on {
+            self.check_error()?;
+        }
         self.change = None;
         self.halted = true; // the controller forgets that it was ready
         let answer = self.ask(&Command::Enable(on))?;
-        if answer.status.error() {
+        // An error stands against enabling; that the motors go off shows in the reports, error or not.
+        if on && answer.status.error() {
             self.check_error()?;
         }
         let until = MonotonicClock.now().after(MOTORS_LIMIT);

@@ -301,6 +301,16 @@ fn a_gripper_that_is_not_there_is_said_and_one_that_falls_silent_harms_nothing()
 }
 
 #[test]
+fn an_arm_in_error_is_disabled_all_the_same() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    emulator.inject(Fault { code: 31, ..Fault::new(FaultKind::ErrorCode) }).unwrap();
+    until("the error", || arm.read_error().unwrap().0 == 31);
+    assert_eq!(arm.write_enable(false), Ok(()));
+    assert_eq!((arm.read_enabled(), arm.read_error().unwrap().0), (Ok(false), 31));
+    assert!(matches!(arm.write_enable(true), Err(AdapterError::Fault { code: 31, .. })));
+}
+
+#[test]
 fn a_wrong_arm_is_refused_before_anything_else_is_asked() {
     let (emulator, mut arm) = pair(6, json!({}));
     emulator.inject(Fault::new(FaultKind::WrongModel)).unwrap();
