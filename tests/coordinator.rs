@@ -235,6 +235,22 @@ fn an_arm_that_is_being_disabled_or_enabled_may_be_silent_meanwhile() {
 }
 
 #[test]
+fn a_stop_while_an_arm_is_being_enabled_is_not_lost() {
+    let mut rig = Rig::new(100.0, vec![arm("arm", 6)], one(trajectory()));
+    rig.arms[0].enabled = false;
+    rig.run(3);
+    assert_eq!(rig.phase(0), Phase::Disabled);
+    assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
+    rig.arms[0].enabled = true; // the motors were on their way
+    rig.run(3);
+    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+    rig.run_for(0.5);
+    assert_eq!((rig.phase(0), rig.commands[0].mode, rig.arms[0].stops), (Phase::Held, None, 1));
+    assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+}
+
+#[test]
 fn activating_again_and_again_does_not_sink() {
     let mut rig = Rig::one_arm(one(trajectory()));
     rig.arms[0].sag = 0.02;

@@ -82,9 +82,15 @@ impl Failsafe {
         before != (self.phase, self.cause)
     }
 
-    /// A latched hold. The first cause stays.
+    /// A latched hold. The first cause stays. An operator's stop holds a disabled arm too: it may be just about to be
+    /// enabled.
     pub fn hold(&mut self, cause: Cause, now: Mono) {
-        if !matches!(self.phase, Phase::Held | Phase::Unknown | Phase::Disabled) {
+        let heeded = match self.phase {
+            Phase::Held | Phase::Unknown => false,
+            Phase::Disabled => cause == Cause::Operator,
+            Phase::Standby | Phase::Activating | Phase::Ready => true,
+        };
+        if heeded {
             self.enter(Phase::Held, cause, now);
         }
     }
