@@ -4,6 +4,7 @@
 //!  blueprint.yaml ─▶ blueprint (schema → resolve) ─▶ runtime: builds everything below, starts threads, stops them in order
 //!
 //!  CLI ──rpc──▶ runtime::service ──requests──▶ coordinator (real-time thread)
+//!                     └─▶ planning: robot model, obstacles (collision) ▶ a verified trajectory ──▲
 //!                                              │ tick: read → compute → arbitrate → limit → route → write
 //!                                              ▼
 //!   tasks ─▶ arbitrate ─▶ limit ─▶ route ──(command slot)──▶ device thread ─▶ adapter ─▶ wire ─▶ arm | emulator

@@ -74,6 +74,7 @@ fn what_cannot_be_is_refused() {
         ("yourarm --fault at=1,kind=panic", "cannot play the fault \"panic\"; it can play \"stall\""),
         ("yourarm --fault at=1,kind=explode", "unknown variant `explode`"),
         ("yourarm --fault nowhere.yaml", "--fault nowhere.yaml"),
+        ("yourarm --fault nonsense", "hint: one fault, like at=2,kind=stall"),
         ("yourarm --option sim.initial_positions=[9,0,0,0,0,0]", "within the joint limits"),
         ("yourarm --model yourarm7", "unknown field `model`"),
         ("yourarm --dof 7", "6 joints, not 7"),
@@ -82,6 +83,26 @@ fn what_cannot_be_is_refused() {
         let address = loopback(3);
         let place = if arguments.contains("--") { String::new() } else { format!(" --bind {address}") };
         home.dimos(&format!("adapter emulate {arguments}{place} --duration 1s")).with(2).says(&[says]);
+    }
+}
+
+#[test]
+fn what_it_says_fits_the_model() {
+    let (home, address) = (Home::new(), loopback(5));
+    if std::net::TcpListener::bind((address.as_str(), 502))
+        .is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied)
+    {
+        println!("SKIPPED: port 502 (sysctl net.ipv4.ip_unprivileged_port_start=502)");
+        assert!(std::env::var("DIMOS_NO_SKIP").is_err(), "DIMOS_NO_SKIP is set");
+        return;
+    }
+    for (model, blueprint) in [("lite6", Some("coordinator-lite6")), ("xarm850", None)] {
+        let line = format!("adapter emulate xarm --model {model} --bind {address} --duration 100ms");
+        let said = home.dimos(&line).with(0).out;
+        assert!(said.contains(&format!("--dof 6 --model {model}\n")), "{said}");
+        assert!(said.contains(&format!("options: {{model: {model}}}")), "{said}");
+        assert_eq!(said.contains("reach it"), blueprint.is_some(), "{said}");
+        assert!(blueprint.is_none_or(|name| said.contains(&format!("dimos run {name} "))), "{said}");
     }
 }
 

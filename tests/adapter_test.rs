@@ -120,6 +120,28 @@ fn an_interruption_stops_the_arm() {
     assert_eq!(emulator.joints().0, before);
 }
 
+/// A terminal that is closed must not leave an arm in motion, with its motors on.
+#[test]
+fn a_closed_terminal_stops_the_arm() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let test = home.start(&format!("adapter test yourarm --address {address} --only row --allow-motion --yes"));
+    test.until("joint 2 in position mode");
+    let ended = test.end(Signal::HUP);
+    assert!(ended.out.contains("interrupted; stopped there"), "{:?} {}", ended.code, ended.out);
+    let asked = requests(&emulator);
+    let last = asked.iter().rposition(Request::moves).unwrap();
+    assert!(asked[last..].contains(&Request::Stop), "{:?}", &asked[last..]);
+    assert!(!emulator.enabled());
+}
+
+#[test]
+fn what_was_found_is_shown_even_if_its_file_cannot_be_written() {
+    let home = Home::new();
+    let ended = home.dimos("adapter test mock --only row --report nowhere/report.md").with(1);
+    assert!(ended.says(&["--report nowhere/report.md"]).out.contains("row_is_complete"));
+}
+
 #[test]
 fn an_error_in_motion_ends_it() {
     let (emulator, address) = arm(&SimOptions::default());

@@ -120,9 +120,9 @@ def serve(arm, listener):
 
 def listen(at):
     if not at.startswith("unix:"):
-        host, port = at.replace("tcp:", "", 1).rsplit(":", 1)
-        if not host.startswith("127."):
-            sys.exit(f"error: {host} is not a loopback address, and the protocol has no authentication")
+        host, _, port = at.replace("tcp:", "", 1).rpartition(":")
+        if not host.startswith("127.") or not port.isdigit():
+            sys.exit(f"error: --at {at}: unix:/PATH, or tcp:127.0.0.1:PORT (loopback only: there is no authentication)")
         return socket.create_server((host, int(port)))
     if os.path.exists(at[5:]) and socket.socket(socket.AF_UNIX).connect_ex(at[5:]):
         os.unlink(at[5:])  # of a shim that is gone
@@ -138,7 +138,7 @@ if __name__ == "__main__":
     parser.add_argument("--hz", type=float, default=100.0, help="how often the arm has a new state (100)")
     given = vars(parser.parse_args())
     (module, _, name), at, hz = given.pop("adapter").partition(":"), given.pop("at"), given.pop("hz")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    [signal.signal(end, signal.default_int_handler) for end in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     sys.path.insert(0, os.getcwd())
     modes, listener = control_modes(), listen(at)
     arm = Arm(getattr(importlib.import_module(module), name)(**given), modes, given.get("dof"), hz)

@@ -91,7 +91,7 @@ enum Command {
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
-    /// Bring your own arm: the start of an adapter for it
+    /// Bring your own arm: write the start of its adapter, test one, run an emulator by itself
     Adapter(adapter::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),

@@ -132,7 +132,8 @@ fn start(args: &Args, row: &AdapterSpec, place: &Place) -> Result<(Box<dyn Emula
 fn script(text: &str) -> Result<Vec<Fault>> {
     let wrong = |what: String| Failure::usage(format!("--fault {text}: {what}"));
     if !text.contains('=') || Path::new(text).is_file() {
-        let content = std::fs::read_to_string(text).map_err(|e| wrong(e.to_string()))?;
+        let hint = "one fault, like at=2,kind=stall,duration=0.5, or a YAML or JSON file with a list of such";
+        let content = std::fs::read_to_string(text).map_err(|e| wrong(format!("no file: {e}")).hint(hint))?;
         return serde_yaml::from_str(&content).map_err(|e| wrong(e.to_string()));
     }
     let mut fault = serde_json::Map::new();
@@ -153,8 +154,9 @@ fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
         Some(bind) if (row.address.check)(&bind.to_string()).is_ok_and(|full| full == address) => bind.to_string(),
         _ => address.to_owned(),
     };
+    let program = program();
     let command = runnable(args, row, dof, &given, registry)
-        .map(|name| format!("dimos run {name} --set hardware.arm.address={given}"));
+        .map(|name| format!("{program} run {name} --set hardware.arm.address={given}"));
     if args.json {
         output::json(&json!({
             "event": "started",
@@ -171,21 +173,40 @@ fn announce(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry:
     if let Some(command) = command {
         output::line(format_args!("  reach it   {command}"));
     }
-    let options = if row.dof.0 == row.dof.1 { String::new() } else { format!(" --dof {dof}") };
-    output::line(format_args!("  check it   dimos adapter test {} --address {given}{options}", row.name));
-    output::line(format_args!("  blueprint  adapter_type: {}, address: \"{given}\"", row.name));
+    let joints = if row.dof.0 == row.dof.1 { String::new() } else { format!(" --dof {dof}") };
+    let model = args.choice.model.as_ref();
+    let (flag, option) =
+        (model.map(|model| format!(" --model {model}")), model.map(|model| format!(", options: {{model: {model}}}")));
+    let (flag, option) = (flag.unwrap_or_default(), option.unwrap_or_default());
+    output::line(format_args!("  check it   {program} adapter test {} --address {given}{joints}{flag}", row.name));
+    output::line(format_args!("  blueprint  adapter_type: {}, address: \"{given}\"{option}", row.name));
     output::note("Ctrl-C ends it");
+}
+
+/// What this program is called: a crate of its own has its arm in no other.
+fn program() -> String {
+    let path = std::env::args_os().next().unwrap_or_default();
+    Path::new(&path).file_name().and_then(|name| name.to_str()).unwrap_or("dimos").to_owned()
 }
 
 /// A blueprint by a likely name that runs this arm and no other.
 fn runnable(args: &Args, row: &AdapterSpec, dof: usize, address: &str, registry: &Registry) -> Option<String> {
     let (name, model) = (row.name, args.choice.model.as_deref().unwrap_or(row.name));
-    let names = [format!("coordinator-{model}"), format!("coordinator-{name}{dof}"), format!("coordinator-{name}")];
+    let kebab = format!("coordinator-{}", name.replace('_', "-"));
+    let names =
+        [format!("coordinator-{model}"), format!("coordinator-{name}{dof}"), format!("coordinator-{name}"), kebab];
     names.into_iter().find(|name| {
         let Ok(found) = blueprint::find(name) else { return false };
         let set = vec![format!("hardware.arm.address={address}")];
         let loaded = blueprint::load(&found, &blueprint::Overrides { set, sim: false }, registry);
-        let fits = |arm: &blueprint::Arm| arm.adapter_type == row.name && arm.joints.len() == dof;
+        let model = |arm: &blueprint::Arm| arm.options.get("model").and_then(Value::as_str).map(str::to_owned);
+        let fits = |arm: &blueprint::Arm| {
+            arm.adapter_type == row.name
+                && arm.joints.len() == dof
+                && args.choice.model.as_ref().is_none_or(|wanted| {
+                    model(arm).map_or(*name == format!("coordinator-{wanted}"), |model| model == *wanted)
+                })
+        };
         loaded.blueprint.is_some_and(|blueprint| blueprint.arms.len() == 1 && blueprint.arms.iter().all(fits))
     })
 }

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
 
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
@@ -69,7 +71,8 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         let names: Vec<_> = checks().map(|check| check.name).collect();
         return Err(Failure::usage("no check has such a name").hint(names.join(", ")));
     }
-    let signals = Signals::watch();
+    // A terminal that is closed must stop the arm too.
+    let signals = Signals::watch_with_hangup();
     let bench = args.bench(&row)?;
     let mut adapter = (row.create)(&bench.subject.config).map_err(|e| failure(Exit::Usage, &e))?;
     let unreachable = |e: AdapterError| {
@@ -244,17 +247,16 @@ impl Args {
         Ok(motion)
     }
 
+    /// Printed first: a file that cannot be written must not cost what was found.
     fn publish(&self, report: &Report) -> Result<()> {
-        if let Some(path) = &self.report {
-            std::fs::write(path, report.markdown())
-                .map_err(|e| Failure::new(Exit::Failed, format!("{}: {e}", path.display())))?;
-        }
         if self.json {
-            output::json(report)
+            output::json(report);
         } else {
-            report.print()
+            report.print();
         }
-        Ok(())
+        let Some(path) = &self.report else { return Ok(()) };
+        std::fs::write(path, report.markdown())
+            .map_err(|e| Failure::new(Exit::Failed, format!("--report {}: {e}", path.display())))
     }
 }
 
@@ -264,12 +266,31 @@ fn confirm(signals: &Signals) -> Result<()> {
         return Err(Failure::usage("nobody can be asked before the motion: this is no terminal").hint("add --yes"));
     }
     output::note("Type yes to go on:");
-    let mut answer = String::new();
-    let read = io::stdin().lock().read_line(&mut answer);
-    if read.is_ok() && answer.trim() == "yes" && signals.last().is_none() {
+    if answered_yes(signals) {
         return Ok(());
     }
-    Err(Failure::new(Exit::Failed, "not moved: the answer was not yes"))
+    Err(match signals.last() {
+        Some(signal) => Failure::new(Exit::by_signal(signal), "not moved: interrupted"),
+        None => Failure::new(Exit::Failed, "not moved: the answer was not yes"),
+    })
+}
+
+/// Waits for a line, and for a signal: reading alone would go on after Ctrl-C.
+fn answered_yes(signals: &Signals) -> bool {
+    let stdin = io::stdin();
+    let moment = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+    while signals.last().is_none() {
+        match poll(&mut [PollFd::new(&stdin, PollFlags::IN)], Some(&moment)) {
+            Ok(0) | Err(Errno::INTR) => continue,
+            Ok(_) => {
+                let mut answer = String::new();
+                let read = stdin.lock().read_line(&mut answer);
+                return read.is_ok() && answer.trim() == "yes" && signals.last().is_none();
+            }
+            Err(_) => return false,
+        }
+    }
+    false
 }
 
 fn arm(row: &AdapterSpec, info: ManipulatorInfo) -> Arm {

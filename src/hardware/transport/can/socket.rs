@@ -84,6 +84,9 @@ fn why_not(name: &str, error: &Error) -> String {
         Some(ENODEV) if std::path::Path::new(INTERFACES).join(name).exists() => {
             format!("it is no CAN interface\nhint: {}", others())
         }
+        Some(ENODEV) if name.starts_with("vcan") => {
+            format!("there is no such interface\nhint: ip link add {name} type vcan && ip link set {name} up (as root)")
+        }
         Some(ENODEV) => format!("there is no such interface\nhint: {}", others()),
         Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
             "this kernel has no CAN\nhint: modprobe can-raw (as root), or a kernel with CAN".to_owned()
