@@ -9,7 +9,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 
 use dimos::rpc::Code;
-use dimos::rpc::api::{ArmEnable, ArmReset, METHODS, State, Status};
+use dimos::rpc::api::{ArmEnable, ArmReset, METHODS, Planner, State, Status};
 use dimos::rpc::client::Client;
 use dimos::rpc::report::TaskReport;
 use program::{Home, PATIENCE, eventually};
@@ -102,11 +102,12 @@ impl Player {
     }
 }
 
-/// A run, and the number of the last motion: as the page shows it, and as this run gave it.
+/// A run, and the numbers of the last motion and the last plan: as the page shows them, and as this run gave them.
 struct Stage {
     home: Home,
     watcher: Client,
     motion: (Value, Value),
+    plan: (Value, Value),
 }
 
 impl Stage {
@@ -130,6 +131,12 @@ impl Stage {
                 if let Some(number) = message.pointer_mut("/params/motion").filter(|m| **m == self.motion.0) {
                     *number = self.motion.1.clone();
                 }
+                if let Some(number) = message.pointer_mut("/params/plan").filter(|p| **p == self.plan.0) {
+                    *number = self.plan.1.clone();
+                }
+                if message["method"] == "planning" {
+                    eventually("planning ends", || self.watcher.call(Planner {}).unwrap().state != "PLANNING");
+                }
                 player.send(&message);
                 continue;
             }
@@ -139,6 +146,9 @@ impl Stage {
             }
             if let (Some(shown), Some(number)) = (message.pointer("/result/motion"), real.pointer("/result/motion")) {
                 self.motion = (shown.clone(), number.clone());
+            }
+            if let (Some(shown), Some(number)) = (message.pointer("/result/plan"), real.pointer("/result/plan")) {
+                self.plan = (shown.clone(), number.clone());
             }
         }
         Ok(())
@@ -163,7 +173,7 @@ fn every_example_is_what_a_run_says() {
     home.write("streams.yaml", include_str!("fixtures/streams.yaml"));
     let _run = home.run("streams.yaml --no-record");
     let watcher = home.client();
-    let mut stage = Stage { home, watcher, motion: (Value::Null, Value::Null) };
+    let mut stage = Stage { home, watcher, motion: (Value::Null, Value::Null), plan: Default::default() };
     let examples = examples();
     assert!(examples.len() > 10, "examples are not found");
     for example in &examples {

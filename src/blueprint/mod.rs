@@ -14,6 +14,7 @@ pub mod params;
 pub mod planner;
 mod planner_check;
 mod planner_files;
+mod planner_models;
 mod range;
 mod reference;
 mod registry;

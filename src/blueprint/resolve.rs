@@ -8,7 +8,7 @@ use crate::blueprint::planner::ViewConfig;
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
 };
-use crate::blueprint::{arms, planner_check, planner_files, tasks};
+use crate::blueprint::{arms, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::planning::config::PlannerConfig;
 use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
@@ -183,7 +183,11 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     if let Some(planner) = &file.planner {
         planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
     }
-    let planner = file.planner.as_ref().map(|planner| planner_files::resolve(&checker, planner));
+    let planner = file.planner.as_ref().map(|planner| {
+        let config = planner_files::resolve(&checker, planner);
+        planner_models::check(&mut checker, planner, &config);
+        config
+    });
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     Blueprint {
         name: name.value,

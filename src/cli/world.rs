@@ -1,11 +1,16 @@
 //! `dimos world`: the obstacles that the planner keeps clear of, and what the robots hold.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+use serde_json::Value;
 
 use super::arguments::{Target, finite};
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, fixed};
-use crate::rpc::api::{Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldMove, WorldObject, WorldRemove};
+use crate::rpc::api::{
+    Attach, Detach, PoseSpec, ShapeSpec, World, WorldAdd, WorldEntry, WorldMove, WorldObject, WorldRemove,
+};
 use crate::rpc::client::Client;
 
 /// Arguments of `world`.
@@ -68,13 +73,13 @@ pub struct AddArgs {
     /// A name for it; an object of the same name is replaced
     pub name: String,
     /// A box: edge lengths [m]
-    #[arg(long = "box", value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite)]
+    #[arg(long = "box", value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
     pub cuboid: Option<Vec<f64>>,
     /// A sphere: radius [m]
-    #[arg(long, value_name = "RADIUS", value_parser = finite)]
+    #[arg(long, value_name = "RADIUS", value_parser = finite, allow_negative_numbers = true)]
     pub sphere: Option<f64>,
     /// A cylinder along z: radius and length [m]
-    #[arg(long, value_names = ["RADIUS", "LENGTH"], num_args = 2, value_parser = finite)]
+    #[arg(long, value_names = ["RADIUS", "LENGTH"], num_args = 2, value_parser = finite, allow_negative_numbers = true)]
     pub cylinder: Option<Vec<f64>>,
     /// A mesh file: STL, OBJ or DAE
     #[arg(long, value_name = "FILE")]
@@ -86,7 +91,7 @@ pub struct AddArgs {
     #[command(flatten)]
     pub at: At,
     /// How much it is thickened all around [m]
-    #[arg(long, value_name = "METRES", value_parser = finite, default_value_t = 0.0)]
+    #[arg(long, value_name = "METRES", value_parser = finite, allow_negative_numbers = true, default_value_t = 0.0)]
     pub padding: f64,
     /// Which run
     #[command(flatten)]
@@ -232,8 +237,13 @@ fn load(file: &Path) -> Result<Vec<WorldObject>> {
     let wrong = |what: String| Failure::usage(format!("{}: {what}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|e| wrong(e.to_string()))?;
     let folder = file.parent().unwrap_or(Path::new(""));
-    let mut objects: std::collections::BTreeMap<String, crate::rpc::api::WorldEntry> =
-        serde_yaml::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    // By way of JSON: a shape is written as in a blueprint, `shape: {box: […]}`.
+    let typed: BTreeMap<String, Value> = serde_yaml::from_str(&text).map_err(|e| wrong(e.to_string()))?;
+    let entry = |(name, value)| match serde_json::from_value::<WorldEntry>(value) {
+        Ok(entry) => Ok((name, entry)),
+        Err(e) => Err(wrong(format!("{name}: {e}"))),
+    };
+    let mut objects = typed.into_iter().map(entry).collect::<Result<BTreeMap<_, _>>>()?;
     let resolve = |path: &mut String| full_path(&folder.join(&path)).map(|full| *path = full);
     for entry in objects.values_mut() {
         if let ShapeSpec::Mesh(path) | ShapeSpec::Cloud(path) = &mut entry.shape {

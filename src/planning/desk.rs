@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::review::review;
 use super::setup::Setup;
 use super::solve::{Failure, Found, Request, solve};
 use crate::collision::Stop;
@@ -77,6 +78,11 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Desk {
     /// Starts the thread.
     pub fn start(setup: Setup, timeout: Duration) -> std::io::Result<Self> {
+        Self::with(setup, timeout, solve)
+    }
+
+    /// Starts the thread with what answers each request.
+    fn with(setup: Setup, timeout: Duration, solver: impl Solver) -> std::io::Result<Self> {
         let (orders, receiver) = channel();
         let world = Mutex::new(setup.world.clone());
         let (setup, shared) = (Arc::new(setup), Arc::new(Shared::default()));
@@ -84,7 +90,7 @@ impl Desk {
         let thread = std::thread::Builder::new()
             .name("planner".into())
             .stack_size(STACK)
-            .spawn(move || work(&its_setup, &its_shared, &receiver))?;
+            .spawn(move || work(solver, &its_setup, &its_shared, &receiver))?;
         let (orders, thread) = (Mutex::new(Some(orders)), Mutex::new(Some(thread)));
         Ok(Self { setup, world, shared, orders, timeout, thread })
     }
@@ -130,6 +136,18 @@ impl Desk {
         planning
     }
 
+    /// Checks a plan's motion in the world as it is now, with all robots where they are now [rad]: work for another
+    /// thread, because it takes as long as it takes.
+    pub fn review(
+        &self,
+        found: Arc<Found>,
+        positions: Vec<Vec<f64>>,
+        stop: Stop,
+    ) -> impl FnOnce() -> Result<(), Failure> + Send + use<> {
+        let (setup, world) = (self.setup.clone(), lock(&self.world).clone());
+        move || review(&setup, &world, &found, &positions, &stop)
+    }
+
     /// A request by its number.
     pub fn job(&self, id: u64) -> Option<Job> {
         lock(&self.shared.jobs).iter().find(|job| job.id == id).cloned()
@@ -152,10 +170,15 @@ impl Drop for Desk {
     }
 }
 
-fn work(setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
+/// What answers a request: [`solve`], or what a test puts in its place.
+trait Solver: Fn(&Setup, &World, &Request, &Stop) -> Result<Found, Failure> + Send + 'static {}
+
+impl<S: Fn(&Setup, &World, &Request, &Stop) -> Result<Found, Failure> + Send + 'static> Solver for S {}
+
+fn work(solver: impl Solver, setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
     while let Ok(order) = orders.recv() {
         let began = Instant::now();
-        let outcome = catch_unwind(AssertUnwindSafe(|| solve(setup, &order.world, &order.request, &order.stop)));
+        let outcome = catch_unwind(AssertUnwindSafe(|| solver(setup, &order.world, &order.request, &order.stop)));
         let took = began.elapsed();
         let progress = match outcome {
             Ok(Ok(found)) => Progress::Found(Arc::new(found), took),
@@ -167,5 +190,180 @@ fn work(setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
         if let Some(job) = lock(&shared.jobs).iter_mut().find(|job| job.id == order.id) {
             job.progress = progress;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use nalgebra::Isometry3;
+
+    use super::super::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+    use super::super::solve::Goal;
+    use super::*;
+
+    const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
+    /// Far more than anything here takes, on a machine that is busy with other things too.
+    const PATIENCE: Duration = Duration::from_secs(20);
+
+    fn object(name: &str, size: [f64; 3], at: [f64; 3]) -> ObjectConfig {
+        let pose = Isometry3::translation(at[0], at[1], at[2]);
+        ObjectConfig { name: name.into(), shape: ObjectShape::Box(size), pose, padding: 0.0 }
+    }
+
+    fn yourarm(objects: Vec<ObjectConfig>) -> Setup {
+        let joints: Vec<String> = (1..=6).map(|k| format!("joint{k}")).collect();
+        let robot = RobotConfig {
+            name: "arm".into(),
+            model_path: "builtin:yourarm".into(),
+            packages: BTreeMap::new(),
+            xacro_args: BTreeMap::new(),
+            base_pose: Isometry3::identity(),
+            base_link: "base_link".into(),
+            end_effector_link: "flange".into(),
+            coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
+            joints,
+            task: None,
+            exclusions: Vec::new(),
+            max_velocity: 1.0,
+            max_acceleration: 2.0,
+            named_poses: BTreeMap::new(),
+        };
+        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), robots: vec![robot], objects }).unwrap()
+    }
+
+    /// Walls that no search gets around in the time of these tests.
+    fn walled() -> Setup {
+        let wall = |name, x| object(name, [2.0, 0.02, 4.0], [x, 0.0, 0.0]);
+        yourarm(vec![wall("front", 1.16), wall("back", -1.16)])
+    }
+
+    fn turn(from: f64, to: f64, seed: u64) -> Request {
+        let at = |angle| [&[angle], &HOME[1..]].concat();
+        Request { goals: vec![(0, Goal::Joints(at(to)))], positions: vec![at(from)], speed: 0.5, seed }
+    }
+
+    fn outcome(desk: &Desk, id: u64) -> Progress {
+        let began = Instant::now();
+        loop {
+            let progress = desk.job(id).unwrap().progress;
+            if !matches!(progress, Progress::Planning(_)) {
+                return progress;
+            }
+            assert!(began.elapsed() < PATIENCE, "request {id} does not end");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    fn found(desk: &Desk, id: u64, request: Request) -> Arc<Found> {
+        desk.begin(id, request, None).unwrap();
+        match outcome(desk, id) {
+            Progress::Found(found, _) => found,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_panic_costs_one_request() {
+        let breaks = |setup: &Setup, world: &World, request: &Request, stop: &Stop| {
+            assert!(request.seed != 13, "a defect");
+            solve(setup, world, request, stop)
+        };
+        let desk = Desk::with(yourarm(Vec::new()), PATIENCE, breaks).unwrap();
+        found(&desk, 1, turn(0.0, 0.5, 0));
+        desk.begin(2, turn(0.0, 0.5, 13), None).unwrap();
+        let failed = outcome(&desk, 2);
+        assert!(matches!(&failed, Progress::Failed(f, _) if f.what.contains("a defect of the program")), "{failed:?}");
+        found(&desk, 3, turn(0.0, 0.5, 0));
+        assert_eq!(desk.newest(true).unwrap().id, 3);
+        assert!(matches!(desk.job(1).unwrap().progress, Progress::Found(..)));
+    }
+
+    #[test]
+    fn the_same_request_gives_the_same_plan() {
+        let post = object("post", [0.04, 0.04, 0.4], [0.22, 0.12, 0.2]);
+        let desk = Desk::start(yourarm(vec![post]), PATIENCE).unwrap();
+        let first = found(&desk, 1, turn(0.0, 1.0, 7));
+        let again = found(&desk, 2, turn(0.0, 1.0, 7));
+        assert!(first.path.len() > 2, "the straight way is not free: {:?}", first.path);
+        assert_eq!((&first.path, &first.trajectory), (&again.path, &again.trajectory));
+        assert_ne!(first.path, found(&desk, 3, turn(0.0, 1.0, 8)).path);
+    }
+
+    #[test]
+    fn time_is_kept() {
+        let desk = Desk::start(walled(), PATIENCE).unwrap();
+        let limit = Duration::from_millis(300);
+        // One look more than the time allows; a busy machine is given several tries to show it.
+        let late = (1..=8).map(|id| {
+            desk.begin(id, turn(1.5, -1.5, id), Some(limit)).unwrap();
+            match outcome(&desk, id) {
+                Progress::Failed(failure, took) => {
+                    assert!(failure.what.contains("in time") && !failure.cancelled, "{failure:?}");
+                    took.saturating_sub(limit)
+                }
+                other => panic!("{other:?}"),
+            }
+        });
+        let least = late.min().unwrap();
+        assert!(least < Duration::from_millis(50), "{least:?} late");
+    }
+
+    #[test]
+    fn a_request_is_cancelled_and_keeps_the_desk_until_then() {
+        let desk = Desk::start(walled(), PATIENCE).unwrap();
+        assert!(!desk.cancel());
+        desk.begin(1, turn(1.5, -1.5, 0), None).unwrap();
+        assert_eq!(desk.begin(2, turn(1.5, 1.4, 0), None), Err(Busy));
+        assert!(desk.cancel());
+        let cancelled = outcome(&desk, 1);
+        assert!(
+            matches!(&cancelled, Progress::Failed(f, took) if f.cancelled && *took < PATIENCE / 4),
+            "{cancelled:?}"
+        );
+        found(&desk, 2, turn(1.5, 1.4, 0));
+        // Its last owner does not wait for what is being planned.
+        desk.begin(3, turn(1.5, -1.5, 0), None).unwrap();
+        let began = Instant::now();
+        drop(desk);
+        assert!(began.elapsed() < PATIENCE / 4);
+    }
+
+    #[test]
+    fn who_is_there_already_stands_for_a_moment() {
+        let desk = Desk::start(yourarm(Vec::new()), PATIENCE).unwrap();
+        let found = found(&desk, 1, turn(0.5, 0.5, 0));
+        assert!(found.trajectory.validate().is_ok() && found.trajectory.duration() < 0.2);
+        assert!(found.trajectory.points.iter().all(|point| point.positions == found.path[0]));
+    }
+
+    #[test]
+    fn a_start_that_touches_a_little_is_left_in_a_timed_motion() {
+        // A plate under the flange's end of the arm, as far into it as may be.
+        let mut plate = object("plate", [0.3, 0.3, 0.02], [0.26, 0.0, 0.1]);
+        let height = |plate: &ObjectConfig, setup: &Setup| {
+            let world = setup.world.snapshot();
+            let depth = crate::collision::ExactChecker::new(world, Default::default());
+            let contacts = crate::collision::CollisionChecker::contacts(&mut { depth }, &HOME);
+            (plate.pose.translation.z, contacts.first().map_or(0.0, |contact| -contact.distance))
+        };
+        let mut setup = yourarm(vec![plate.clone()]);
+        while height(&plate, &setup).1 < 0.001 {
+            plate.pose.translation.z += 0.001;
+            assert!(plate.pose.translation.z < 0.5, "the arm is never touched");
+            setup = yourarm(vec![plate.clone()]);
+        }
+        let desk = Desk::start(setup, PATIENCE).unwrap();
+        let mut up = turn(0.0, 0.3, 0);
+        up.goals = vec![(0, Goal::Joints(vec![0.3, -0.6, 0.6, 0.0, 0.8, 0.0]))];
+        let found = found(&desk, 1, up);
+        assert_eq!(found.path[0], HOME);
+        // And it is still free when it is looked at again, where nothing has changed.
+        desk.review(found.clone(), vec![HOME.to_vec()], Stop::never())().unwrap();
+        let stone = object("stone", [0.1, 0.1, 0.1], [0.25, 0.06, 0.42]);
+        desk.world(|world| world.add(super::super::setup::obstacle(&stone).unwrap())).unwrap();
+        let failure = desk.review(found, vec![HOME.to_vec()], Stop::never())().unwrap_err();
+        assert!(failure.what.contains("obstacle \"stone\""), "{failure:?}");
     }
 }

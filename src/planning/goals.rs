@@ -4,7 +4,7 @@ use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
 use super::path::Path;
 use super::setup::PlannedRobot;
-use super::solve::{Failure, Goal, Stage};
+use super::solve::{Failure, Goal, Stage, late};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 use glamx::DAffine3;
@@ -18,10 +18,10 @@ const CLOSE: f64 = 1e-5;
 /// A straight line that ends so close to its end is whole.
 const WHOLE: f64 = 1.0 - 1e-9;
 
-/// Configurations of all moving robots that are goals of the search. Where a robot goes to a pose there are several,
-/// found without regard to what touches: the search passes over those that do, and says which.
+/// Configurations of all moving robots that are goals of the search. Where a robot goes to a pose there are several. Of
+/// one robot they are free, where any is; else the search says what touches.
 pub(super) fn configurations(
-    stage: &Stage<'_>,
+    stage: &mut Stage<'_>,
     wanted: &[(usize, Goal)],
     seed: u64,
     stop: &Stop,
@@ -29,6 +29,9 @@ pub(super) fn configurations(
     // One list of configurations per robot; a combination of one from each is a goal of all.
     let mut all: Path = vec![Vec::new()];
     let mut first = 0;
+    let checker = &mut stage.checker;
+    let alone = stage.robots.len() == 1;
+    let mut free = |q: &[f64]| !alone || checker.is_free(q);
     for (robot, index) in stage.robots.iter().zip(&stage.indices) {
         let own = stage.start.get(first..first + robot.joints.len()).unwrap_or_default().to_vec();
         first += robot.joints.len();
@@ -37,11 +40,12 @@ pub(super) fn configurations(
             Some(Goal::Joints(values)) => vec![values.clone()],
             Some(Goal::Pose(pose)) => {
                 let settings = IkSettings { seed, ..reach() };
-                reached(robot, &frame(pose), &own, &settings, stop)?
+                reached(robot, &frame(pose), &own, &settings, &mut free, stop)?
             }
             Some(Goal::Place(place)) => {
                 let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
-                reached(robot, &target, &own, &IkSettings { seed, position_only: true, ..reach() }, stop)?
+                let settings = IkSettings { seed, position_only: true, ..reach() };
+                reached(robot, &target, &own, &settings, &mut free, stop)?
             }
             Some(Goal::Line(_)) | None => vec![own],
         };
@@ -60,13 +64,19 @@ fn reached(
     target: &DAffine3,
     near: &[f64],
     settings: &IkSettings,
+    free: &mut impl FnMut(&[f64]) -> bool,
     stop: &Stop,
 ) -> Result<Path, Failure> {
     let in_root = robot.body.base.inverse() * *target;
     let mut ik = Ik::new(&robot.body.kinematics, robot.end_effector);
+    if let Ok(several) = ik.solve(&in_root, near, settings, free, stop) {
+        return Ok(several);
+    }
     ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
-        let what = format!("{}: {failure}", robot.config.name);
-        Failure { cancelled: stop.is_cancelled(), ..Failure::new(what) }
+        if stop.is_cancelled() {
+            return Failure { cancelled: true, ..Failure::new("cancelled") };
+        }
+        Failure::new(format!("{}: {failure}", robot.config.name))
             .hint("poses are of the link `end_effector_link`, in metres and radians, in the frame `map`")
     })
 }
@@ -84,11 +94,11 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     let line = straight_line(&kinematics, robot.end_effector, &start, &in_root, &LineSettings::default(), |a, b| {
         checker.motion_is_free(a, b, stop)
     });
-    if stop.is_cancelled() {
-        return Err(Failure { cancelled: true, ..Failure::new("cancelled") });
-    }
     if line.fraction >= WHOLE {
         return Ok((line.path, 1.0));
+    }
+    if let Some(failure) = late(stop) {
+        return Err(failure);
     }
     let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
     let part = 100.0 * line.fraction;

@@ -23,6 +23,9 @@ const SAMPLES: usize = 200;
 /// Links that touch in more than this part of the poses are taken to touch always.
 const ALWAYS: f64 = 0.99;
 
+/// Largest file of a point cloud [bytes].
+const MAX_CLOUD: u64 = 256 << 20;
+
 /// A robot that can be planned for.
 #[derive(Debug, Clone)]
 pub struct PlannedRobot {
@@ -170,6 +173,10 @@ pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
         ObjectShape::Cylinder([radius, length]) => Solid::cylinder(*radius, *length, at),
         ObjectShape::Mesh(path) => of_mesh(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, MeshMode::Triangles, at),
         ObjectShape::Cloud(path) => {
+            let about = std::fs::metadata(path).map_err(|e| format!("{}: {e}", path.display()))?;
+            if !about.is_file() || about.len() > MAX_CLOUD {
+                return Err(format!("{}: not a file of at most {} MiB", path.display(), MAX_CLOUD >> 20));
+            }
             let data = std::fs::read(path).map_err(|e| format!("{}: {e}", path.display()))?;
             let points = ply::read(&data).map_err(|e| format!("{}: {e}", path.display()))?;
             let cloud = Cloud::new(points).ok_or_else(|| format!("{}: no points", path.display()))?;

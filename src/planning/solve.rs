@@ -6,6 +6,7 @@ use std::time::Instant;
 use nalgebra::{Isometry3, Vector3};
 
 use super::goals;
+use super::leaving::{Leaving, passes};
 use super::path::{Path, between, distance, length};
 use super::planner::{PlanError, PlanSettings, plan};
 use super::setup::{PlannedRobot, Setup};
@@ -14,10 +15,14 @@ use crate::collision::world::World;
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use crate::robot::kinematics::frame;
 use crate::robot::model::Limits;
-use crate::trajectory::JointTrajectory;
+use crate::trajectory::{JointTrajectory, TrajectoryPoint};
 
 /// Distance between two looks for the clearance of a path [rad].
 const CLEARANCE_STEP: f64 = 0.05;
+/// A path shorter than this is none: the robots are there already [rad].
+const THERE: f64 = 1e-6;
+/// How long the motion of robots takes that are there already [s].
+const MOMENT: f64 = 0.1;
 
 /// Where a robot shall go.
 #[derive(Debug, Clone, PartialEq)]
@@ -54,7 +59,8 @@ pub struct Found {
     pub path: Path,
     /// The motion, with the coordinator's joint names.
     pub trajectory: JointTrajectory,
-    /// Smallest distance on the path [m], and between which two, where there is anything to be near to.
+    /// Smallest distance on the path [m], and between which two; none where there is nothing to be near to, or where
+    /// time was up before it was known.
     pub clearance: Option<(f64, [String; 2])>,
     /// Of a straight line, the part that can be done.
     pub fraction: Option<f64>,
@@ -102,7 +108,8 @@ pub(super) struct Stage<'a> {
 /// Plans a motion. The same setup, world and request give the same motion, as long as time does not run out.
 pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Result<Found, Failure> {
     let mut times = BTreeMap::new();
-    let mut stage = stage(setup, world, request)?;
+    let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
+    let mut stage = stage(setup, world, &moving, &request.positions)?;
     let began = Instant::now();
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
@@ -118,7 +125,7 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
             return Err(Failure::new("a straight line is planned for one robot at a time"));
         }
         wanted => {
-            let goals = goals::configurations(&stage, wanted, request.seed, stop)?;
+            let goals = goals::configurations(&mut stage, wanted, request.seed, stop)?;
             lap(&mut times, "ik", began);
             let settings = PlanSettings { seed: request.seed, ..PlanSettings::default() };
             let start = stage.start.clone();
@@ -128,24 +135,30 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
             (found.path, None)
         }
     };
-    if length(&path) < 1e-6 {
-        return Err(Failure::new("the robot is there already"));
-    }
     let timing = Instant::now();
-    let trajectory = timed(&mut stage, &path, request.speed, fraction.is_some())?;
+    let trajectory = match length(&path) < THERE {
+        true => rest(&stage.joints, &path),
+        false => timed(&mut stage, &path, request.speed, fraction.is_some(), stop)?,
+    };
     let looking = lap(&mut times, "timing", timing);
-    let clearance = clearance(&mut stage.checker, &path);
+    let clearance = clearance(&mut stage.checker, &path, stop);
     lap(&mut times, "clearance", looking);
     Ok(Found { robots: stage.indices, path, trajectory, clearance, fraction, times })
 }
 
-fn stage<'a>(setup: &'a Setup, world: &World, request: &Request) -> Result<Stage<'a>, Failure> {
+/// The world of one request: robots that move, by index, and all others where they are [rad].
+pub(super) fn stage<'a>(
+    setup: &'a Setup,
+    world: &World,
+    moving: &[usize],
+    positions: &[Vec<f64>],
+) -> Result<Stage<'a>, Failure> {
     let (mut robots, mut indices, mut bodies) = (Vec::new(), Vec::new(), Vec::new());
     let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
     for (index, robot) in setup.robots.iter().enumerate() {
-        let at = request.positions.get(index).filter(|at| at.len() == robot.joints.len());
+        let at = positions.get(index).filter(|at| at.len() == robot.joints.len());
         let at = at.ok_or_else(|| Failure::new(format!("the positions of {} are not known", robot.config.name)))?;
-        if !request.goals.iter().any(|(moves, _)| *moves == index) {
+        if !moving.contains(&index) {
             bodies.push(robot.standing(at).map_err(Failure::new)?);
             continue;
         }
@@ -179,8 +192,20 @@ fn told(stage: &Stage<'_>, error: &PlanError) -> Failure {
     }
 }
 
+/// The motion of robots that are there already: they stand for a moment.
+fn rest(joints: &[String], path: &Path) -> JointTrajectory {
+    let still = vec![0.0; joints.len()];
+    let at = |time| TrajectoryPoint {
+        time_from_start: time,
+        positions: path.first().cloned().unwrap_or_default(),
+        velocities: still.clone(),
+        accelerations: still.clone(),
+    };
+    JointTrajectory { joint_names: joints.to_vec(), points: vec![at(0.0), at(MOMENT)] }
+}
+
 /// Times a path within the joints' limits, and checks the timed motion.
-fn timed(stage: &mut Stage<'_>, path: &Path, speed: f64, line: bool) -> Result<JointTrajectory, Failure> {
+fn timed(stage: &mut Stage<'_>, path: &Path, speed: f64, line: bool, stop: &Stop) -> Result<JointTrajectory, Failure> {
     let bounds = bounds(&stage.joints, &stage.limits).map_err(|e| Failure::new(e.to_string()))?;
     // Half the speed means half the velocity and half the acceleration, as a direct move has it.
     let bounds: Vec<_> = bounds
@@ -196,19 +221,32 @@ fn timed(stage: &mut Stage<'_>, path: &Path, speed: f64, line: bool) -> Result<J
     let deviation = if line { 1e-3 } else { TimingSettings::default().deviation };
     let settings = TimingSettings { deviation, speed: 1.0 };
     let checker = &mut stage.checker;
-    let never = Stop::never();
-    let timed = time(&stage.joints, path, &bounds, &settings, |a, b| checker.motion_is_free(a, b, &never));
-    timed.map(|timed| timed.trajectory).map_err(|e| Failure::new(e.to_string()))
+    let leaving = Leaving::of(checker, path);
+    let free = |a: &[f64], b: &[f64]| passes(checker, leaving.as_ref(), a, b, stop);
+    let timed = time(&stage.joints, path, &bounds, &settings, free);
+    timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| Failure::new(e.to_string())))
 }
 
-/// The smallest distance on a path, and between which two.
-fn clearance(checker: &mut ExactChecker, path: &Path) -> Option<(f64, [String; 2])> {
+/// What failed because it was cancelled, or because time was up.
+pub(super) fn late(stop: &Stop) -> Option<Failure> {
+    match (stop.is_cancelled(), stop.is_over()) {
+        (true, _) => Some(Failure { cancelled: true, ..Failure::new("cancelled") }),
+        (_, true) => Some(Failure::new("no motion was found in time").hint("give it more time with --timeout")),
+        _ => None,
+    }
+}
+
+/// The smallest distance on a path, and between which two. A figure for people: without it where time is up.
+fn clearance(checker: &mut ExactChecker, path: &Path, stop: &Stop) -> Option<(f64, [String; 2])> {
     let mut least: Option<(f64, [String; 2])> = None;
     let mut q = path.first()?.clone();
     for pair in path.windows(2) {
         let [a, b] = pair else { continue };
         let steps = (distance(a, b) / CLEARANCE_STEP).ceil().max(1.0) as usize;
         for step in 0..=steps {
+            if stop.is_over() {
+                return None;
+            }
             between(a, b, step as f64 / steps as f64, &mut q);
             let contact = checker.clearance(&q)?;
             if least.as_ref().is_none_or(|(distance, _)| contact.distance < *distance) {

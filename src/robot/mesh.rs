@@ -40,8 +40,11 @@ impl Mesh {
     /// round, so that their outside stays outside.
     pub fn read(path: &Path, scale: Vector3<f64>) -> Result<Self, String> {
         let named = |what: String| format!("{}: {what}", path.display());
-        let size = fs::metadata(path).map_err(|e| named(e.to_string()))?.len();
-        if size > MAX_BYTES {
+        let about = fs::metadata(path).map_err(|e| named(e.to_string()))?;
+        if !about.is_file() {
+            return Err(named("not a file".to_owned()));
+        }
+        if about.len() > MAX_BYTES {
             return Err(named(format!("the file is larger than {} MiB", MAX_BYTES >> 20)));
         }
         let bytes = fs::read(path).map_err(|e| named(e.to_string()))?;

@@ -40,6 +40,8 @@ pub enum Code {
     UnknownRobot,
     /// No such plan, or one too long ago.
     UnknownPlan,
+    /// The world has changed since the plan was made, and something is in its way now.
+    PlanOutdated,
     /// No such object in the world.
     UnknownObject,
     /// The planner is busy with another request.

@@ -51,6 +51,8 @@ impl Server {
                     _ = stopped => tokio::time::sleep(LAST_WORDS).await,
                 }
             });
+            // A large file that is still being read does not keep the run from ending.
+            runtime.shutdown_background();
         })?;
         Ok(Self { claim, stop: Some(stop), thread: Some(thread) })
     }

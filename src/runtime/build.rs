@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
-use super::planning_requests::PlannerPort;
+use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
 use super::watchdog::Watchdog;
@@ -59,6 +59,9 @@ impl Run {
                 what,
                 hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
             })?;
+        for (robot, [a, b]) in planner.iter().flat_map(PlannerPort::always_touching) {
+            tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
+        }
         let pulse = Arc::new(Pulse::default());
         let (notes, noted) = channel();
 

@@ -16,12 +16,14 @@ mod handle;
 mod in_process;
 mod motion_requests;
 mod motions;
-mod planning_requests;
+mod plan_requests;
+mod planner_port;
 mod repeats;
 mod reports;
 mod service;
 mod service_manager;
 mod watchdog;
+mod world_requests;
 
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -13,7 +13,7 @@ use serde_json::Value;
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::Motions;
-use super::planning_requests::PlannerPort;
+use super::planner_port::PlannerPort;
 use super::repeats::Repeats;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;

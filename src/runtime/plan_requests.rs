@@ -1,0 +1,220 @@
+//! Plans, over rpc: begun, looked at, and handed to the coordinator.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::dispatch::lock;
+use super::planner_port::{PlannerPort, apart, isometry, robot_index};
+use super::service::{Service, internal};
+use crate::collision::Stop;
+use crate::planning::desk::{Job, Progress};
+use crate::planning::path::length;
+use crate::planning::setup::{PlannedRobot, Setup};
+use crate::planning::solve::{Found, Goal, Request};
+use crate::rpc::api::{self, PlanSummary, Reply};
+use crate::rpc::{Code, RpcError};
+
+/// The longest time to find out whether a plan is still free; then it is not carried out.
+const REVIEW_LIMIT: Duration = Duration::from_secs(2);
+
+impl Service {
+    pub(super) fn begin_plan(&self, port: &PlannerPort, plan: &api::Plan) -> Result<api::PlanReply, RpcError> {
+        let setup = port.desk.setup();
+        let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
+        let positions = self.robot_positions(setup)?;
+        let request = Request { goals, positions, speed: plan.speed, seed: plan.seed };
+        let id = self.parts.dispatcher.number();
+        port.desk
+            .begin(id, request, plan.timeout.map(Duration::from_secs_f64))
+            .map_err(|busy| RpcError::new(Code::Planning, busy.to_string()).hint("wait for it, or `dimos cancel`"))?;
+        Ok(api::PlanReply { plan: id })
+    }
+
+    pub(super) fn preview(&self, port: &PlannerPort, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
+        let (job, found) = found(port, plan)?;
+        let setup = port.desk.setup();
+        let mut end_effectors = BTreeMap::new();
+        let mut first = 0;
+        for &index in &found.robots {
+            let Some(robot) = setup.robots.get(index) else { continue };
+            let kinematics = &robot.body.kinematics;
+            let mut frames = kinematics.frames();
+            let place = |point: &crate::trajectory::TrajectoryPoint, frames: &mut Vec<_>| {
+                let own = point.positions.get(first..first + robot.joints.len()).unwrap_or_default();
+                kinematics.forward_from(&robot.body.base, own, frames);
+                kinematics.link_frame(robot.end_effector, frames).translation.to_array()
+            };
+            let way = found.trajectory.points.iter().map(|point| place(point, &mut frames)).collect();
+            end_effectors.insert(robot.config.name.clone(), way);
+            first += robot.joints.len();
+        }
+        let summary = summary(&job, &found);
+        Ok(api::PreviewReply { plan: job.id, summary, trajectory: travelling(&found), end_effectors })
+    }
+
+    pub(super) async fn execute_plan(&self, port: &PlannerPort, plan: Option<u64>) -> Result<Reply, RpcError> {
+        let (job, found) = found(port, plan)?;
+        let setup = port.desk.setup();
+        // Several robots move in one trajectory: one task must have the joints of all.
+        let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
+        let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
+        let task = task.map(|task| (*task).clone());
+        self.still_free(port, &job, &found).await?;
+        let reply = self.execute(api::Execute { trajectory: travelling(&found), task }).await?;
+        if let Reply::Execute(begun) = &reply {
+            *lock(&port.executed) = Some((job.id, begun.motion));
+            return Ok(Reply::ExecutePlan(begun.clone()));
+        }
+        Ok(reply)
+    }
+
+    /// The world may have changed since a plan was made, or a robot that it does not move may have moved.
+    async fn still_free(&self, port: &PlannerPort, job: &Job, found: &Arc<Found>) -> Result<(), RpcError> {
+        let positions = self.robot_positions(port.desk.setup())?;
+        let stop = Stop::new(Some(Instant::now() + REVIEW_LIMIT), None);
+        apart(port.desk.review(found.clone(), positions, stop)).await?.map_err(|failure| {
+            let what = format!("plan {} is no longer free: {}", job.id, failure.what);
+            RpcError::new(Code::PlanOutdated, what).hint("plan again: the world is not as it was")
+        })
+    }
+
+    pub(super) fn planner_report(&self, port: &PlannerPort) -> api::PlannerReport {
+        let newest = port.desk.newest(false);
+        let motion = lock(&port.executed).and_then(|(_, motion)| self.motion(motion).ok());
+        let (state, error) = match (&newest, &motion) {
+            (Some(Job { progress: Progress::Planning(_), .. }), _) => ("PLANNING", None),
+            (_, Some(motion)) if !motion.done => ("EXECUTING", None),
+            (Some(Job { progress: Progress::Failed(failure, _), .. }), _) if !failure.cancelled => {
+                ("FAULT", Some(failure.what.clone()))
+            }
+            (_, Some(motion)) if motion.state == "COMPLETED" => ("COMPLETED", None),
+            (_, Some(motion)) => ("FAULT", motion.error.clone()),
+            _ => ("IDLE", None),
+        };
+        let robot = |robot: &PlannedRobot| api::RobotReport {
+            name: robot.config.name.clone(),
+            end_effector_link: robot.config.end_effector_link.clone(),
+            joints: robot.config.coordinator_joints.clone(),
+            limits: robot.limits.iter().map(|l| [l.lower, l.upper]).collect(),
+            task: robot.config.task.clone(),
+            named_poses: robot.config.named_poses.clone(),
+        };
+        let mut always_touching: BTreeMap<String, Vec<[String; 2]>> = BTreeMap::new();
+        for (name, pair) in port.always_touching() {
+            always_touching.entry(name.clone()).or_default().push(pair.clone());
+        }
+        api::PlannerReport {
+            state: state.to_owned(),
+            error,
+            robots: port.desk.setup().robots.iter().map(robot).collect(),
+            plan: port.desk.newest(true).map(|job| job.id),
+            always_touching,
+        }
+    }
+}
+
+fn goal_of(setup: &Setup, goal: &api::PlanGoal) -> Result<(usize, Goal), RpcError> {
+    let index = robot_index(setup, &goal.robot)?;
+    let config = &setup.robots.get(index).ok_or_else(internal)?.config;
+    let joints = |values: &[f64]| {
+        if values.len() == config.joints.len() {
+            return Ok(Goal::Joints(values.to_vec()));
+        }
+        let what = format!("{} has {} joints, the goal {} values", config.name, config.joints.len(), values.len());
+        Err(RpcError::new(Code::InvalidParams, what).hint("give one position [rad] per joint, in order"))
+    };
+    let goal = match (&goal.joints, &goal.named, &goal.pose) {
+        (Some(values), _, _) => joints(values)?,
+        (_, Some(name), _) => {
+            let names: Vec<&String> = config.named_poses.keys().collect();
+            let unknown = || RpcError::unknown(Code::InvalidParams, "named pose", name, &names);
+            joints(config.named_poses.get(name).ok_or_else(unknown)?)?
+        }
+        (_, _, Some(pose)) if goal.linear => Goal::Line(isometry(pose)),
+        (_, _, Some(pose)) if pose.rpy.is_none() && pose.quat.is_none() => Goal::Place(pose.xyz.into()),
+        (_, _, Some(pose)) => Goal::Pose(isometry(pose)),
+        _ => return Err(internal()),
+    };
+    Ok((index, goal))
+}
+
+pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError> {
+    let job = match plan {
+        Some(id) => port.desk.job(id),
+        None => port.desk.newest(true),
+    };
+    job.ok_or_else(|| match plan {
+        Some(id) => RpcError::new(Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago"))
+            .hint("`dimos plan` makes one"),
+        None => RpcError::new(Code::UnknownPlan, "there is no plan yet").hint("`dimos plan` makes one"),
+    })
+}
+
+pub(super) fn found(port: &PlannerPort, plan: Option<u64>) -> Result<(Job, Arc<Found>), RpcError> {
+    let job = job(port, plan)?;
+    match &job.progress {
+        Progress::Found(found, _) => Ok((job.clone(), found.clone())),
+        Progress::Planning(_) => Err(RpcError::new(Code::Planning, format!("plan {} is not ready yet", job.id))),
+        Progress::Failed(failure, _) => {
+            Err(RpcError::new(Code::UnknownPlan, format!("plan {} was not found: {}", job.id, failure.what)))
+        }
+    }
+}
+
+pub(super) fn report(job: &Job) -> api::PlanningReport {
+    let base = api::PlanningReport {
+        plan: job.id,
+        state: "PLANNING".to_owned(),
+        elapsed: 0.0,
+        error: None,
+        hint: None,
+        summary: None,
+    };
+    match &job.progress {
+        Progress::Planning(since) => api::PlanningReport { elapsed: since.elapsed().as_secs_f64(), ..base },
+        Progress::Found(found, took) => api::PlanningReport {
+            state: "PLANNED".to_owned(),
+            elapsed: took.as_secs_f64(),
+            summary: Some(summary(job, found)),
+            ..base
+        },
+        Progress::Failed(failure, took) => api::PlanningReport {
+            state: if failure.cancelled { "CANCELLED" } else { "FAILED" }.to_owned(),
+            elapsed: took.as_secs_f64(),
+            error: Some(failure.what.clone()),
+            hint: failure.hint.clone(),
+            ..base
+        },
+    }
+}
+
+fn summary(job: &Job, found: &Found) -> PlanSummary {
+    PlanSummary {
+        joints: found.trajectory.joint_names.clone(),
+        start: found.path.first().cloned().unwrap_or_default(),
+        goal: found.path.last().cloned().unwrap_or_default(),
+        waypoints: found.path.len(),
+        length: length(&found.path),
+        duration: found.trajectory.duration(),
+        clearance: found.clearance.as_ref().map(|(distance, _)| *distance),
+        closest: found.clearance.as_ref().map(|(_, pair)| pair.clone()),
+        fraction: found.fraction,
+        seed: job.request.seed,
+        times: found.times.clone(),
+    }
+}
+
+/// The trajectory as rpc has it.
+fn travelling(found: &Found) -> api::Trajectory {
+    let point = |point: &crate::trajectory::TrajectoryPoint| api::Point {
+        time_from_start: point.time_from_start,
+        positions: point.positions.clone(),
+        velocities: Some(point.velocities.clone()).filter(|v| !v.is_empty()),
+        accelerations: Some(point.accelerations.clone()).filter(|a| !a.is_empty()),
+    };
+    api::Trajectory {
+        joint_names: found.trajectory.joint_names.clone(),
+        points: found.trajectory.points.iter().map(point).collect(),
+    }
+}

@@ -1,0 +1,178 @@
+//! The planner's world, over rpc: objects that come, go, move, are held. As they were given they stand in
+//! [`PlannerPort::objects`], as shapes in the desk's world; the two change together.
+
+use std::path::PathBuf;
+
+use nalgebra::Isometry3;
+
+use super::dispatch::lock;
+use super::planner_port::{PlannerPort, apart, isometry, robot_index, spec};
+use super::service::{Service, internal};
+use crate::collision::Solid;
+use crate::collision::world::{Attached, Obstacle, World};
+use crate::planning::config::{ObjectConfig, ObjectShape};
+use crate::planning::setup::{PlannedRobot, obstacle};
+use crate::robot::kinematics::{frame, pose};
+use crate::rpc::api::{self, Done, ShapeSpec, WorldObject};
+use crate::rpc::{Code, RpcError};
+
+impl Service {
+    pub(super) fn attach(&self, port: &PlannerPort, call: &api::Attach) -> Result<Done, RpcError> {
+        let setup = port.desk.setup();
+        let index = robot_index(setup, &call.robot)?;
+        let robot = setup.robots.get(index).ok_or_else(internal)?;
+        let mut object = named(port, &call.name)?;
+        let link = call.link.clone().unwrap_or_else(|| robot.config.end_effector_link.clone());
+        for link in &call.touch_links {
+            link_index(robot, link)?;
+        }
+        let at = self.link_pose(robot, &link)?.inverse() * isometry(&object.pose);
+        let held = |world: &mut World| {
+            let stood = world.remove(&call.name)?;
+            let solid = Solid { frame: frame(&at), ..stood.solid.clone() };
+            let taken = world.attach(Attached {
+                name: call.name.clone(),
+                robot: index,
+                link: link.clone(),
+                solids: vec![solid],
+                touch_links: call.touch_links.clone(),
+                padding: object.padding,
+            });
+            // What cannot be held stays where it was: nothing vanishes from the world by a mistake.
+            if taken.is_err() {
+                world.add(stood)?;
+            }
+            taken
+        };
+        port.desk.world(held).map_err(|e| wrong(e.to_string()))?;
+        object.pose = spec(&at);
+        object.held_by = Some([call.robot.clone(), link]);
+        lock(&port.objects).insert(call.name.clone(), object);
+        Ok(Done {})
+    }
+
+    pub(super) fn detach(&self, port: &PlannerPort, name: &str) -> Result<Done, RpcError> {
+        let mut object = known(port, name)?;
+        let Some([robot, link]) = object.held_by.take() else {
+            return Err(wrong(format!("nobody holds {name}")));
+        };
+        let setup = port.desk.setup();
+        let robot = setup.robots.get(robot_index(setup, &robot)?).ok_or_else(internal)?;
+        let at = self.link_pose(robot, &link)? * isometry(&object.pose);
+        let let_go = |world: &mut World| {
+            let held = world.detach(name)?;
+            let solids = held.solids.into_iter();
+            solids
+                .map(|solid| Solid { frame: frame(&at), ..solid })
+                .try_for_each(|solid| world.add(Obstacle { name: name.to_owned(), solid, padding: held.padding }))
+        };
+        port.desk.world(let_go).map_err(|e| wrong(e.to_string()))?;
+        object.pose = spec(&at);
+        lock(&port.objects).insert(name.to_owned(), object);
+        Ok(Done {})
+    }
+
+    /// Where a robot's link is now, in the frame `map`.
+    fn link_pose(&self, robot: &PlannedRobot, link: &str) -> Result<Isometry3<f64>, RpcError> {
+        let index = link_index(robot, link)?;
+        let kinematics = &robot.body.kinematics;
+        let mut frames = kinematics.frames();
+        kinematics.forward_from(&robot.body.base, &self.positions_of(&robot.config.coordinator_joints)?, &mut frames);
+        Ok(pose(&kinematics.link_frame(index, &frames)))
+    }
+}
+
+fn wrong(what: impl Into<String>) -> RpcError {
+    RpcError::new(Code::InvalidParams, what)
+}
+
+fn unknown_object(port: &PlannerPort, name: &str) -> RpcError {
+    let names: Vec<String> = lock(&port.objects).keys().cloned().collect();
+    RpcError::unknown(Code::UnknownObject, "object", name, &names)
+}
+
+fn link_index(robot: &PlannedRobot, link: &str) -> Result<usize, RpcError> {
+    let names: Vec<&str> = robot.model.links.iter().map(|link| link.name.as_str()).collect();
+    let unknown = || RpcError::unknown(Code::InvalidParams, "link", link, &names);
+    robot.model.link_index(link).ok_or_else(unknown)
+}
+
+/// An object that nobody holds.
+fn named(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
+    not_held(port, name)?;
+    known(port, name)
+}
+
+fn known(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
+    // Not in one expression: its lock would be held while the refusal takes it again.
+    let object = lock(&port.objects).get(name).cloned();
+    object.ok_or_else(|| unknown_object(port, name))
+}
+
+fn not_held(port: &PlannerPort, name: &str) -> Result<(), RpcError> {
+    let holder = lock(&port.objects).get(name).and_then(|object| object.held_by.clone());
+    match holder {
+        Some([robot, _]) => {
+            Err(wrong(format!("{robot} holds {name}")).hint(format!("`dimos world detach {name}` lets go of it")))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Puts an object into the world. Its file is read beside everything else: it may be large.
+pub(super) async fn put(port: &PlannerPort, object: WorldObject) -> Result<Done, RpcError> {
+    not_held(port, &object.name)?;
+    let config = configured(&object, isometry(&object.pose));
+    let made = apart(move || obstacle(&config)).await?.map_err(wrong)?;
+    // Somebody may have attached it meanwhile.
+    not_held(port, &object.name)?;
+    port.desk.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
+    lock(&port.objects).insert(object.name.clone(), object);
+    Ok(Done {})
+}
+
+pub(super) fn move_to(port: &PlannerPort, call: &api::WorldMove) -> Result<Done, RpcError> {
+    let mut object = named(port, &call.name)?;
+    let at = frame(&isometry(&call.pose));
+    port.desk.world(|world| world.move_to(&call.name, at)).map_err(|e| wrong(e.to_string()))?;
+    object.pose = call.pose;
+    lock(&port.objects).insert(call.name.clone(), object);
+    Ok(Done {})
+}
+
+pub(super) fn remove(port: &PlannerPort, name: Option<&str>) -> Result<Done, RpcError> {
+    let mut gone: Vec<String> = Vec::new();
+    match name {
+        Some(name) => gone.push(named(port, name)?.name),
+        None => gone.extend(lock(&port.objects).values().filter(|o| o.held_by.is_none()).map(|o| o.name.clone())),
+    }
+    for name in gone {
+        port.desk.world(|world| world.remove(&name)).map_err(|e| wrong(e.to_string()))?;
+        lock(&port.objects).remove(&name);
+    }
+    Ok(Done {})
+}
+
+fn configured(object: &WorldObject, pose: Isometry3<f64>) -> ObjectConfig {
+    let shape = match &object.shape {
+        ShapeSpec::Box(size) => ObjectShape::Box(*size),
+        ShapeSpec::Sphere(radius) => ObjectShape::Sphere(*radius),
+        ShapeSpec::Cylinder(size) => ObjectShape::Cylinder(*size),
+        ShapeSpec::Mesh(path) => ObjectShape::Mesh(PathBuf::from(path)),
+        ShapeSpec::Cloud(path) => ObjectShape::Cloud(PathBuf::from(path)),
+    };
+    ObjectConfig { name: object.name.clone(), shape, pose, padding: object.padding }
+}
+
+/// An object of the blueprint, as rpc has it.
+pub(super) fn typed(object: &ObjectConfig) -> WorldObject {
+    let shape = match &object.shape {
+        ObjectShape::Box(size) => ShapeSpec::Box(*size),
+        ObjectShape::Sphere(radius) => ShapeSpec::Sphere(*radius),
+        ObjectShape::Cylinder(size) => ShapeSpec::Cylinder(*size),
+        ObjectShape::Mesh(path) => ShapeSpec::Mesh(path.display().to_string()),
+        ObjectShape::Cloud(path) => ShapeSpec::Cloud(path.display().to_string()),
+    };
+    let pose = spec(&object.pose);
+    WorldObject { name: object.name.clone(), shape, pose, padding: object.padding, held_by: None }
+}
