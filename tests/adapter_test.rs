@@ -4,12 +4,15 @@
 #[path = "support/program.rs"]
 mod program;
 
+use std::io::Read as _;
+
 use dimos::hardware::arms::yourarm::emulator::wire::Request;
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use program::Home;
 use rustix::process::Signal;
+use rustix::pty::{OpenptFlags, openpt, ptsname, unlockpt};
 
 /// Pose at power-up [deg], as it goes over the wire.
 const START: [f32; 6] = [0.0, -17.188734, 34.37747, 0.0, 45.836624, 0.0];
@@ -118,6 +121,37 @@ fn an_interruption_stops_the_arm() {
     let before = emulator.joints().0;
     std::thread::sleep(std::time::Duration::from_millis(100));
     assert_eq!(emulator.joints().0, before);
+}
+
+/// Reading a line goes on after a signal: the question must not.
+#[test]
+fn an_interruption_at_the_question_is_a_no() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
+    unlockpt(&master).unwrap();
+    let name = ptsname(&master, Vec::new()).unwrap();
+    let terminal = std::fs::File::options().read(true).write(true).open(name.to_str().unwrap()).unwrap();
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_dimos"));
+    command.args(["adapter", "test", "yourarm", "--address", &address, "--only", "row", "--allow-motion"]);
+    home.settle(&mut command);
+    command.stdin(terminal.try_clone().unwrap()).stdout(std::process::Stdio::null()).stderr(terminal);
+    let mut test = command.spawn().unwrap();
+    drop(command);
+    let (mut master, mut said) = (std::fs::File::from(master), String::new());
+    while !said.contains("Type yes") {
+        let mut bytes = [0; 1024];
+        let count = master.read(&mut bytes).unwrap();
+        said += &String::from_utf8_lossy(&bytes[..count]);
+    }
+    rustix::process::kill_process(rustix::process::Pid::from_child(&test), Signal::INT).unwrap();
+    let mut code = None;
+    program::eventually("it ends", || {
+        code = test.try_wait().unwrap();
+        code.is_some()
+    });
+    assert_eq!(code.unwrap().code(), Some(130));
+    assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
 }
 
 /// A terminal that is closed must not leave an arm in motion, with its motors on.

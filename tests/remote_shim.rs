@@ -335,8 +335,11 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     let home = Home::new();
     let ended = shim(&home, "tcp:127.0.0.1:1", &["--dof", "6"], &[("TROUBLE", "connect")]).wait().with(1);
     assert!(ended.err.contains("connect() said no") || ended.err.contains("Permission"), "{}", ended.err);
-    let ended = shim(&home, "tcp:0.0.0.0:7450", &[], &[]).wait().with(1);
-    assert!(ended.err.contains("not a loopback address"), "{}", ended.err);
+    for at in ["tcp:0.0.0.0:7450", "nonsense", "tcp:127.0.0.1:x"] {
+        let ended = shim(&home, at, &[], &[]).wait().with(1);
+        assert!(ended.err.starts_with(&format!("error: --at {at}: ")), "{}", ended.err);
+        assert!(ended.err.contains("not a loopback address"), "{}", ended.err);
+    }
 }
 
 #[test]

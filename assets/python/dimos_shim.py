@@ -122,7 +122,7 @@ def listen(at):
     if not at.startswith("unix:"):
         host, _, port = at.replace("tcp:", "", 1).rpartition(":")
         if not host.startswith("127.") or not port.isdigit():
-            sys.exit(f"error: --at {at}: unix:/PATH, or tcp:127.0.0.1:PORT (loopback only: there is no authentication)")
+            sys.exit(f"error: --at {at}: it is no unix:/PATH, and not a loopback address, tcp:127.0.0.1:PORT")
         return socket.create_server((host, int(port)))
     if os.path.exists(at[5:]) and socket.socket(socket.AF_UNIX).connect_ex(at[5:]):
         os.unlink(at[5:])  # of a shim that is gone
