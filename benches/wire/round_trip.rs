@@ -23,7 +23,7 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// An adapter that does nothing, in the form of the guide's skeleton: what remains is the way there and back.
 const IDLE_ARM: &str = "\
 class IdleArm:
-    def __init__(self, address, dof=6): self.q, self.on = [0.0] * dof, False
+    def __init__(self, address, dof=6): self.q, self.on, self.mode = [0.0] * dof, False, None
     def connect(self): return True
     def disconnect(self): pass
     def is_connected(self): return True
