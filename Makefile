@@ -5,7 +5,7 @@ READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
-.PHONY: run install check test test-tools test-rerun bench can-rate jitter
+.PHONY: run install check test test-tools test-rerun bench jitter
 
 # Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
@@ -55,10 +55,6 @@ test-rerun: .venv/readers-installed
 # are verified.
 bench:
 	cargo bench --locked --bench control --bench wire --bench rpc --bench verify
-
-# A Piper at its full rate, and its vendor's client, over a guest kernel's CAN: on a machine that has nothing else to do.
-can-rate:
-	cargo test --locked --test piper_kernel -- --ignored --nocapture --test-threads 1
 
 # Lateness of the tick beside cyclictest.
 jitter:

@@ -59,7 +59,6 @@ fn near(a: &[f64], b: &[f64]) -> bool {
 }
 
 #[test]
-#[ignore = "needs a processor of its own: make can-rate"]
 fn at_the_full_rate_for_ten_seconds_nothing_is_lost() {
     in_guest("at_the_full_rate_for_ten_seconds_nothing_is_lost", &Guest::with(uml::VCAN), || {
         let emulator = emulator("vcan0", &SimOptions::default());
@@ -150,7 +149,6 @@ fn two_arms_on_two_interfaces_do_not_hear_each_other() {
 
 /// The vendor's SDK opens its sockets without local loopback: on one interface its commands would reach nobody here.
 #[test]
-#[ignore = "needs a processor of its own: make can-rate"]
 fn the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces() {
     let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
     let mut import = std::process::Command::new(&python);

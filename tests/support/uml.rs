@@ -92,11 +92,7 @@ pub fn in_guest(name: &str, guest: &Guest, body: impl FnOnce()) {
         return body();
     }
     let this = std::env::current_exe().expect("the test's own path");
-    let script = format!(
-        "{}\nexport {INSIDE}=1\n'{}' --exact {name} --include-ignored --nocapture\n",
-        guest.setup,
-        this.display()
-    );
+    let script = format!("{}\nexport {INSIDE}=1\n'{}' --exact {name} --nocapture\n", guest.setup, this.display());
     let Some(ran) = run(guest.modules, &script, guest.limit) else { return };
     assert_eq!(ran.status, 0, "in the guest:\n{}", ran.output);
     assert!(ran.output.contains("1 passed"), "no test is named {name}:\n{}", ran.output);
