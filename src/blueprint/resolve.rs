@@ -180,12 +180,11 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     let found = arms::resolve(&mut checker, &file.hardware);
     let tasks = tasks::resolve(&mut checker, &file.tasks, &found);
     planner_check::assets(&mut checker, &file.assets);
-    if let Some(planner) = &file.planner {
-        planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
-    }
     let planner = file.planner.as_ref().map(|planner| {
-        let config = planner_files::resolve(&checker, planner);
-        planner_models::check(&mut checker, planner, &config);
+        let described = planner_models::read(&mut checker, planner);
+        planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &found);
+        let config = planner_files::resolve(&checker, planner, &described);
+        planner_models::check(&mut checker, planner, &described, &config);
         config
     });
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));

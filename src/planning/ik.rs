@@ -3,6 +3,8 @@
 //! reaches the pose to the tolerances, inside the limits, and is valid as the caller says; if not, it says what was
 //! missing.
 
+use std::f64::consts::TAU;
+
 use glamx::{DAffine3, DVec3};
 
 use crate::collision::checker::Stop;
@@ -83,6 +85,8 @@ pub struct Ik<'a> {
     columns: Vec<Column>,
     q: Vec<f64>,
     motion: Vec<f64>,
+    /// Joints that come to the same after a whole turn.
+    comes_round: Vec<bool>,
 }
 
 /// How far a configuration is from a pose.
@@ -103,7 +107,15 @@ impl<'a> Ik<'a> {
     pub fn new(kinematics: &'a Kinematics, link: usize) -> Self {
         let n = kinematics.dof();
         let (frames, columns) = (kinematics.frames(), vec![[0.0; 6]; n]);
-        Self { kinematics, link, frames, columns, q: vec![0.0; n], motion: vec![0.0; n] }
+        Self {
+            kinematics,
+            link,
+            frames,
+            columns,
+            q: vec![0.0; n],
+            motion: vec![0.0; n],
+            comes_round: kinematics.comes_round(),
+        }
     }
 
     /// Configurations in which the link stands at `target` (in the root's frame), the nearest to `near` first. Those
@@ -237,12 +249,17 @@ impl<'a> Ik<'a> {
         miss
     }
 
-    /// Turns joints without limits by whole turns, to be near.
+    /// Turns joints by whole turns, as far as their limits let them, to be near.
     fn unwind(&mut self, near: &[f64]) {
-        let turn = std::f64::consts::TAU;
-        for ((q, near), l) in self.q.iter_mut().zip(near).zip(self.kinematics.limits()) {
-            if l.lower.is_infinite() && l.upper.is_infinite() {
-                *q += ((near - *q) / turn).round() * turn;
+        for (((q, near), l), round) in self.q.iter_mut().zip(near).zip(self.kinematics.limits()).zip(&self.comes_round)
+        {
+            let turned = |whole: f64| *q + whole * TAU;
+            let whole = ((near - *q) / TAU).round();
+            // Up to where the limits end: the last turn that is within them is the nearest.
+            let (most, least) = (((l.upper - *q) / TAU).floor(), ((l.lower - *q) / TAU).ceil());
+            let whole = whole.min(most).max(least);
+            if *round && whole != 0.0 && (l.lower..=l.upper).contains(&turned(whole)) {
+                *q = turned(whole);
             }
         }
     }

@@ -137,6 +137,19 @@ impl Kinematics {
         &self.kinds
     }
 
+    /// Whether each joint, and all that follows it, comes to the same after a whole turn.
+    pub fn comes_round(&self) -> Vec<bool> {
+        let round = |b: &Body| b.motion == Motion::Turn && b.multiplier.fract() == 0.0;
+        let driven = |v: usize| self.bodies.iter().skip(1).filter(move |b| b.variable == v);
+        (0..self.dof()).map(|v| driven(v).all(round)).collect()
+    }
+
+    /// Which joints turn without end: they come to the same after a whole turn, and have no limits.
+    pub fn turns(&self) -> Vec<bool> {
+        let endless = |l: &Limits| l.lower == f64::NEG_INFINITY && l.upper == f64::INFINITY;
+        self.comes_round().into_iter().zip(&self.limits).map(|(round, l)| round && endless(l)).collect()
+    }
+
     /// Number of bodies, the root included: the length of a buffer of frames.
     pub fn bodies(&self) -> usize {
         self.bodies.len()
