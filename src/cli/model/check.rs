@@ -37,10 +37,10 @@ pub(super) fn run(file: &File) -> Result {
         Some(summary) => {
             output::line(summary);
             let warnings = loaded.warnings();
-            output::line(if warnings == 0 {
-                "no mistakes".to_owned()
-            } else {
-                format!("no mistakes, {warnings} warnings")
+            output::line(match warnings {
+                0 => "no mistakes".to_owned(),
+                1 => "no mistakes, 1 warning".to_owned(),
+                more => format!("no mistakes, {more} warnings"),
             });
             Ok(Exit::Ok)
         }
@@ -57,10 +57,11 @@ fn touching_links(robot: RobotModel, loaded: &mut Loaded) {
         Err(_) if loaded.has_errors() => return,
         Err(why) => return loaded.report(Diag::error(why)),
     };
-    for [a, b] in touching {
+    for (number, [a, b]) in touching.iter().enumerate() {
         let what = format!("the links `{a}` and `{b}` touch in every pose: a planner does not check them");
         let hint = "if they may touch, exclude the pair: disable_collisions in an SRDF, or collision_exclusion_pairs";
-        loaded.report(Diag::warning(what).hint(hint));
+        let last = (number + 1 == touching.len()).then(|| hint.to_owned());
+        loaded.report(Diag::warning(what).maybe_hint(last));
     }
 }
 
