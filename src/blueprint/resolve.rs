@@ -183,7 +183,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     let planner = file.planner.as_ref().map(|planner| {
         let described = planner_models::read(&mut checker, planner);
         planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &found);
-        let config = planner_files::resolve(&checker, planner, &described);
+        let config = planner_files::resolve(&checker, planner, &described, &found.arms);
         planner_models::check(&mut checker, planner, &described, &config);
         config
     });

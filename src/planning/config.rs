@@ -46,6 +46,9 @@ pub struct RobotConfig {
     pub joints: Vec<String>,
     /// The coordinator's names of the same joints.
     pub coordinator_joints: Vec<String>,
+    /// Lowest and highest positions that the arm itself takes, in the same order [rad]; empty: any. Joints that turn
+    /// without end in the model turn that far.
+    pub arm_range: Vec<[f64; 2]>,
     /// The trajectory task that executes its motions.
     pub task: Option<String>,
     /// Pairs of links that may touch.

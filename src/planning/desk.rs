@@ -227,6 +227,7 @@ mod tests {
             end_effector_link: "flange".into(),
             coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
             joints,
+            arm_range: Vec::new(),
             task: None,
             exclusions: Vec::new(),
             max_velocity: 1.0,

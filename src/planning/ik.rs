@@ -3,8 +3,6 @@
 //! reaches the pose to the tolerances, inside the limits, and is valid as the caller says; if not, it says what was
 //! missing.
 
-use std::f64::consts::TAU;
-
 use glamx::{DAffine3, DVec3};
 
 use crate::collision::checker::Stop;
@@ -85,8 +83,6 @@ pub struct Ik<'a> {
     columns: Vec<Column>,
     q: Vec<f64>,
     motion: Vec<f64>,
-    /// Joints that come to the same after a whole turn.
-    comes_round: Vec<bool>,
 }
 
 /// How far a configuration is from a pose.
@@ -107,15 +103,7 @@ impl<'a> Ik<'a> {
     pub fn new(kinematics: &'a Kinematics, link: usize) -> Self {
         let n = kinematics.dof();
         let (frames, columns) = (kinematics.frames(), vec![[0.0; 6]; n]);
-        Self {
-            kinematics,
-            link,
-            frames,
-            columns,
-            q: vec![0.0; n],
-            motion: vec![0.0; n],
-            comes_round: kinematics.comes_round(),
-        }
+        Self { kinematics, link, frames, columns, q: vec![0.0; n], motion: vec![0.0; n] }
     }
 
     /// Configurations in which the link stands at `target` (in the root's frame), the nearest to `near` first. Those
@@ -149,7 +137,7 @@ impl<'a> Ik<'a> {
             failure.attempts += 1;
             let miss = self.descend(target, settings);
             if settings_met(&miss, settings) {
-                self.unwind(near);
+                self.kinematics.unwind(&mut self.q, near, |_| true);
                 let new = !found.iter().any(|q| distance(q, &self.q) < 1e-3);
                 if new && valid(&self.q) {
                     found.push(self.q.clone());
@@ -247,21 +235,6 @@ impl<'a> Ik<'a> {
             best = best.min(miss.squared());
         }
         miss
-    }
-
-    /// Turns joints by whole turns, as far as their limits let them, to be near.
-    fn unwind(&mut self, near: &[f64]) {
-        for (((q, near), l), round) in self.q.iter_mut().zip(near).zip(self.kinematics.limits()).zip(&self.comes_round)
-        {
-            let turned = |whole: f64| *q + whole * TAU;
-            let whole = ((near - *q) / TAU).round();
-            // Up to where the limits end: the last turn that is within them is the nearest.
-            let (most, least) = (((l.upper - *q) / TAU).floor(), ((l.lower - *q) / TAU).ceil());
-            let whole = whole.min(most).max(least);
-            if *round && whole != 0.0 && (l.lower..=l.upper).contains(&turned(whole)) {
-                *q = turned(whole);
-            }
-        }
     }
 }
 

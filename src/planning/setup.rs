@@ -16,7 +16,7 @@ use crate::collision::{Solid, ply};
 use crate::robot::kinematics::{Kinematics, frame};
 use crate::robot::load;
 use crate::robot::mesh::Mesh;
-use crate::robot::model::{Limits, RobotModel};
+use crate::robot::model::{JointKind, Limits, RobotModel};
 
 /// Poses that are looked at for pairs of links that always touch.
 const SAMPLES: usize = 200;
@@ -130,8 +130,14 @@ impl PlannedRobot {
             ));
         }
         let joints = config.joints.iter().map(|name| joint(&model, name)).collect::<Result<Vec<_>, _>>()?;
-        for &index in &joints {
+        for (number, &index) in joints.iter().enumerate() {
             if let Some(joint) = model.joints.get_mut(index) {
+                let [lower, upper] =
+                    config.arm_range.get(number).copied().unwrap_or([f64::NEG_INFINITY, f64::INFINITY]);
+                if joint.kind == JointKind::Continuous {
+                    joint.limits.lower = joint.limits.lower.max(lower);
+                    joint.limits.upper = joint.limits.upper.min(upper);
+                }
                 let own = joint.limits.acceleration.unwrap_or(DEFAULT_ACCELERATION.max(config.max_acceleration));
                 joint.limits.velocity = joint.limits.velocity.min(config.max_velocity);
                 joint.limits.acceleration = Some(own.min(config.max_acceleration));

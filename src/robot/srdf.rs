@@ -136,7 +136,8 @@ pub fn read(root: &Element, robot: &RobotModel, tree: &mut Tree, calls: &Calls) 
     }
     reader.check_groups(root, &out);
     if reader.missing > 0 {
-        let what = format!("{} pairs of `disable_collisions` name links that this robot lacks", reader.missing);
+        let pairs = if reader.missing == 1 { "pair" } else { "pairs" };
+        let what = format!("{} {pairs} of `disable_collisions` with links that this robot lacks", reader.missing);
         reader.tree.report(Diag::warning(what).at(root.at.label()));
     }
     Some(out)
@@ -301,7 +302,7 @@ mod tests {
         assert_eq!(out.poses_of(&of(&["j2", "j1"])), [("home", vec![-0.25, 0.5])]);
         assert_eq!((out.poses_of(&of(&["j1", "j3"])), out.poses_of(&[])), (vec![], vec![]));
         assert_eq!((out.end_effectors.len(), out.disabled.len()), (1, 1));
-        assert!(text.contains("1 pairs") && !text.contains("error"), "{text}");
+        assert!(text.contains("1 pair of") && !text.contains("error"), "{text}");
     }
 
     #[test]
