@@ -47,10 +47,11 @@ pub fn run(args: &Args) -> Result {
         return Err(Failure::usage(what).hint(format!("the joints are: {}", moving.join(" "))));
     }
     for (joint, q) in moving.iter().zip(&args.positions) {
-        let limits = robot.joint_index(joint).and_then(|i| robot.joints.get(i)).map(|j| j.limits);
-        if let Some(limits) = limits.filter(|l| *q < l.lower || *q > l.upper) {
+        let joint = robot.joint_index(joint).and_then(|i| robot.joints.get(i));
+        if let Some(joint) = joint.filter(|j| *q < j.limits.lower || *q > j.limits.upper) {
+            let (name, unit, limits) = (&joint.name, joint.kind.unit(), joint.limits);
             output::note(format_args!(
-                "warning: {joint} {q} is outside its limits {} to {}",
+                "warning: {name} at {q} {unit} is outside its limits {:.4} to {:.4} {unit}",
                 limits.lower, limits.upper
             ));
         }
