@@ -17,6 +17,7 @@ mod in_process;
 mod motion_requests;
 mod motions;
 mod plan_requests;
+mod planner_link;
 mod planner_port;
 mod repeats;
 mod reports;
@@ -41,6 +42,7 @@ pub use service_manager::ServiceManager;
 use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
+use crate::planning::desk::Solver;
 use crate::recording::recorder::Recorder;
 use crate::rpc::place::RunFolder;
 use crate::rpc::server::Server;
@@ -78,6 +80,8 @@ pub struct Options {
     pub folder: RunFolder,
     /// Called at each tick; for tests and benchmarks.
     pub probe: Option<Probe>,
+    /// What answers the planner's requests in the place of this program's own planner.
+    pub solver: Option<Solver>,
     /// Whether idle states of the processor are held off.
     pub hold_latency: bool,
     /// Who is told when the run is up, beats and ends: systemd, for a run that is a service.
@@ -91,6 +95,7 @@ impl Default for Options {
             record: Record::AsBlueprint,
             folder: RunFolder::standard(),
             probe: None,
+            solver: None,
             hold_latency: true,
             service_manager: None,
         }
