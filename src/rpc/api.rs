@@ -14,9 +14,9 @@ pub use super::arm_api::*;
 pub use super::attach_api::*;
 use super::error::{Code, RpcError};
 use super::lease::Subject;
-use super::planner_line::PlannerLine;
 pub use super::motion_api::*;
 pub use super::planner_api::*;
+use super::planner_line::PlannerLine;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::streams::Streams;
 

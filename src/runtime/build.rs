@@ -73,7 +73,10 @@ impl Run {
         let planner = planner.map(|(config, setup)| PlannerPort::start(config, setup, &limits, options.solver.take()));
         let planner = planner.transpose().map_err(|what| {
             arms.release();
-            StartError::other(what, "the model's limits, the arm's, and `limits` in the blueprint must have room in common")
+            StartError::other(
+                what,
+                "the model's limits, the arm's, and `limits` in the blueprint must have room in common",
+            )
         })?;
 
         let samples = ring_size(&config);

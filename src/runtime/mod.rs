@@ -8,6 +8,7 @@
 
 mod arm_requests;
 mod arms;
+mod attached;
 mod build;
 mod builder;
 pub(crate) mod device_lock;
@@ -33,6 +34,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+pub use attached::{AttachedPlanner, Turn};
 pub use builder::Builder;
 pub use device_lock::DeviceTaken;
 pub use dispatch::log_of;

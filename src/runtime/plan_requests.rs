@@ -24,15 +24,13 @@ impl PlannerPort {
         let positions = all_positions(setup, moment)?;
         let request = Request { goals, positions, speed: plan.speed, seed: plan.seed };
         let id = moment.plan;
-        self.desk
-            .begin(id, request, plan.timeout.map(Duration::from_secs_f64))
-            .map_err(|why| {
-                let error = RpcError::new(Code::Planning, why.to_string());
-                match why {
-                    NotBegun::Busy => error.hint("wait for it, or `dimos cancel`"),
-                    NotBegun::Hangs => error.hint("start the planner again"),
-                }
-            })?;
+        self.desk.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
+            let error = RpcError::new(Code::Planning, why.to_string());
+            match why {
+                NotBegun::Busy => error.hint("wait for it, or `dimos cancel`"),
+                NotBegun::Hangs => error.hint("start the planner again"),
+            }
+        })?;
         Ok(api::PlanReply { plan: id })
     }
 

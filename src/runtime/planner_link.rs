@@ -59,9 +59,8 @@ impl Planner<'_> {
             Self::Attached(planner) => {
                 let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan }).written();
                 let released = planner.line.ask(method, params, moment, LONG).await?;
-                serde_json::from_value(released).map_err(|e| {
-                    RpcError::new(Code::Internal, format!("the planner released no plan: {e}"))
-                })
+                serde_json::from_value(released)
+                    .map_err(|e| RpcError::new(Code::Internal, format!("the planner released no plan: {e}")))
             }
         }
     }
@@ -139,7 +138,8 @@ impl Service {
 
     /// What the planner is and does, and how its last motion goes.
     async fn planner_report(&self, planner: &Planner<'_>, limit: Duration) -> Result<PlannerReport, RpcError> {
-        let Reply::Planner(mut report) = planner.answer(Call::Planner(api::Planner {}), Moment::default(), limit).await?
+        let Reply::Planner(mut report) =
+            planner.answer(Call::Planner(api::Planner {}), Moment::default(), limit).await?
         else {
             return Err(internal());
         };
@@ -157,7 +157,11 @@ impl Service {
 
     /// The planner in `status`; none where there is none.
     pub(super) async fn planner_status(&self) -> Option<PlannerStatus> {
-        let own = |e: &RpcError| PlannerStatus { state: "FAULT".into(), error: Some(e.message.clone()), ..Default::default() };
+        let own = |e: &RpcError| PlannerStatus {
+            state: "FAULT".into(),
+            error: Some(e.message.clone()),
+            ..Default::default()
+        };
         let planner = match self.planner() {
             Ok(planner) => planner,
             Err(_) => return None,

@@ -46,16 +46,13 @@ impl PlannerPort {
         Ok(Self { desk, objects: Mutex::new(objects) })
     }
 
-    /// The robots, as a run needs to know them.
-    pub fn robots(&self) -> Vec<RegisteredRobot> {
-        registered(self.desk.setup())
-    }
-
     /// Answers one of the planner's methods, but for `execute_plan`: see [`release`](Self::release).
     pub async fn answer(&self, call: Call, moment: &Moment) -> Result<Reply, RpcError> {
         match call {
             Call::Plan(plan) => self.begin_plan(&plan, moment).map(Reply::Plan),
-            Call::Planning(planning) => Ok(Reply::Planning(super::plan_requests::report(&job(self, Some(planning.plan))?))),
+            Call::Planning(planning) => {
+                Ok(Reply::Planning(super::plan_requests::report(&job(self, Some(planning.plan))?)))
+            }
             Call::Preview(preview) => self.preview(preview.plan).map(Reply::Preview),
             Call::Planner(_) => Ok(Reply::Planner(self.report())),
             Call::Cancel(_) => {

@@ -107,7 +107,6 @@ impl PlannerPort {
     }
 }
 
-
 /// Where a robot's link is now, in the frame `map`.
 fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isometry3<f64>, RpcError> {
     let index = link_index(robot, link)?;
