@@ -122,11 +122,11 @@ impl Search {
     }
 }
 
-/// Whether the run has a planner.
+/// Whether the run has a planner. One that had a planner until it went away is an error.
 pub fn has_planner(client: &mut Client) -> Result<bool> {
     match client.call(Planner {}) {
         Ok(_) => Ok(true),
-        Err(ClientError::Refused(RpcError { code: Code::NoPlanner, .. })) => Ok(false),
+        Err(ClientError::Refused(RpcError { code: Code::NoPlanner, data: None, .. })) => Ok(false),
         Err(e) => Err(e.into()),
     }
 }

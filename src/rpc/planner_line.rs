@@ -123,8 +123,10 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// The planner's process has ended.
+/// The planner's process has ended. A run that never had one refuses without `data`: who relied on a planner must not be
+/// moved without one because it crashed.
 pub fn gone() -> RpcError {
     RpcError::new(Code::NoPlanner, "the planner that was attached to this run has gone")
-        .hint("start it again: `dimos run` its blueprint, such as yourarm-planner, beside this run")
+        .hint("start it again: `dimos run` its blueprint beside this run; `dimos move … --direct` needs none")
+        .data(json!({"planner": "gone"}))
 }
