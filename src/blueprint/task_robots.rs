@@ -75,7 +75,8 @@ fn robot(
         },
         (None, Some(planned)) => of_planner(planned, joints, mapped),
         (None, None) => {
-            let diag = Diag::error(format!("the description of the robot is missing, which a `{}` task needs", kind.name()));
+            let diag =
+                Diag::error(format!("the description of the robot is missing, which a `{}` task needs", kind.name()));
             let hint = "name it: `params: {model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: arm_}`, \
                         or add a robot with these joints to `planner`";
             checker.error(place.entry.kind.at, diag.hint(hint));

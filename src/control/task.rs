@@ -208,7 +208,9 @@ impl Task {
     /// loses the joint until its next target.
     pub fn lose(&mut self, winner: u16, joint: u16) -> Option<Box<Motion>> {
         match &mut self.body {
-            Body::Trajectory(_) | Body::Cartesian(_) => return self.end(TaskState::Aborted, Reason::Preempted(winner, joint)),
+            Body::Trajectory(_) | Body::Cartesian(_) => {
+                return self.end(TaskState::Aborted, Reason::Preempted(winner, joint));
+            }
             Body::Servo(t) => t.mute(&self.joints, joint),
             Body::Velocity(t) => t.mute(&self.joints, joint),
         }

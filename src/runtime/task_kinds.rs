@@ -55,10 +55,8 @@ fn cartesian(typed: &blueprint::CartesianParams, robot: Option<&TaskRobot>) -> R
         let rest = model.positions(&HashMap::new());
         let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
         let root = frame(&(base_pose * base.inverse()));
-        params.root = Place {
-            position: root.translation.to_array(),
-            orientation: DQuat::from_mat3(&root.matrix3).to_array(),
-        };
+        params.root =
+            Place { position: root.translation.to_array(), orientation: DQuat::from_mat3(&root.matrix3).to_array() };
         params.base = DQuat::from_mat3(&frame(&base).matrix3).to_array();
     }
     Ok(params)

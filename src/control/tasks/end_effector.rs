@@ -97,6 +97,7 @@ impl EndEffector {
         way: Option<&Velocity>,
         claims: &mut Vec<Claim>,
     ) {
+        let before = self.velocity;
         self.approach(wanted, cx.dt);
         let Velocity { linear, angular } = self.velocity;
         let horizon = way.map_or(f64::INFINITY, |way| {
@@ -116,6 +117,11 @@ impl EndEffector {
             };
         }
         let step = self.stepper.step(&mut self.joints, &Wish { linear, angular, horizon }, &self.bounds, cx.dt);
+        // It changes its velocity no faster than the joints can follow, so that it keeps its direction.
+        if step.share < 1.0 {
+            self.velocity.linear = before.linear + (linear - before.linear) * step.share;
+            self.velocity.angular = before.angular + (angular - before.angular) * step.share;
+        }
         let index = |j: usize| joints.get(j).copied().unwrap_or_default();
         self.bound = match step.bound {
             Bounded::None => Bound::None,
@@ -133,10 +139,8 @@ impl EndEffector {
             return self.approach(&Velocity::default(), dt);
         }
         let p = &self.params;
-        let change = Velocity {
-            linear: wanted.linear - self.velocity.linear,
-            angular: wanted.angular - self.velocity.angular,
-        };
+        let change =
+            Velocity { linear: wanted.linear - self.velocity.linear, angular: wanted.angular - self.velocity.angular };
         let needed = seconds(&change, p.max_linear_acceleration, p.max_angular_acceleration);
         if needed <= dt {
             self.velocity = *wanted;
