@@ -61,7 +61,7 @@ pub struct RobotConfig {
     pub base_link: String,
     /// The link that pose goals are for.
     pub end_effector_link: Located<String>,
-    /// The joints that are planned for, as the model names them, base first; or `{group: NAME}`, a group of the SRDF.
+    /// The joints that are planned for, as the model names them, base first; or `{group: NAME}`: a `group` of the SRDF.
     pub joint_names: Located<RobotJoints>,
     /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
     #[serde(default)]

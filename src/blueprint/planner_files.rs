@@ -10,18 +10,17 @@ use crate::blueprint::planner::{
     ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry,
 };
 use crate::blueprint::planner_models::Described;
-use crate::blueprint::resolve::{Arm, Checker};
-use crate::control::config::POSITION_MARGIN;
+use crate::blueprint::resolve::Checker;
 use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
 /// What a planner is made from. Only of use when nothing was reported.
-pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Described], arms: &[Arm]) -> PlannerConfig {
+pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Described]) -> PlannerConfig {
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
-        robots: robots.map(|(robot, described)| self::robot(checker, robot, described, arms)).collect(),
+        robots: robots.map(|(robot, described)| self::robot(checker, robot, described)).collect(),
         objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
     }
 }
@@ -39,18 +38,7 @@ pub(super) fn source(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> Sour
     }
 }
 
-/// The positions that an arm takes commands for [rad].
-fn range(arms: &[Arm], joint: &str) -> [f64; 2] {
-    let found = arms.iter().find_map(|arm| Some((arm, arm.joints.iter().position(|name| name == joint)?)));
-    let Some((arm, at)) = found else { return [f64::NEG_INFINITY, f64::INFINITY] };
-    let own = (arm.adapter.limits)(arm.joints.len());
-    let given = arm.limits.get(at).copied().unwrap_or_default();
-    let lower = given.position_lower.or(own.position_lower.get(at).copied());
-    let upper = given.position_upper.or(own.position_upper.get(at).copied());
-    [lower.map_or(f64::NEG_INFINITY, |q| q + POSITION_MARGIN), upper.map_or(f64::INFINITY, |q| q - POSITION_MARGIN)]
-}
-
-fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Described, arms: &[Arm]) -> RobotConfig {
+fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Described) -> RobotConfig {
     let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
     let source = source(checker, typed);
     let ours = |model: &String| {
@@ -58,7 +46,6 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Describ
         let prefix = typed.joint_prefix.as_ref().map_or("", |prefix| prefix.as_str());
         mapped.map_or_else(|| format!("{prefix}{model}"), |(ours, _)| ours.value.clone())
     };
-    let coordinator_joints: Vec<String> = joints.iter().map(ours).collect();
     RobotConfig {
         name: typed.name.value.clone(),
         model_path: source.path,
@@ -70,8 +57,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Describ
         base_pose: pose(&typed.base_pose),
         base_link: typed.base_link.clone(),
         end_effector_link: typed.end_effector_link.value.clone(),
-        arm_range: coordinator_joints.iter().map(|name| range(arms, name)).collect(),
-        coordinator_joints,
+        coordinator_joints: joints.iter().map(ours).collect(),
         joints,
         task: typed.coordinator_task_name.as_ref().map(|name| name.value.clone()),
         exclusions: typed.collision_exclusion_pairs.clone(),
@@ -98,7 +84,7 @@ fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> Ob
 }
 
 /// A path as seen from the file that names it; from here, where that file is one of those in the box.
-fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
+pub(super) fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
     if path.starts_with(crate::robot::builtin::PREFIX) {
         return path.into();
     }

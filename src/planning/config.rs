@@ -46,9 +46,6 @@ pub struct RobotConfig {
     pub joints: Vec<String>,
     /// The coordinator's names of the same joints.
     pub coordinator_joints: Vec<String>,
-    /// Lowest and highest positions that the arm itself takes, in the same order [rad]; empty: any. Joints that turn
-    /// without end in the model turn that far.
-    pub arm_range: Vec<[f64; 2]>,
     /// The trajectory task that executes its motions.
     pub task: Option<String>,
     /// Pairs of links that may touch.
@@ -73,6 +70,17 @@ impl RobotConfig {
             ..Source::default()
         }
     }
+}
+
+/// How far and how fast those who execute a motion let one joint go.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JointBounds {
+    /// Lowest and highest position [rad].
+    pub position: [f64; 2],
+    /// Highest speed [rad/s].
+    pub velocity: f64,
+    /// Highest acceleration [rad/s²].
+    pub acceleration: f64,
 }
 
 /// An object in the world.
