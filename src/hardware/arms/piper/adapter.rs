@@ -245,9 +245,11 @@ impl ManipulatorAdapter for PiperAdapter {
             }
         }
         self.arm.may_move()?;
-        let speed = if self.mode == ControlMode::Position { self.percent(velocity) } else { 100 };
         let joints: WireJoints = positions.map(millidegrees);
-        self.arm.send(&protocol::joint_targets(speed, self.follow(), joints))
+        match self.mode {
+            ControlMode::ServoPosition => self.arm.stream(&protocol::joint_targets(100, self.follow(), joints)),
+            _ => self.arm.send(&protocol::joint_targets(self.percent(velocity), self.follow(), joints)),
+        }
     }
 
     /// Holds the arm where it is. Confirmed when its feedback shows that every joint gets slower or stands.

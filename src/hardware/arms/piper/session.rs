@@ -71,9 +71,14 @@ impl Session {
         result
     }
 
-    /// Sends a command.
+    /// Sends a command: an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
         self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
+    }
+
+    /// Sends a set point of a stream, which may get lost: the next one replaces it.
+    pub fn stream(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
+        self.wire.as_mut().ok_or(AdapterError::NotConnected)?.stream(frames)
     }
 
     /// Takes up feedback until `done` says so; `false` when the time is over.
@@ -231,12 +236,14 @@ impl Session {
         let switched = |p: &Picture| p.drivers_heard() && if on { p.enabled() } else { p.disabled() };
         let end = MonotonicClock.now().after(ENABLE_TIMEOUT);
         self.picture.expect_drivers();
+        let mut sent = Ok(());
         while MonotonicClock.now() < end {
-            self.send(&[protocol::enable(on)])?;
+            sent = self.send(&[protocol::enable(on)]);
             if self.watch(REPEAT, switched)? {
                 return Ok(());
             }
         }
+        sent?;
         let wrong = |(_, driver): &(usize, &protocol::Driver)| driver.enabled() != on;
         let joints: Vec<String> =
             (1..).zip(&self.picture.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();

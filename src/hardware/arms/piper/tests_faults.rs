@@ -188,9 +188,10 @@ fn f16_what_waits_when_the_power_goes_moves_nothing_when_it_returns() {
 }
 
 #[test]
-fn f17_full_queues_cost_commands_and_then_an_error() {
+fn f17_full_queues_cost_set_points_and_then_an_error() {
     let (emulator, mut arm) = connected();
     activate(&emulator, &mut arm);
+    arm.set_control_mode(ControlMode::ServoPosition).unwrap();
     emulator.inject(Fault::new(FaultKind::NoBuffers)).unwrap();
     until("one command less", || {
         arm.write_joint_positions(&START, 0.1).unwrap();
@@ -211,6 +212,67 @@ fn f17_full_queues_cost_commands_and_then_an_error() {
         read(&mut arm).unwrap();
         arm.write_joint_positions(&START, 0.1).is_ok()
     });
+}
+
+/// The bus has no room for the next so many commands, from now on.
+fn no_room(emulator: &PiperEmulator, commands: usize) {
+    emulator.inject(Fault::new(FaultKind::NoBuffers)).unwrap();
+    let mut other = other(emulator);
+    let mut left = 4; // of one strike
+    until("no room", || {
+        left -= usize::from(other.send(&[golden::frame(golden::ASK_FIRMWARE)]).unwrap() == 0);
+        left == commands
+    });
+}
+
+#[test]
+fn f17_a_stop_that_the_bus_does_not_take_is_no_stop() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+    no_room(&emulator, 1);
+    emulator.record();
+    let error = arm.write_stop().unwrap_err().to_string();
+    assert!(error.contains("its bus takes no frames"), "{error}");
+    assert_eq!((ids(&emulator), arm.is_connected()), (vec![], true));
+    arm.write_stop().unwrap();
+    until("the hold", || ids(&emulator) == [0x151, 0x155, 0x156, 0x157]);
+}
+
+#[test]
+fn f17_motors_do_not_come_on_when_the_hold_before_them_is_lost() {
+    let (emulator, mut arm) = connected();
+    no_room(&emulator, 1);
+    emulator.record();
+    let error = arm.write_enable(true).unwrap_err().to_string();
+    assert!(error.contains("its bus takes no frames"), "{error}");
+    assert_eq!((ids(&emulator), emulator.enabled()), (vec![], false));
+    activate(&emulator, &mut arm);
+    assert!(farthest(&emulator.joints().0, &START) < 1e-3);
+}
+
+#[test]
+fn f17_what_nothing_replaces_is_told_when_it_is_lost() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(7)).unwrap();
+    until("the collision", || {
+        read(&mut arm).unwrap();
+        arm.read_error().unwrap().0 == 7
+    });
+    no_room(&emulator, 1);
+    assert!(matches!(arm.write_clear_errors(), Err(AdapterError::Io(_))));
+    arm.write_clear_errors().unwrap();
+    let pose = arm.read_cartesian_position().unwrap().unwrap();
+    no_room(&emulator, 3);
+    assert!(arm.write_joint_positions(&START, 0.1).is_err(), "a planned move");
+    assert!(arm.write_cartesian_position(&pose, 0.1).is_err());
+    assert!(arm.write_gripper_position(0.01).is_err());
+    arm.write_gripper_position(0.01).unwrap();
+    // The command for the motors is repeated until they obey.
+    no_room(&emulator, 2);
+    arm.write_enable(false).unwrap();
+    assert!(!emulator.enabled());
 }
 
 #[test]
