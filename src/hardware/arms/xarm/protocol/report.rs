@@ -37,10 +37,11 @@ impl Kind {
         }
     }
 
-    /// Which lengths it can have: a newer firmware may add to it, an old one sends less.
+    /// Which lengths it can have, from the end of what is read of it: a newer firmware may add to it, an old one sends
+    /// less. Of the full report both 784 and 804 bytes are documented.
     fn fits(self, length: usize) -> bool {
         match self {
-            Self::Full => (804..=2048).contains(&length),
+            Self::Full => (736..=2048).contains(&length),
             Self::Real => (87..=512).contains(&length),
             Self::Normal => (133..=512).contains(&length),
         }

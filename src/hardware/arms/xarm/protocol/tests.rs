@@ -94,6 +94,17 @@ fn reports_are_read_from_the_golden_bytes() {
 }
 
 #[test]
+fn a_full_report_may_be_as_short_as_the_vendors_page_has_it() {
+    let short = golden::full_784();
+    let Scan::Take(784, (784, motion)) = report::scan(&short, Kind::Full, None, Motion::decode_full) else {
+        panic!("784 bytes are a report")
+    };
+    assert_eq!(Some(motion), Motion::decode_full(&golden::full()), "the last 20 bytes are not read");
+    let cut = [&735_u32.to_be_bytes()[..], &short[4..735]].concat();
+    assert_eq!(report::scan(&cut, Kind::Full, None, Motion::decode_full), Scan::Skip(1), "the wrench is missing");
+}
+
+#[test]
 fn damaged_reports_are_skipped_up_to_the_next() {
     let good = golden::full();
     let decode = Motion::decode_full;
