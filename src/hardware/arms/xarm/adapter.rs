@@ -307,7 +307,6 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        let used = self.options.force_torque;
-        Ok(self.recent()?.motion().0.wrench.filter(|_| used))
+        Ok(self.recent()?.wrench())
     }
 }

@@ -26,6 +26,8 @@ use crate::joint::JointLimits;
 /// A controller that lives reports 100 or 250 times a second: after so much silence, also on a connection that
 /// looks well, it is gone.
 pub const SILENCE: Duration = Duration::from_millis(500);
+/// Reports from before an answer may still be on the way for so long after it: two periods of the slower kind.
+const ON_THE_WAY: Duration = Duration::from_millis(20);
 /// How long one call may work on a change of mode. It goes on with the next call.
 const MODE_SLICE: Duration = Duration::from_millis(15);
 /// How long an activation may take for the motors, and for the mode.
@@ -86,6 +88,8 @@ pub struct Session {
     change: Option<ModeChange>,
     /// The mode that the last change did not reach, and why, until somebody hears of it.
     failed: Option<(u8, &'static str)>,
+    /// When the force/torque sensor was switched on: before that its place in the reports holds zeros.
+    wrench_since: Option<Mono>,
     updated: Mono,
 }
 
@@ -117,6 +121,7 @@ impl Session {
             halted: true,
             change: None,
             failed: None,
+            wrench_since: None,
             updated: arrived,
         }
     }
@@ -149,6 +154,12 @@ impl Session {
     /// What became of requests so far.
     pub fn counts(&self) -> Counts {
         self.control.counts()
+    }
+
+    /// Force and torque at the sensor [N, Nm], once that is switched on.
+    pub fn wrench(&self) -> Option<[f64; 6]> {
+        let measured = |since| self.fresh_at.since(since) > ON_THE_WAY;
+        self.motion.wrench.filter(|_| self.wrench_since.is_some_and(measured))
     }
 
     /// Whether all motors are on.
@@ -283,7 +294,8 @@ impl Session {
             self.enable(true)?;
         }
         if force_torque {
-            self.ask(&Command::EnableForceTorque(true))?;
+            let status = self.ask(&Command::EnableForceTorque(true))?.status;
+            self.wrench_since = (!status.error() && !status.invalid()).then(|| MonotonicClock.now());
         }
         self.control.take_refusal();
         self.begin_change(mode);

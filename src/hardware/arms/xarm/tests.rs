@@ -136,6 +136,20 @@ fn si_units_and_the_vendors_units() {
 }
 
 #[test]
+fn the_zeros_of_a_sensor_that_is_off_are_no_measurement() {
+    let (_emulator, mut arm) = pair(6, json!({"force_torque": true}));
+    arm.connect().unwrap();
+    assert_eq!(arm.read_force_torque(), Ok(None), "not switched on yet");
+    arm.activate().unwrap();
+    until("the sensor", || arm.read_force_torque().unwrap().is_some_and(|wrench| wrench[2] < -4.0));
+    arm.disconnect();
+    arm.connect().unwrap();
+    assert_eq!(arm.read_force_torque(), Ok(None), "another controller may have lost its power meanwhile");
+    let (_emulator, mut arm) = ready(json!({}), ControlMode::Position);
+    assert_eq!(arm.read_force_torque(), Ok(None), "not asked for");
+}
+
+#[test]
 fn starting_and_stopping_asks_for_no_motion() {
     let (emulator, mut arm) = pair(6, json!({"gripper": "xarm"}));
     emulator.record();
