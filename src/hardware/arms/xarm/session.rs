@@ -28,6 +28,8 @@ use crate::joint::JointLimits;
 pub const SILENCE: Duration = Duration::from_millis(500);
 /// Reports from before an answer may still be on the way for so long after it: two periods of the slower kind.
 const ON_THE_WAY: Duration = Duration::from_millis(20);
+/// Which motors are on is told five times a second, and by nothing else: after so much silence that is not known.
+const CONDITION_SILENCE: Duration = Duration::from_millis(1000);
 /// How long one call may work on a change of mode. It goes on with the next call.
 const MODE_SLICE: Duration = Duration::from_millis(15);
 /// How long an activation may take for the motors, and for the mode.
@@ -186,6 +188,9 @@ impl Session {
         if MonotonicClock.now().since(self.fresh_at) > SILENCE {
             return Err(AdapterError::Io(format!("{} sent nothing new for {SILENCE:?}", self.reports.peer())));
         }
+        if MonotonicClock.now().since(self.normal.arrived) > CONDITION_SILENCE {
+            return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_SILENCE:?}", self.normal.peer())));
+        }
         self.advance_change()?;
         if let Some(question) = self.known.condition.due(now, self.control.last_sent()) {
             self.control.post(&question, Purpose::Health)?;
@@ -312,6 +317,8 @@ impl Session {
         self.update(Duration::ZERO)?;
         self.fault()?;
         if self.change.is_none() {
+            // A change that came to nothing between two calls has stopped the arm: first why, then that.
+            self.reached()?;
             let _ = self.heed_refusal(); // of a set point; but it may tell that the arm was stopped
             self.may_be_commanded()?;
         }
@@ -345,10 +352,13 @@ impl Session {
             self.update(Duration::ZERO)?;
         }
         self.fault()?;
-        match self.failed.take() {
-            None => Ok(true),
-            Some((mode, why)) => Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}"))),
-        }
+        self.reached().map(|()| true)
+    }
+
+    /// An error, told once, when the last change did not reach its mode.
+    fn reached(&mut self) -> AdapterResult<()> {
+        let Some((mode, why)) = self.failed.take() else { return Ok(()) };
+        Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}")))
     }
 
     /// Goes on with the change of mode, as far as the newest report allows.

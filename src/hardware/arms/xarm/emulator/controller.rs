@@ -113,6 +113,10 @@ pub struct Controller {
     pub(super) current: Option<Move>,
     pub(super) velocity_until: Option<Mono>,
     pub(super) settings: Settings,
+    /// It answers to a change of mode, and stays in the mode that it is in.
+    pub keeps_mode: bool,
+    /// It sends no reports of how it is; all others go on.
+    pub condition_muted: bool,
     estop_open: bool,
     estop_until: Option<Mono>,
     pub(super) script: FaultScript,
@@ -159,6 +163,8 @@ impl Controller {
             current: None,
             velocity_until: None,
             settings: Settings { sensitivity: [3, 3], ..Settings::default() },
+            keeps_mode: false,
+            condition_muted: false,
             estop_open: false,
             estop_until: None,
             script: FaultScript::new(&options.faults),

@@ -276,6 +276,9 @@ impl Floor {
             let period = Duration::from_micros(reader.kind.period_us());
             reader.due = if now > reader.due + period { now + period } else { reader.due + period };
             let mut controller = lock(&shared.controller);
+            if reader.kind == Kind::Normal && controller.condition_muted {
+                return true;
+            }
             let mono = MonotonicClock.now();
             let snapshot = controller.snapshot(mono);
             // Damage strikes where it matters: at the reports with the joints.
