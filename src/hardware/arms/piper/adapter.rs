@@ -58,11 +58,9 @@ impl PiperAdapter {
             return Err(rejected(format!("piper has {DOF} joints, not {}", config.dof)));
         }
         let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
-        Ok(Self {
-            arm: Session::new(config.hardware_id.clone(), address),
-            options: config.options()?,
-            mode: ControlMode::Position,
-        })
+        let options: Options = config.options()?;
+        let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
+        Ok(Self { arm, options, mode: ControlMode::Position })
     }
 
     /// What was counted since the connection was made: frames of the arm, and of the bus.
@@ -85,6 +83,11 @@ impl PiperAdapter {
     /// Makes the place where the arm is its target.
     fn hold(&mut self) -> AdapterResult<()> {
         self.arm.send(&protocol::joint_targets(100, self.follow(), self.arm.picture.joints))
+    }
+
+    /// With how much torque the gripper closes at most [mNm].
+    fn gripper_torque(&self) -> u16 {
+        (self.options.gripper_torque / MILLI).round() as u16
     }
 
     fn velocities(&self) -> Joints {
@@ -288,6 +291,10 @@ impl ManipulatorAdapter for PiperAdapter {
             return self.arm.in_order();
         }
         self.arm.send(&[protocol::clear_errors()])?;
+        if let Some(gripper) = self.arm.picture.gripper.filter(|_| self.arm.picture.gripper_errors().next().is_some()) {
+            let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
+            self.arm.send(&[frame])?;
+        }
         self.arm.picture.expect_drivers();
         let asked = MonotonicClock.now();
         let cleared = |p: &Picture| p.drivers_heard() && p.status_at > asked && p.error_code() == 0;
@@ -335,7 +342,6 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(self.arm.refuse(format!("gripper opening {position} m is not within 0 to {stroke} m")));
         }
         self.arm.may_move()?;
-        let torque = (self.options.gripper_torque / MILLI).round() as u16;
-        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, torque)])
+        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque())])
     }
 }

@@ -26,6 +26,8 @@ pub const MOVE_POSE: [&str; 4] =
     ["151#0100320000000000", "152#0000DB40FFFCF2C0", "153#00034112FFFD40E0", "154#00014C08000001F4"];
 /// Gripper to 42.5 mm with 1 Nm, enabled.
 pub const GRIPPER: &str = "159#0000A60403E80100";
+/// The same, which clears its errors; and to 0, off.
+pub const CLEAR_GRIPPER: [&str; 2] = ["159#0000A60403E80300", "159#0000000003E80200"];
 /// All motors on, and off.
 pub const ENABLE: &str = "471#0702000000000000";
 pub const DISABLE: &str = "471#0701000000000000";

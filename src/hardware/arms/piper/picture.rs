@@ -5,7 +5,9 @@
 
 use std::time::Duration;
 
-use super::protocol::{DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text};
+use super::protocol::{
+    DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
+};
 use crate::clock::Mono;
 
 /// Frames of one burst arrive within less than a period of the arm.
@@ -77,6 +79,8 @@ pub struct Picture {
     pub drivers: [Driver; DOF],
     /// The gripper, once it was heard of.
     pub gripper: Option<Gripper>,
+    /// Whether the gripper is used: only then its errors are errors.
+    pub gripper_used: bool,
     /// The limits that the controller was asked for.
     pub limits: [Option<MotorLimits>; DOF],
     /// When somebody else last sent a command to an arm on this bus.
@@ -103,6 +107,7 @@ impl Default for Picture {
             motors: Default::default(),
             drivers: Default::default(),
             gripper: None,
+            gripper_used: false,
             limits: [None; DOF],
             commanded_at: Mono::ZERO,
             counts: Counts::default(),
@@ -117,6 +122,11 @@ impl Default for Picture {
 }
 
 impl Picture {
+    /// Nothing known yet, of an arm whose gripper is used or not.
+    pub fn of_arm(gripper_used: bool) -> Self {
+        Self { gripper_used, ..Self::default() }
+    }
+
     /// Adds what a frame says that arrived at `now`.
     pub fn take(&mut self, feedback: Feedback, now: Mono) {
         match feedback {
@@ -207,7 +217,7 @@ impl Picture {
     // --- Errors ---
 
     /// The first error, by weight: 1–15 and above a state of the arm, 201–206 a joint that does not answer, 101–106 a
-    /// joint beyond its limits, 3jb bit b of the driver of joint j; 0 = none.
+    /// joint beyond its limits, 3jb bit b of the driver of joint j, 40b bit b of the gripper; 0 = none.
     pub fn error_code(&self) -> i32 {
         let bit = |bits: u8| bits.trailing_zeros() as i32 + 1;
         let Status { arm, limits, silent, .. } = self.status;
@@ -220,7 +230,8 @@ impl Picture {
         if limits != 0 {
             return 100 + bit(limits);
         }
-        self.driver_errors().next().map_or(0, |(joint, bit, _)| 300 + 10 * joint as i32 + i32::from(bit))
+        let driver = self.driver_errors().map(|(joint, bit, _)| 300 + 10 * joint as i32 + i32::from(bit)).next();
+        driver.or_else(|| self.gripper_errors().next().map(|(bit, _)| 400 + i32::from(bit))).unwrap_or(0)
     }
 
     /// All that is wrong, in words; empty when nothing is.
@@ -250,6 +261,7 @@ impl Picture {
                 _ => format!("joint {joint}: {what}"),
             }
         }));
+        parts.extend(self.gripper_errors().map(|(_, what)| format!("gripper: {what}")));
         parts.join("; ")
     }
 
@@ -259,6 +271,12 @@ impl Picture {
             let errors = (0..8).filter(|bit| driver.status & (1 << bit) != 0 && driver_text(*bit).is_some());
             errors.map(move |bit| (i + 1, bit, driver))
         })
+    }
+
+    /// Bit and words of every error that the gripper reports, where it is used.
+    pub fn gripper_errors(&self) -> impl Iterator<Item = (u8, &'static str)> {
+        let status = self.gripper.filter(|_| self.gripper_used).map_or(0, |gripper| gripper.status);
+        (0..8).filter(move |bit| status & (1 << bit) != 0).filter_map(|bit| Some((bit, gripper_text(bit)?)))
     }
 }
 
@@ -323,6 +341,16 @@ mod tests {
         assert_eq!((picture.error_code(), picture.error_text()), (9, text.into()));
         picture.take(Feedback::Status(Status { arm: 12, ..Status::default() }), ms(0));
         assert_eq!(picture.error_code(), 331, "being taught is no error");
+        let closed_too_hard = Gripper { status: 0xC0 | 0b100100, ..Gripper::default() };
+        let mut picture = Picture::default();
+        picture.take(Feedback::Gripper(closed_too_hard), ms(0));
+        assert_eq!((picture.error_code(), picture.error_text()), (0, String::new()), "of no interest");
+        picture.gripper_used = true;
+        let text = "gripper: overcurrent; gripper: driver error";
+        assert_eq!((picture.error_code(), picture.error_text()), (402, text.into()));
+        picture.take(Feedback::Driver(2, hot), ms(0));
+        let text = "joint 3: motor too hot (84 °C); gripper: overcurrent; gripper: driver error";
+        assert_eq!((picture.error_code(), picture.error_text()), (331, text.into()));
     }
 
     #[test]

@@ -43,13 +43,13 @@ pub struct Session {
 
 impl Session {
     /// A session with the arm on the bus at `address`. Does not connect.
-    pub fn new(hardware_id: String, address: CanAddress) -> Self {
-        Self { hardware_id, address, wire: None, picture: Picture::default(), drained_at: Mono::ZERO }
+    pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
+        Self { hardware_id, address, wire: None, picture: Picture::of_arm(gripper_used), drained_at: Mono::ZERO }
     }
 
     /// Opens the port and waits for a whole state. Only asks.
     pub fn connect(&mut self) -> AdapterResult<()> {
-        self.picture = Picture::default();
+        self.picture = Picture::of_arm(self.picture.gripper_used);
         self.wire = Some(Wire::open(&self.address)?);
         let introduced = self.introduce();
         if introduced.is_err() {

@@ -326,6 +326,47 @@ fn f19_faults_have_code_and_text_and_are_cleared_without_a_fall() {
 }
 
 #[test]
+fn f19_faults_of_the_gripper_are_told_and_cleared_where_it_is_used() {
+    let (emulator, mut arm) = connected();
+    for on in [false, true] {
+        if on {
+            activate(&emulator, &mut arm);
+            arm.write_gripper_position(0.03).unwrap();
+            until("the gripper", || {
+                read(&mut arm).unwrap();
+                arm.read_gripper_position().unwrap().unwrap() == 0.03
+            });
+        }
+        let opening = arm.read_gripper_position().unwrap().unwrap();
+        emulator.inject(Fault::new(FaultKind::ErrorCode).code(402)).unwrap();
+        until("overcurrent", || {
+            read(&mut arm).unwrap();
+            arm.read_error() == Ok((402, "gripper: overcurrent".into()))
+        });
+        assert!(matches!(arm.write_gripper_position(0.05), Err(AdapterError::Fault { code: 402, .. })));
+        emulator.record();
+        arm.write_clear_errors().unwrap();
+        assert_eq!(arm.read_error(), Ok((0, String::new())));
+        let frames: Vec<CanFrame> = emulator.trace().iter().map(|(_, f)| *f).collect();
+        assert_eq!(frames[0], golden::frame(golden::CLEAR));
+        let stroke = (opening * 1e6).round() as i32;
+        assert_eq!((two(&frames[1])[0], frames[1].data[6], frames.len()), (stroke, if on { 3 } else { 2 }, 2));
+    }
+    arm.write_gripper_position(0.05).unwrap();
+    let (emulator, mut arm) = pair(serde_json::json!({}));
+    drop(arm);
+    let without = config(&emulator.address(), serde_json::json!({ "gripper": "none" }));
+    arm = PiperAdapter::new(&without).unwrap();
+    arm.connect().unwrap();
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(402)).unwrap();
+    let end = Instant::now() + Duration::from_millis(200);
+    while Instant::now() < end {
+        read(&mut arm).unwrap();
+        assert_eq!(arm.read_error(), Ok((0, String::new())), "nobody uses it");
+    }
+}
+
+#[test]
 fn modes_that_are_not_emulated_are_said_so() {
     for frame in ["151#010400AD00000000", "151#0105320000000000", "151#0102320000000000", "15A#0000000000000000"] {
         let (emulator, mut arm) = connected();
