@@ -90,12 +90,18 @@ impl PiperAdapter {
         (self.options.gripper_torque / MILLI).round() as u16
     }
 
-    fn velocities(&self) -> Joints {
-        joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI))
+    /// Velocities [rad/s]; `None` when a motor has not told its own lately.
+    fn velocities(&self) -> Option<Joints> {
+        let known = self.arm.measures();
+        known.then(|| joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI)))
     }
 
-    /// Torques [Nm]; `None` when the firmware, which says how to read the currents, is not known.
+    /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which says
+    /// how to read the currents.
     fn efforts(&self) -> Option<Joints> {
+        if !self.arm.measures() {
+            return None;
+        }
         let quarter = self.arm.picture.firmware()? <= QUARTER_CURRENT;
         let mut efforts = [0.0; DOF];
         let motors = self.arm.picture.motors.iter().zip(TORQUE).enumerate();
@@ -190,15 +196,16 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
-        self.arm.refresh()?;
+        self.arm.whole()?;
         fill(positions, &self.arm.picture.joints.map(radians));
         Ok(())
     }
 
     fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
         self.arm.known()?;
-        fill(velocities, &self.velocities());
-        Ok(true)
+        let known = self.velocities();
+        known.iter().for_each(|known| fill(velocities, known));
+        Ok(known.is_some())
     }
 
     fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
@@ -209,11 +216,11 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
-        self.arm.refresh()?;
+        self.arm.whole()?;
         *reading = JointReading {
             stamp: Some(self.arm.picture.joints_at),
             position: joints_of(&self.arm.picture.joints.map(radians)),
-            velocity: Some(self.velocities()),
+            velocity: self.velocities(),
             effort: self.efforts(),
         };
         Ok(())
@@ -262,10 +269,11 @@ impl ManipulatorAdapter for PiperAdapter {
         if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
             self.hold()?;
         }
-        let sent = self.arm.picture.joints_at;
+        let sent = MonotonicClock.now();
         let slower = |picture: &Picture| {
             let speeds = picture.motors.iter().map(|motor| i32::from(motor.speed).abs());
-            picture.joints_at > sent && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
+            picture.motors_heard(sent)
+                && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
         };
         Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
     }
@@ -295,9 +303,8 @@ impl ManipulatorAdapter for PiperAdapter {
             let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
             self.arm.send(&[frame])?;
         }
-        self.arm.picture.expect_drivers();
         let asked = MonotonicClock.now();
-        let cleared = |p: &Picture| p.drivers_heard() && p.status_at > asked && p.error_code() == 0;
+        let cleared = |p: &Picture| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
         if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
             return Ok(());
         }

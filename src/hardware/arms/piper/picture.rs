@@ -16,8 +16,6 @@ const BURST: Duration = Duration::from_millis(4);
 const FAR: u32 = 360_000;
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
-/// All joints, as bits.
-const ALL: u8 = 0x3F;
 /// Room for the text of the firmware.
 const TEXT: usize = 128;
 
@@ -75,8 +73,12 @@ pub struct Picture {
     pub status_at: Mono,
     /// Speeds and currents.
     pub motors: [Motor; DOF],
+    /// When each of `motors` arrived.
+    motors_at: [Mono; DOF],
     /// Voltages, temperatures, errors.
     pub drivers: [Driver; DOF],
+    /// When each of `drivers` arrived.
+    drivers_at: [Mono; DOF],
     /// The gripper, once it was heard of.
     pub gripper: Option<Gripper>,
     /// Whether the gripper is used: only then its errors are errors.
@@ -87,9 +89,6 @@ pub struct Picture {
     pub commanded_at: Mono,
     /// What was counted.
     pub counts: Counts,
-    /// Of which motors and drivers there was news, as bits: ever, and since [`Picture::expect_drivers`].
-    motors_seen: u8,
-    drivers_seen: u8,
     joint_parts: Triple,
     pose_parts: Triple,
     text: [u8; TEXT],
@@ -105,14 +104,14 @@ impl Default for Picture {
             status: Status::default(),
             status_at: Mono::ZERO,
             motors: Default::default(),
+            motors_at: [Mono::ZERO; DOF],
             drivers: Default::default(),
+            drivers_at: [Mono::ZERO; DOF],
             gripper: None,
             gripper_used: false,
             limits: [None; DOF],
             commanded_at: Mono::ZERO,
             counts: Counts::default(),
-            motors_seen: 0,
-            drivers_seen: 0,
             joint_parts: Triple::default(),
             pose_parts: Triple::default(),
             text: [0; TEXT],
@@ -148,12 +147,14 @@ impl Picture {
             Feedback::Status(status) => (self.status, self.status_at) = (status, now),
             Feedback::Gripper(gripper) => self.gripper = Some(gripper),
             Feedback::Motor(joint, motor) => {
-                self.motors.get_mut(joint).into_iter().for_each(|to| *to = motor);
-                self.motors_seen |= 1 << joint;
+                if let (Some(to), Some(at)) = (self.motors.get_mut(joint), self.motors_at.get_mut(joint)) {
+                    (*to, *at) = (motor, now);
+                }
             }
             Feedback::Driver(joint, driver) => {
-                self.drivers.get_mut(joint).into_iter().for_each(|to| *to = driver);
-                self.drivers_seen |= 1 << joint;
+                if let (Some(to), Some(at)) = (self.drivers.get_mut(joint), self.drivers_at.get_mut(joint)) {
+                    (*to, *at) = (driver, now);
+                }
             }
             Feedback::Limits(joint, limits) => {
                 self.limits.get_mut(joint).into_iter().for_each(|to| *to = Some(limits));
@@ -181,8 +182,24 @@ impl Picture {
 
     /// Whether everything was heard of that the reads need.
     pub fn complete(&self) -> bool {
-        let heard = [self.joints_at, self.status_at].iter().all(|at| *at != Mono::ZERO);
-        heard && self.motors_seen == ALL && self.drivers_seen == ALL
+        let others = self.motors_at.iter().chain(&self.drivers_at);
+        [self.joints_at, self.status_at].iter().chain(others).all(|at| *at != Mono::ZERO)
+    }
+
+    /// Whether every motor was heard of after this time.
+    pub fn motors_heard(&self, after: Mono) -> bool {
+        self.motors_at.iter().all(|at| *at > after)
+    }
+
+    /// Whether every driver was heard of after this time.
+    pub fn drivers_heard(&self, after: Mono) -> bool {
+        self.drivers_at.iter().all(|at| *at > after)
+    }
+
+    /// The joints, counted from 1, whose drivers were not heard of after this time: `2, 5`.
+    pub fn silent_drivers(&self, after: Mono) -> String {
+        let silent = (1..).zip(&self.drivers_at).filter(|(_, at)| **at <= after);
+        silent.map(|(joint, _): (u32, _)| joint.to_string()).collect::<Vec<_>>().join(", ")
     }
 
     /// Whether every motor is on.
@@ -193,16 +210,6 @@ impl Picture {
     /// Whether every motor is off.
     pub fn disabled(&self) -> bool {
         !self.drivers.iter().any(Driver::enabled)
-    }
-
-    /// Forgets which drivers were heard of, to hear of each of them anew.
-    pub fn expect_drivers(&mut self) {
-        self.drivers_seen = 0;
-    }
-
-    /// Whether all drivers were heard of since [`Picture::expect_drivers`].
-    pub fn drivers_heard(&self) -> bool {
-        self.drivers_seen == ALL
     }
 
     /// The firmware as (1, 6, 3) for `S-V1.6-3`, once the controller has said it.

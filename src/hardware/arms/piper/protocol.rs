@@ -104,10 +104,6 @@ pub struct Status {
     pub control: u8,
     /// The arm's state; 0 = in order.
     pub arm: u8,
-    /// The move mode in use.
-    pub move_mode: u8,
-    /// Whether the arm is on its way to a target.
-    pub moving: bool,
     /// Joints beyond their limits: bit 0 = joint 1.
     pub limits: u8,
     /// Joints that do not answer: bit 0 = joint 1.
@@ -134,8 +130,6 @@ pub struct Driver {
     pub motor_temperature: i8,
     /// Bits: 0 low voltage, 1 motor hot, 2 overcurrent, 3 driver hot, 4 collision, 5 driver error, 6 enabled, 7 stall.
     pub status: u8,
-    /// From the supply [mA].
-    pub bus_current: u16,
 }
 
 impl Driver {
@@ -212,14 +206,7 @@ pub fn decode(frame: &CanFrame) -> Feedback {
     let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
     let from = |first: u16| usize::from(id.wrapping_sub(first));
     let feedback = match id {
-        0x2A1 => Feedback::Status(Status {
-            control: a,
-            arm: b,
-            move_mode: c,
-            moving: e != 0,
-            limits: g & 0x3F,
-            silent: h & 0x3F,
-        }),
+        0x2A1 => Feedback::Status(Status { control: a, arm: b, limits: g & 0x3F, silent: h & 0x3F }),
         0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
         0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
         0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], status: g }),
@@ -233,7 +220,6 @@ pub fn decode(frame: &CanFrame) -> Feedback {
                 driver_temperature: i16::from_be_bytes([c, d]),
                 motor_temperature: i8::from_be_bytes([e]),
                 status: f,
-                bus_current: u16::from_be_bytes([g, h]),
             };
             Feedback::Driver(from(0x261), driver)
         }

@@ -20,7 +20,7 @@ fn commands_are_the_golden_bytes() {
 #[test]
 fn feedback_is_read_from_the_golden_bytes() {
     let read = |text| decode(&frame(text));
-    let status = Status { control: 1, arm: 4, move_mode: 1, moving: true, limits: 0b10, silent: 0b100000 };
+    let status = Status { control: 1, arm: 4, limits: 0b10, silent: 0b100000 };
     assert_eq!(read(golden::STATUS), Feedback::Status(status));
     for part in 0..3 {
         let two = |all: [i32; 6]| [all[2 * part], all[2 * part + 1]];
@@ -31,8 +31,7 @@ fn feedback_is_read_from_the_golden_bytes() {
     assert_eq!(read(golden::GRIPPER_FEEDBACK), Feedback::Gripper(gripper));
     assert_eq!(read(golden::MOTOR_1), Feedback::Motor(0, Motor { speed: -1500, current: 2000 }));
     assert_eq!(read(golden::MOTOR_6), Feedback::Motor(5, Motor { speed: 1, current: -1 }));
-    let driver =
-        Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0, bus_current: 1500 };
+    let driver = Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0 };
     assert_eq!(read(golden::DRIVER_3), Feedback::Driver(2, driver));
     assert!(driver.enabled());
     assert_eq!(read(golden::LIMITS_3), Feedback::Limits(2, MotorLimits { upper: 0, lower: -1700, speed: 3000 }));

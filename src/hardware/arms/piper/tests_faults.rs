@@ -5,8 +5,10 @@ use std::time::{Duration, Instant};
 use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::golden;
+use super::picture::Picture;
 use super::protocol::{DOF, decode};
 use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
+use crate::clock::Mono;
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{AdapterError, ManipulatorAdapter, Stop};
@@ -60,6 +62,41 @@ fn f05_silence_is_noticed_by_the_age_of_the_state() {
     let error = arm.connect().unwrap_err().to_string();
     assert!(error.contains("nothing was heard") && error.contains("\nhint: is the arm powered"), "{error}");
     assert!(start.elapsed() < Duration::from_secs(3));
+}
+
+#[test]
+fn f05_speeds_that_are_old_are_not_told() {
+    let (emulator, mut arm) = connected();
+    assert!(read(&mut arm).unwrap().velocity.is_some());
+    emulator.mute(Some(0x252..=0x252));
+    until("the silence of motor 2", || read(&mut arm).unwrap().velocity.is_none());
+    assert!(read(&mut arm).unwrap().effort.is_none());
+    let mut values = [7.0; DOF];
+    assert_eq!((arm.read_joint_velocities(&mut values), values), (Ok(false), [7.0; DOF]));
+    assert_eq!((arm.read_joint_efforts(&mut values), values), (Ok(false), [7.0; DOF]));
+    assert_eq!(arm.write_stop(), Ok(Stop::Sent), "nothing shows that motor 2 stands");
+    emulator.mute(None);
+    until("news of it", || read(&mut arm).unwrap().velocity.is_some());
+    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+}
+
+#[test]
+fn f05_drivers_that_fall_silent_are_named_and_the_arm_can_still_be_stopped() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.mute(Some(0x263..=0x264));
+    let error = failure(&mut arm);
+    let AdapterError::Timeout(text) = &error else { panic!("{error:?}") };
+    assert!(text.ends_with("the drivers of joints 3, 4 have said nothing for 300 ms"), "{text}");
+    assert_eq!(arm.write_joint_positions(&START, 0.1), Err(error), "whether its motors are on is not known");
+    emulator.record();
+    assert!(arm.write_stop().is_ok() && arm.is_connected());
+    until("the hold", || ids(&emulator) == [0x151, 0x155, 0x156, 0x157]);
+    let off = arm.write_enable(false).unwrap_err().to_string();
+    assert_eq!(off, "arm: the drivers of joints 3, 4 have said nothing for 1000 ms");
+    emulator.mute(None);
+    until("all of them", || read(&mut arm).is_ok());
+    assert_eq!(arm.read_enabled(), Ok(false));
 }
 
 #[test]
@@ -296,14 +333,23 @@ fn f18_noise_and_short_frames_cost_nothing_but_readings() {
             arm.counts().0.damaged > before
         });
     }
-    // Random frames: nothing panics, and no pose is made of them.
+    // Random frames at the arm's rate: nothing panics, and neither joints nor a pose are made of them.
+    let mut picture = Picture::default();
     let mut seed = 0x2545_F491_4F6C_DD1D_u64;
-    for _ in 0..200_000 {
+    let mut take = |n: u64, id: Option<u16>| {
         seed ^= seed << 13;
         seed ^= seed >> 7;
         seed ^= seed << 17;
-        let _ = decode(&CanFrame { id: (seed >> 48) as u16 & 0x7FF, len: seed as u8 % 10, data: seed.to_le_bytes() });
-    }
+        let (id, len) = id.map_or(((seed >> 48) as u16 & 0x7FF, seed as u8 % 10), |id| (id, 8));
+        picture.take(decode(&CanFrame { id, len, data: seed.to_le_bytes() }), Mono(330_000 * (n + 1)));
+        (picture.joints_at, picture.counts.sets, picture.pose, picture.counts.damaged)
+    };
+    let random = (0..200_000).fold(Default::default(), |_, n| take(n, None));
+    assert_eq!((random.0, random.1, random.2), (Mono::ZERO, 0, None));
+    assert!(random.3 > 1_000, "some were as good as the arm's");
+    // Not even where they come in the order of joint positions.
+    let ordered = (200_001..260_001).fold(random, |_, n| take(n, Some(0x2A5 + (n % 3) as u16)));
+    assert_eq!((ordered.0, ordered.1, ordered.3 - random.3), (Mono::ZERO, 0, 20_000), "60 000 frames, 20 000 sets");
 }
 
 #[test]

@@ -5,6 +5,7 @@
 //! motors were off is where it goes when they come on; every reset takes the power away.
 
 use std::f64::consts::TAU;
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::super::{GripperKind, RANGES, SPEED, limits, protocol::DOF};
@@ -85,6 +86,8 @@ pub struct Controller {
     trace: Option<Vec<(Mono, CanFrame)>>,
     /// How often the motors lost their power under a reset.
     pub power_drops: u64,
+    /// Frames that it does not send.
+    pub muted: Option<RangeInclusive<u16>>,
 }
 
 impl Controller {
@@ -123,6 +126,7 @@ impl Controller {
             advanced_to: now,
             trace: None,
             power_drops: 0,
+            muted: None,
         }
     }
 
@@ -461,6 +465,9 @@ impl Controller {
             for (joint, on) in (1..).zip(self.motors) {
                 out.push(wire::driver(joint, 240, [35, 30], if on { 0x40 } else { 0 }, if on { 400 } else { 20 }));
             }
+        }
+        if let Some(muted) = &self.muted {
+            out.retain(|frame| !muted.contains(&frame.id));
         }
     }
 
