@@ -20,7 +20,7 @@ use crate::joint::{JointLimits, Joints};
 
 /// How far joints are behind their set points [s].
 const LAG: f64 = 0.01;
-/// Acceleration and jerk of the emulated joints [rad/s²]: a real arm does less than its limit.
+/// Acceleration of the emulated joints [rad/s²]: a real arm does less than its limit.
 const ACCELERATION: f64 = 12.0;
 /// Longest stretch that is advanced at once [s], so that queued moves follow one another.
 const SLICE: f64 = 0.02;

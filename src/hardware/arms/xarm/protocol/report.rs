@@ -57,8 +57,6 @@ pub struct Motion {
     pub state: u8,
     /// The mode.
     pub mode: u8,
-    /// Moves that wait in the queue.
-    pub queued: u16,
     /// Joint positions [rad].
     pub position: [f64; 7],
     /// Joint velocities [rad/s], where it tells.
@@ -74,12 +72,11 @@ pub struct Motion {
 impl Motion {
     /// Decodes a report of port 30000.
     pub fn decode_full(packet: &[u8]) -> Option<Self> {
-        let [state_mode, queue_high, queue_low] = take::bytes(packet, 12)?;
+        let [state_mode] = take::bytes(packet, 12)?;
         let motion = Self {
             time_us: Some(u64::from_be_bytes(take::bytes(packet, 4)?)),
             state: state_mode & 0x0F,
             mode: state_mode >> 4,
-            queued: u16::from_be_bytes([queue_high, queue_low]),
             position: take::floats(packet, 116)?,
             velocity: Some(take::floats(packet, 144)?),
             torque: take::floats(packet, 228)?,
@@ -91,12 +88,11 @@ impl Motion {
 
     /// Decodes a report of port 30003.
     pub fn decode_real(packet: &[u8]) -> Option<Self> {
-        let [state_mode, queue_high, queue_low] = take::bytes(packet, 4)?;
+        let [state_mode] = take::bytes(packet, 4)?;
         let motion = Self {
             time_us: None,
             state: state_mode & 0x0F,
             mode: state_mode >> 4,
-            queued: u16::from_be_bytes([queue_high, queue_low]),
             position: take::floats(packet, 7)?,
             velocity: None,
             torque: take::floats(packet, 59)?,
