@@ -77,7 +77,7 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-fn index(robot: &RobotModel, name: &str) -> Result<usize> {
+pub(super) fn index(robot: &RobotModel, name: &str) -> Result<usize> {
     robot.link_index(name).ok_or_else(|| {
         let hint = did_you_mean(name, robot.links.iter().map(|l| l.name.as_str()), "the links are");
         Failure { hint, ..Failure::usage(format!("{} has no link `{name}`", robot.name)) }
@@ -85,7 +85,7 @@ fn index(robot: &RobotModel, name: &str) -> Result<usize> {
 }
 
 /// The first link that most joints lead to.
-fn deepest(robot: &RobotModel) -> usize {
+pub(super) fn deepest(robot: &RobotModel) -> usize {
     let mut depths = vec![0; robot.links.len()];
     for joint in &robot.joints {
         depths[joint.child] = depths[joint.parent] + 1;
