@@ -1,7 +1,6 @@
 """Serves a Python arm adapter, one with the guide's methods, to dimos (`adapter_type: remote`; docs/remote-adapter.md):
-    python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock
-"""
-import argparse, enum, importlib, json, os, select, signal, socket, sys, time, types
+    python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock"""
+import argparse, enum, importlib, json, math, os, select, signal, socket, sys, time, types
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after so long without a request [s]; bytes of a line
 FEEDBACK, EXTRAS = ["read_joint_velocities", "read_joint_efforts"], ["modes", "gripper_range", "holds_when_disabled"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",
@@ -9,8 +8,7 @@ READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_g
 INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these
 DISABLED = "it was stopped by itself or is not enabled: enable it first"
 
-def control_modes():
-    """The ControlMode of dimos; where that is not installed, an object stands in for what adapters import from it."""
+def control_modes():  # that of dimos; where it is not installed, an object stands in for what adapters import from it
     name, bag = "dimos.hardware.manipulators", types.SimpleNamespace
     try:
         return importlib.import_module(name + ".spec").ControlMode
@@ -32,8 +30,14 @@ class Arm:  # the adapter, called from one thread only
     def lost(self):
         return hasattr(self.adapter, "is_connected") and not self.adapter.is_connected()
     def read(self, *names):  # feedback of nothing but zeros since the start is the guide's word for "not measured"
-        self.state.update((name, getattr(self.adapter, name)()) for name in names if hasattr(self.adapter, name))
-        self.measured.update(name for name in FEEDBACK if any(self.state.get(name) or []))
+        for name, answer in [(name, getattr(self.adapter, name)()) for name in names if hasattr(self.adapter, name)]:
+            if name.startswith("read_joint_") and answer is not None:
+                odd = [f"{value} for joint {i}" for i, value in enumerate(answer, 1) if not math.isfinite(value)]
+                odd += [f"{len(answer)} values for {self.dof} joints"] * (len(answer) != self.dof)
+                if odd:
+                    raise ValueError(f"{name}() answers {odd[0]}")
+                self.measured.update([name] * any(answer))
+            self.state[name] = answer
     def call(self, name, *args):
         name, args = (name, args) if hasattr(self.adapter, name) else INSTEAD.get(name, (name, args))
         answer = getattr(self.adapter, name)(*args)
@@ -43,8 +47,7 @@ class Arm:  # the adapter, called from one thread only
             raise RuntimeError(f"{name}() said no" + (f" (error {code}: {text})" if code else ""))
     def hello(self, **_):
         self.held = True
-        if self.lost():
-            self.call("connect")
+        self.lost() and self.call("connect")
         return {"version": 1, "dof": self.dof, "native_rate": self.hz, "info": vars(self.adapter.get_info()),
                 "limits": vars(self.adapter.get_limits()), "parts": [k for k, v in self.state.items() if v is not None],
                 **{k: getattr(self.adapter, k, None) for k in EXTRAS}}
@@ -53,10 +56,8 @@ class Arm:  # the adapter, called from one thread only
             raise RuntimeError(DISABLED if "position" in do else f"{do} is not for clients")
         self.commanded |= do == "write_cartesian_position"
         self.call(do, *([self.modes[args[0].upper()]] if do == "set_control_mode" else args))
-        if do in ("activate", "write_enable"):
-            self.held = not (do == "activate" or args[0])
-        self.commanded &= do not in ("write_stop", "deactivate") and not self.held
-        self.due = 0.0
+        self.held = {"activate": False, "write_enable": not all(args)}.get(do, self.held)
+        self.commanded, self.due = self.commanded and do not in ("write_stop", "deactivate") and not self.held, 0.0
         self.read(*READS[:3])
     def stop(self, why):
         print(f"{why}: stopping the arm", flush=True)
@@ -69,15 +70,14 @@ class Arm:  # the adapter, called from one thread only
     def cycle(self, command=None):  # one command, one reading; its time is when the SDK had read the positions
         refused = DISABLED if command and self.held else None
         if command and not refused:
-            velocity, self.commanded = command["mode"] == "velocity", True
-            args = [command["values"]] if velocity else [command["values"], command["velocity"]]
+            planned, self.commanded = [command["velocity"]] if command["mode"] != "velocity" else [], True
             try:
-                self.call("write_joint_velocities" if velocity else "write_joint_positions", *args)
+                self.call("write_joint_positions" if planned else "write_joint_velocities", command["values"], *planned)
             except Exception as e:
                 refused = str(e) or repr(e)
         time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # who asks again waits for something new
         if time.monotonic() >= self.due:
-            self.state["read_joint_positions"] = self.adapter.read_joint_positions()
+            self.read("read_joint_positions")
             self.state["time"], self.due = time.monotonic_ns(), time.monotonic() + 0.5 / self.hz
             self.turn = (self.turn + 1) % (len(READS) - len(FEEDBACK))
             self.read(*READS if self.quick else [READS[self.turn]])
@@ -98,24 +98,21 @@ def serve(arm, listener):
     client, data = None, b""
     while True:
         ready = select.select([listener, client] if client else [listener], [], [], SILENCE)[0]
-        if not ready and arm.commanded:
-            arm.stop(f"no request came for {SILENCE} s")
+        not ready and arm.commanded and arm.stop(f"no request came for {SILENCE} s")
         if client in ready:
             try:
                 arrived = client.recv(LONGEST)
                 *lines, data = (data + arrived).split(b"\n")
                 if not arrived or len(data) > LONGEST:
                     raise OSError("it has gone" if not arrived else "a line without end")
-                for line in lines:
-                    client.sendall(arm.reply(line))
+                client.sendall(b"".join(map(arm.reply, lines)))
             except (OSError, ValueError, LookupError) as e:  # it has gone, or speaks something else
                 client, data = client.close(), b""
                 arm.commanded and arm.stop(f"the client's connection ended ({e})")
         if listener in ready:
             another = listener.accept()[0]
             another.settimeout(1.0)
-            if client:
-                another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
+            client and another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
             client = client or another
 
 def listen(at):
@@ -140,8 +137,11 @@ if __name__ == "__main__":
     (module, _, name), at, hz = given.pop("adapter").partition(":"), given.pop("at"), given.pop("hz")
     [signal.signal(end, signal.default_int_handler) for end in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     sys.path.insert(0, os.getcwd())
-    modes, listener = control_modes(), listen(at)
-    arm = Arm(getattr(importlib.import_module(module), name)(**given), modes, given.get("dof"), hz)
+    try:
+        modes, adapter = control_modes(), getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as e:
+        sys.exit(f"error: {module}:{name}: {e}\nhint: give MODULE:CLASS, a class in a file here or on PYTHONPATH")
+    listener, arm = listen(at), Arm(adapter(**given), modes, given.get("dof"), hz)
     print(f"serving {name} at {at}; Ctrl-C ends it", flush=True)
     try:
         serve(arm, listener)

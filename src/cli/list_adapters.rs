@@ -25,6 +25,12 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         output::json(&registry.rows().iter().map(to_json).chain(registry.absent().map(lacking)).collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
+    lines(registry).iter().for_each(output::line);
+    Ok(Exit::Ok)
+}
+
+/// The table, and a paragraph for each adapter.
+fn lines(registry: &Registry) -> Vec<String> {
     let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS"]);
     for row in registry.rows() {
         table.row([
@@ -42,24 +48,22 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         let nothing = ["-"; 6].map(str::to_owned);
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
-    table.print();
+    let mut lines = table.lines();
     for row in registry.rows() {
-        output::line("");
-        output::line(format_args!("{}: {}", row.name, row.about));
-        output::line(format_args!("  modes: {}", modes(row).join(", ")));
+        lines.extend([String::new(), format!("{}: {}", row.name, row.about)]);
+        lines.push(format!("  modes: {}", modes(row).join(", ")));
         if let Some((dof, limits)) = limits(row) {
             let fastest = limits.velocity_max.iter().copied().fold(0.0, f64::max).to_degrees();
             let joints = if dof == 1 { "joint" } else { "joints" };
-            output::line(format_args!("  limits: {dof} {joints}, up to {fastest:.0}°/s"));
+            lines.push(format!("  limits: {dof} {joints}, up to {fastest:.0}°/s"));
         }
-        output::line(format_args!("  options: {}", options(row).join(", ")));
+        lines.push(format!("  options: {}", options(row).join(", ")));
     }
     for absent in registry.absent() {
-        output::line("");
-        output::line(format_args!("{}: {}", absent.name, absent.about));
-        output::line(format_args!("  not in this build: {}", absent.remedy));
+        lines.extend([String::new(), format!("{}: {}", absent.name, absent.about)]);
+        lines.push(format!("  not in this build: {}", absent.remedy));
     }
-    Ok(Exit::Ok)
+    lines
 }
 
 fn dof(row: &AdapterSpec) -> String {
@@ -119,4 +123,23 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
 /// An adapter that is not in this build has a way to get it, and nothing else.
 fn lacking(absent: &Absent) -> serde_json::Value {
     json!({"name": absent.name, "about": absent.about, "in_this_build": false, "remedy": absent.remedy})
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hardware::arms::{ABSENT, TABLE};
+
+    /// Such a build is compiled by `make check`; its list is that of a registry without the rows that it lacks.
+    #[test]
+    fn what_a_build_lacks_is_listed_with_the_way_to_get_it() {
+        let lacking = lines(&Registry::default().lacking(ABSENT)).join("\n");
+        assert!(lacking.contains("piper  not in this build"), "{lacking}");
+        assert!(lacking.ends_with("  not in this build: build with --features can"), "{lacking}");
+        let here = Registry::builtin();
+        let absent: Vec<_> = here.absent().map(|absent| absent.name).collect();
+        let expected: &[&str] = if cfg!(feature = "can") { &[] } else { &["piper"] };
+        assert_eq!(absent, expected);
+        assert!(TABLE.iter().all(|row| lines(&here).iter().any(|line| line.starts_with(&format!("{}: ", row.name)))));
+    }
 }

@@ -3,7 +3,6 @@
 use serde_json::{Map, Value};
 
 use super::super::exit::{Exit, Failure, Result};
-use crate::hardware::arms::ABSENT;
 use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
 use crate::hardware::spec::AdapterError;
@@ -31,7 +30,7 @@ impl Choice {
         if let Some(row) = registry.get(&self.name) {
             return Ok(*row);
         }
-        if let Some(absent) = ABSENT.iter().find(|absent| absent.name == self.name) {
+        if let Some(absent) = registry.absent().find(|absent| absent.name == self.name) {
             return Err(Failure::usage(format!("{} is not in this build", absent.name)).hint(absent.remedy));
         }
         let close = |name: &&&str| strsim::damerau_levenshtein(name, &self.name) <= 2;

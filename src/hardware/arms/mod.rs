@@ -19,8 +19,6 @@ pub const TABLE: &[AdapterSpec] = &[
     remote::SPEC,
 ];
 
-/// The adapters that this build does not have.
-pub const ABSENT: &[Absent] = &[
-    #[cfg(not(feature = "can"))]
-    Absent { name: "piper", about: "AgileX Piper, 6 joints and gripper", remedy: "build with --features can" },
-];
+/// The adapters that a build may lack, with the way to get them. Those that are in the table are not lacking.
+pub const ABSENT: &[Absent] =
+    &[Absent { name: "piper", about: "AgileX Piper, 6 joints and gripper", remedy: "build with --features can" }];

@@ -9,6 +9,7 @@ use std::sync::{Arc, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::diary::{self, Happening};
 use super::stream::{Controller, Ending, Shared, lock};
 use crate::clock::Mono;
 use crate::hardware::spec::{AdapterError, AdapterResult};
@@ -114,7 +115,9 @@ impl<C: Controller> Inner<C> {
     /// Serves one client until it is gone.
     fn serve(&self, mut stream: TcpStream) {
         let _ = stream.set_nodelay(true);
+        diary::note(Happening::Came);
         let ending = self.shared.serve(&mut stream);
+        diary::note(Happening::Gone);
         if let Ending::Dark(time) = ending {
             lock(&self.shared.line).dark_until = Instant::now() + time;
         }
@@ -167,6 +170,7 @@ fn listen<C: Controller>(inner: &Arc<Inner<C>>, mut listener: TcpListener) {
         }
         if !inner.wait_for_free() {
             inner.refused.fetch_add(1, Ordering::Relaxed);
+            diary::note(Happening::TurnedAway);
             inner.turn_away(stream);
             continue;
         }

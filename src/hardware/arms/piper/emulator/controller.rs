@@ -12,6 +12,7 @@ use super::SimOptions;
 use super::kinematics;
 use super::wire::{self, Request, Status};
 use crate::clock::Mono;
+use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::sim::faults::{Fault, FaultKind, FaultScript};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Plant, Tracking};
@@ -237,7 +238,10 @@ impl Controller {
     /// Does what a frame says; answers go into `out`.
     pub fn handle(&mut self, frame: &CanFrame, now: Mono, out: &mut Vec<CanFrame>) {
         self.advance(now);
-        self.first_frame.get_or_insert(now);
+        if self.first_frame.is_none() {
+            self.first_frame = Some(now);
+            diary::note(Happening::Came);
+        }
         if let Some(trace) = &mut self.trace
             && trace.len() < TRACE
         {

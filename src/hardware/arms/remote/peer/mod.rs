@@ -21,6 +21,7 @@ use self::service::Service;
 use super::Options;
 use super::address::Address;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, Registry};
+use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_kind};
 use crate::hardware::sim::tcp_server::cannot_listen;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
@@ -278,9 +279,11 @@ impl Serving {
             if knocked && let Ok(mut client) = listener.accept() {
                 if self.client.is_none() {
                     self.client = Some(client);
+                    diary::note(Happening::Came);
                 } else {
                     let busy = AdapterError::Rejected("it serves another client already".to_owned());
                     client.send(&wire::refused(1, &busy));
+                    diary::note(Happening::TurnedAway);
                 }
             }
             self.watch_for_silence();
@@ -342,7 +345,9 @@ impl Serving {
     }
 
     fn hang_up(&mut self) {
-        self.client = None;
+        if self.client.take().is_some() {
+            diary::note(Happening::Gone);
+        }
         let mut service = lock(&self.service);
         if service.commanded() {
             service.stop_by_itself("its client has gone");
