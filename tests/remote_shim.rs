@@ -317,7 +317,6 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     for (trouble, parts) in [
         ("nan", &["error: arm: ", "read_joint_positions() answers nan for joint 3"][..]),
         ("short", &["error: arm: ", "read_joint_positions() answers 5 values for 6 joints"]),
-        ("infinite", &["read_joint_velocities() answers -inf for joint 2"]),
         ("read_enabled", &["cannot be enabled: enabled, but the motors do not come on"]),
     ] {
         let home = Home::new();
@@ -328,6 +327,8 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     let home = Home::new();
     let ended = shim(&home, "tcp:127.0.0.1:1", &["--dof", "6"], &[("TROUBLE", "connect")]).wait().with(1);
     assert!(ended.err.contains("connect() said no") || ended.err.contains("Permission"), "{}", ended.err);
+    let ended = shim(&home, &socket(&home), &["--dof", "6"], &[("TROUBLE", "infinite")]).wait().with(1);
+    assert!(ended.err.ends_with("read_joint_velocities() answers -inf for joint 2\n"), "{}", ended.err);
     for at in ["tcp:0.0.0.0:7450", "nonsense", "tcp:127.0.0.1:x"] {
         let ended = shim(&home, at, &[], &[]).wait().with(1);
         assert!(ended.err.starts_with(&format!("error: --at {at}: ")), "{}", ended.err);

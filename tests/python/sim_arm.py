@@ -139,7 +139,7 @@ class SimArmAdapter:
         if not self._sdk:
             return [0.0] * self._dof
         self._sdk.step()
-        if TROUBLE == "infinite" and self._sdk.on:
+        if TROUBLE == "infinite":
             return [0.0, -math.inf] + [0.0] * (self._dof - 2)
         return [math.radians(v) for v in self._sdk.v]
 
