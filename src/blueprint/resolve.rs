@@ -11,6 +11,7 @@ use crate::blueprint::schema::{
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
 use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
@@ -76,6 +77,8 @@ pub struct Arm {
     pub on_exit_given: bool,
     /// The adapter's own options: an object.
     pub options: serde_json::Value,
+    /// The arm's own nominal limits, by its number of joints and its options.
+    pub own_limits: JointLimits,
     /// Limits narrower than the arm's own, one entry for each joint.
     pub limits: Vec<JointOverride>,
 }

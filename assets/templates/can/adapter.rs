@@ -17,7 +17,7 @@ use dimos::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanP
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Control, FILTERS, Feedback, Identity, Mode, PAIRS, Status, WireJoints};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 
 /// Longest wait for the arm's introduction, and for its first state: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1200);
@@ -57,9 +57,7 @@ impl AcmeAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("acme has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
             address: CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?,
@@ -277,7 +275,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // YOUR ARM: ask it, if it knows them
+        Ok(limits()) // YOUR ARM: ask it, if it knows them
     }
 
     // --- Mode ---

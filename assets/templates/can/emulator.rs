@@ -10,7 +10,7 @@ use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
 use dimos::hardware::sim::arm::{Delivery, SimArm};
 use dimos::hardware::sim::can_server::{CanController, CanServer};
-use dimos::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use dimos::hardware::sim::faults::{Fault, FaultKind, check_kind};
 use dimos::hardware::spec::AdapterResult;
 use dimos::hardware::transport::can::CanFrame;
 use dimos::joint::{ControlMode, Joints};
@@ -18,7 +18,7 @@ use dimos::joint::{ControlMode, Joints};
 use super::{DOF, NATIVE_RATE, Options, limits};
 
 /// The faults that the emulator can play: on a bus no byte is damaged, and integers are never NaN.
-const PLAYABLE: &[FaultKind] = &[
+pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
     FaultKind::Disconnect,
@@ -39,7 +39,7 @@ pub struct AcmeEmulator(CanServer<AcmeController>);
 impl AcmeEmulator {
     /// Starts an emulator at `place`, with the `sim` part of the arm's options.
     pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
-        let (options, limits) = (config.options::<Options>()?.sim, limits(DOF));
+        let (options, limits) = (config.options::<Options>()?.sim, limits());
         options.check("acme", &limits, PLAYABLE)?;
         let arm = SimArm::new(&limits, &options, f64::INFINITY, MonotonicClock.now());
         let controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
@@ -53,7 +53,7 @@ impl Emulator for AcmeEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the acme emulator", &[fault], PLAYABLE)?;
+        check_kind("the acme emulator", &fault, PLAYABLE)?;
         self.0.with(|controller, now| controller.arm.inject(fault, now));
         Ok(())
     }
@@ -174,7 +174,7 @@ mod tests {
     #[test]
     fn the_golden_commands_are_obeyed() {
         let now = Mono(1_000_000_000);
-        let arm = SimArm::new(&limits(DOF), &SimOptions::default(), f64::INFINITY, now);
+        let arm = SimArm::new(&limits(), &SimOptions::default(), f64::INFINITY, now);
         let mut controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
         let mut answers = Vec::new();
         let mut hear = |frame: &CanFrame, after: u64| {

@@ -7,7 +7,7 @@
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
 use dimos::hardware::sim::arm::{Delivery, Refusal, SimArm};
-use dimos::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use dimos::hardware::sim::faults::{Fault, FaultKind, check_kind};
 use dimos::hardware::sim::serial_server::SerialServer;
 use dimos::hardware::sim::stream::Controller;
 use dimos::hardware::spec::AdapterResult;
@@ -20,7 +20,7 @@ use super::{DOF, Options, limits};
 const VELOCITY_TIMEOUT: f64 = 0.2;
 
 /// The faults that the emulator can play: integers are never NaN.
-const PLAYABLE: &[FaultKind] = &[
+pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
     FaultKind::Disconnect,
@@ -42,7 +42,7 @@ pub struct AcmeEmulator(SerialServer<AcmeController>);
 impl AcmeEmulator {
     /// Starts an emulator at `place`, with the `sim` part of the arm's options.
     pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
-        let (options, limits) = (config.options::<Options>()?.sim, limits(DOF));
+        let (options, limits) = (config.options::<Options>()?.sim, limits());
         options.check("acme", &limits, PLAYABLE)?;
         let arm = SimArm::new(&limits, &options, VELOCITY_TIMEOUT, MonotonicClock.now());
         SerialServer::start("acme", AcmeController { arm }, place).map(Self)
@@ -55,7 +55,7 @@ impl Emulator for AcmeEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the acme emulator", &[fault], PLAYABLE)?;
+        check_kind("the acme emulator", &fault, PLAYABLE)?;
         self.0.with(|controller, now| controller.arm.inject(fault, now));
         Ok(())
     }

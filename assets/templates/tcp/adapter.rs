@@ -17,7 +17,7 @@ use dimos::hardware::transport::tcp::{Endpoint, Scan, TcpLink};
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Command, Hello, MAX_COMMAND, Mode, State, WireJoints};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 
 /// Longest wait for the connection and for the controller's introduction: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1500);
@@ -49,9 +49,7 @@ impl AcmeAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("acme has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
             endpoint: Endpoint::parse(&config.address, protocol::PORT)
@@ -221,7 +219,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // YOUR ARM: ask the controller, if it knows them
+        Ok(limits()) // YOUR ARM: ask the controller, if it knows them
     }
 
     // --- Mode ---

@@ -6,8 +6,9 @@
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
-use dimos::hardware::sim::arm::{Delivery, PLAYABLE, Refusal, SimArm};
-use dimos::hardware::sim::faults::{Fault, check_kinds};
+pub use dimos::hardware::sim::arm::PLAYABLE;
+use dimos::hardware::sim::arm::{Delivery, Refusal, SimArm};
+use dimos::hardware::sim::faults::{Fault, check_kind};
 use dimos::hardware::sim::stream::Controller;
 use dimos::hardware::sim::tcp_server::TcpServer;
 use dimos::hardware::spec::AdapterResult;
@@ -26,7 +27,7 @@ pub struct AcmeEmulator(TcpServer<AcmeController>);
 impl AcmeEmulator {
     /// Starts an emulator at `place`, with the `sim` part of the arm's options.
     pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
-        let (options, limits) = (config.options::<Options>()?.sim, limits(DOF));
+        let (options, limits) = (config.options::<Options>()?.sim, limits());
         options.check("acme", &limits, PLAYABLE)?;
         let arm = SimArm::new(&limits, &options, VELOCITY_TIMEOUT, MonotonicClock.now());
         TcpServer::start("acme", AcmeController { arm }, place.tcp(PORT)?).map(Self)
@@ -39,7 +40,7 @@ impl Emulator for AcmeEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the acme emulator", &[fault], PLAYABLE)?;
+        check_kind("the acme emulator", &fault, PLAYABLE)?;
         self.0.with(|controller, now| controller.arm.inject(fault, now));
         Ok(())
     }

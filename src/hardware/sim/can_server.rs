@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::diary::{self, Happening};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::registry::Place;
 use crate::hardware::sim::arm::Delivery;
@@ -113,6 +114,7 @@ impl<C: CanController> Drop for CanServer<C> {
 fn live<C: CanController>(shared: &Shared<C>, mut port: Box<dyn CanPort>, period: Duration) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
     let mut frames = Vec::with_capacity(64);
+    let mut heard = false;
     let mut next = Instant::now();
     // Until then the arm neither hears nor sends.
     let mut deaf_until = next;
@@ -120,6 +122,9 @@ fn live<C: CanController>(shared: &Shared<C>, mut port: Box<dyn CanPort>, period
         loop {
             match port.receive() {
                 Ok(Some(CanEvent::Frame(frame))) if Instant::now() >= deaf_until => {
+                    if !std::mem::replace(&mut heard, true) {
+                        diary::note(Happening::Came);
+                    }
                     shared.controller().hear(&frame, MonotonicClock.now(), &mut frames);
                 }
                 Ok(Some(_)) => {}

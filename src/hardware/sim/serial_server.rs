@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::diary::{self, Happening};
 use super::stream::{Controller, Ending, Shared, lock};
 use crate::clock::Mono;
 use crate::hardware::registry::Place;
@@ -66,7 +67,7 @@ impl<C: Controller> Drop for SerialServer<C> {
 /// The controller's thread.
 fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
-    let mut line = Line { pty, shared };
+    let mut line = Line { pty, shared, heard: false };
     while !shared.closing() {
         let silence = match shared.serve(&mut line) {
             Ending::Closed => LOOK,
@@ -86,6 +87,8 @@ fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
 struct Line<'a, C> {
     pty: Pty,
     shared: &'a Shared<C, ()>,
+    /// Somebody has written to it.
+    heard: bool,
 }
 
 impl<C: Controller> Read for Line<'_, C> {
@@ -93,7 +96,12 @@ impl<C: Controller> Read for Line<'_, C> {
         while !self.shared.closing() && !room.is_empty() {
             match self.pty.read(room, LOOK) {
                 Ok(0) => {}
-                Ok(n) => return Ok(n),
+                Ok(n) => {
+                    if !std::mem::replace(&mut self.heard, true) {
+                        diary::note(Happening::Came);
+                    }
+                    return Ok(n);
+                }
                 Err(error) => return Err(std::io::Error::other(error.to_string())),
             }
         }

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
-use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
@@ -54,9 +54,7 @@ impl YourArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("yourarm has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         Ok(Self {
             endpoint: Endpoint::parse(&config.address, protocol::PORT)
                 .map_err(|e| rejected(format!("address: {e}")))?,
@@ -236,7 +234,7 @@ impl ManipulatorAdapter for YourArmAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // the controller cannot be asked for them
+        Ok(limits()) // the controller cannot be asked for them
     }
 
     // --- Mode ---

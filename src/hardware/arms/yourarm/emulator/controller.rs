@@ -64,7 +64,7 @@ pub struct Controller {
 impl Controller {
     /// A controller that was just switched on: disabled, in position mode.
     pub fn new(initial: &[f64], faults: &[Fault], now: Mono) -> Self {
-        let limits = limits(DOF);
+        let limits = limits();
         let initial = if initial.is_empty() { &INITIAL } else { initial };
         Self {
             plant: Plant::new(&limits, initial, Tracking::Lag(LAG), 0.0),

@@ -13,12 +13,14 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::limits;
-use super::protocol::{DOF, PORT};
+use super::protocol::PORT;
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
 use crate::hardware::sim::tcp_server::TcpServer;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::spec::AdapterResult;
 use crate::joint::Joints;
 use controller::Controller;
 pub use controller::Received;
@@ -53,6 +55,15 @@ pub struct SimOptions {
     pub faults: Vec<Fault>,
 }
 
+impl SimOptions {
+    /// Refuses a pose outside the joint limits, and faults that the emulator cannot play.
+    pub(super) fn check(&self) -> Result<(), Misfit> {
+        check_script("the yourarm emulator", &self.faults, PLAYABLE)
+            .and_then(|()| check_pose(&self.initial_positions, &limits()))
+            .map_err(|misfit| misfit.within("sim"))
+    }
+}
+
 /// A running emulator. Ends when it is dropped.
 pub struct YourArmEmulator {
     server: TcpServer<Controller>,
@@ -70,19 +81,8 @@ impl YourArmEmulator {
     }
 
     fn listen(options: &SimOptions, address: SocketAddr) -> AdapterResult<Self> {
-        let rejected = |text| AdapterError::Rejected(format!("yourarm emulator: {text}"));
-        check_kinds("the yourarm emulator", &options.faults, PLAYABLE).map_err(AdapterError::Rejected)?;
+        options.check()?;
         let initial = &options.initial_positions;
-        if !initial.is_empty() {
-            let limits = limits(DOF);
-            let inside = initial
-                .iter()
-                .zip(limits.position_lower.iter().zip(&limits.position_upper))
-                .all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
-            if initial.len() != DOF || !inside {
-                return Err(rejected(format!("initial_positions must be {DOF} angles [rad] within the joint limits")));
-            }
-        }
         let controller = Controller::new(initial, &options.faults, MonotonicClock.now());
         Ok(Self { server: TcpServer::start("yourarm", controller, address)? })
     }
@@ -135,7 +135,7 @@ impl Emulator for YourArmEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the yourarm emulator", &[fault], PLAYABLE)?;
+        check_kind("the yourarm emulator", &fault, PLAYABLE)?;
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
     }
