@@ -89,14 +89,14 @@ fn plans_and_moves(home: &Home, program: &Path) {
     let checked = acme("model check builtin:acme_arm");
     assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
     let tip = acme("model fk builtin:acme_arm 0 0 0 0 0 0 0 --link flange --json").json();
-    println!("{tip}");
+    assert!((tip["xyz"][2].as_f64().unwrap() - 1.1).abs() < 1e-9, "it stands straight up: {tip}");
     let checked = acme("check acme-arm-planner");
     assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
 
     let run = start("run acme-arm-planner --sim --no-record");
     run.until(UP);
     let planned = acme("plan arm --named home").out;
-    assert!(planned.contains("clearance") && planned.contains("nothing has moved"), "{planned}");
+    assert!(planned.contains("clearance"), "{planned}");
     acme("preview");
     acme("execute");
     is_at(home, &[0.0, 0.53, 0.0, 0.53, 0.0, 0.53, 0.0]);
@@ -159,7 +159,7 @@ fn checkout(at: &Path) {
                 .into(),
         ),
         ("src/hardware/arms/nothing.rs", String::new()),
-        ("src/robot/builtin.rs", "robots!(\n    \"lite6\",\n    \"piper\"\n);\n".into()),
+        ("src/robot/builtin.rs", "\nrobots!(\n    \"lite6\",\n    \"piper\"\n);\n".into()),
         ("tests/conformance.rs", SUITE.into()),
     ] {
         let path = at.join(path);
@@ -183,7 +183,8 @@ fn arms_in_the_tree_are_built_and_tested() {
         let line = format!("adapter new {name} --dof {dof} --transport {transport} --in-tree --path tree --json");
         let report = home.dimos(&line).with(0).json();
         assert_eq!(report["changed"], json!(["tree/src/hardware/arms/mod.rs", "tree/src/robot/builtin.rs"]));
-        assert_eq!(report["written"].as_array().unwrap().len(), 8, "{report}");
+        let files = if transport == "can" { 8 } else { 9 };
+        assert_eq!(report["written"].as_array().unwrap().len(), files, "{report}");
         let blueprint = fs::read_to_string(tree.join(format!("blueprints/coordinator-{name}.yaml"))).unwrap();
         assert!(blueprint.contains(&format!("count: {dof}}}")), "{blueprint}");
         let snake = name.replace('-', "_");

@@ -46,7 +46,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     options: OptionsSpec::of::<Options>(),
     limits,
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
-    emulate: Some(|config, place| Ok(Box::new(emulator::AcmeEmulator::start(config, place)?))),
+    emulate: Some(emulator::start),
 };
 
 /// The joint limits of the data sheet, in SI units.
@@ -54,11 +54,9 @@ fn limits(_dof: usize) -> JointLimits {
     // YOUR ARM: lowest and highest position [deg] and top speed [deg/s] of each joint, base first.
     const DATA_SHEET: [(f64, f64, f64); DOF] = [(-170.0, 170.0, 180.0); DOF];
     JointLimits {
-        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
-        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
-        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
-        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it empty where the sheet says nothing
+        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it out where the sheet says nothing
         jerk_max: vec![100.0; DOF],        // YOUR ARM [rad/s³]; the same
+        ..JointLimits::of_degrees(&DATA_SHEET)
     }
 }
 

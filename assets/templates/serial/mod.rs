@@ -1,12 +1,13 @@
-//! Acme, a 6-joint arm on a serial line. Where a comment says `YOUR ARM`, the template is made up: put in what the
-//! vendor's manual says. In this order: `protocol.rs` and `golden.rs` (the bytes), `adapter.rs` (the units), the numbers below, and
-//! `emulator.rs` (the controller's side of the same bytes).
+//! Acme, a 6-joint arm on a serial line. Where a comment says `YOUR ARM`, the template is made up: put in what the vendor's
+//! manual says. In this order: `protocol.rs` and `golden.rs` (the bytes), `wire.rs` (what they travel on), `adapter.rs`
+//! (the units), the numbers below, and `emulator.rs` (the controller's side of the same bytes).
 
 pub mod adapter;
 pub mod emulator;
 #[cfg(test)]
 mod golden;
 pub mod protocol;
+pub mod wire;
 
 use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
 use dimos::hardware::sim::arm::SimOptions;
@@ -35,16 +36,16 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     wire_units: "deg",
     native_rate: NATIVE_RATE,
     address: AddressForm {
-        form: "/dev/ttyX[@BAUD]",
+        form: wire::FORM,
         required: true,
-        check: |address| protocol::Line::parse(address).map(|line| line.to_string()),
+        check: |address| wire::address(address).map(|address| address.to_string()),
     },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: false,
     options: OptionsSpec::of::<Options>(),
     limits,
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
-    emulate: Some(|config, place| Ok(Box::new(emulator::AcmeEmulator::start(config, place)?))),
+    emulate: Some(emulator::start),
 };
 
 /// The joint limits of the data sheet, in SI units.
@@ -52,11 +53,9 @@ fn limits(_dof: usize) -> JointLimits {
     // YOUR ARM: lowest and highest position [deg] and top speed [deg/s] of each joint, base first.
     const DATA_SHEET: [(f64, f64, f64); DOF] = [(-170.0, 170.0, 180.0); DOF];
     JointLimits {
-        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
-        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
-        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
-        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it empty where the sheet says nothing
+        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it out where the sheet says nothing
         jerk_max: vec![100.0; DOF],        // YOUR ARM [rad/s³]; the same
+        ..JointLimits::of_degrees(&DATA_SHEET)
     }
 }
 

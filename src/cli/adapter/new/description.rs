@@ -141,7 +141,7 @@ mod tests {
     use std::time::Duration;
 
     use crate::clock::Mono;
-    use crate::hardware::sim::arm::{SimArm, SimOptions};
+    use crate::hardware::sim::arm::{PLAYABLE, SimArm, SimOptions};
     use crate::joint::{JointLimits, MAX_DOF};
     use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
     use crate::planning::setup::Setup;
@@ -192,7 +192,8 @@ mod tests {
             let robot = &setup.robots[0];
             let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
             let limits = JointLimits::uniform(dof.into(), 170_f64.to_radians(), 1.0);
-            let emulated = SimArm::new(&limits, &SimOptions::default(), 1.0, Mono::ZERO).joints().0;
+            let emulated =
+                SimArm::new("acme", &limits, &SimOptions::default(), PLAYABLE, Mono::ZERO).unwrap().joints().0;
             let power_up = ("power-up".to_owned(), emulated[..usize::from(dof)].to_vec());
             for (name, pose) in robot.config.named_poses.clone().into_iter().chain([power_up]) {
                 assert!(checker.is_free(&pose), "{dof} joints: {name} collides: {:?}", checker.contacts(&pose));

@@ -8,20 +8,21 @@ use super::description;
 use super::name::Name;
 
 macro_rules! arm {
-    ($folder:literal) => {
+    ($folder:literal $($more:literal)?) => {
         [
             ("mod.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/mod.rs"))),
             ("adapter.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/adapter.rs"))),
             ("protocol.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/protocol.rs"))),
             ("golden.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/golden.rs"))),
             ("emulator.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/emulator.rs"))),
+            $(($more, include_str!(concat!("../../../../assets/templates/", $folder, "/", $more))),)?
         ]
     };
 }
 
-const TCP: [(&str, &str); 5] = arm!("tcp");
-const CAN: [(&str, &str); 5] = arm!("can");
-const SERIAL: [(&str, &str); 5] = arm!("serial");
+const TCP: &[(&str, &str)] = &arm!("tcp" "wire.rs");
+const CAN: &[(&str, &str)] = &arm!("can");
+const SERIAL: &[(&str, &str)] = &arm!("serial" "wire.rs");
 
 const BLUEPRINT: &str = include_str!("../../../../assets/templates/blueprint.yaml");
 const PLANNER: &str = include_str!("../../../../assets/templates/planner.yaml");
@@ -94,9 +95,9 @@ impl Arm {
 
     fn sources(&self) -> &'static [(&'static str, &'static str)] {
         match self.transport {
-            Transport::Tcp => &TCP,
-            Transport::Can => &CAN,
-            Transport::Serial => &SERIAL,
+            Transport::Tcp => TCP,
+            Transport::Can => CAN,
+            Transport::Serial => SERIAL,
         }
     }
 
@@ -177,8 +178,8 @@ mod tests {
         for (transport, sources) in [(Transport::Tcp, TCP), (Transport::Can, CAN), (Transport::Serial, SERIAL)] {
             let files = arm("acme", 6, transport).own_crate("path = \"x\"");
             for (file, text) in sources {
-                let path = if file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
-                assert!(files.contains(&(path, text.to_owned())), "{file}");
+                let path = if *file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
+                assert!(files.contains(&(path, (*text).to_owned())), "{file}");
             }
         }
     }
@@ -212,7 +213,7 @@ mod tests {
     fn in_the_tree_nothing_is_of_another_crate() {
         for transport in [Transport::Tcp, Transport::Can, Transport::Serial] {
             let files = arm("otto", 7, transport).in_tree();
-            assert_eq!(files.len(), 8);
+            assert_eq!(files.len(), if transport == Transport::Can { 8 } else { 9 });
             let left = |text: &str| text.contains("dimos::") || text.to_lowercase().contains("acme");
             assert!(files.iter().all(|(_, text)| !left(text)), "{transport:?}");
         }

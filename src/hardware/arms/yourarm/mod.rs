@@ -15,6 +15,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
 
@@ -69,11 +70,9 @@ const JERK: f64 = 100.0;
 /// The joint limits in SI units. They do not depend on `dof`: the arm has 6 joints.
 fn limits(_dof: usize) -> JointLimits {
     JointLimits {
-        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
-        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
-        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
         acceleration_max: vec![ACCELERATION; protocol::DOF],
         jerk_max: vec![JERK; protocol::DOF],
+        ..JointLimits::of_degrees(&DATA_SHEET)
     }
 }
 
@@ -88,12 +87,12 @@ pub struct Options {
     /// Whether to use the gripper.
     pub gripper: bool,
     /// What the emulator does, when one stands in for the arm.
-    pub sim: emulator::SimOptions,
+    pub sim: SimOptions,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { speed_scale: 1.0, gripper: true, sim: emulator::SimOptions::default() }
+        Self { speed_scale: 1.0, gripper: true, sim: SimOptions::default() }
     }
 }
 
