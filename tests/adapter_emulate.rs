@@ -118,6 +118,7 @@ fn a_program_finds_the_address_and_an_end() {
     );
     // Its port is free again, and taken while it is used.
     let first = emulate(&home, &format!("yourarm --bind {address}"));
-    home.dimos(&format!("adapter emulate yourarm --bind {address} --duration 1s")).with(2).says(&["cannot listen at"]);
+    let again = format!("adapter emulate yourarm --bind {address} --duration 1s");
+    home.dimos(&again).with(3).says(&["cannot listen at", "hint: take another address"]);
     first.end(Signal::INT).with(130);
 }

@@ -44,6 +44,38 @@ fn shipped_blueprints_have_no_mistakes() {
     }
 }
 
+/// What the options' types cannot say, the arms in the box say: each at its place, like any other mistake.
+#[test]
+#[cfg(feature = "can")]
+fn options_that_do_not_fit_are_told_where_they_stand() {
+    let file = fixtures().join("misfits.yaml");
+    let found = SearchPath { folders: vec![fixtures()] }.find(file.to_str().unwrap()).unwrap();
+    let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin());
+    let got = loaded.render(false).replace(&format!("{}/", fixtures().display()), "");
+    if env::var_os("DIMOS_REGENERATE").is_some() {
+        fs::write(file.with_extension("txt"), &got).unwrap();
+    }
+    assert_eq!(got, fs::read_to_string(file.with_extension("txt")).unwrap());
+}
+
+/// The limits that `check` shows are those of the model, not of the number of joints.
+#[test]
+fn limits_are_those_of_the_model() {
+    let joint = |name: &str, overrides: &[&str]| {
+        let set = overrides.iter().map(|text| (*text).to_owned()).collect();
+        let loaded = load(&find(name).unwrap(), &Overrides { set, sim: true }, &Registry::builtin());
+        assert_eq!(loaded.render(false), "", "{name}");
+        let lower = Summary::of(&loaded.blueprint.unwrap()).arms[0].joints[2].position_lower.unwrap().value;
+        (lower * 1e6).round() / 1e6
+    };
+    assert_eq!(joint("coordinator-xarm6", &[]), -3.822271, "xArm 6, the narrower of its series");
+    assert_eq!(joint("coordinator-lite6", &[]), -0.061087);
+    assert_eq!(
+        joint("coordinator-xarm6", &["hardware.arm.options.gripper=none", "hardware.arm.options.model=xarm850"]),
+        -4.223697
+    );
+}
+
 #[test]
 fn every_broken_blueprint_gets_its_answer() {
     let mut files: Vec<PathBuf> = fs::read_dir(fixtures()).unwrap().map(|e| e.unwrap().path()).collect();

@@ -10,6 +10,7 @@ use crate::blueprint::schema::{
 };
 use crate::blueprint::{arms, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
 
@@ -74,6 +75,8 @@ pub struct Arm {
     pub on_exit_given: bool,
     /// The adapter's own options: an object.
     pub options: serde_json::Value,
+    /// The arm's own nominal limits, by its number of joints and its options.
+    pub own_limits: JointLimits,
     /// Limits narrower than the arm's own, one entry for each joint.
     pub limits: Vec<JointOverride>,
 }

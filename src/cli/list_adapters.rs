@@ -4,7 +4,8 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::hardware::registry::{Absent, AdapterSpec, Registry};
+use crate::hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry};
+use crate::joint::JointLimits;
 
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
@@ -46,6 +47,12 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         output::line("");
         output::line(format_args!("{}: {}", row.name, row.about));
         output::line(format_args!("  modes: {}", modes(row).join(", ")));
+        if let Some((dof, limits)) = limits(row) {
+            let fastest = limits.velocity_max.iter().copied().fold(0.0, f64::max).to_degrees();
+            let joints = if dof == 1 { "joint" } else { "joints" };
+            output::line(format_args!("  limits: {dof} {joints}, up to {fastest:.0}°/s"));
+        }
+        output::line(format_args!("  options: {}", options(row).join(", ")));
     }
     for absent in registry.absent() {
         output::line("");
@@ -66,6 +73,24 @@ fn modes(row: &AdapterSpec) -> Vec<&'static str> {
     row.modes.iter().map(|mode| mode.name()).collect()
 }
 
+/// The limits of the arm with the most joints and no options.
+fn limits(row: &AdapterSpec) -> Option<(usize, JointLimits)> {
+    let config = |dof| AdapterConfig {
+        hardware_id: row.name.to_owned(),
+        address: String::new(),
+        dof,
+        options: serde_json::Value::Null,
+    };
+    (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.fit)(&config(dof)).ok()?.limits)))
+}
+
+/// The names of its options.
+fn options(row: &AdapterSpec) -> Vec<String> {
+    let schema = (row.options.schema)(&mut schemars::SchemaGenerator::default());
+    let properties = schema.get("properties").and_then(|properties| properties.as_object());
+    properties.map(|properties| properties.keys().cloned().collect()).unwrap_or_default()
+}
+
 fn to_json(row: &AdapterSpec) -> serde_json::Value {
     json!({
         "name": row.name,
@@ -79,6 +104,13 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
         "native_rate_hz": row.native_rate,
         "address": {"form": row.address.form, "required": row.address.required},
         "holds_when_disabled": row.holds_when_disabled,
+        "options": options(row),
+        "limits": limits(row).map(|(dof, limits)| json!({
+            "dof": dof,
+            "position_lower": limits.position_lower,
+            "position_upper": limits.position_upper,
+            "velocity_max": limits.velocity_max,
+        })),
         "gripper": row.gripper,
         "emulator": row.emulate.is_some(),
     })

@@ -22,19 +22,9 @@ pub fn fault(code: u16, text: &str) -> AdapterError {
 }
 
 impl AdapterConfig {
-    /// Refuses another number of joints than `adapter` has, and an address that `parse` does not understand. Gives the
-    /// address.
-    pub fn fits<A>(
-        &self,
-        adapter: &str,
-        dof: usize,
-        parse: impl FnOnce(&str) -> Result<A, String>,
-    ) -> AdapterResult<A> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", self.hardware_id));
-        if self.dof != dof {
-            return Err(rejected(format!("{adapter} has {dof} joints, not {}", self.dof)));
-        }
-        parse(&self.address).map_err(|e| rejected(format!("address: {e}")))
+    /// The address as `parse` reads it; an error names the arm.
+    pub fn parse_address<A>(&self, parse: impl FnOnce(&str) -> Result<A, String>) -> AdapterResult<A> {
+        parse(&self.address).map_err(|e| AdapterError::Rejected(format!("{}: address: {e}", self.hardware_id)))
     }
 }
 
@@ -55,17 +45,16 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused_by_name() {
-        let config = |dof, address: &str| AdapterConfig {
+    fn a_bad_address_names_the_arm() {
+        let config = |address: &str| AdapterConfig {
             hardware_id: "left".into(),
             address: address.into(),
-            dof,
+            dof: 6,
             options: serde_json::Value::Null,
         };
         let number = |text: &str| text.parse::<u16>().map_err(|e| e.to_string());
-        assert_eq!(config(6, "17").fits("acme", 6, number), Ok(17));
-        let refused = |config: AdapterConfig| config.fits("acme", 6, number).unwrap_err().to_string();
-        assert_eq!(refused(config(7, "17")), "left: acme has 6 joints, not 7");
-        assert!(refused(config(6, "x")).starts_with("left: address: invalid digit"));
+        assert_eq!(config("17").parse_address(number), Ok(17));
+        let refused = config("x").parse_address(number).unwrap_err().to_string();
+        assert!(refused.starts_with("left: address: invalid digit"), "{refused}");
     }
 }

@@ -18,7 +18,7 @@ use dimos::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanP
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Control, FILTERS, Feedback, Identity, Mode, PAIRS, Status, WireJoints};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 
 /// Longest wait for the arm's introduction, and for its first state: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1200);
@@ -57,10 +57,10 @@ struct State {
 impl AcmeAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let address = config.fits("acme", DOF, CanAddress::parse)?;
+        config.fit(fit)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
-            address,
+            address: config.parse_address(CanAddress::parse)?,
             port: None,
             identity: None,
             round: State::default(),
@@ -261,7 +261,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // YOUR ARM: ask it, if it knows them
+        Ok(limits()) // YOUR ARM: ask it, if it knows them
     }
 
     // --- Mode ---

@@ -19,7 +19,7 @@ use super::{DOF, NATIVE_RATE, Options, limits};
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
 pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
     let options: Options = config.options()?;
-    let arm = SimArm::new("acme", &limits(DOF), &options.sim, PLAYABLE, MonotonicClock.now())?;
+    let arm = SimArm::new("acme", &limits(), &options.sim, PLAYABLE, MonotonicClock.now())?;
     let controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
     Ok(Box::new(CanServer::start("acme", controller, place, Duration::from_secs_f64(1.0 / NATIVE_RATE))?))
 }
@@ -138,7 +138,7 @@ mod tests {
     #[test]
     fn the_golden_commands_are_obeyed() {
         let now = Mono(1_000_000_000);
-        let arm = SimArm::new("acme", &limits(DOF), &SimOptions::default(), PLAYABLE, now).unwrap();
+        let arm = SimArm::new("acme", &limits(), &SimOptions::default(), PLAYABLE, now).unwrap();
         let mut controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
         let mut answers = Vec::new();
         let mut hear = |frame: &CanFrame, after: u64| {

@@ -19,7 +19,7 @@ use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Command, Hello, MAX_COMMAND, Mode, State, WireJoints};
 use super::wire::{self, Address, Link};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 
 /// The controller is asked who it is until it says so, as it may just be starting. With the connection: below 3 s.
 const HELLO: Patience = Patience { each: Duration::from_millis(250), times: 5 };
@@ -45,10 +45,10 @@ pub struct AcmeAdapter {
 impl AcmeAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let address = config.fits("acme", DOF, wire::address)?;
+        config.fit(fit)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
-            address,
+            address: config.parse_address(wire::address)?,
             line: Dialogue::default(),
             hello: None,
             number: 0,
@@ -190,7 +190,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // YOUR ARM: ask the controller, if it knows them
+        Ok(limits()) // YOUR ARM: ask the controller, if it knows them
     }
 
     // --- Mode ---

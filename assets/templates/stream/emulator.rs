@@ -20,7 +20,7 @@ const VELOCITY_TIMEOUT: f64 = 0.2;
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
 pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
     let options: Options = config.options()?;
-    let arm = SimArm::new("acme", &limits(DOF), &options.sim, PLAYABLE, MonotonicClock.now())?;
+    let arm = SimArm::new("acme", &limits(), &options.sim, PLAYABLE, MonotonicClock.now())?;
     Ok(Box::new(wire::serve(AcmeController { arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT) }, place)?))
 }
 

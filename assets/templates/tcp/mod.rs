@@ -9,8 +9,9 @@ mod golden;
 pub mod protocol;
 pub mod wire;
 
-use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
-use dimos::hardware::sim::arm::SimOptions;
+use dimos::hardware::fit::{Fit, Misfit};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use dimos::hardware::sim::arm::{PLAYABLE, SimOptions};
 use dimos::joint::{ControlMode, JointLimits};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -43,13 +44,21 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: false,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
     emulate: Some(emulator::start),
 };
 
+/// Whether number of joints and options go together, and the joint limits that follow: `dimos check` asks this.
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("acme", SPEC.dof)?;
+    let (options, limits) = (config.options::<Options>()?, limits());
+    options.sim.check("acme", &limits, PLAYABLE)?;
+    Ok(Fit { limits }) // YOUR ARM: where an option changes the limits, like a model, this is the place
+}
+
 /// The joint limits of the data sheet, in SI units.
-fn limits(_dof: usize) -> JointLimits {
+fn limits() -> JointLimits {
     // YOUR ARM: lowest and highest position [deg] and top speed [deg/s] of each joint, base first.
     const DATA_SHEET: [(f64, f64, f64); DOF] = [(-170.0, 170.0, 180.0); DOF];
     JointLimits {

@@ -12,7 +12,7 @@ use super::super::arguments::duration;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
-use super::choice::{self, Choice};
+use super::choice::{Choice, not_started};
 use crate::blueprint;
 use crate::hardware::registry::{AdapterSpec, Emulator, Place, Registry};
 use crate::hardware::sim::faults::Fault;
@@ -110,22 +110,14 @@ fn start(args: &Args, row: &AdapterSpec, place: &Place) -> Result<(Box<dyn Emula
             "it needs none: it is an arm in memory"
         }));
     };
-    let mut refusal = None;
-    for dof in args.choice.dofs(row)? {
-        match emulate(&args.choice.config("", dof)?, place) {
-            Ok(emulator) => return Ok((emulator, dof)),
-            Err(AdapterError::Unsupported) => {
-                return Err(Failure::usage(format!(
-                    "the emulator of {} cannot be there: it speaks {}",
-                    row.name, row.transport
-                )));
-            }
-            // With another number of joints it may be the model that was asked for.
-            Err(error @ AdapterError::Rejected(_)) => refusal = refusal.or(Some(choice::failure(Exit::Usage, &error))),
-            Err(error) => return Err(choice::failure(Exit::Hardware, &error)),
+    let config = args.choice.config(row, "")?;
+    match emulate(&config, place) {
+        Ok(emulator) => Ok((emulator, config.dof)),
+        Err(AdapterError::Unsupported) => {
+            Err(Failure::usage(format!("the emulator of {} cannot be there: it speaks {}", row.name, row.transport)))
         }
+        Err(error) => Err(not_started(error)),
     }
-    Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
 }
 
 /// A fault script: one fault as `key=value,…`, or a file with a list.

@@ -7,9 +7,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::clock::Mono;
-use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript, check_kinds};
+use crate::hardware::fit::Misfit;
+use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript, check_kind, check_script};
 use crate::hardware::sim::plant::{Drive, Plant, Tracking};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::spec::AdapterResult;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
 /// How far joints are behind their set points [s].
@@ -41,7 +42,7 @@ pub const PLAYABLE: &[FaultKind] = &[
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint; a pose near the middle of the joints' ranges when empty.
+    /// Joint positions at power-up [rad], one per joint; a pose of the arm's own when empty.
     pub initial_positions: Vec<f64>,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
@@ -49,15 +50,27 @@ pub struct SimOptions {
 
 impl SimOptions {
     /// Refuses a pose outside `limits`, and faults that are not among `playable`. `name` is the arm's.
-    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> AdapterResult<()> {
-        check_kinds(&format!("the {name} emulator"), &self.faults, playable).map_err(AdapterError::Rejected)?;
-        let dof = limits.position_lower.len();
-        let fits = self.initial_positions.len() == dof && inside(&self.initial_positions, limits, 0.0);
-        if self.initial_positions.is_empty() || fits {
-            return Ok(());
+    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), Misfit> {
+        check_script(&format!("the {name} emulator"), &self.faults, playable)
+            .and_then(|()| check_pose(&self.initial_positions, limits))
+            .map_err(|misfit| misfit.within("sim"))
+    }
+}
+
+/// Refuses `initial_positions` [rad] that are neither empty nor a pose within `limits`.
+pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), Misfit> {
+    let (dof, given) = (limits.position_lower.len(), positions.len());
+    let needed = format!("initial_positions must be {dof} angles [rad] within the joint limits");
+    if given != 0 && given != dof {
+        return Err(Misfit::new("initial_positions", format!("{needed}, not {given}")));
+    }
+    let mut range = limits.position_lower.iter().zip(&limits.position_upper).zip(positions).enumerate();
+    match range.find(|(_, ((lower, upper), value))| !(**lower..=**upper).contains(value)) {
+        None => Ok(()),
+        Some((joint, ((lower, upper), value))) => {
+            let what = format!("{needed}: joint {} goes from {lower:.4} to {upper:.4}, not to {value}", joint + 1);
+            Err(Misfit::new(format!("initial_positions.{joint}"), what))
         }
-        let what = format!("initial_positions must be {dof} angles [rad] within the joint limits");
-        Err(AdapterError::Rejected(format!("{name} emulator: {what}")))
     }
 }
 
@@ -220,7 +233,7 @@ impl SimArm {
 
     /// Lets a fault happen `fault.at` seconds from `now`; an error names the kinds that can be played.
     pub fn inject(&mut self, fault: Fault, now: Mono) -> Result<(), String> {
-        check_kinds(&format!("the {} emulator", self.name), &[fault], self.playable)?;
+        check_kind(&format!("the {} emulator", self.name), &fault, self.playable)?;
         let t = self.first_client.map_or(0.0, |first| now.seconds_since(first));
         self.script.inject(fault, t);
         Ok(())

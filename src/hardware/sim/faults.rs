@@ -5,6 +5,8 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::hardware::fit::Misfit;
+
 /// What goes wrong. Not every simulated arm can play every kind; each names those it can.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -53,6 +55,13 @@ pub enum FaultKind {
     NoBuffers,
     /// The arm leads others: it sends commands instead of its state.
     Leader,
+}
+
+impl FaultKind {
+    /// The name in a script.
+    pub fn name(self) -> String {
+        serde_json::to_value(self).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
+    }
 }
 
 /// One fault of a script.
@@ -205,16 +214,18 @@ impl FaultScript {
     }
 }
 
-/// Refuses a script with kinds that the simulated arm `name` cannot play.
-pub fn check_kinds(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), String> {
-    match faults.iter().find(|fault| !playable.contains(&fault.kind)) {
-        None => Ok(()),
-        Some(fault) => {
-            let word = |kind: &FaultKind| serde_json::to_value(kind).map_or(String::new(), |v| v.to_string());
-            let known: Vec<String> = playable.iter().map(word).collect();
-            Err(format!("{name} cannot play the fault {}; it can play {}", word(&fault.kind), known.join(", ")))
-        }
-    }
+/// Refuses a script with kinds that the simulated arm `name` cannot play. The option is that of `faults`.
+pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), Misfit> {
+    let unknown = faults.iter().enumerate().find(|(_, fault)| !playable.contains(&fault.kind));
+    let Some((index, fault)) = unknown else { return Ok(()) };
+    let known: Vec<String> = playable.iter().map(|kind| format!("{:?}", kind.name())).collect();
+    let what = format!("{name} cannot play the fault {:?}; it can play {}", fault.kind.name(), known.join(", "));
+    Err(Misfit::new(format!("faults.{index}.kind"), what))
+}
+
+/// Refuses a fault that the simulated arm `name` cannot play.
+pub fn check_kind(name: &str, fault: &Fault, playable: &[FaultKind]) -> Result<(), String> {
+    check_script(name, std::slice::from_ref(fault), playable).map_err(|misfit| misfit.what)
 }
 
 #[cfg(test)]
@@ -262,7 +273,7 @@ mod tests {
 
     #[test]
     fn kinds_that_cannot_be_played_are_named() {
-        let wrong = check_kinds("mock", &[Fault::new(FaultKind::Garbage)], &[FaultKind::Stall]).unwrap_err();
+        let wrong = check_kind("mock", &Fault::new(FaultKind::Garbage), &[FaultKind::Stall]).unwrap_err();
         assert_eq!(wrong, r#"mock cannot play the fault "garbage"; it can play "stall""#);
     }
 }

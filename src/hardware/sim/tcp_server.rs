@@ -2,7 +2,7 @@
 //!
 //! A thread waits for clients, another serves the one that is connected; both sleep in the kernel while nothing comes.
 
-use std::io::{Read, Write};
+use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError};
@@ -36,8 +36,7 @@ struct Inner<C> {
 impl<C: Controller> TcpServer<C> {
     /// Listens at `address`, which should be a loopback address. `name` is the arm's, for messages.
     pub fn start(name: &str, controller: C, address: SocketAddr) -> AdapterResult<Self> {
-        let failed =
-            |e: std::io::Error| AdapterError::Rejected(format!("{name} emulator: cannot listen at {address}: {e}"));
+        let failed = |e| cannot_listen(&format!("{name} emulator"), address, &e);
         let listener = TcpListener::bind(address).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
         let inner = Arc::new(Inner { address, shared: Shared::new(controller), refused: AtomicU64::new(0) });
@@ -145,6 +144,20 @@ impl<C: Controller> Inner<C> {
         lock(&self.shared.line).client = None;
         self.shared.changed.notify_all();
     }
+}
+
+/// Why `who` cannot have a port of this computer, and what to do.
+pub fn cannot_listen(who: &str, at: SocketAddr, error: &io::Error) -> AdapterError {
+    let hint = match error.kind() {
+        ErrorKind::PermissionDenied => format!(
+            "\nhint: allow it with `sysctl net.ipv4.ip_unprivileged_port_start={}` as root, or give the program \
+             CAP_NET_BIND_SERVICE",
+            at.port()
+        ),
+        ErrorKind::AddrInUse => "\nhint: take another address of this computer, like 127.0.0.5".to_owned(),
+        _ => String::new(),
+    };
+    AdapterError::Io(format!("{who}: cannot listen at {at}: {error}{hint}"))
 }
 
 /// The thread that waits for clients.

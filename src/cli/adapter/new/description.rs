@@ -85,7 +85,7 @@ fn revolute(out: &mut String, number: usize, joint: Joint, height: f64) {
          <parent link=\"{parent}\"/><child link=\"link{number}\"/>\n    \
          <origin xyz=\"0 0 {height}\" rpy=\"0 0 0\"/>\n    \
          <axis xyz=\"{axis}\"/>\n    \
-         <limit lower=\"{}\" upper=\"{}\" velocity=\"{}\" effort=\"50\"/> <!-- {lower} to {upper} deg, {speed} deg/s -->\n  \
+         <limit lower=\"{}\" upper=\"{}\" velocity=\"{}\" effort=\"50\"/> <!-- joint {number}: {lower} to {upper} deg, {speed} deg/s -->\n  \
          </joint>\n",
         lower.to_radians(),
         upper.to_radians(),

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
-use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::kit::{fault, fill, finite};
@@ -51,8 +51,9 @@ pub struct YourArmAdapter {
 impl YourArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
+        config.fit(fit)?;
         Ok(Self {
-            endpoint: config.fits("yourarm", DOF, |address| Endpoint::parse(address, protocol::PORT))?,
+            endpoint: config.parse_address(|address| Endpoint::parse(address, protocol::PORT))?,
             options: config.options()?,
             line: Dialogue::default(),
             hello: None,
@@ -202,7 +203,7 @@ impl ManipulatorAdapter for YourArmAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // the controller cannot be asked for them
+        Ok(limits()) // the controller cannot be asked for them
     }
 
     // --- Mode ---

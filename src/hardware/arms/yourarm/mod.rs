@@ -14,7 +14,8 @@ mod tests;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
@@ -49,7 +50,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
 };
@@ -67,8 +68,17 @@ const DATA_SHEET: [(f64, f64, f64); protocol::DOF] = [
 const ACCELERATION: f64 = 10.0;
 const JERK: f64 = 100.0;
 
-/// The joint limits in SI units. They do not depend on `dof`: the arm has 6 joints.
-fn limits(_dof: usize) -> JointLimits {
+/// Whether number of joints and options go together: what the type of the options cannot say. All arms have the same
+/// limits; where they depend on an option, like a model, this is the place.
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("yourarm", SPEC.dof)?;
+    let (options, limits) = (config.options::<Options>()?, limits());
+    options.sim.check("yourarm", &limits, emulator::PLAYABLE)?;
+    Ok(Fit { limits })
+}
+
+/// The joint limits in SI units.
+fn limits() -> JointLimits {
     JointLimits {
         acceleration_max: vec![ACCELERATION; protocol::DOF],
         jerk_max: vec![JERK; protocol::DOF],

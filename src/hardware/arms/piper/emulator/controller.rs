@@ -92,7 +92,7 @@ impl Controller {
         let mut firmware = [0; 8];
         firmware.iter_mut().zip(options.firmware.bytes()).for_each(|(to, byte)| *to = byte);
         Self {
-            plant: Plant::new(&limits(DOF), initial, Tracking::Lag(LAG), 0.0),
+            plant: Plant::new(&limits(), initial, Tracking::Lag(LAG), 0.0),
             gripper: Gripper::new(gripper.stroke().unwrap_or_default(), GRIPPER_SPEED),
             has_gripper: gripper != GripperKind::None,
             firmware,

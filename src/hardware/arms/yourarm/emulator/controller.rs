@@ -53,7 +53,7 @@ impl Controller {
         if options.initial_positions.is_empty() {
             options.initial_positions = INITIAL.to_vec();
         }
-        let arm = SimArm::new("yourarm", &limits(DOF), &options, playable, now)?;
+        let arm = SimArm::new("yourarm", &limits(), &options, playable, now)?;
         Ok(Self {
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),

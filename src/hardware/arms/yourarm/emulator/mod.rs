@@ -21,7 +21,7 @@ use controller::Controller;
 pub use controller::Received;
 
 /// The faults that the emulator can play.
-const PLAYABLE: &[FaultKind] = &[
+pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
     FaultKind::Disconnect,
