@@ -18,6 +18,8 @@ pub type Address = SerialAddress;
 /// The line to it.
 pub type Link = SerialLink;
 
+/// What it is called in tables.
+pub const TRANSPORT: &str = "serial";
 /// How an address is written.
 pub const FORM: &str = "/dev/ttyX[@BAUD]";
 

@@ -18,6 +18,8 @@ pub type Address = Endpoint;
 /// The connection to it.
 pub type Link = TcpLink;
 
+/// What it is called in tables.
+pub const TRANSPORT: &str = "tcp";
 /// How an address is written.
 pub const FORM: &str = "HOST[:PORT]";
 
