@@ -511,7 +511,7 @@ fn a_goal_at_a_limit_is_refused_when_it_is_planned() {
     let words = ["goal: arm_joint1 at 1.4950 rad is outside its limits -1.4900 … 1.4900", "hint: "];
     home.dimos("plan arm 1.495 -0.3 0.6 0 0.8 0").with(1).says(&words);
     let robot = home.client().call(dimos::rpc::api::Planner {}).unwrap().robots.remove(0);
-    assert_eq!(robot.limits[0], [-1.49, 1.49]);
+    assert_eq!(robot.limits[0], [Some(-1.49), Some(1.49)]);
     home.dimos("move arm 1.49 -0.3 0.6 0 0.8 0 --speed 1").with(0);
     is_at(&home, "arm", &[1.49, -0.3, 0.6, 0.0, 0.8, 0.0]);
     // No solution of a pose lies outside either.

@@ -5,12 +5,15 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::arm::HasArm;
 use super::diary::{self, Happening};
+use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared, lock};
 use crate::clock::Mono;
-use crate::hardware::registry::Place;
+use crate::hardware::registry::{Emulator, Place};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::serial::Pty;
+use crate::joint::Joints;
 use crate::rt::host;
 
 /// How long a fault that cuts the line keeps it cut: longer than any adapter should believe in a silent arm.
@@ -51,6 +54,20 @@ impl<C: Controller> SerialServer<C> {
     /// Does something with the controller, now.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         self.shared.with(f)
+    }
+}
+
+impl<C: Controller + HasArm> Emulator for SerialServer<C> {
+    fn address(&self) -> String {
+        self.path.clone()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.with(|controller, now| controller.arm().inject(fault, now))
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.with(|controller, now| controller.arm().positions_at(now)))
     }
 }
 

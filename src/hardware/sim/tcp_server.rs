@@ -9,10 +9,14 @@ use std::sync::{Arc, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::arm::HasArm;
 use super::diary::{self, Happening};
+use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared, lock};
 use crate::clock::Mono;
+use crate::hardware::registry::Emulator;
 use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::joint::Joints;
 use crate::rt::host;
 
 /// How long a new client waits for the end of one that has just gone.
@@ -56,6 +60,20 @@ impl<C: Controller> TcpServer<C> {
     /// How many clients were turned away because another one was connected.
     pub fn refused(&self) -> u64 {
         self.inner.refused.load(Ordering::Relaxed)
+    }
+}
+
+impl<C: Controller + HasArm> Emulator for TcpServer<C> {
+    fn address(&self) -> String {
+        self.inner.address.to_string()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.with(|controller, now| controller.arm().inject(fault, now))
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.with(|controller, now| controller.arm().positions_at(now)))
     }
 }
 

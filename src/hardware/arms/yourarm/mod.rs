@@ -16,6 +16,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::hardware::fit::{Fit, Misfit};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
 
@@ -71,18 +72,17 @@ const JERK: f64 = 100.0;
 /// limits; where they depend on an option, like a model, this is the place.
 fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
     config.check_dof("yourarm", SPEC.dof)?;
-    config.options::<Options>()?.sim.check()?;
-    Ok(Fit { limits: limits() })
+    let (options, limits) = (config.options::<Options>()?, limits());
+    options.sim.check("yourarm", &limits, emulator::PLAYABLE)?;
+    Ok(Fit { limits })
 }
 
 /// The joint limits in SI units.
 fn limits() -> JointLimits {
     JointLimits {
-        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
-        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
-        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
         acceleration_max: vec![ACCELERATION; protocol::DOF],
         jerk_max: vec![JERK; protocol::DOF],
+        ..JointLimits::of_degrees(&DATA_SHEET)
     }
 }
 
@@ -97,12 +97,12 @@ pub struct Options {
     /// Whether to use the gripper.
     pub gripper: bool,
     /// What the emulator does, when one stands in for the arm.
-    pub sim: emulator::SimOptions,
+    pub sim: SimOptions,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { speed_scale: 1.0, gripper: true, sim: emulator::SimOptions::default() }
+        Self { speed_scale: 1.0, gripper: true, sim: SimOptions::default() }
     }
 }
 
