@@ -149,7 +149,7 @@ fn checkout(at: &Path) {
         ),
         (
             "src/lib.rs",
-            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{registry, sim, spec, \
+            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{fit, kit, registry, sim, spec, \
              transport};\n}\n"
                 .into(),
         ),
