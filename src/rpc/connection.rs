@@ -183,7 +183,8 @@ impl Connection {
             Ok(request) => request,
             Err(refusal) => return self.reply::<Done>(&id, Err(refusal)).await,
         };
-        let is_target = matches!(request, Request::Servo(_) | Request::Velocity(_));
+        let is_target =
+            matches!(request, Request::Servo(_) | Request::Velocity(_) | Request::Twist(_) | Request::Pose(_));
         let mut answer = self.call(method, request);
         if !is_target {
             self.settle().await?;

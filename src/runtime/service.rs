@@ -23,7 +23,6 @@ use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Device};
-use crate::joint::joints_of;
 use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
 use crate::rpc::place::Claim;
@@ -249,22 +248,6 @@ impl Service {
         Ok(Reply::Gripper(Done {}))
     }
 
-    async fn stream(&self, task: String, values: Vec<f64>, positions: bool) -> Result<(), RpcError> {
-        let index = self.task_index(&task)?;
-        let width = self.parts.config.tasks[index as usize].joints.len();
-        if values.len() != width {
-            let what = format!("{task} has {width} joints, the target {} values", values.len());
-            return Err(RpcError::new(Code::InvalidParams, what));
-        }
-        let target = joints_of(&values);
-        self.ask(match positions {
-            true => Request::Servo { task: index, target },
-            false => Request::Velocity { task: index, target },
-        })
-        .await?;
-        Ok(())
-    }
-
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
         let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
         if changes && self.closed.load(Ordering::Acquire) {
@@ -298,6 +281,8 @@ impl Service {
             Call::Gripper(g) => self.gripper(g).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
+            Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
+            Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),
             Call::Shutdown(_) => {
                 let _ = self.parts.endings.send(Ending::Asked);
                 Ok(Reply::Shutdown(Done {}))

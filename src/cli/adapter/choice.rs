@@ -3,7 +3,6 @@
 use serde_json::{Map, Value};
 
 use super::super::exit::{Exit, Failure, Result};
-use crate::hardware::arms::ABSENT;
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
 use crate::hardware::spec::AdapterError;
 use crate::joint::MAX_DOF;
@@ -30,7 +29,7 @@ impl Choice {
         if let Some(row) = registry.get(&self.name) {
             return Ok(*row);
         }
-        if let Some(absent) = ABSENT.iter().find(|absent| absent.name == self.name) {
+        if let Some(absent) = registry.absent().find(|absent| absent.name == self.name) {
             return Err(Failure::usage(format!("{} is not in this build", absent.name)).hint(absent.remedy));
         }
         let close = |name: &&&str| strsim::damerau_levenshtein(name, &self.name) <= 2;
@@ -97,7 +96,17 @@ pub fn failure(exit: Exit, error: &AdapterError) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hardware::registry::Absent;
     use serde_json::json;
+
+    #[test]
+    fn what_this_build_lacks_is_told_also_where_a_program_of_its_own_lacks_it() {
+        let servobot = Absent { name: "servobot", about: "an arm", remedy: "build with --features servobot" };
+        let registry = Registry::builtin().lacking(&[servobot]);
+        let choice = Choice { name: "servobot".into(), dof: None, model: None, options: Vec::new() };
+        let failure = choice.row(&registry).unwrap_err();
+        assert_eq!(failure.hint.as_deref(), Some("build with --features servobot"));
+    }
 
     #[test]
     fn options_nest_by_their_dots() {

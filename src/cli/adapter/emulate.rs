@@ -114,12 +114,6 @@ fn start(args: &Args, row: &AdapterSpec, place: &Place) -> Result<(Box<dyn Emula
     for dof in args.choice.dofs(row)? {
         match emulate(&args.choice.config("", dof)?, place) {
             Ok(emulator) => return Ok((emulator, dof)),
-            Err(AdapterError::Unsupported) => {
-                return Err(Failure::usage(format!(
-                    "the emulator of {} cannot be there: it speaks {}",
-                    row.name, row.transport
-                )));
-            }
             // With another number of joints it may be the model that was asked for.
             Err(error @ AdapterError::Rejected(_)) => refusal = refusal.or(Some(choice::failure(Exit::Usage, &error))),
             Err(error) => return Err(choice::failure(Exit::Hardware, &error)),
