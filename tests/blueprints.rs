@@ -313,8 +313,8 @@ tasks:
     }
     let mapped = "end_effector_link: flange, joint_name_mapping: {arm_joint1: joint2, arm_joint2: joint1}";
     for (entry, said, place) in [
-        (task("params: {}"), "the description of the robot is missing", "4:20"),
-        (own(""), "the end effector is missing", "4:87"),
+        (task("params: {}"), "the description of the robot is missing", "4:21"),
+        (own(""), "the end effector is missing", "builtin:yourarm"),
         (own("end_effector_link: flnge, joint_prefix: arm_"), "no link `flnge`", "flnge"),
         (own("end_effector_link: base_link, joint_prefix: arm_"), "no joint of the task moves", "base_link"),
         (own("end_effector_link: flange"), "the model has no joint `arm_joint1`", "4:"),

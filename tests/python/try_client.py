@@ -90,14 +90,14 @@ def moves_the_end_effector(robot):
     """A twist about the base's z turns joint 1; a pose goes there and stays."""
     before = robot.state("arm").position
     for _ in range(25):
-        robot.twist("twist_arm", [0, 0, 0.05])
+        robot.twist("twist_arm", [0, 0, 0.05], [0, 0, 0])
         time.sleep(0.02)
     robot.settle()
     after = robot.state("arm").position
     assert abs(after[0] - before[0]) < 1e-3 and not near(after[1:4], before[1:4], 0.01), (before, after)
-    robot.twist("twist_arm", [0, 0, 0, 0])
+    robot.twist("twist_arm", [0, 0, 0, 0], [0, 0, 0])
     refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
-    robot.twist("twist_arm", [0, 0, 0.05], frame="world")
+    robot.twist("twist_arm", [0, 0, 0.05], [0, 0, 0], frame="world")
     refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
     robot.pose("pose_arm", [0.35, 0, 0.3])
     refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
