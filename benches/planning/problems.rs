@@ -3,18 +3,15 @@
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{Scene, Solid, World};
+use dimos::robot::Source;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::{JointKind, RobotModel};
-use dimos::robot::packages::Packages;
-use dimos::robot::urdf::{Meshes, read};
-use dimos::robot::xml::{Calls, parse};
-use dimos::yaml::{Tree, render};
 use glamx::{DAffine3, DQuat, DVec3};
 use serde::Deserialize;
 
@@ -69,21 +66,12 @@ pub struct Arm {
 
 impl Arm {
     /// Reads a URDF, and the pairs that may touch from an SRDF.
-    pub fn load(urdf: &Path, srdf: Option<&Path>, packages: Packages) -> Result<Self, Box<dyn Error>> {
-        let text = fs::read_to_string(urdf).map_err(|e| format!("{}: {e}", urdf.display()))?;
-        let mut tree = Tree::new();
-        let source = tree.add_source(urdf.display().to_string(), &text);
-        let resolve = |uri: &str| packages.resolve(uri, urdf.parent().unwrap_or(Path::new(".")));
-        let root = parse(&mut tree, source);
-        let model = root.and_then(|d| read(&d.root, &mut tree, &Calls::default(), Meshes::Find, &resolve));
-        let Some(model) = model else {
-            let lines: Vec<String> = tree.diags().iter().map(|d| render(&tree, d, false)).collect();
-            return Err(lines.join("\n").into());
-        };
+    pub fn load(urdf: &Path, srdf: Option<&Path>, packages: BTreeMap<String, PathBuf>) -> Result<Self, Box<dyn Error>> {
+        let source = Source { path: urdf.to_owned(), packages, srdf: srdf.map(Path::to_owned), ..Source::default() };
+        let mut loaded = dimos::robot::load(&source);
+        let allowed = std::mem::take(&mut loaded.semantics).disabled_pairs().collect();
+        let model = loaded.into_model()?;
         let solids = solids(&model, MeshMode::Hull)?;
-        let allowed = srdf.map(allowed_pairs).transpose()?.unwrap_or_default();
-        let known = |(a, b): &(String, String)| model.link_index(a).is_some() && model.link_index(b).is_some();
-        let allowed = allowed.into_iter().filter(known).collect();
         Ok(Self { model: Arc::new(model), solids, allowed })
     }
 
@@ -168,23 +156,14 @@ fn solid(thing: &Thing, family: &str, shapes: Shapes) -> Result<Solid, Box<dyn E
     Ok(made?)
 }
 
-/// The pairs of `disable_collisions` in an SRDF.
-fn allowed_pairs(srdf: &Path) -> Result<Vec<(String, String)>, Box<dyn Error>> {
-    let text = fs::read_to_string(srdf).map_err(|e| format!("{}: {e}", srdf.display()))?;
-    let document = roxmltree::Document::parse(&text)?;
-    let pairs = document.descendants().filter(|n| n.has_tag_name("disable_collisions"));
-    let name = |n: &roxmltree::Node, key: &str| n.attribute(key).unwrap_or_default().to_owned();
-    Ok(pairs.map(|n| (name(&n, "link1"), name(&n, "link2"))).collect())
-}
-
 /// `NAME=DIR` arguments.
-pub fn packages(arguments: &[String]) -> Result<Packages, Box<dyn Error>> {
+pub fn packages(arguments: &[String]) -> Result<BTreeMap<String, PathBuf>, Box<dyn Error>> {
     let mut named = BTreeMap::new();
     for argument in arguments {
         let (name, folder) = argument.split_once('=').ok_or(format!("{argument:?} is not NAME=DIR"))?;
         named.insert(name.to_owned(), folder.into());
     }
-    Ok(Packages::named(named).with_environment())
+    Ok(named)
 }
 
 /// Length of the prefix that all names share, up to a separator.

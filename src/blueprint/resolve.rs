@@ -3,15 +3,17 @@
 use serde::Serialize;
 
 use crate::blueprint::limits::JointOverride;
-use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::planner::ViewConfig;
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
 };
+use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
+use crate::robot::Source;
 use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
 
 /// A blueprint without mistakes.
@@ -91,6 +93,10 @@ pub enum TaskKind {
     Servo(ServoParams),
     /// Follows streamed velocities.
     Velocity(VelocityParams),
+    /// Takes an end effector to streamed poses.
+    CartesianIk(CartesianParams),
+    /// Moves an end effector with streamed twists.
+    EefTwist(CartesianParams),
 }
 
 impl TaskKind {
@@ -100,6 +106,16 @@ impl TaskKind {
             Self::Trajectory(_) => "trajectory",
             Self::Servo(_) => "servo",
             Self::Velocity(_) => "velocity",
+            Self::CartesianIk(_) => "cartesian_ik",
+            Self::EefTwist(_) => "eef_twist",
+        }
+    }
+
+    /// The parameters of a task that moves an end effector.
+    pub fn cartesian(&self) -> Option<&CartesianParams> {
+        match self {
+            Self::CartesianIk(params) | Self::EefTwist(params) => Some(params),
+            _ => None,
         }
     }
 }
@@ -119,6 +135,21 @@ pub struct Task {
     pub priority: i32,
     /// Whether it is started with the run.
     pub auto_start: bool,
+    /// The robot whose end effector it moves, where its type needs one.
+    pub robot: Option<TaskRobot>,
+}
+
+/// The robot of a task that moves an end effector. Its description has been checked, and is read again for a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TaskRobot {
+    /// Its description.
+    pub source: Source,
+    /// The model's names of the task's joints, in the task's order.
+    pub joints: Vec<String>,
+    /// The link that is moved.
+    pub link: String,
+    /// Where it stands, if it is a robot of the planner; else all is in the frame of the model's root.
+    pub base: Option<Base>,
 }
 
 /// What every check needs: the tree to point into, and what reading had to leave out.
@@ -181,16 +212,16 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         checker.check_name(&Located { at, value: name.value.clone() }, "blueprint's name");
     }
     let found = arms::resolve(&mut checker, &file.hardware);
-    let tasks = tasks::resolve(&mut checker, &file.tasks, &found);
+    let mut tasks = tasks::resolve(&mut checker, &file.tasks, &found);
     planner_check::assets(&mut checker, &file.assets);
-    if let Some(planner) = &file.planner {
-        planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
-    }
     let planner = file.planner.as_ref().map(|planner| {
-        let config = planner_files::resolve(&checker, planner);
-        planner_models::check(&mut checker, planner, &config);
+        let described = planner_models::read(&mut checker, planner);
+        planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &found);
+        let config = planner_files::resolve(&checker, planner, &described);
+        planner_models::check(&mut checker, planner, &described, &config);
         config
     });
+    task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     Blueprint {
         name: name.value,

@@ -14,8 +14,6 @@ use crate::yaml;
 /// How far an adapter has been proven without its hardware.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Level {
-    /// Compiles and connects.
-    Works,
     /// Passes the conformance suite against a double at its SDK or wire boundary.
     Conformant,
     /// Has an emulator of its real wire format, and passes the suite against it.
@@ -26,7 +24,6 @@ impl Level {
     /// The name used in tables.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Works => "works",
             Self::Conformant => "conformant",
             Self::Emulated => "emulated",
         }
@@ -117,7 +114,7 @@ impl Place {
     }
 }
 
-/// Starts an emulator for an arm's configuration; `Unsupported` for a place that the arm's transport does not have.
+/// Starts an emulator for an arm's configuration; `Rejected` for a place that the arm's transport does not have.
 pub type Emulate = fn(&AdapterConfig, &Place) -> AdapterResult<Box<dyn Emulator>>;
 
 /// One row of the table.

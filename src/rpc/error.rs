@@ -36,6 +36,8 @@ pub enum Code {
     LeaseHeld,
     /// The run has no planner.
     NoPlanner,
+    /// The run has a planner, and takes no second one.
+    HasPlanner,
     /// No such robot in the planner.
     UnknownRobot,
     /// No such plan, or one too long ago.
@@ -103,6 +105,7 @@ impl Code {
             Outcome::StillFaulted(..) => Some(Self::StillFaulted),
             Outcome::WrongTask(_) => Some(Self::WrongTask),
             Outcome::NonFinite(_) => Some(Self::NonFinite),
+            Outcome::InvalidTarget(_) => Some(Self::InvalidParams),
             Outcome::OutOfLimits(..) => Some(Self::OutOfLimits),
             Outcome::NoGripper(_) => Some(Self::NoGripper),
             Outcome::ShuttingDown => Some(Self::ShuttingDown),

@@ -9,22 +9,24 @@ use std::time::{Duration, Instant};
 
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
+use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
+use super::task_kinds::task_kinds;
 use super::watchdog::Watchdog;
 use super::{Ending, Handle, Options, Record, Run, StartError};
 use crate::arm::ArmState;
-use crate::blueprint::{Arm, Blueprint, TaskKind as Typed};
+use crate::blueprint::{Arm, Blueprint};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
-use crate::control::config::{
-    ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
-};
+use crate::control::config::{ArmConfig, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Request;
 use crate::control::tick_loop::{self, Pulse, TickPorts};
 use crate::hardware::device;
 use crate::joint::MAX_DOF;
+use crate::planning::config::PlannerConfig;
+use crate::planning::setup::Setup;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
@@ -54,14 +56,11 @@ impl Run {
         let log = log_path(blueprint, &options, &name, wall)?;
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
-        let planner =
-            blueprint.planner.as_ref().map(PlannerPort::start).transpose().map_err(|what| StartError::Blueprint {
-                what,
-                hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
-            })?;
-        for (robot, [a, b]) in planner.iter().flat_map(PlannerPort::always_touching) {
-            tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
-        }
+        let robots = blueprint.planner.as_ref().map(robots).transpose()?;
+        let kinds = task_kinds(blueprint).map_err(|what| StartError::Blueprint {
+            what,
+            hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
+        })?;
         let pulse = Arc::new(Pulse::default());
         let (notes, noted) = channel();
 
@@ -71,7 +70,17 @@ impl Run {
         };
         let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
         let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
-        let config = coordinator_config(blueprint, &connected);
+        let config = coordinator_config(blueprint, &connected, kinds);
+        let limits = command_limits(&names, &config);
+        let planner = blueprint.planner.as_ref().zip(robots);
+        let planner = planner.map(|(config, setup)| PlannerPort::start(config, setup, &limits, options.solver.take()));
+        let planner = planner.transpose().map_err(|what| {
+            arms.release();
+            StartError::other(
+                what,
+                "the model's limits, the arm's, and `limits` in the blueprint must have room in common",
+            )
+        })?;
 
         let samples = ring_size(&config);
         let (mut sample_producer, mut sample_consumer) = rtrb::RingBuffer::new(samples);
@@ -226,6 +235,18 @@ impl Run {
     }
 }
 
+/// The planner's robots, with what must be said of them.
+pub(super) fn robots(config: &PlannerConfig) -> Result<Setup, StartError> {
+    let setup = Setup::load(config).map_err(|what| StartError::Blueprint {
+        what,
+        hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
+    })?;
+    for (robot, [a, b]) in &setup.always_touching {
+        tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
+    }
+    Ok(setup)
+}
+
 /// What the watchdog does at each look that finds the tick alive.
 fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
     match manager.map(ServiceManager::signs_of_life) {
@@ -298,6 +319,7 @@ fn names_of(blueprint: &Blueprint) -> Names {
 fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, crate::joint::JointLimits)],
+    kinds: Vec<TaskKind>,
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
@@ -315,31 +337,15 @@ fn coordinator_config(
         tasks: blueprint
             .tasks
             .iter()
-            .map(|task| TaskConfig {
+            .zip(kinds)
+            .map(|(task, kind)| TaskConfig {
                 name: task.name.clone(),
-                kind: kind_of(&task.kind),
+                kind,
                 joints: task.joints.iter().map(|&j| j as u16).collect(),
                 priority: task.priority,
                 auto_start: task.auto_start,
             })
             .collect(),
-    }
-}
-
-fn kind_of(typed: &Typed) -> TaskKind {
-    match typed {
-        Typed::Trajectory(p) => TaskKind::Trajectory(TrajectoryParams {
-            start_position_tolerance: p.start_position_tolerance,
-            path_tolerance: p.path_tolerance,
-            goal_tolerance: p.goal_tolerance,
-            goal_time: p.goal_time,
-        }),
-        Typed::Servo(p) => {
-            TaskKind::Servo(ServoParams { timeout: p.timeout, default_positions: p.default_positions.clone() })
-        }
-        Typed::Velocity(p) => {
-            TaskKind::Velocity(VelocityParams { timeout: p.timeout, zero_on_timeout: p.zero_on_timeout })
-        }
     }
 }
 

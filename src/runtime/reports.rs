@@ -14,7 +14,7 @@ use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
 use crate::rt::histogram::Figures;
-use crate::telemetry::describe::{Described, Severity, cause_text, outcome_text, reason_text};
+use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, outcome_text, reason_text};
 use crate::telemetry::{Cause, Outcome, Reason, TaskState};
 
 impl Service {
@@ -55,6 +55,7 @@ impl Service {
             }),
             arms: (0..parts.config.arms.len()).filter_map(|i| self.arm_report(i)).collect(),
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
+            planner: None, // asked when somebody waits for the answer
         }
     }
 
@@ -113,6 +114,7 @@ impl Service {
             progress: (view.motion > 0).then_some(view.progress),
             reason: self.reason(&view.reason),
             motion: (view.motion > 0).then_some(view.motion),
+            bound: Some(bound_text(view.bound, &self.parts.names)).filter(|text| !text.is_empty()),
         })
     }
 

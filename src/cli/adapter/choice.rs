@@ -112,7 +112,17 @@ pub fn not_started(error: AdapterError) -> Failure {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hardware::registry::Absent;
     use serde_json::json;
+
+    #[test]
+    fn what_this_build_lacks_is_told_also_where_a_program_of_its_own_lacks_it() {
+        let servobot = Absent { name: "servobot", about: "an arm", remedy: "build with --features servobot" };
+        let registry = Registry::builtin().lacking(&[servobot]);
+        let choice = Choice { name: "servobot".into(), dof: None, model: None, options: Vec::new() };
+        let failure = choice.row(&registry).unwrap_err();
+        assert_eq!(failure.hint.as_deref(), Some("build with --features servobot"));
+    }
 
     #[test]
     fn options_nest_by_their_dots() {

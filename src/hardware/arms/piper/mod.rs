@@ -18,8 +18,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::hardware::fit::{Fit, Misfit};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::transport::can::CanAddress;
-use crate::hardware::transport::can::address::FORMS;
+use crate::hardware::transport::can::{self, address::FORMS};
 use crate::joint::{ControlMode, JointLimits};
 
 /// The modes of the arm. It has no velocity mode.
@@ -41,11 +40,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "0.001 deg, 0.001 mm",
     native_rate: NATIVE_RATE,
-    address: AddressForm {
-        form: FORMS,
-        required: true,
-        check: |address| CanAddress::parse(address).map(|address| address.to_string()),
-    },
+    address: AddressForm { form: FORMS, required: true, check: can::check },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),

@@ -1,6 +1,7 @@
 //! The xArm adapter: the adapter protocol on one side, a [`Session`] with the controller on the other.
 //!
-//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. Every conversion between the two is in this file.
+//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. The conversions between the two are in this file, those of the
+//! gripper's pulses in `protocol/gripper.rs`.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -308,7 +309,6 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        let used = self.options.force_torque;
-        Ok(self.recent()?.motion().0.wrench.filter(|_| used))
+        Ok(self.recent()?.wrench())
     }
 }

@@ -10,6 +10,8 @@ mod kinematics;
 mod server;
 mod wire;
 
+use std::ops::RangeInclusive;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -132,6 +134,11 @@ impl PiperEmulator {
     /// How often a client has let the motors lose their power by a reset (0x150).
     pub fn power_drops(&self) -> u64 {
         self.server.with(|controller, _| controller.power_drops)
+    }
+
+    /// Lets it leave out the frames with these identifiers, or none again; all others go on.
+    pub fn mute(&self, identifiers: Option<RangeInclusive<u16>>) {
+        self.server.with(|controller, _| controller.muted = identifiers);
     }
 
     /// Starts to record what comes over the bus, up to 200 000 frames; forgets what was recorded before.

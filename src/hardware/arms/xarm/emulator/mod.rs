@@ -145,6 +145,16 @@ impl XArmEmulator {
         self.server.with(|controller, _| controller.release_estop());
     }
 
+    /// Lets it stay in its mode whatever it is told, or obey again.
+    pub fn keep_mode(&self, keep: bool) {
+        self.server.with(|controller, _| controller.keeps_mode = keep);
+    }
+
+    /// Lets port 30001 fall silent while its connections stay open and all other ports go on, or report again.
+    pub fn mute_condition(&self, mute: bool) {
+        self.server.with(|controller, _| controller.condition_muted = mute);
+    }
+
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
         self.server.with(|controller, now| {

@@ -80,8 +80,7 @@ impl Shared {
         self.wake.raise();
     }
 
-    /// What a fault leaves of a packet; `None`: nothing is sent, `Some(false)` in the second place: after it the
-    /// connection is in order again.
+    /// Does to a packet, and to the connections, what a fault does. Whether what is left of the packet is to be sent.
     fn deliver(&self, delivery: Delivery, packet: &mut Vec<u8>) -> bool {
         match delivery {
             Delivery::Send | Delivery::Frozen => return true,
@@ -280,6 +279,9 @@ impl Floor {
             let period = Duration::from_micros(reader.kind.period_us());
             reader.due = if now > reader.due + period { now + period } else { reader.due + period };
             let mut controller = lock(&shared.controller);
+            if reader.kind == Kind::Normal && controller.condition_muted {
+                return true;
+            }
             let mono = MonotonicClock.now();
             let snapshot = controller.snapshot(mono);
             // Damage strikes where it matters: at the reports with the joints.
