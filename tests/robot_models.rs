@@ -248,13 +248,13 @@ fn mistakes_around_a_description_stand_at_the_keys_that_name_it() {
     }
     home.write("lab.yaml", BLUEPRINT);
     for (file, text, right, wrong, words) in [
-        ("robots/rig.srdf", SRDF, "value=\"3.0\"", "value=\"up\"", "rig.srdf:5:93: `up` is no position of a joint"),
+        ("robots/rig.srdf", SRDF, "value=\"3.0\"", "value=\"up\"", "rig.srdf:5:97: `up` is no position of a joint"),
         (
             "robots/joint_limits.yaml",
             LIMITS,
             "max_jerk: 4",
             "max_jerk: -4",
-            "joint_limits.yaml:2:118: `max_jerk` is -4",
+            "joint_limits.yaml:2:120: `max_jerk` is -4",
         ),
         ("robots/urdf/rig.urdf.xacro", RIG, "lower=\"-1.5\"", "lower=\"2\"", "is above the upper limit 1.5"),
     ] {
