@@ -154,7 +154,7 @@ fn speeds_are_as_high_as_toppras() {
                 for k in usize::from(p > 0)..=steps {
                     let at = piece.length * k as f64 / steps as f64;
                     s.push(start + at);
-                    q.push((0..6).map(|j| piece.at(j, at).q).collect::<Vec<f64>>());
+                    q.push(piece.jets(at).map(|jet| jet.q).collect::<Vec<f64>>());
                 }
                 start += piece.length;
             }
