@@ -69,9 +69,14 @@ impl Arm {
     pub fn load(urdf: &Path, srdf: Option<&Path>, packages: BTreeMap<String, PathBuf>) -> Result<Self, Box<dyn Error>> {
         let source = Source { path: urdf.to_owned(), packages, srdf: srdf.map(Path::to_owned), ..Source::default() };
         let mut loaded = dimos::robot::load(&source);
-        let allowed = std::mem::take(&mut loaded.semantics).disabled_pairs().collect();
+        let allowed: Vec<_> = std::mem::take(&mut loaded.semantics).disabled_pairs().collect();
         let model = loaded.into_model()?;
         let solids = solids(&model, MeshMode::Hull)?;
+        let all = allowed.len();
+        let allowed: Vec<_> = allowed.into_iter().filter_map(|pair| own_pair(&model, &pair)).collect();
+        if allowed.len() < all {
+            println!("note      {} of the SRDF's {all} pairs name links that {} has", allowed.len(), model.name);
+        }
         Ok(Self { model: Arc::new(model), solids, allowed })
     }
 
@@ -99,6 +104,12 @@ impl Arm {
                 .ok_or(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
         };
         let joints = problem.joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
+        for (i, joint) in joints.iter().enumerate() {
+            if let Some(twin) = joints[..i].iter().position(|j| j == joint) {
+                let (a, b) = (&problem.joints[twin], &problem.joints[i]);
+                return Err(format!("joints {a:?} and {b:?} of the problems are one joint of the robot's").into());
+            }
+        }
         // Sliding joints of the others are a gripper's: it is open.
         let open = |j: &dimos::robot::Joint| if j.kind == JointKind::Prismatic { j.limits.upper } else { 0.0 };
         let mut rest: Vec<f64> = self.model.joints.iter().map(open).collect();
@@ -154,6 +165,20 @@ fn solid(thing: &Thing, family: &str, shapes: Shapes) -> Result<Solid, Box<dyn E
         _ => return Err(format!("{:?} is a {:?} with sizes {:?}", thing.name, thing.kind, thing.size).into()),
     };
     Ok(made?)
+}
+
+/// A pair of links as the model has them: by name, else by an ending that only one link has.
+fn own_pair(model: &RobotModel, (a, b): &(String, String)) -> Option<(String, String)> {
+    let own = |name: &String| {
+        let ends = |suffix: &str| match model.links.iter().filter(|l| l.name.ends_with(suffix)).collect::<Vec<_>>()[..]
+        {
+            [one] => Some(one.name.clone()),
+            _ => None,
+        };
+        let exact = model.link_index(name).map(|_| name.clone());
+        exact.or_else(|| name.match_indices(['_', '/', '-']).find_map(|(at, _)| ends(&name[at..])))
+    };
+    Some((own(a)?, own(b)?))
 }
 
 /// `NAME=DIR` arguments.

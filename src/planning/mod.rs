@@ -24,6 +24,7 @@ pub mod setup;
 pub mod shortcut;
 mod smooth;
 pub mod solve;
+mod steady;
 pub mod timing;
 pub mod topp;
 pub mod verify;
