@@ -1,0 +1,184 @@
+//! The terminal while jog has it: raw, on its alternate screen, and given back however jog ends.
+
+use std::io::{self, IsTerminal, Write};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use crossterm::cursor::{Hide, MoveTo, Show};
+use crossterm::event::{
+    DisableFocusChange, EnableFocusChange, Event, KeyboardEnhancementFlags, PopKeyboardEnhancementFlags,
+    PushKeyboardEnhancementFlags, poll, read,
+};
+use crossterm::style::{Attribute, Color, Print, ResetColor, SetAttribute, SetForegroundColor};
+use crossterm::terminal::{
+    Clear, ClearType, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode, size,
+};
+use crossterm::{execute, queue};
+
+use crate::cli::output;
+
+/// Whether there is something to give back.
+static TAKEN: AtomicBool = AtomicBool::new(false);
+
+/// How a piece of text looks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Look {
+    /// As it comes.
+    #[default]
+    Plain,
+    /// It matters.
+    Bold,
+    /// It is there for those who look for it.
+    Dim,
+    /// As it should be.
+    Good,
+    /// Worth a look.
+    Warning,
+    /// Wrong.
+    Bad,
+}
+
+/// A line of the screen: pieces of text.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Line(pub Vec<(String, Look)>);
+
+impl Line {
+    /// Adds a piece.
+    pub fn with(mut self, text: impl Into<String>, look: Look) -> Self {
+        self.0.push((text.into(), look));
+        self
+    }
+
+    /// Adds a plain piece.
+    pub fn and(self, text: impl Into<String>) -> Self {
+        self.with(text, Look::Plain)
+    }
+
+    /// Its width in characters.
+    pub fn width(&self) -> usize {
+        self.0.iter().map(|(text, _)| text.chars().count()).sum()
+    }
+
+    /// Its text alone.
+    #[cfg(test)]
+    pub fn text(&self) -> String {
+        self.0.iter().map(|(text, _)| text.as_str()).collect()
+    }
+}
+
+/// The terminal. Dropping it gives it back.
+pub struct Terminal {
+    drawn: Vec<Line>,
+    size: (usize, usize),
+    colour: bool,
+}
+
+impl Terminal {
+    /// Takes the terminal.
+    pub fn open() -> io::Result<Self> {
+        let (columns, rows) = size()?;
+        give_back_on_panic();
+        enable_raw_mode()?;
+        TAKEN.store(true, Ordering::SeqCst);
+        let terminal =
+            Self { drawn: Vec::new(), size: (columns.into(), rows.into()), colour: output::colour(&io::stdout()) };
+        // A terminal that does not know the kitty keyboard protocol passes over its sequence; one that does will tell
+        // when keys go up. Whether it does is known by the first key-up.
+        let flags = KeyboardEnhancementFlags::DISAMBIGUATE_ESCAPE_CODES | KeyboardEnhancementFlags::REPORT_EVENT_TYPES;
+        let keyboard = PushKeyboardEnhancementFlags(flags);
+        execute!(io::stdout(), EnterAlternateScreen, keyboard, EnableFocusChange, Hide, Clear(ClearType::All))?;
+        Ok(terminal)
+    }
+
+    /// Columns and rows.
+    pub fn size(&self) -> (usize, usize) {
+        self.size
+    }
+
+    /// The next key or change of the terminal, waiting up to `patience`. Fails when the terminal is gone.
+    pub fn event(&mut self, patience: Duration) -> io::Result<Option<Event>> {
+        match poll(patience) {
+            Ok(true) => {}
+            Ok(false) => return Ok(None),
+            // A signal: whoever waits looks for it.
+            Err(e) if e.kind() == io::ErrorKind::Interrupted => return Ok(None),
+            Err(e) => return Err(e),
+        }
+        let event = read()?;
+        if let Event::Resize(columns, rows) = event {
+            self.size = (columns.into(), rows.into());
+            self.drawn.clear();
+            execute!(io::stdout(), Clear(ClearType::All))?;
+        }
+        Ok(Some(event))
+    }
+
+    /// Whether it is still there: one that was closed gives no keys, and must not be waited for.
+    pub fn is_there(&self) -> bool {
+        rustix::termios::tcgetattr(io::stdin()).is_ok() && io::stdin().is_terminal()
+    }
+
+    /// Shows these lines, from the top; what does not fit is cut off.
+    pub fn draw(&mut self, lines: Vec<Line>) -> io::Result<()> {
+        let (columns, rows) = self.size;
+        let mut out = io::stdout().lock();
+        for row in 0..rows {
+            let (new, old) = (lines.get(row), self.drawn.get(row));
+            if new == old {
+                continue;
+            }
+            queue!(out, MoveTo(0, row as u16))?;
+            let mut room = columns;
+            for (text, look) in new.map_or(&[][..], |line| &line.0) {
+                let text: String = text.chars().filter(|c| !c.is_control()).take(room).collect();
+                room -= text.chars().count();
+                self.look(&mut out, *look)?;
+                queue!(out, Print(text), SetAttribute(Attribute::Reset), ResetColor)?;
+            }
+            if room > 0 {
+                queue!(out, Clear(ClearType::UntilNewLine))?;
+            }
+        }
+        self.drawn = lines;
+        out.flush()
+    }
+
+    fn look(&self, out: &mut impl Write, look: Look) -> io::Result<()> {
+        let colour = match look {
+            Look::Plain => return Ok(()),
+            Look::Bold => return queue!(out, SetAttribute(Attribute::Bold)),
+            Look::Dim => return queue!(out, SetAttribute(Attribute::Dim)),
+            Look::Good => Color::Green,
+            Look::Warning => Color::Yellow,
+            Look::Bad => Color::Red,
+        };
+        match self.colour {
+            true => queue!(out, SetForegroundColor(colour), SetAttribute(Attribute::Bold)),
+            false => queue!(out, SetAttribute(Attribute::Bold)),
+        }
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        give_back();
+    }
+}
+
+/// Makes the terminal what it was. That it is gone is no error here.
+fn give_back() {
+    if TAKEN.swap(false, Ordering::SeqCst) {
+        let mut out = io::stdout();
+        let _ = execute!(out, DisableFocusChange, PopKeyboardEnhancementFlags, Show, LeaveAlternateScreen);
+        let _ = disable_raw_mode();
+    }
+}
+
+/// A panic's message must reach a terminal that shows it.
+fn give_back_on_panic() {
+    let before = std::panic::take_hook();
+    std::panic::set_hook(Box::new(move |panic| {
+        give_back();
+        before(panic);
+    }));
+}
