@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use super::arm_api::*;
+pub use super::cartesian_api::*;
 use super::error::{Code, RpcError};
 use super::lease::Subject;
 pub use super::motion_api::*;
@@ -114,6 +115,10 @@ methods! {
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.
     "velocity" Velocity -> Done, check Velocity::valid;
+    /// Next target of an `eef_twist` task; repeat it within the task's timeout.
+    "twist" Twist -> Done, check Twist::valid;
+    /// Next target of a `cartesian_ik` task; repeat it within the task's timeout.
+    "pose" Pose -> Done, check Pose::valid;
     /// Plans a collision-free motion. Answers when planning begins; `planning` tells how it goes. Moves nothing.
     "plan" Plan -> PlanReply, check Plan::valid;
     /// How planning goes, or what came of it.

@@ -160,7 +160,8 @@ impl Connection {
         if let Err(refusal) = self.lessee.admit(&request, &*self.backend) {
             return self.reply::<Done>(&id, Err(refusal)).await;
         }
-        let is_target = matches!(request, Request::Servo(_) | Request::Velocity(_));
+        let is_target =
+            matches!(request, Request::Servo(_) | Request::Velocity(_) | Request::Twist(_) | Request::Pose(_));
         let mut answer = self.call(method, request);
         if !is_target {
             self.settle().await?;

@@ -48,6 +48,8 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Execute(e) => Need::Lease(Subject::Joints(&e.trajectory.joint_names)),
         Request::Servo(s) => Need::Lease(Subject::Task(&s.task)),
         Request::Velocity(v) => Need::Lease(Subject::Task(&v.task)),
+        Request::Twist(t) => Need::Lease(Subject::Task(&t.task)),
+        Request::Pose(p) => Need::Lease(Subject::Task(&p.task)),
         Request::ArmReset(a) => Need::Peace(Subject::Arm(&a.arm)),
         Request::ArmEnable(a) => Need::Peace(Subject::Arm(&a.arm)),
         Request::ArmDisable(a) => Need::Peace(Subject::Arm(&a.arm)),

@@ -15,6 +15,7 @@
 
 pub mod api;
 mod arm_api;
+mod cartesian_api;
 pub mod client;
 mod connection;
 pub mod error;

@@ -23,7 +23,7 @@ pub struct PoseSpec {
 }
 
 impl PoseSpec {
-    fn valid(&self, field: &str) -> Result<(), String> {
+    pub(super) fn valid(&self, field: &str) -> Result<(), String> {
         finite(&format!("{field}.xyz"), &self.xyz)?;
         finite(&format!("{field}.rpy"), &self.rpy.unwrap_or_default())?;
         let quat = self.quat.unwrap_or([0.0, 0.0, 0.0, 1.0]);

@@ -255,6 +255,12 @@ impl Service {
         Ok(())
     }
 
+    /// No task follows these targets yet.
+    fn stream_of_another_type(&self, task: &str) -> Result<Reply, RpcError> {
+        let index = self.task_index(task)?;
+        self.refusal(&Outcome::WrongTask(index)).map_or_else(|| Err(internal()), Err)
+    }
+
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
         let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
         if changes && self.closed.load(Ordering::Acquire) {
@@ -285,6 +291,8 @@ impl Service {
             Call::Gripper(g) => self.gripper(g).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
+            Call::Twist(t) => self.stream_of_another_type(&t.task),
+            Call::Pose(p) => self.stream_of_another_type(&p.task),
             Call::Shutdown(_) => {
                 let _ = self.parts.endings.send(Ending::Asked);
                 Ok(Reply::Shutdown(Done {}))

@@ -1,0 +1,100 @@
+//! Parameters of the methods that stream targets of an end effector.
+
+use serde::{Deserialize, Serialize};
+
+use super::api::finite;
+use super::planner_api::PoseSpec;
+
+/// Parameters of `twist`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Twist {
+    /// The `eef_twist` task's name.
+    pub task: String,
+    /// Velocity of the end effector's origin: x, y, z [m/s].
+    pub linear: [f64; 3],
+    /// Angular velocity of the end effector: about x, y, z [rad/s].
+    pub angular: [f64; 3],
+    /// Whose axes those are.
+    #[serde(default)]
+    pub frame: TwistFrame,
+}
+
+/// Whose axes the parts of a twist are along.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TwistFrame {
+    /// Those of the robot's base.
+    #[default]
+    Base,
+    /// Those of the end effector itself.
+    Tool,
+}
+
+impl Twist {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        finite("linear", &self.linear)?;
+        finite("angular", &self.angular)
+    }
+}
+
+/// Parameters of `pose`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pose {
+    /// The `cartesian_ik` task's name.
+    pub task: String,
+    /// Where the end effector shall be: x, y, z [m].
+    pub xyz: [f64; 3],
+    /// Its roll, pitch, yaw about fixed axes [rad].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rpy: Option<[f64; 3]>,
+    /// A quaternion x, y, z, w, in place of `rpy`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub quat: Option<[f64; 4]>,
+}
+
+impl Pose {
+    /// The target without the task.
+    pub fn spec(&self) -> PoseSpec {
+        PoseSpec { xyz: self.xyz, rpy: self.rpy, quat: self.quat }
+    }
+
+    pub(super) fn valid(&self) -> Result<(), String> {
+        if self.rpy.is_none() && self.quat.is_none() {
+            return Err("the orientation is missing: give rpy or quat".into());
+        }
+        self.spec().valid("the target")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::super::api::Request;
+    use super::*;
+
+    #[test]
+    fn targets_that_cannot_be_meant_are_refused() {
+        let refused = |method: &str, params: serde_json::Value| Request::read(method, params).unwrap_err().message;
+        let pose = |more: serde_json::Value| {
+            let mut params = json!({"task": "t", "xyz": [0.3, 0, 0.4]});
+            params.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+            params
+        };
+        assert!(refused("pose", pose(json!({}))).contains("orientation"));
+        assert!(refused("pose", pose(json!({"rpy": [0, 0, 0], "quat": [0, 0, 0, 1]}))).contains("both"));
+        assert!(refused("pose", pose(json!({"quat": [0, 0, 0, 2]}))).contains("length"));
+        assert!(refused("pose", pose(json!({"quat": [0, 0, 0, 0]}))).contains("length"));
+        assert!(refused("pose", pose(json!({"rpy": [0, null, 0]}))).contains("null"));
+        assert!(Request::read("pose", pose(json!({"quat": [0, 0, 0, 1]}))).is_ok());
+        let twist = json!({"task": "t", "linear": [0.1, 0, 0], "angular": [0, 0, 0], "frame": "tool"});
+        let Ok(Request::Twist(read)) = Request::read("twist", twist) else { panic!() };
+        assert_eq!(read.frame, TwistFrame::Tool);
+        let odd = json!({"task": "t", "linear": [0.1, 0, 0], "angular": [0, 0, 0], "frame": "world"});
+        assert!(refused("twist", odd).contains("world"));
+        let infinite = Twist { linear: [0.0, f64::INFINITY, 0.0], ..read };
+        assert!(infinite.valid().unwrap_err().contains("inf"));
+    }
+}
