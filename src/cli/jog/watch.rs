@@ -13,7 +13,7 @@ use crate::rpc::api::{State, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::RunFolder;
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
-use crate::rpc::streams::Subscribe;
+use crate::rpc::streams::{Stream, Subscribe};
 
 /// How often the joints are read.
 const STATE: Duration = Duration::from_millis(50);
@@ -88,7 +88,7 @@ fn lock(seen: &Mutex<Seen>) -> std::sync::MutexGuard<'_, Seen> {
 }
 
 fn read(client: &mut Client, arm: &str, to: &Mutex<Seen>, ending: &AtomicBool) -> std::result::Result<(), ClientError> {
-    client.call(Subscribe { stream: "events".into(), rate: None })?;
+    client.call(Subscribe { stream: Stream::Events, rate: None })?;
     let mut next = Instant::now();
     for round in 0_u32.. {
         if ending.load(Ordering::Relaxed) {
