@@ -6,6 +6,7 @@
 //! ```
 
 mod arms;
+mod assets;
 mod include;
 mod json_schema;
 mod limits;
@@ -28,6 +29,6 @@ pub use limits::JointOverride;
 pub use load::{Loaded, Overrides, load, load_from};
 pub use reference::reference;
 pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list};
-pub use resolve::{Arm, Blueprint, Task, TaskKind};
+pub use resolve::{Arm, Blueprint, Task, TaskKind, UsedAsset};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

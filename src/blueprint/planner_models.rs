@@ -1,5 +1,6 @@
 //! Checks the planner's robots against their descriptions, so that `dimos check` finds what a run would fail at: files
-//! that are not there, joints and links that the model does not have, poses outside its limits.
+//! that are not there, joints and links that the model does not have, poses outside its limits. What lies in an asset
+//! that has not been fetched yet is checked once it has been.
 
 use std::path::Path;
 
@@ -13,6 +14,7 @@ use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
 pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, config: &PlannerConfig) {
     for (robot, config) in typed.robots.iter().zip(&config.robots) {
         let known = checker.has(robot.at, "model_path") && !checker.lost.contains(robot.model_path.at);
+        let known = known && !checker.assets.robot_awaited(robot);
         if known && let Some(model) = model(checker, robot, config) {
             names(checker, robot, &model);
             exclusions(checker, robot, &model);
@@ -22,10 +24,15 @@ pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, config: &PlannerCo
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
         if let (ShapeEntry::Mesh(_) | ShapeEntry::Cloud(_), ObjectShape::Mesh(path) | ObjectShape::Cloud(path)) =
             (&entry.shape.value, &object.shape)
+            && !shape_awaited(checker, &entry.shape.value)
         {
             file(checker, entry.shape.at, path);
         }
     }
+}
+
+fn shape_awaited(checker: &Checker<'_>, shape: &ShapeEntry) -> bool {
+    matches!(shape, ShapeEntry::Mesh(path) | ShapeEntry::Cloud(path) if checker.assets.awaited(path))
 }
 
 fn file(checker: &mut Checker<'_>, at: NodeId, path: &Path) {

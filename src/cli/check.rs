@@ -4,6 +4,7 @@ use serde_json::json;
 
 use super::arguments::setting;
 use super::exit::{Exit, Failure, Result};
+use super::fetch;
 use super::output::{self, Table};
 use crate::blueprint::{self, Limit, Loaded, OnExit, Overrides, Summary};
 use crate::hardware::registry::Registry;
@@ -37,6 +38,15 @@ pub fn load(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Lo
     Ok(blueprint::load(&found, overrides, registry))
 }
 
+/// The same for a run: fetches what the blueprint uses and what is not here yet, and then checks that too.
+pub fn load_to_run(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
+    let loaded = load(name, overrides, registry)?;
+    match &loaded.blueprint {
+        Some(blueprint) if fetch::missing(blueprint)? => load(name, overrides, registry),
+        _ => Ok(loaded),
+    }
+}
+
 /// Why a blueprint cannot be run: all its mistakes, shown.
 pub fn refuse(loaded: &Loaded) -> Failure {
     output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
@@ -63,6 +73,10 @@ pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: b
     let Some(summary) = summary else { return Err(refuse(&loaded)) };
     print_warnings(&loaded);
     print(&summary);
+    let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
+    for asset in awaited {
+        output::note(format_args!("{} is not fetched yet: what lies in it was not checked", asset.name));
+    }
     Ok(Exit::Ok)
 }
 

@@ -12,6 +12,7 @@ pub mod doctor;
 pub mod down;
 pub mod execute;
 pub mod exit;
+mod fetch;
 mod follow;
 mod goal;
 pub mod jog;
@@ -197,7 +198,7 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
-        Command::Model(args) => model::run(args),
+        Command::Model(args) => model::run(args, registry),
         Command::Schema(args) => schema::run(args, registry),
         Command::Replay(args) => {
             return match replay::run(args, registry) {

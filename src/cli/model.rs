@@ -1,5 +1,6 @@
 //! `dimos model …`: look into robot descriptions. Needs no run.
 
+mod assets;
 mod check;
 mod fk;
 mod info;
@@ -8,6 +9,7 @@ use std::path::PathBuf;
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
+use crate::hardware::registry::Registry;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Loaded, RobotModel, Source, load};
 
@@ -30,6 +32,8 @@ enum Verb {
     Expand(File),
     /// Where a link is at joint positions
     Fk(fk::Args),
+    /// The files that a blueprint fetches on first use: list, fetch, clean
+    Assets(assets::Args),
 }
 
 /// A description, and what it needs.
@@ -96,13 +100,14 @@ impl File {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args) -> Result {
+pub fn run(args: &Args, registry: &Registry) -> Result {
     match &args.verb {
         Verb::Info(file) => info::info(file),
         Verb::Tree(file) => info::tree(file),
         Verb::Check(file) => check::run(file),
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
+        Verb::Assets(args) => assets::run(args, registry),
     }
 }
 

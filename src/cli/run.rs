@@ -108,7 +108,7 @@ fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
 }
 
 fn bring_up(args: &Args, registry: &Registry) -> Result<(Run, Signals, Terminal)> {
-    let loaded = check::load(&args.blueprint, &args.overrides(), registry)?;
+    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     // Taken before anything is connected: a signal during the start ends the run as soon as it is up, controlled.

@@ -54,11 +54,6 @@ impl Line {
         self.with(text, Look::Plain)
     }
 
-    /// Its width in characters.
-    pub fn width(&self) -> usize {
-        self.0.iter().map(|(text, _)| text.chars().count()).sum()
-    }
-
     /// Its text alone.
     #[cfg(test)]
     pub fn text(&self) -> String {

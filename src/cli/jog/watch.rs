@@ -106,8 +106,9 @@ fn read(client: &mut Client, arm: &str, to: &Mutex<Seen>, ending: &AtomicBool) -
             seen.tasks = status.tasks;
         }
         while let Some(message) = client.kept_message() {
-            if let Some(text) = bound(&message.data, &lock(to)) {
-                lock(to).bound = Some((text, Instant::now()));
+            let mut seen = lock(to);
+            if let Some(text) = bound(&message.data, &seen) {
+                seen.bound = Some((text, Instant::now()));
             }
         }
         next = (next + STATE).max(Instant::now());
