@@ -108,7 +108,7 @@ fn mistakes_of_assets_are_found_at_their_places() {
             "include: [yourarm-planner]\nassets: {assets}\nplanner: {{robots: [{{name: arm, model_path: \"{path}\"}}]}}\n"
         )
     };
-    let good = format!("{{yourarm: {{url: \"https://x.invalid/a.zip\", sha256: {sum}}}}}");
+    let good = format!("{{yourarm: {{url: \"https://x.invalid/a.zip\", sha256: \"{sum}\"}}}}");
     home.write("good.yaml", &cell(&good, "asset:yourarm/a.urdf"));
     home.dimos("check good.yaml").with(0);
     for (assets, path, place, says) in [

@@ -100,13 +100,13 @@ impl Session {
             loop {
                 let patience = beat.saturating_duration_since(Instant::now());
                 match terminal.event(patience).map_err(no_terminal)? {
-                    Some(Event::Key(key)) => {
-                        if let Some(exit) = self.key(&key)? {
+                    Some((Event::Key(key), at)) => {
+                        if let Some(exit) = self.key(&key, at)? {
                             return Ok(exit);
                         }
                     }
                     // Without the keyboard there are no key-ups.
-                    Some(Event::FocusLost) => self.held.clear(),
+                    Some((Event::FocusLost, _)) => self.held.clear(),
                     _ => {}
                 }
                 if Instant::now() >= beat {
@@ -129,8 +129,7 @@ impl Session {
         }
     }
 
-    fn key(&mut self, key: &KeyEvent) -> Result<Option<Exit>> {
-        let now = Instant::now();
+    fn key(&mut self, key: &KeyEvent, now: Instant) -> Result<Option<Exit>> {
         let Some(wish) = meaning(key, self.setting.joint_mode) else { return Ok(None) };
         match (wish, key.kind) {
             (Wish::Move(motion), KeyEventKind::Press) => {

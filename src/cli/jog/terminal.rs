@@ -2,12 +2,13 @@
 
 use std::io::{self, IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::time::{Duration, Instant};
 
 use crossterm::cursor::{Hide, MoveTo, Show};
 use crossterm::event::{
     DisableFocusChange, EnableFocusChange, Event, KeyboardEnhancementFlags, PopKeyboardEnhancementFlags,
-    PushKeyboardEnhancementFlags, poll, read,
+    PushKeyboardEnhancementFlags, read,
 };
 use crossterm::style::{Attribute, Color, Print, ResetColor, SetAttribute, SetForegroundColor};
 use crossterm::terminal::{
@@ -19,6 +20,9 @@ use crate::cli::output;
 
 /// Whether there is something to give back.
 static TAKEN: AtomicBool = AtomicBool::new(false);
+
+/// Keys that wait to be taken up.
+const KEYS: usize = 256;
 
 /// How a piece of text looks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -66,6 +70,7 @@ pub struct Terminal {
     drawn: Vec<Line>,
     size: (usize, usize),
     colour: bool,
+    events: Receiver<io::Result<(Event, Instant)>>,
 }
 
 impl Terminal {
@@ -75,8 +80,8 @@ impl Terminal {
         give_back_on_panic();
         enable_raw_mode()?;
         TAKEN.store(true, Ordering::SeqCst);
-        let terminal =
-            Self { drawn: Vec::new(), size: (columns.into(), rows.into()), colour: output::colour(&io::stdout()) };
+        let size = (columns.into(), rows.into());
+        let terminal = Self { drawn: Vec::new(), size, colour: output::colour(&io::stdout()), events: listen()? };
         // A terminal that does not know the kitty keyboard protocol passes over its sequence; one that does will tell
         // when keys go up. Whether it does is known by the first key-up.
         let flags = KeyboardEnhancementFlags::DISAMBIGUATE_ESCAPE_CODES | KeyboardEnhancementFlags::REPORT_EVENT_TYPES;
@@ -90,22 +95,20 @@ impl Terminal {
         self.size
     }
 
-    /// The next key or change of the terminal, waiting up to `patience`. Fails when the terminal is gone.
-    pub fn event(&mut self, patience: Duration) -> io::Result<Option<Event>> {
-        match poll(patience) {
-            Ok(true) => {}
-            Ok(false) => return Ok(None),
-            // A signal: whoever waits looks for it.
-            Err(e) if e.kind() == io::ErrorKind::Interrupted => return Ok(None),
-            Err(e) => return Err(e),
-        }
-        let event = read()?;
+    /// The next key or change of the terminal, and when it came, waiting up to `patience`. Fails when there will be
+    /// no more.
+    pub fn event(&mut self, patience: Duration) -> io::Result<Option<(Event, Instant)>> {
+        let (event, at) = match self.events.recv_timeout(patience) {
+            Ok(event) => event?,
+            Err(RecvTimeoutError::Timeout) => return Ok(None),
+            Err(RecvTimeoutError::Disconnected) => return Err(io::ErrorKind::UnexpectedEof.into()),
+        };
         if let Event::Resize(columns, rows) = event {
             self.size = (columns.into(), rows.into());
             self.drawn.clear();
             execute!(io::stdout(), Clear(ClearType::All))?;
         }
-        Ok(Some(event))
+        Ok(Some((event, at)))
     }
 
     /// Whether it is still there: one that was closed gives no keys, and must not be waited for.
@@ -158,6 +161,23 @@ impl Drop for Terminal {
     fn drop(&mut self) {
         give_back();
     }
+}
+
+/// Reads keys on a thread of its own: on a terminal that is gone the library never comes back from its reading. And
+/// keys keep the time when they were typed, however late they are taken up.
+fn listen() -> io::Result<Receiver<io::Result<(Event, Instant)>>> {
+    let (to, events) = sync_channel(KEYS);
+    let listening = move || {
+        loop {
+            let event = read().map(|event| (event, Instant::now()));
+            let over = event.is_err();
+            if to.send(event).is_err() || over {
+                return;
+            }
+        }
+    };
+    std::thread::Builder::new().name("jog-keys".into()).spawn(listening)?;
+    Ok(events)
 }
 
 /// Makes the terminal what it was. That it is gone is no error here.
