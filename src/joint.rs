@@ -23,6 +23,16 @@ pub fn joints_of(values: &[f64]) -> Joints {
     out
 }
 
+/// The highest speed [rad/s] of a step of `dt` [s] that ends no further than `distance` [rad] when the steps after it
+/// slow down by `acceleration` [rad/s²] each. Exact in discrete time: with n more steps before the last one,
+/// distance / dt = (n + 1) v − c n (n + 1) / 2, where c is the change of velocity per step.
+pub fn braking_speed(distance: f64, acceleration: f64, dt: f64) -> f64 {
+    let change = acceleration * dt;
+    let steps = distance / dt;
+    let n = ((((1.0 + 8.0 * steps / change).sqrt() - 3.0) / 2.0).ceil()).max(0.0);
+    steps / (n + 1.0) + change * n / 2.0
+}
+
 /// `prefix_joint1 … prefix_jointN`: the guide's `make_joints`.
 pub fn make_joints(prefix: &str, count: usize) -> Vec<String> {
     (1..=count).map(|i| format!("{prefix}_joint{i}")).collect()

@@ -113,6 +113,61 @@ fn a_held_key_moves_the_arm_and_letting_go_stops_it() {
 }
 
 #[test]
+fn the_end_effector_moves_along_the_axes_of_its_keys() {
+    let home = Home::new();
+    let run = home.run("keyboard-teleop-yourarm --no-record");
+    let watcher = home.client();
+    let mut rig = Rig { home, run: Some(run), watcher };
+    // Away from the straight arm, where not every direction is free.
+    rig.home.dimos("move arm 0 -0.3 0.9 0 0.8 0").with(0);
+    let terminal = Terminal::new(80, 24);
+    let jog = terminal.start(&rig.home, "jog arm");
+    terminal.until("CARTESIAN along the axes of the base");
+    terminal.until("task twist_arm IDLE  at rest");
+    let mut pose = || rig.watcher.call(State {}).unwrap().arms[0].pose.unwrap();
+    for (key, axis, sign) in
+        [("w", 0, 1.0), ("s", 0, -1.0), ("a", 1, 1.0), ("D", 1, -1.0), ("q", 2, 1.0), ("e", 2, -1.0)]
+    {
+        let (from, began) = (pose().xyz, Instant::now());
+        while (pose().xyz[axis] - from[axis]) * sign < 0.015 {
+            assert!(began.elapsed() < PATIENCE, "{key:?} does not move it:\n{}", terminal.text());
+            terminal.keys(key);
+            std::thread::sleep(HOLD);
+        }
+        terminal.until("at rest");
+        let to = pose().xyz;
+        for other in (0..3).filter(|other| *other != axis) {
+            assert!((to[other] - from[other]).abs() < 0.004, "{key:?}: {from:?} to {to:?}");
+        }
+    }
+    // Turning leaves the place as it is.
+    let (from, began) = (pose(), Instant::now());
+    while (pose().rpy[2] - from.rpy[2]).abs() < 0.05 {
+        assert!(began.elapsed() < PATIENCE, "it does not turn:\n{}", terminal.text());
+        terminal.keys("y");
+        std::thread::sleep(HOLD);
+    }
+    terminal.until("at rest");
+    let to = pose();
+    assert!(to.xyz.iter().zip(from.xyz).all(|(to, from)| (to - from).abs() < 0.004), "{from:?} to {to:?}");
+
+    // B: along the tool's own axes.
+    terminal.keys("b");
+    terminal.until("CARTESIAN along the axes of the tool");
+    terminal.keys("q");
+    terminal.until_with("moving +z", || terminal.keys("q"));
+    terminal.until("at rest");
+    terminal.keys("\t");
+    terminal.until("JOINT arm_joint1");
+    rig.hold(&terminal, "+", 0, 0.03);
+    rig.rest();
+    terminal.keys("\x1b");
+    jog.wait().with(0);
+    // The planner's own motions are none of its business.
+    rig.home.dimos("move arm --named home").with(0);
+}
+
+#[test]
 fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
     let mut rig = Rig::new(YOURARM);
     let terminal = Terminal::new(80, 24);
@@ -144,7 +199,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
         let text = terminal.text();
         text.contains("arm_joint6") && !text.contains('#') && text.contains("task velocity_arm")
     });
-    assert!(terminal.has_colour());
+    eventually("what is good is green", || terminal.has_colour());
     jog.end(Signal::TERM).with(143);
     assert!(terminal.is_as_before());
 

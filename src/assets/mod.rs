@@ -95,6 +95,12 @@ impl Cache {
         self.folder(sha256).is_dir()
     }
 
+    /// Whether a path leads into the folder of an asset that is not there.
+    pub fn awaits(&self, path: &Path) -> bool {
+        let inside = path.strip_prefix(&self.0).ok().and_then(|rest| rest.components().next());
+        inside.is_some_and(|folder| !self.0.join(folder).is_dir())
+    }
+
     /// How much of an asset has come in a download that is not done [bytes].
     pub fn part(&self, sha256: &str) -> Option<u64> {
         fs::metadata(self.file(sha256, ".part")).ok().map(|part| part.len())

@@ -1,11 +1,12 @@
 //! The section `assets`, and the paths that lead into them: `asset:NAME/path`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::assets::{Asset, Cache, split};
-use crate::blueprint::planner::{PlannerConfig, RobotConfig, ShapeEntry};
+use crate::blueprint::planner::{PlannerConfig, ShapeEntry};
 use crate::blueprint::resolve::{Checker, UsedAsset};
-use crate::blueprint::schema::AssetEntry;
+use crate::blueprint::schema::{AssetEntry, TaskEntry};
+use crate::robot::Source;
 use crate::yaml::{Diag, Keyed, Located, NodeId, did_you_mean, quote};
 
 /// The assets of a blueprint, while it is checked.
@@ -31,19 +32,19 @@ impl Assets {
         Some(if inside.is_empty() { folder } else { folder.join(inside) })
     }
 
-    /// Whether a path leads into an asset that has not been fetched yet.
-    pub fn awaited(&self, path: &str) -> bool {
-        split(path).and_then(|(name, _)| self.entry(name)).is_some_and(|entry| !self.cache.has(&entry.sha256))
+    /// Whether a file lies in an asset that has not been fetched yet.
+    pub fn awaited(&self, path: &Path) -> bool {
+        self.cache.awaits(path)
     }
 
-    /// Whether a robot's description lies in one.
-    pub fn robot_awaited(&self, robot: &RobotConfig) -> bool {
-        self.awaited(&robot.model_path) || robot.package_paths.values().any(|path| self.awaited(path))
+    /// Whether anything of a description does.
+    pub fn source_awaited(&self, source: &Source) -> bool {
+        self.awaited(&source.path) || source.packages.values().any(|path| self.awaited(path))
     }
 }
 
 /// Reports entries that cannot be fetched, and paths into assets that there are not.
-pub(super) fn check(checker: &mut Checker<'_>, planner: Option<&Located<PlannerConfig>>) {
+pub(super) fn check(checker: &mut Checker<'_>, tasks: &[Located<TaskEntry>], planner: Option<&Located<PlannerConfig>>) {
     for (name, entry) in checker.assets.entries.0.clone() {
         checker.check_name(&name, "asset's name");
         address(checker, &entry.url);
@@ -53,7 +54,7 @@ pub(super) fn check(checker: &mut Checker<'_>, planner: Option<&Located<PlannerC
             checker.error(sum.at, diag.hint("`sha256sum FILE` prints it"));
         }
     }
-    for (at, path) in planner.into_iter().flat_map(|planner| paths(checker, planner)).collect::<Vec<_>>() {
+    for (at, path) in paths(checker, tasks, planner) {
         reference(checker, at, &path);
     }
 }
@@ -72,9 +73,13 @@ fn reference(checker: &mut Checker<'_>, at: NodeId, path: &str) {
 }
 
 /// The assets with the places of their entries, and whether any path leads into them.
-pub(super) fn resolved(checker: &Checker<'_>, planner: Option<&Located<PlannerConfig>>) -> Vec<UsedAsset> {
-    let paths: Vec<String> = planner.into_iter().flat_map(|p| paths(checker, p)).map(|(_, path)| path).collect();
-    let used = |name: &str| paths.iter().any(|path| split(path).is_some_and(|(ours, _)| ours == name));
+pub(super) fn resolved(
+    checker: &Checker<'_>,
+    tasks: &[Located<TaskEntry>],
+    planner: Option<&Located<PlannerConfig>>,
+) -> Vec<UsedAsset> {
+    let paths = paths(checker, tasks, planner);
+    let used = |name: &str| paths.iter().any(|(_, path)| split(path).is_some_and(|(ours, _)| ours == name));
     let asset = |(name, entry): &(Located<String>, AssetEntry)| {
         let place = Diag::error("").at(checker.tree.label(name.at)).located(checker.tree);
         let (line, column) = (place.line.unwrap_or(1), place.column.unwrap_or(1));
@@ -90,18 +95,23 @@ pub(super) fn resolved(checker: &Checker<'_>, planner: Option<&Located<PlannerCo
     checker.assets.entries.0.iter().map(asset).collect()
 }
 
-/// All paths of a planner's files, with their places.
-fn paths(checker: &Checker<'_>, planner: &PlannerConfig) -> Vec<(NodeId, String)> {
+/// All paths of descriptions and shapes, with their places.
+fn paths(
+    checker: &Checker<'_>,
+    tasks: &[Located<TaskEntry>],
+    planner: Option<&Located<PlannerConfig>>,
+) -> Vec<(NodeId, String)> {
+    let tree = &checker.tree;
     let mut all = Vec::new();
-    for robot in &planner.robots {
-        all.push((robot.model_path.at, robot.model_path.value.clone()));
-        let packages = checker.tree.get(robot.at, "package_paths");
-        for (name, path) in &robot.package_paths {
-            let at = packages.and_then(|map| checker.tree.get(map, name));
-            all.push((at.unwrap_or(robot.at), path.clone()));
-        }
+    // Tasks and robots give them by the same keys.
+    let tasks = tasks.iter().filter_map(|task| task.params.as_ref()).map(|params| params.at);
+    let robots = planner.iter().flat_map(|planner| planner.robots.iter()).map(|robot| robot.at);
+    for owner in tasks.chain(robots) {
+        let packages = tree.get(owner, "package_paths").map(|map| tree.entries(map)).unwrap_or_default();
+        let nodes = tree.get(owner, "model_path").into_iter().chain(packages.iter().map(|(_, path)| *path));
+        all.extend(nodes.filter_map(|at| Some((at, tree.text(at)?.to_owned()))));
     }
-    for (_, object) in &planner.world.0 {
+    for (_, object) in planner.iter().flat_map(|planner| planner.world.0.iter()) {
         if let ShapeEntry::Mesh(path) | ShapeEntry::Cloud(path) = &object.shape.value {
             all.push((object.shape.at, path.clone()));
         }

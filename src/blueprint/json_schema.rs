@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
 use serde_json::{Value, json};
 
-use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::schema::BlueprintFile;
 use crate::hardware::registry::Registry;
 
@@ -28,6 +28,8 @@ pub(super) fn full_schema(adapters: &Registry) -> Value {
         ("trajectory", subschema::<TrajectoryParams>(&mut generator)),
         ("servo", subschema::<ServoParams>(&mut generator)),
         ("velocity", subschema::<VelocityParams>(&mut generator)),
+        ("cartesian_ik", subschema::<CartesianParams>(&mut generator)),
+        ("eef_twist", subschema::<CartesianParams>(&mut generator)),
     ];
     let mut schema = generator.into_root_schema_for::<BlueprintFile>().to_value();
     let names: Vec<&str> = adapters.names();

@@ -22,13 +22,15 @@ mod registry;
 mod resolve;
 pub mod schema;
 mod summary;
+mod task_robots;
 mod tasks;
 
 pub use json_schema::json_schema;
 pub use limits::JointOverride;
 pub use load::{Loaded, Overrides, load, load_from};
+pub use params::CartesianParams;
 pub use reference::reference;
 pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list};
-pub use resolve::{Arm, Blueprint, Task, TaskKind, UsedAsset};
+pub use resolve::{Arm, Blueprint, Task, TaskKind, TaskRobot, UsedAsset};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

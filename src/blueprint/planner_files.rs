@@ -64,7 +64,7 @@ fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> Ob
 }
 
 /// A path into an asset; or as seen from the file that names it; from here, where that file is one of those in the box.
-fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
+pub(super) fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
     if path.starts_with(crate::robot::builtin::PREFIX) {
         return path.into();
     }

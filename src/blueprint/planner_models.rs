@@ -14,7 +14,6 @@ use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
 pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, config: &PlannerConfig) {
     for (robot, config) in typed.robots.iter().zip(&config.robots) {
         let known = checker.has(robot.at, "model_path") && !checker.lost.contains(robot.model_path.at);
-        let known = known && !checker.assets.robot_awaited(robot);
         if known && let Some(model) = model(checker, robot, config) {
             names(checker, robot, &model);
             exclusions(checker, robot, &model);
@@ -24,15 +23,11 @@ pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, config: &PlannerCo
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
         if let (ShapeEntry::Mesh(_) | ShapeEntry::Cloud(_), ObjectShape::Mesh(path) | ObjectShape::Cloud(path)) =
             (&entry.shape.value, &object.shape)
-            && !shape_awaited(checker, &entry.shape.value)
+            && !checker.assets.awaited(path)
         {
             file(checker, entry.shape.at, path);
         }
     }
-}
-
-fn shape_awaited(checker: &Checker<'_>, shape: &ShapeEntry) -> bool {
-    matches!(shape, ShapeEntry::Mesh(path) | ShapeEntry::Cloud(path) if checker.assets.awaited(path))
 }
 
 fn file(checker: &mut Checker<'_>, at: NodeId, path: &Path) {
@@ -50,6 +45,9 @@ fn model(checker: &mut Checker<'_>, robot: &TypedRobot, config: &RobotConfig) ->
         xacro_args: config.xacro_args.clone(),
         ..Source::default()
     };
+    if checker.assets.source_awaited(&source) {
+        return None;
+    }
     let loaded = load(&source);
     let first = loaded.reports().into_iter().find(|report| report.severity == Severity::Error);
     if let Some(first) = first {

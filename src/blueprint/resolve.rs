@@ -5,12 +5,14 @@ use serde::Serialize;
 use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::limits::JointOverride;
-use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::planner::ViewConfig;
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
+use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::planning::config::PlannerConfig;
+use crate::robot::Source;
 use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Tree, quote};
 
 /// A blueprint without mistakes.
@@ -103,6 +105,10 @@ pub enum TaskKind {
     Servo(ServoParams),
     /// Follows streamed velocities.
     Velocity(VelocityParams),
+    /// Takes an end effector to streamed poses.
+    CartesianIk(CartesianParams),
+    /// Moves an end effector with streamed twists.
+    EefTwist(CartesianParams),
 }
 
 impl TaskKind {
@@ -112,6 +118,16 @@ impl TaskKind {
             Self::Trajectory(_) => "trajectory",
             Self::Servo(_) => "servo",
             Self::Velocity(_) => "velocity",
+            Self::CartesianIk(_) => "cartesian_ik",
+            Self::EefTwist(_) => "eef_twist",
+        }
+    }
+
+    /// The parameters of a task that moves an end effector.
+    pub fn cartesian(&self) -> Option<&CartesianParams> {
+        match self {
+            Self::CartesianIk(params) | Self::EefTwist(params) => Some(params),
+            _ => None,
         }
     }
 }
@@ -131,6 +147,21 @@ pub struct Task {
     pub priority: i32,
     /// Whether it is started with the run.
     pub auto_start: bool,
+    /// The robot whose end effector it moves, where its type needs one.
+    pub robot: Option<TaskRobot>,
+}
+
+/// The robot of a task that moves an end effector. Its description has been checked, and is read again for a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TaskRobot {
+    /// Its description.
+    pub source: Source,
+    /// The model's names of the task's joints, in the task's order.
+    pub joints: Vec<String>,
+    /// The link that is moved.
+    pub link: String,
+    /// Where it stands, if it is a robot of the planner; else all is in the frame of the model's root.
+    pub base: Option<Base>,
 }
 
 /// What every check needs: the tree to point into, and what reading had to leave out.
@@ -195,9 +226,9 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         checker.check_name(&Located { at, value: name.value.clone() }, "blueprint's name");
     }
     let found = arms::resolve(&mut checker, &file.hardware);
-    let tasks = tasks::resolve(&mut checker, &file.tasks, &found);
+    let mut tasks = tasks::resolve(&mut checker, &file.tasks, &found);
     checker.assets = Assets::of(file.assets);
-    assets::check(&mut checker, file.planner.as_ref());
+    assets::check(&mut checker, &file.tasks, file.planner.as_ref());
     if let Some(planner) = &file.planner {
         planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
     }
@@ -206,7 +237,8 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         planner_models::check(&mut checker, planner, &config);
         config
     });
-    let assets = assets::resolved(&checker, file.planner.as_ref());
+    task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
+    let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     Blueprint {
         name: name.value,

@@ -201,9 +201,10 @@ pub struct TaskEntry {
     /// Unique name of the task: letters, digits, `_` and `-`.
     pub name: Located<String>,
     /// What the task does: `trajectory` executes trajectories, `servo` follows streamed positions, `velocity` follows
-    /// streamed velocities. (`cartesian_ik` is not in this version.)
+    /// streamed velocities; `cartesian_ik` takes the end effector to streamed poses, `eef_twist` moves it with streamed
+    /// velocities.
     #[serde(rename = "type")]
-    #[schemars(extend("enum" = ["trajectory", "servo", "velocity"]))]
+    #[schemars(extend("enum" = ["trajectory", "servo", "velocity", "cartesian_ik", "eef_twist"]))]
     pub kind: Located<String>,
     /// The joints it commands: a list of names, or `{hardware: arm}` for all joints of an arm.
     pub joint_names: Located<JointNames>,

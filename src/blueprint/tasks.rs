@@ -3,16 +3,14 @@
 use serde::de::DeserializeOwned;
 
 use crate::blueprint::arms::Found;
-use crate::blueprint::params::{ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::resolve::{Checker, Task, TaskKind};
 use crate::blueprint::schema::{JointNames, TaskEntry};
 use crate::joint::{ControlMode, MAX_DOF};
 use crate::yaml::{Diag, Located, Missing, NodeId, did_you_mean, quote, read};
 
 /// The task types of this version.
-pub(super) const KINDS: [&str; 3] = ["trajectory", "servo", "velocity"];
-/// A task type of the guide that comes later.
-const LATER: &str = "cartesian_ik";
+pub(super) const KINDS: [&str; 5] = ["trajectory", "servo", "velocity", "cartesian_ik", "eef_twist"];
 
 /// A task as far as it is understood, with its places.
 struct Checked<'e> {
@@ -50,6 +48,7 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>],
                 arms,
                 priority: entry.priority,
                 auto_start: entry.auto_start,
+                robot: None,
             });
         }
         checked.push(Checked { entry, joints });
@@ -131,12 +130,8 @@ fn kind(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, joints: &[usize],
             Some(TaskKind::Servo(servo))
         }
         "velocity" => Some(TaskKind::Velocity(read_params::<VelocityParams>(checker, params))),
-        LATER => {
-            let diag = Diag::error(format!("`{LATER}` is not in this version"));
-            let hint = "use `servo` and stream joint positions, or leave the task out";
-            checker.error(entry.kind.at, diag.hint(hint));
-            None
-        }
+        "cartesian_ik" => Some(TaskKind::CartesianIk(read_params::<CartesianParams>(checker, params))),
+        "eef_twist" => Some(TaskKind::EefTwist(read_params::<CartesianParams>(checker, params))),
         other => {
             let diag = Diag::error(format!("there is no task type {}", quote(other)));
             checker.error(entry.kind.at, diag.maybe_hint(did_you_mean(other, KINDS, "there are")));
@@ -147,7 +142,7 @@ fn kind(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, joints: &[usize],
 
 /// A stream's target crosses to the tick as one fixed array.
 fn check_width(checker: &mut Checker<'_>, entry: &TaskEntry, joints: &[usize]) {
-    if matches!(entry.kind.as_str(), "servo" | "velocity") && joints.len() > MAX_DOF {
+    if KINDS.contains(&entry.kind.as_str()) && entry.kind.value != "trajectory" && joints.len() > MAX_DOF {
         let kind = entry.kind.as_str();
         let diag =
             Diag::error(format!("a {kind} task moves at most {MAX_DOF} joints, this one names {}", joints.len()));
@@ -183,8 +178,8 @@ fn check_default_positions(
 /// Whether every arm of the task can be commanded the way the task does.
 fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, kind: &TaskKind, arms: &[usize], found: &Found) {
     let wanted: &[ControlMode] = match kind {
-        TaskKind::Trajectory(_) | TaskKind::Servo(_) => &[ControlMode::ServoPosition, ControlMode::Position],
         TaskKind::Velocity(_) => &[ControlMode::Velocity],
+        _ => &[ControlMode::ServoPosition, ControlMode::Position],
     };
     for (id, row) in arms.iter().filter_map(|i| found.entries.get(*i)).filter_map(|e| Some((&e.id, e.adapter?))) {
         if row.modes.iter().any(|mode| wanted.contains(mode)) {

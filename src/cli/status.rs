@@ -223,6 +223,9 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
         if let Some(reason) = &task.reason {
             output::line(format_args!("  {} is {}: {reason}", task.name, task.state));
         }
+        if let Some(bound) = &task.bound {
+            output::line(format_args!("  {} is held back by {bound}", task.name));
+        }
     }
 }
 

@@ -5,6 +5,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::joint::{ControlMode, JointLimits};
+use crate::robot::kinematics::Kinematics;
 
 /// A step of a command further than this from the one before it is refused [rad].
 pub const JUMP: f64 = 0.2;
@@ -80,6 +81,10 @@ pub enum TaskKind {
     Servo(ServoParams),
     /// Follows a stream of velocities.
     Velocity(VelocityParams),
+    /// Takes an end effector to a stream of poses.
+    CartesianIk(Box<CartesianParams>),
+    /// Moves an end effector with a stream of twists.
+    EefTwist(Box<CartesianParams>),
 }
 
 impl TaskKind {
@@ -89,6 +94,8 @@ impl TaskKind {
             Self::Trajectory(_) => "trajectory",
             Self::Servo(_) => "servo",
             Self::Velocity(_) => "velocity",
+            Self::CartesianIk(_) => "cartesian_ik",
+            Self::EefTwist(_) => "eef_twist",
         }
     }
 }
@@ -139,5 +146,84 @@ pub struct VelocityParams {
 impl Default for VelocityParams {
     fn default() -> Self {
         Self { timeout: 0.2, zero_on_timeout: true }
+    }
+}
+
+/// Parameters of a Cartesian task, and the robot that it moves.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CartesianParams {
+    /// How long a target stands without a new one [s]; 0 = for ever.
+    pub timeout: f64,
+    /// Highest speed of the end effector's origin [m/s].
+    pub max_linear_velocity: f64,
+    /// Highest angular speed of the end effector [rad/s].
+    pub max_angular_velocity: f64,
+    /// Highest acceleration of the end effector's origin [m/s²].
+    pub max_linear_acceleration: f64,
+    /// Highest angular acceleration of the end effector [rad/s²].
+    pub max_angular_acceleration: f64,
+    /// A joint that is further than this from where it is commanded to be ends the motion [rad].
+    pub max_tracking_error: f64,
+    /// The robot's kinematics, for the joints of the task in the task's order.
+    pub kinematics: Kinematics,
+    /// The end effector: index of its link.
+    pub link: usize,
+    /// Where the model's root is in the frame that poses are given in.
+    pub root: Place,
+    /// The base whose axes twists are along, in the frame of the model's root: quaternion x, y, z, w.
+    pub base: [f64; 4],
+}
+
+/// A frame in another.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Place {
+    /// x, y, z [m].
+    pub position: [f64; 3],
+    /// Quaternion x, y, z, w.
+    pub orientation: [f64; 4],
+}
+
+/// The quaternion of no rotation.
+pub const NO_ROTATION: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
+
+impl Place {
+    /// The same frame.
+    pub const SAME: Self = Self { position: [0.0; 3], orientation: NO_ROTATION };
+}
+
+impl CartesianParams {
+    /// The defaults for a robot without anything around it.
+    pub fn new(kinematics: Kinematics, link: usize) -> Self {
+        Self {
+            timeout: 0.3,
+            max_linear_velocity: 0.25,
+            max_angular_velocity: 1.0,
+            max_linear_acceleration: 1.0,
+            max_angular_acceleration: 4.0,
+            max_tracking_error: 0.1745,
+            kinematics,
+            link,
+            root: Place::SAME,
+            base: NO_ROTATION,
+        }
+    }
+
+    /// Says what of it cannot be worked with, for a task of so many joints.
+    pub fn check(&self, joints: usize) -> Result<(), String> {
+        let rates = [
+            self.max_linear_velocity,
+            self.max_angular_velocity,
+            self.max_linear_acceleration,
+            self.max_angular_acceleration,
+            self.max_tracking_error,
+        ];
+        let turned = |q: &[f64; 4]| (0.9..1.1).contains(&q.iter().map(|v| v * v).sum::<f64>());
+        match () {
+            () if self.kinematics.dof() != joints => Err("its kinematics have other joints".to_owned()),
+            () if self.link >= self.kinematics.links() => Err("its end effector does not exist".to_owned()),
+            () if !rates.iter().all(|rate| *rate > 0.0) => Err("its limits leave no room to move".to_owned()),
+            () if !turned(&self.base) || !turned(&self.root.orientation) => Err("a frame is not one".to_owned()),
+            () => Ok(()),
+        }
     }
 }

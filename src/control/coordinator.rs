@@ -8,6 +8,7 @@ use super::config::CoordinatorConfig;
 use super::limit::Refusal;
 use super::request::{Envelope, Motion, Request};
 use super::task::{Body, Context, JointView, Task};
+use super::tasks::cartesian::Goal;
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 use crate::joint::Joints;
@@ -162,6 +163,9 @@ impl Coordinator {
                     position: arm.state.position.get(j).copied().unwrap_or_default(),
                     velocity: arm.state.velocity.get(j).copied().unwrap_or_default(),
                     commanded: limiter.position(),
+                    commanded_velocity: limiter.velocity(),
+                    lower: limiter.bounds().lower,
+                    upper: limiter.bounds().upper,
                     acceleration: limiter.bounds().acceleration,
                     velocity_limit: limiter.bounds().velocity,
                 };
@@ -238,6 +242,7 @@ impl Coordinator {
             Request::Execute { task, motion } => self.execute(now, task, motion),
             Request::Servo { task, target } => self.stream(now, task, &target, true),
             Request::Velocity { task, target } => self.stream(now, task, &target, false),
+            Request::Steer { task, goal } => self.steer(now, task, &goal),
             Request::Reset { arm } => self.with_arm(arm, |a| a.failsafe.reset(arm, &a.state, a.fresh(), now)),
             Request::Ready { arm } => self.ready(arm, now),
             Request::Park { arm } => {
@@ -359,6 +364,38 @@ impl Coordinator {
         t.reason = Reason::None;
         if idle {
             self.begin(task);
+        }
+        Outcome::Accepted
+    }
+
+    /// A goal of a Cartesian task.
+    fn steer(&mut self, now: Mono, task: u16, goal: &Goal) -> Outcome {
+        let cx = Context { now, dt: self.period, joints: &self.joints };
+        let Some(t) = self.tasks.get(task as usize) else { return Outcome::WrongTask(task) };
+        if let Err(outcome) = self.admit(&t.joints) {
+            return outcome;
+        }
+        let Some(t) = self.tasks.get_mut(task as usize) else { return Outcome::WrongTask(task) };
+        let idle = !t.is_active();
+        let Body::Cartesian(body) = &mut t.body else { return Outcome::WrongTask(task) };
+        if !body.follows(goal) {
+            return Outcome::WrongTask(task);
+        }
+        if let Some((joint, error)) = body.strayed(&cx, &t.joints).filter(|_| idle) {
+            return Outcome::StartStateMismatch(joint, error.abs());
+        }
+        if !body.set_goal(&cx, goal) {
+            return Outcome::InvalidTarget(task);
+        }
+        if idle || t.state == TaskState::Cancelling {
+            let granted = t.granted;
+            self.begin(task);
+            // Called back while it slows down, it goes on from there.
+            if let Some(t) = self.tasks.get_mut(task as usize) {
+                t.granted = granted;
+            }
+        } else {
+            t.reason = Reason::None;
         }
         Outcome::Accepted
     }

@@ -3,6 +3,7 @@
 //! is too fast is followed as well as the limits allow, without overshoot; a jump is refused.
 
 use super::config::{JUMP, POSITION_MARGIN};
+use crate::joint::braking_speed;
 use crate::telemetry::LimitKind;
 
 /// Slack for rounding: a command at its limit is not "limited".
@@ -218,14 +219,9 @@ impl Limiter {
         (-self.braking_speed((at - lower).max(0.0), dt), self.braking_speed((upper - at).max(0.0), dt))
     }
 
-    /// The highest speed [rad/s] of a step that ends no further than `distance` when the steps after it slow down
-    /// by the acceleration limit each. Exact in discrete time: with n more steps before the last one,
-    /// distance / dt = (n + 1) v − c n (n + 1) / 2, where c is the change of velocity per step.
+    /// See [`braking_speed`].
     fn braking_speed(&self, distance: f64, dt: f64) -> f64 {
-        let change = self.bounds.acceleration * dt;
-        let steps = distance / dt;
-        let n = ((((1.0 + 8.0 * steps / change).sqrt() - 3.0) / 2.0).ceil()).max(0.0);
-        steps / (n + 1.0) + change * n / 2.0
+        braking_speed(distance, self.bounds.acceleration, dt)
     }
 }
 

@@ -1,6 +1,7 @@
 //! What the coordinator can be told. Requests arrive through a ring; nothing in them is freed by the tick: a
 //! trajectory that is done goes back through [`TickOutput::retired`](super::coordinator::TickOutput).
 
+use super::tasks::cartesian::Goal;
 use crate::joint::Joints;
 use crate::trajectory::Spline;
 
@@ -41,6 +42,13 @@ pub enum Request {
         task: u16,
         /// Velocities [rad/s].
         target: Joints,
+    },
+    /// A new goal of a Cartesian task: a pose, or a twist, as the task's type is.
+    Steer {
+        /// The task.
+        task: u16,
+        /// The goal.
+        goal: Goal,
     },
     /// Latched hold of an arm, or of all.
     Stop {

@@ -2,6 +2,7 @@
 
 use super::config::{TaskConfig, TaskKind};
 use super::request::Motion;
+use super::tasks::cartesian::CartesianTask;
 use super::tasks::servo::ServoTask;
 use super::tasks::trajectory::TrajectoryTask;
 use super::tasks::velocity::VelocityTask;
@@ -17,6 +18,12 @@ pub struct JointView {
     pub velocity: f64,
     /// Last commanded position [rad].
     pub commanded: f64,
+    /// Last commanded velocity [rad/s].
+    pub commanded_velocity: f64,
+    /// Lowest position that is commanded [rad].
+    pub lower: f64,
+    /// Highest position that is commanded [rad].
+    pub upper: f64,
     /// Acceleration limit [rad/s²].
     pub acceleration: f64,
     /// Velocity limit [rad/s].
@@ -71,6 +78,8 @@ pub enum Body {
     Servo(ServoTask),
     /// See [`VelocityTask`].
     Velocity(VelocityTask),
+    /// See [`CartesianTask`].
+    Cartesian(Box<CartesianTask>),
 }
 
 /// A task of a coordinator.
@@ -102,6 +111,8 @@ impl Task {
             TaskKind::Trajectory(p) => Body::Trajectory(TrajectoryTask::new(p.clone(), width)),
             TaskKind::Servo(p) => Body::Servo(ServoTask::new(p.clone())),
             TaskKind::Velocity(p) => Body::Velocity(VelocityTask::new(p.clone())),
+            TaskKind::CartesianIk(p) => Body::Cartesian(Box::new(CartesianTask::new(*p.clone(), true))),
+            TaskKind::EefTwist(p) => Body::Cartesian(Box::new(CartesianTask::new(*p.clone(), false))),
         };
         Self {
             joints: config.joints.clone(),
@@ -154,6 +165,18 @@ impl Task {
                     false => self.end(TaskState::Idle, Reason::Timeout),
                 }
             }
+            Body::Cartesian(t) => {
+                self.demand = Demand::Positions;
+                match t.compute(cx, &self.joints, self.granted, &mut self.claims) {
+                    None => {
+                        if t.timed_out() && self.state == TaskState::Executing {
+                            self.reason = Reason::Timeout;
+                        }
+                        None
+                    }
+                    Some((state, reason)) => self.end(state, reason),
+                }
+            }
         }
     }
 
@@ -174,13 +197,20 @@ impl Task {
                 t.drop_target();
                 None
             }
+            Body::Cartesian(t) => {
+                t.drop_target();
+                None
+            }
         }
     }
 
-    /// Another task took a joint. A trajectory is all or nothing; a stream loses the joint until its next target.
+    /// Another task took a joint. A trajectory is all or nothing, as is an end effector's motion; a stream of joint values
+    /// loses the joint until its next target.
     pub fn lose(&mut self, winner: u16, joint: u16) -> Option<Box<Motion>> {
         match &mut self.body {
-            Body::Trajectory(_) => return self.end(TaskState::Aborted, Reason::Preempted(winner, joint)),
+            Body::Trajectory(_) | Body::Cartesian(_) => {
+                return self.end(TaskState::Aborted, Reason::Preempted(winner, joint));
+            }
             Body::Servo(t) => t.mute(&self.joints, joint),
             Body::Velocity(t) => t.mute(&self.joints, joint),
         }
@@ -188,13 +218,16 @@ impl Task {
         None
     }
 
-    /// A cancel: a trajectory slows down along its path, a stream just ends. `false`: there was nothing to cancel.
+    /// A cancel: a trajectory slows down along its path, an end effector in its direction, a stream of joint values just
+    /// ends. `false`: there was nothing to cancel.
     pub fn cancel(&mut self) -> bool {
         match (&self.body, self.state) {
             (_, TaskState::Cancelling) => true,
-            (Body::Trajectory(_), TaskState::Executing) => {
-                if let Body::Trajectory(t) = &mut self.body {
-                    t.slow_down();
+            (Body::Trajectory(_) | Body::Cartesian(_), TaskState::Executing) => {
+                match &mut self.body {
+                    Body::Trajectory(t) => t.slow_down(),
+                    Body::Cartesian(t) => t.slow_down(),
+                    _ => {}
                 }
                 self.state = TaskState::Cancelling;
                 self.reason = Reason::Cancelled;
@@ -212,8 +245,10 @@ impl Task {
     /// What is told of it.
     pub fn view(&self) -> TaskView {
         let mut view = TaskView { state: self.state, reason: self.reason, ..TaskView::default() };
-        if let Body::Trajectory(t) = &self.body {
-            t.describe(&mut view);
+        match &self.body {
+            Body::Trajectory(t) => t.describe(&mut view),
+            Body::Cartesian(t) if self.is_active() => view.bound = t.bound(),
+            _ => {}
         }
         view
     }

@@ -3,6 +3,7 @@
 use serde::Deserialize;
 
 use crate::control::request::{Motion, Request};
+use crate::control::tasks::cartesian::Goal;
 use crate::joint::{Joints, joints_of};
 use crate::trajectory::{JointTrajectory, Spline};
 
@@ -20,6 +21,8 @@ enum Told {
     Cancel { task: Option<u16> },
     Servo { task: u16, target: Vec<Option<f64>> },
     Velocity { task: u16, target: Vec<Option<f64>> },
+    Pose { task: u16, position: [Option<f64>; 3], orientation: [Option<f64>; 4] },
+    Twist { task: u16, linear: [Option<f64>; 3], angular: [Option<f64>; 3], tool: bool },
     Stop { arm: Option<u16> },
     Reset { arm: u16 },
     Ready { arm: u16 },
@@ -58,6 +61,14 @@ fn request(told: Told, joints: &[String]) -> Result<Request, String> {
         Told::Cancel { task } => Request::Cancel { task },
         Told::Servo { task, target } => Request::Servo { task, target: values(&target) },
         Told::Velocity { task, target } => Request::Velocity { task, target: values(&target) },
+        Told::Pose { task, position, orientation } => {
+            let goal = Goal::Pose { position: numbers(position), orientation: numbers(orientation) };
+            Request::Steer { task, goal }
+        }
+        Told::Twist { task, linear, angular, tool } => {
+            let goal = Goal::Twist { linear: numbers(linear), angular: numbers(angular), tool };
+            Request::Steer { task, goal }
+        }
         Told::Stop { arm } => Request::Stop { arm },
         Told::Reset { arm } => Request::Reset { arm },
         Told::Ready { arm } => Request::Ready { arm },
@@ -71,6 +82,10 @@ fn request(told: Told, joints: &[String]) -> Result<Request, String> {
 fn values(told: &[Option<f64>]) -> Joints {
     let values: Vec<f64> = told.iter().map(|v| v.unwrap_or(f64::NAN)).collect();
     joints_of(&values)
+}
+
+fn numbers<const N: usize>(told: [Option<f64>; N]) -> [f64; N] {
+    told.map(|v| v.unwrap_or(f64::NAN))
 }
 
 #[cfg(test)]
@@ -90,6 +105,14 @@ mod tests {
             Request::Cancel { task: Some(3) },
             Request::Servo { task: 1, target },
             Request::Velocity { task: 2, target },
+            Request::Steer {
+                task: 3,
+                goal: Goal::Pose { position: [0.1 + 0.2, -0.0, 1e-300], orientation: [f64::NAN, 0.0, 0.6, 0.8] },
+            },
+            Request::Steer {
+                task: 4,
+                goal: Goal::Twist { linear: [0.1 + 0.2, -0.0, 1e300], angular: [0.0, f64::NAN, 1.0], tool: true },
+            },
             Request::Stop { arm: None },
             Request::Stop { arm: Some(1) },
             Request::Reset { arm: 1 },

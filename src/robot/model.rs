@@ -11,6 +11,7 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 
 use nalgebra::{Isometry3, Matrix3, Unit, Vector3};
+use serde::{Deserialize, Serialize};
 
 /// A robot: a tree of links. Links are `0..n`, joints are `0..n-1`, both in an order where parents come first;
 /// joint `i` moves link `i + 1`.
@@ -104,7 +105,8 @@ pub struct Inertial {
 }
 
 /// What a joint lets its link do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum JointKind {
     /// Nothing.
     Fixed,

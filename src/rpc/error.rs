@@ -103,6 +103,7 @@ impl Code {
             Outcome::StillFaulted(..) => Some(Self::StillFaulted),
             Outcome::WrongTask(_) => Some(Self::WrongTask),
             Outcome::NonFinite(_) => Some(Self::NonFinite),
+            Outcome::InvalidTarget(_) => Some(Self::InvalidParams),
             Outcome::OutOfLimits(..) => Some(Self::OutOfLimits),
             Outcome::NoGripper(_) => Some(Self::NoGripper),
             Outcome::ShuttingDown => Some(Self::ShuttingDown),

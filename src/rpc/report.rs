@@ -183,7 +183,7 @@ pub struct FaultReport {
 pub struct TaskReport {
     /// Its name.
     pub name: String,
-    /// Its type: `trajectory`, `servo`, `velocity`.
+    /// Its type: `trajectory`, `servo`, `velocity`, `cartesian_ik`, `eef_twist`.
     #[serde(rename = "type")]
     pub kind: String,
     /// The joints that it may claim.
@@ -198,6 +198,9 @@ pub struct TaskReport {
     pub reason: Option<String>,
     /// The motion it carries out, or carried out last.
     pub motion: Option<u64>,
+    /// What holds its end effector back just now.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub bound: Option<String>,
 }
 
 /// Reply to `state`.

@@ -12,14 +12,13 @@ use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
+use super::task_kinds::task_kinds;
 use super::watchdog::Watchdog;
 use super::{Ending, Handle, Options, Record, Run, StartError};
 use crate::arm::ArmState;
-use crate::blueprint::{Arm, Blueprint, TaskKind as Typed};
+use crate::blueprint::{Arm, Blueprint};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
-use crate::control::config::{
-    ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
-};
+use crate::control::config::{ArmConfig, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Request;
 use crate::control::tick_loop::{self, Pulse, TickPorts};
@@ -59,6 +58,10 @@ impl Run {
                 what,
                 hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
             })?;
+        let kinds = task_kinds(blueprint).map_err(|what| StartError::Blueprint {
+            what,
+            hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
+        })?;
         for (robot, [a, b]) in planner.iter().flat_map(PlannerPort::always_touching) {
             tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
         }
@@ -71,7 +74,7 @@ impl Run {
         };
         let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
         let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
-        let config = coordinator_config(blueprint, &connected);
+        let config = coordinator_config(blueprint, &connected, kinds);
 
         let samples = ring_size(&config);
         let (mut sample_producer, mut sample_consumer) = rtrb::RingBuffer::new(samples);
@@ -298,6 +301,7 @@ fn names_of(blueprint: &Blueprint) -> Names {
 fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, crate::joint::JointLimits)],
+    kinds: Vec<TaskKind>,
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
@@ -315,31 +319,15 @@ fn coordinator_config(
         tasks: blueprint
             .tasks
             .iter()
-            .map(|task| TaskConfig {
+            .zip(kinds)
+            .map(|(task, kind)| TaskConfig {
                 name: task.name.clone(),
-                kind: kind_of(&task.kind),
+                kind,
                 joints: task.joints.iter().map(|&j| j as u16).collect(),
                 priority: task.priority,
                 auto_start: task.auto_start,
             })
             .collect(),
-    }
-}
-
-fn kind_of(typed: &Typed) -> TaskKind {
-    match typed {
-        Typed::Trajectory(p) => TaskKind::Trajectory(TrajectoryParams {
-            start_position_tolerance: p.start_position_tolerance,
-            path_tolerance: p.path_tolerance,
-            goal_tolerance: p.goal_tolerance,
-            goal_time: p.goal_time,
-        }),
-        Typed::Servo(p) => {
-            TaskKind::Servo(ServoParams { timeout: p.timeout, default_positions: p.default_positions.clone() })
-        }
-        Typed::Velocity(p) => {
-            TaskKind::Velocity(VelocityParams { timeout: p.timeout, zero_on_timeout: p.zero_on_timeout })
-        }
     }
 }
 

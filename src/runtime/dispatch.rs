@@ -13,6 +13,7 @@ use tokio::sync::oneshot;
 
 use crate::clock::{Clock, MonotonicClock};
 use crate::control::request::{Envelope, Motion, Request};
+use crate::control::tasks::cartesian::Goal;
 use crate::recording::recorder::Note;
 use crate::rt::wake::Wake;
 use crate::telemetry::Outcome;
@@ -95,6 +96,12 @@ pub fn log_of(request: &Request) -> Value {
         Request::Cancel { task } => json!({"cancel": {"task": task}}),
         Request::Servo { task, target } => json!({"servo": {"task": task, "target": target}}),
         Request::Velocity { task, target } => json!({"velocity": {"task": task, "target": target}}),
+        Request::Steer { task, goal: Goal::Pose { position, orientation } } => {
+            json!({"pose": {"task": task, "position": position, "orientation": orientation}})
+        }
+        Request::Steer { task, goal: Goal::Twist { linear, angular, tool } } => {
+            json!({"twist": {"task": task, "linear": linear, "angular": angular, "tool": tool}})
+        }
         Request::Stop { arm } => json!({"stop": {"arm": arm}}),
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
         Request::Ready { arm } => json!({"ready": {"arm": arm}}),

@@ -22,6 +22,8 @@ mod repeats;
 mod reports;
 mod service;
 mod service_manager;
+mod stream_requests;
+mod task_kinds;
 mod watchdog;
 mod world_requests;
 

@@ -14,7 +14,7 @@ use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
 use crate::rt::histogram::Figures;
-use crate::telemetry::describe::{Described, Severity, cause_text, outcome_text, reason_text};
+use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, outcome_text, reason_text};
 use crate::telemetry::{Cause, Outcome, Reason, TaskState};
 
 impl Service {
@@ -121,6 +121,7 @@ impl Service {
             progress: (view.motion > 0).then_some(view.progress),
             reason: self.reason(&view.reason),
             motion: (view.motion > 0).then_some(view.motion),
+            bound: Some(bound_text(view.bound, &self.parts.names)).filter(|text| !text.is_empty()),
         })
     }
 

@@ -22,7 +22,6 @@ use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Device};
-use crate::joint::joints_of;
 use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, Reply, Request as Call};
 use crate::rpc::place::Claim;
@@ -239,28 +238,6 @@ impl Service {
         Ok(Reply::Gripper(Done {}))
     }
 
-    async fn stream(&self, task: String, values: Vec<f64>, positions: bool) -> Result<(), RpcError> {
-        let index = self.task_index(&task)?;
-        let width = self.parts.config.tasks[index as usize].joints.len();
-        if values.len() != width {
-            let what = format!("{task} has {width} joints, the target {} values", values.len());
-            return Err(RpcError::new(Code::InvalidParams, what));
-        }
-        let target = joints_of(&values);
-        self.ask(match positions {
-            true => Request::Servo { task: index, target },
-            false => Request::Velocity { task: index, target },
-        })
-        .await?;
-        Ok(())
-    }
-
-    /// No task follows these targets yet.
-    fn stream_of_another_type(&self, task: &str) -> Result<Reply, RpcError> {
-        let index = self.task_index(task)?;
-        self.refusal(&Outcome::WrongTask(index)).map_or_else(|| Err(internal()), Err)
-    }
-
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
         let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
         if changes && self.closed.load(Ordering::Acquire) {
@@ -291,8 +268,8 @@ impl Service {
             Call::Gripper(g) => self.gripper(g).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
-            Call::Twist(t) => self.stream_of_another_type(&t.task),
-            Call::Pose(p) => self.stream_of_another_type(&p.task),
+            Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),
+            Call::Pose(pose) => self.pose(&pose).await.map(Reply::Pose),
             Call::Shutdown(_) => {
                 let _ = self.parts.endings.send(Ending::Asked);
                 Ok(Reply::Shutdown(Done {}))

@@ -4,7 +4,7 @@
 
 use serde::Serialize;
 
-use super::{Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
+use super::{Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
 
 /// The names behind the tick's indices, in the blueprint's order.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -144,7 +144,9 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
     let mut d = Described { request: Some(id), ..plain("request", severity, outcome.name(), text) };
     match outcome {
         Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped | Outcome::ShuttingDown => {}
-        Outcome::AlreadyExecuting(task) | Outcome::WrongTask(task) => d.task = Some(names.task(task)),
+        Outcome::AlreadyExecuting(task) | Outcome::WrongTask(task) | Outcome::InvalidTarget(task) => {
+            d.task = Some(names.task(task));
+        }
         Outcome::NonFinite(joint) => d.joint = Some(names.joint(joint)),
         Outcome::StartStateMismatch(joint, by) | Outcome::OutOfLimits(joint, by) => {
             d.joint = Some(names.joint(joint));
@@ -180,6 +182,9 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::OutOfLimits(joint, by) => {
             format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
         }
+        Outcome::InvalidTarget(task) => {
+            format!("the target of task {} is not finite, or its orientation is none", names.task(task))
+        }
         Outcome::NoGripper(arm) => format!("{} has no gripper", names.arm(arm)),
         Outcome::ShuttingDown => "the run is ending".into(),
     }
@@ -199,7 +204,10 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
     let mut d = Described { task: Some(name), ..plain("task", severity, state.name(), text) };
     match reason {
         Reason::None | Reason::Cancelled | Reason::Timeout => {}
-        Reason::PathTolerance(joint, value) | Reason::GoalTolerance(joint, value) | Reason::Jump(joint, value) => {
+        Reason::PathTolerance(joint, value)
+        | Reason::GoalTolerance(joint, value)
+        | Reason::TrackingError(joint, value)
+        | Reason::Jump(joint, value) => {
             d.joint = Some(names.joint(joint));
             d.values = vec![value];
         }
@@ -224,6 +232,20 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::ArmHeld(arm, cause) => format!("{} is held{}", names.arm(arm), because(cause)),
         Reason::NonFinite(joint) => format!("the command of {} was not a finite number", names.joint(joint)),
         Reason::Jump(joint, by) => format!("the command of {} jumped by {}", names.joint(joint), angle(by)),
+        Reason::TrackingError(joint, by) => {
+            format!("{} was {} from where it was commanded to be", names.joint(joint), angle(by))
+        }
+    }
+}
+
+/// What holds an end effector back, in words; empty where nothing does.
+pub fn bound_text(bound: Bound, names: &Names) -> String {
+    match bound {
+        Bound::None => String::new(),
+        Bound::Velocity(joint) => format!("the highest speed of {}", names.joint(joint)),
+        Bound::Position(joint) => format!("the end of the range of {}", names.joint(joint)),
+        Bound::Singularity => "a singular configuration nearby".into(),
+        Bound::Invalid => "a target that cannot be computed with".into(),
     }
 }
 

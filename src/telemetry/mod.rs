@@ -188,6 +188,24 @@ pub enum Reason {
     NonFinite(u16),
     /// A command jumped: joint, step [rad].
     Jump(u16, f64),
+    /// A joint was further from where it was commanded to be than the task allows: joint, error [rad].
+    TrackingError(u16, f64),
+}
+
+/// What holds an end effector back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Bound {
+    /// Nothing.
+    #[default]
+    None,
+    /// The highest speed of this joint.
+    Velocity(u16),
+    /// The end of this joint's range.
+    Position(u16),
+    /// The arm is close to a singular configuration.
+    Singularity,
+    /// Its target or its state is nothing to compute with.
+    Invalid,
 }
 
 /// What a limit did to a command.
@@ -260,6 +278,8 @@ pub enum Outcome {
     NonFinite(u16),
     /// A target is outside the joint's limits: joint, by how much [rad or rad/s].
     OutOfLimits(u16, f64),
+    /// The target is not finite, or its orientation is none: the task.
+    InvalidTarget(u16),
     /// The arm has no gripper: the arm.
     NoGripper(u16),
     /// The run is ending.
@@ -282,6 +302,7 @@ impl Outcome {
             Self::WrongTask(_) => "WRONG_TASK",
             Self::NonFinite(_) => "NON_FINITE",
             Self::OutOfLimits(..) => "OUT_OF_LIMITS",
+            Self::InvalidTarget(_) => "INVALID_TARGET",
             Self::NoGripper(_) => "NO_GRIPPER",
             Self::ShuttingDown => "SHUTTING_DOWN",
         }
@@ -303,4 +324,6 @@ pub struct TaskView {
     pub elapsed: f64,
     /// Time to the motion's end [s].
     pub remaining: f64,
+    /// What holds its end effector back, while it moves one.
+    pub bound: Bound,
 }

@@ -75,7 +75,11 @@ impl Drives {
 pub fn line(arm: &str, joint_mode: bool) -> String {
     match joint_mode {
         true => format!("- {{name: velocity_{arm}, type: velocity, joint_names: {{hardware: {arm}}}, priority: 20}}"),
-        false => format!("- {{name: twist_{arm}, type: eef_twist, joint_names: {{hardware: {arm}}}, priority: 20}}"),
+        // Where the planner has the arm its description is known, and `params` can be left out.
+        false => format!(
+            "- {{name: twist_{arm}, type: eef_twist, joint_names: {{hardware: {arm}}}, priority: 20, params: \
+             {{model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: {arm}_}}}}"
+        ),
     }
 }
 

@@ -194,8 +194,10 @@ fn motion(view: &View<'_>) -> Vec<Line> {
         "" => line.and("  at rest"),
         moving => line.and("  moving ").with(moving, Look::Good),
     };
-    let bound = match &view.seen.bound {
-        Some((text, _)) => Line::default().with(format!("bounded: {text}"), Look::Warning),
+    // The task's own word goes before that of a joint's limiter.
+    let held_back = task.and_then(|task| task.bound.clone());
+    let bound = match held_back.or_else(|| view.seen.bound.as_ref().map(|(text, _)| text.clone())) {
+        Some(text) => Line::default().with(format!("bounded: {text}"), Look::Warning),
         None => Line::default(),
     };
     vec![first, line, bound]

@@ -1,5 +1,7 @@
 //! The types of tasks.
 
+pub mod cartesian;
+pub mod end_effector;
 pub mod servo;
 pub mod trajectory;
 pub mod velocity;

@@ -8,9 +8,11 @@
 
 pub mod jacobian;
 pub mod step;
+mod stored;
 
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 use nalgebra::Isometry3;
+use serde::{Deserialize, Serialize};
 
 use crate::robot::model::{Joint, JointKind, Limits, RobotModel};
 
@@ -51,7 +53,8 @@ pub enum KinematicsError {
 }
 
 /// The kinematics of some joints of a robot; the others stand still.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "stored::Stored", into = "stored::Stored")]
 pub struct Kinematics {
     names: Vec<String>,
     limits: Vec<Limits>,

@@ -1,5 +1,5 @@
 use super::jacobian::{Column, manipulability, smallest_singular_value};
-use super::step::{Bound, StepSettings, Stepper, rotation_between};
+use super::step::{Bound, JointBounds, JointMotion, Step, StepSettings, Stepper, Wish, rotation_between};
 use super::*;
 use crate::robot::random::Random;
 use crate::robot::urdf::from_text;
@@ -121,51 +121,111 @@ fn no_point_moves_more_than_the_levers_say() {
     }
 }
 
-#[test]
-fn steps_follow_a_twist_within_speeds_and_limits() {
+/// Steps of the tool, and bounds for its joints: the model's positions, one speed and acceleration for all.
+fn stepper(velocity: f64, acceleration: f64) -> (Stepper, Vec<JointBounds>) {
     let model = robot();
     let kinematics = Kinematics::whole(&model).unwrap();
-    let tool = model.link_index("tool").unwrap();
-    let mut stepper = Stepper::new(&kinematics, tool, StepSettings::default());
-    let mut random = Random::new(4);
-    let mut followed = 0;
-    for _ in 0..500 {
-        let mut q = random_q(&kinematics, &mut random);
-        let before = q.clone();
-        let start = stepper.pose(&kinematics, &q);
-        let twist = DVec3::new(random.between(-1e-3, 1e-3), random.between(-1e-3, 1e-3), 1e-3);
-        let velocity = [0.5; 6];
-        let step = stepper.step(&kinematics, &mut q, twist, DVec3::ZERO, &velocity, 0.01);
-        for ((x, y), l) in q.iter().zip(&before).zip(kinematics.limits()) {
-            assert!((x - y).abs() <= 0.5 * 0.01 + 1e-12 && *x <= l.upper && *x >= l.lower);
-        }
-        let moved = stepper.pose(&kinematics, &q).translation - start.translation;
-        if step.bound == Bound::None {
-            followed += 1;
-            assert!((moved - twist).length() < 1e-4, "{moved} {twist} {step:?}");
-        } else {
-            assert!(step.scale <= 1.0 && moved.length() < 0.05);
-        }
-    }
-    assert!(followed > 100, "{followed}");
-    let mut q = vec![0.0; 6];
-    let bad = stepper.step(&kinematics, &mut q, DVec3::new(f64::NAN, 0.0, 0.0), DVec3::ZERO, &[1.0; 6], 0.01);
-    assert_eq!((bad.bound, q.as_slice()), (Bound::Invalid, &[0.0; 6][..]));
+    let bound = |l: &Limits| JointBounds { lower: l.lower, upper: l.upper, velocity, acceleration };
+    let bounds = kinematics.limits().iter().map(bound).collect();
+    (Stepper::new(kinematics, model.link_index("tool").unwrap(), StepSettings::default()), bounds)
+}
+
+fn standing(q: &[f64]) -> JointMotion {
+    JointMotion { position: crate::joint::joints_of(q), ..JointMotion::default() }
+}
+
+fn up(speed: f64) -> Wish {
+    Wish { linear: DVec3::new(0.0, 0.0, speed), angular: DVec3::ZERO, horizon: f64::INFINITY }
 }
 
 #[test]
-fn a_step_into_a_limit_stops_at_it_and_others_go_on() {
-    let model = robot();
-    let kinematics = Kinematics::whole(&model).unwrap();
-    let tool = model.link_index("tool").unwrap();
-    let mut stepper = Stepper::new(&kinematics, tool, StepSettings::default());
-    let mut q = vec![0.0, 1.9, 0.1, 0.3, 0.2, 0.1];
-    for _ in 0..2000 {
-        stepper.step(&kinematics, &mut q, DVec3::new(0.0, 0.0, -1e-3), DVec3::ZERO, &[1.0; 6], 0.01);
-        for (x, l) in q.iter().zip(kinematics.limits()) {
-            assert!(*x <= l.upper && *x >= l.lower, "{q:?}");
+fn steps_follow_a_twist_within_speeds_and_limits() {
+    let (mut stepper, bounds) = stepper(0.5, 1e6);
+    let (mut random, mut followed) = (Random::new(4), 0);
+    for _ in 0..500 {
+        let q = random_q(stepper.kinematics(), &mut random);
+        let mut joints = standing(&q);
+        let start = stepper.pose(&q);
+        let wish = Wish { linear: DVec3::new(random.between(-0.1, 0.1), random.between(-0.1, 0.1), 0.1), ..up(0.0) };
+        let step = stepper.step(&mut joints, &wish, &bounds, 0.01);
+        for ((x, y), b) in joints.position.iter().zip(&q).zip(&bounds) {
+            assert!((x - y).abs() <= 0.5 * 0.01 + 1e-12 && *x <= b.upper && *x >= b.lower);
+        }
+        let moved = stepper.pose(&joints.position).translation - start.translation;
+        if step.bound == Bound::None {
+            followed += 1;
+            assert!((moved - wish.linear * 0.01).length() < 1e-4, "{moved} {wish:?} {step:?}");
+        } else {
+            assert!(step.pace < 1.0 && moved.length() < 0.05);
         }
     }
+    assert!(followed > 100, "{followed}");
+    let mut joints = standing(&[0.0; 6]);
+    let bad = stepper.step(&mut joints, &up(f64::NAN), &bounds, 0.01);
+    assert_eq!((bad.bound, joints), (Bound::Invalid, standing(&[0.0; 6])));
+}
+
+/// Whatever bounds a motion makes it slower, all joints by the same factor.
+#[test]
+fn what_is_too_fast_keeps_its_direction() {
+    let (mut fast, wide) = stepper(1e6, 1e9);
+    let (mut slow, narrow) = stepper(0.1, 1e9);
+    let (mut random, mut bounded) = (Random::new(5), 0);
+    for _ in 0..300 {
+        let q = random_q(fast.kinematics(), &mut random);
+        let wish = Wish { angular: DVec3::new(random.between(-1.0, 1.0), 0.5, 0.0), ..up(random.between(-0.3, 0.3)) };
+        let (mut a, mut b) = (standing(&q), standing(&q));
+        let free = fast.step(&mut a, &wish, &wide, 0.001);
+        let held = slow.step(&mut b, &wish, &narrow, 0.001);
+        if let Bound::Velocity(joint) = held.bound {
+            bounded += 1;
+            assert!((b.velocity[joint].abs() - 0.1).abs() < 1e-9);
+            let part = held.pace / free.pace;
+            assert!(a.velocity.iter().zip(&b.velocity).all(|(a, b)| (a * part - b).abs() < 1e-9), "{a:?} {b:?}");
+        }
+    }
+    assert!(bounded > 100, "{bounded}");
+}
+
+#[test]
+fn a_motion_into_a_limit_brakes_before_it_and_leaves_it_again() {
+    let (mut stepper, bounds) = stepper(1.0, 2.0);
+    let mut joints = standing(&[0.0, 1.9, 0.1, 0.3, 0.2, 0.1]);
+    let run = |stepper: &mut Stepper, joints: &mut JointMotion, speed: f64| {
+        let mut last = Step::default();
+        for _ in 0..3000 {
+            let before = *joints;
+            last = stepper.step(joints, &up(speed), &bounds, 0.01);
+            for (((q, v), was), b) in joints.position.iter().zip(&joints.velocity).zip(&before.velocity).zip(&bounds) {
+                assert!(*q <= b.upper && *q >= b.lower, "{joints:?}");
+                assert!(v.abs() <= 1.0 + 1e-9 && (v - was).abs() <= 2.0 * 0.01 + 1e-9, "{was} {joints:?}");
+            }
+        }
+        last
+    };
+    let end = run(&mut stepper, &mut joints, -0.1);
+    assert!(matches!(end.bound, Bound::Position(_)), "{end:?} {joints:?}");
+    assert!(joints.velocity.iter().all(|v| v.abs() < 1e-6), "{joints:?}");
+    let stopped = stepper.pose(&joints.position).translation.z;
+    for _ in 0..200 {
+        stepper.step(&mut joints, &up(0.1), &bounds, 0.01);
+    }
+    assert!(stepper.pose(&joints.position).translation.z > stopped + 0.01);
+}
+
+#[test]
+fn kinematics_come_back_from_a_log_as_they_were() {
+    let kinematics = Kinematics::whole(&robot()).unwrap();
+    let told = serde_json::to_string(&kinematics).unwrap();
+    let again: Kinematics = serde_json::from_str(&told).unwrap();
+    assert_eq!(again, kinematics);
+    // A body that hangs on a later one would be looked up for ever.
+    let mut odd: serde_json::Value = serde_json::from_str(&told).unwrap();
+    odd["bodies"][2]["parent"] = serde_json::json!(2);
+    assert!(serde_json::from_value::<Kinematics>(odd.clone()).is_err());
+    odd["bodies"][2]["parent"] = serde_json::json!(1);
+    odd["bodies"][2]["variable"] = serde_json::json!(6);
+    assert!(serde_json::from_value::<Kinematics>(odd).is_err());
 }
 
 #[test]
