@@ -193,12 +193,15 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
     }
     terminal.keys("\t");
     terminal.until("add to `tasks`");
-    terminal.resize(40, 12);
-    terminal.until("JOINT arm_joint1");
-    eventually("it fits", || {
-        let text = terminal.text();
-        text.contains("arm_joint6") && !text.contains('#') && text.contains("task velocity_arm")
-    });
+    terminal.resize(40, 16);
+    terminal.until("jog arm");
+    let fits =
+        |text: &str| ["ready", "arm_joint6", "task velocity_arm", "add to"].iter().all(|part| text.contains(part));
+    let began = Instant::now();
+    while !fits(&terminal.text()) || terminal.text().contains('#') {
+        assert!(began.elapsed() < PATIENCE, "{}", terminal.text());
+        std::thread::sleep(HOLD);
+    }
     eventually("what is good is green", || terminal.has_colour());
     jog.end(Signal::TERM).with(143);
     assert!(terminal.is_as_before());

@@ -123,7 +123,8 @@ impl Session {
                 if !terminal.is_there() {
                     return Err(no_terminal(std::io::ErrorKind::UnexpectedEof.into()));
                 }
-                let lines = screen::lines(&self.view(&seen), terminal.size());
+                let size = terminal.size().map_err(no_terminal)?;
+                let lines = screen::lines(&self.view(&seen), size);
                 terminal.draw(lines).map_err(no_terminal)?;
             }
         }

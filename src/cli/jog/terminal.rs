@@ -90,12 +90,19 @@ impl Terminal {
         Ok(terminal)
     }
 
-    /// Columns and rows.
-    pub fn size(&self) -> (usize, usize) {
-        self.size
+    /// Columns and rows, as they are now: not every change of them is told.
+    pub fn size(&mut self) -> io::Result<(usize, usize)> {
+        let (columns, rows) = size()?;
+        let now = (usize::from(columns), usize::from(rows));
+        if now != self.size {
+            self.size = now;
+            self.drawn.clear();
+            execute!(io::stdout(), Clear(ClearType::All))?;
+        }
+        Ok(now)
     }
 
-    /// The next key or change of the terminal, and when it came, waiting up to `patience`. Fails when there will be
+    /// The next key, and when it came, waiting up to `patience`. Fails when there will be
     /// no more.
     pub fn event(&mut self, patience: Duration) -> io::Result<Option<(Event, Instant)>> {
         let (event, at) = match self.events.recv_timeout(patience) {
@@ -103,11 +110,6 @@ impl Terminal {
             Err(RecvTimeoutError::Timeout) => return Ok(None),
             Err(RecvTimeoutError::Disconnected) => return Err(io::ErrorKind::UnexpectedEof.into()),
         };
-        if let Event::Resize(columns, rows) = event {
-            self.size = (columns.into(), rows.into());
-            self.drawn.clear();
-            execute!(io::stdout(), Clear(ClearType::All))?;
-        }
         Ok(Some((event, at)))
     }
 
