@@ -5,6 +5,7 @@
 mod rig;
 
 use std::f64::consts::PI;
+use std::sync::LazyLock;
 
 use dimos::control::config::*;
 use dimos::control::request::Request;
@@ -21,9 +22,12 @@ const POSES: u16 = 0;
 const TWISTS: u16 = 1;
 
 fn params() -> CartesianParams {
-    let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
-    let link = model.link_index("flange").unwrap();
-    CartesianParams::new(Kinematics::whole(&model).unwrap(), link)
+    static PARAMS: LazyLock<CartesianParams> = LazyLock::new(|| {
+        let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
+        let link = model.link_index("flange").unwrap();
+        CartesianParams::new(Kinematics::whole(&model).unwrap(), link)
+    });
+    PARAMS.clone()
 }
 
 /// An arm with both tasks, and a trajectory task above and one below them; ready at a pose.
@@ -169,7 +173,7 @@ fn joint_limits_keep_the_direction() {
     let mut rig = rig_at(&HOME, params(), wide);
     let start = commanded(&rig);
     let (mut bound, mut astray) = (false, 0.0f64);
-    stream(&mut rig, TWISTS, twist([0.0, 3.0, 0.0], [0.0; 3]), 0.35, |rig| {
+    stream(&mut rig, TWISTS, twist([0.0, 3.0, 0.0], [0.0; 3]), 0.7, |rig| {
         bound |= matches!(rig.tasks[1].bound, Bound::Velocity(_));
         let moved = commanded(rig).translation - start.translation;
         astray = astray.max(moved.x.hypot(moved.z) - 0.02 * moved.y);
@@ -232,10 +236,11 @@ fn an_arm_that_does_not_follow_is_held_and_says_why() {
     let Reason::TrackingError(joint, error) = rig.tasks[1].reason else { panic!("{:?}", rig.tasks[1]) };
     assert!(error.abs() > 0.1745 && error.abs() < 0.25, "{joint} {error}");
     assert_eq!(rig.tasks[1].state, TaskState::Aborted);
-    assert!(rig.commanded(0).iter().zip(&began).all(|(a, b)| (a - b).abs() < 0.3));
+    // That error, and the way to brake.
+    assert!(rig.commanded(0).iter().zip(&began).all(|(a, b)| (a - b).abs() < 0.2 + V_MAX * V_MAX / (2.0 * A_MAX)));
     // It does not start again while the arm is elsewhere.
     let again = steer(&mut rig, TWISTS, twist([0.0, 0.2, 0.0], [0.0; 3]));
-    assert!(matches!(again, Outcome::StartStateMismatch(j, e) if j == joint && e > 0.1745), "{again:?}");
+    assert!(matches!(again, Outcome::StartStateMismatch(_, e) if e > 0.1745), "{again:?}");
 }
 
 #[test]
@@ -256,7 +261,7 @@ fn bad_goals_are_refused_and_stop_the_stream() {
     assert!(rig.speed(0) > 0.1);
     let bad = twist([0.0, f64::NAN, 0.0], [0.0; 3]);
     assert_eq!(steer(&mut rig, TWISTS, bad), Outcome::InvalidTarget(TWISTS));
-    rig.run_for(0.25);
+    rig.run_for(0.6);
     assert_eq!((rig.speed(0), rig.tasks[1].state), (0.0, TaskState::Idle));
     // Numbers that are finite and make none.
     let far = Goal::Pose { position: [1e308, -1e308, 1e308], orientation: [0.0, 0.0, 0.0, 1.0] };
@@ -267,24 +272,24 @@ fn bad_goals_are_refused_and_stop_the_stream() {
     assert_eq!(rig.phase(0), Phase::Ready);
 }
 
-/// Stretched out the arm is singular: it goes there slowly and stays there, and comes back.
+/// With joint 5 straight, axes 4 and 6 are the same: it goes there slowly, moves no joint fast there, and comes back.
 #[test]
 fn near_a_singular_configuration_it_slows_down_and_says_so() {
     let mut rig = rig();
-    let mut fastest = 0.0f64;
+    let mut straight = HOME;
+    straight[4] = 0.0;
     let mut seen = false;
-    let out = commanded(&rig).translation.normalize() * 0.2;
-    stream(&mut rig, TWISTS, twist(out.to_array(), [0.0; 3]), 6.0, |rig| {
-        if rig.tasks[1].bound == Bound::Singularity {
-            seen = true;
-        }
+    stream(&mut rig, POSES, pose_of(&flange(&straight)), 8.0, |rig| seen |= rig.tasks[0].bound == Bound::Singularity);
+    assert!(seen && rig.commanded(0)[4].abs() < 0.1, "{:?} {:?}", rig.tasks[0], rig.commanded(0));
+    let (mut fastest, start) = (0.0f64, commanded(&rig));
+    stream(&mut rig, TWISTS, Goal::Twist { linear: [0.0; 3], angular: [0.5, 0.0, 0.0], tool: true }, 1.0, |rig| {
         fastest = fastest.max(rig.speed(0));
     });
-    assert!(seen, "{:?}", rig.tasks[1]);
-    let stretched = commanded(&rig).translation.length();
-    assert!(stretched > 0.6, "{stretched}");
-    stream(&mut rig, TWISTS, twist((-out).to_array(), [0.0; 3]), 6.0, |_| {});
-    assert!(commanded(&rig).translation.length() < stretched - 0.1);
+    let (_, turned) = between(&commanded(&rig), &start);
+    assert!(fastest < 0.5 && turned < 0.3 && turned > 0.01, "{fastest} {turned} {:?}", rig.tasks[1]);
+    stream(&mut rig, POSES, pose_of(&flange(&HOME)), 8.0, |_| {});
+    let (distance, angle) = between(&commanded(&rig), &flange(&HOME));
+    assert!(distance < 1e-3 && angle < 2e-3, "{distance} {angle} {:?}", rig.tasks[0]);
 }
 
 #[test]
@@ -341,7 +346,7 @@ fn a_cancel_slows_down_in_the_same_direction_and_the_next_target_begins_again() 
     assert_eq!(rig.tasks[1].state, TaskState::Cancelling);
     rig.run_until(1.0, |rig| rig.tasks[1].state == TaskState::Aborted);
     let moved = commanded(&rig).translation - start;
-    assert!(moved.y > 0.01 && moved.x.hypot(moved.z) < 1e-3, "{moved}");
+    assert!(moved.y > 0.01 && moved.x.hypot(moved.z) < 0.01 * moved.y, "{moved}");
     assert_eq!(rig.speed(0), 0.0);
     // A target while it slows down takes it up again.
     stream(&mut rig, TWISTS, twist([0.0, -0.2, 0.0], [0.0; 3]), 0.5, |_| {});

@@ -23,6 +23,14 @@ include: [coordinator-yourarm]
 tasks:
   - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}
 ";
+/// The same arm with nothing that moves its end effector.
+const JOINTS_ONLY: &str = "
+name: jogged
+hardware:
+  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: yourarm, address: sim}
+tasks:
+  - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}
+";
 /// The keys of one joint, as often as a held key comes, and so that a busy machine is no gap.
 const HOLD: Duration = Duration::from_millis(40);
 
@@ -169,7 +177,7 @@ fn the_end_effector_moves_along_the_axes_of_its_keys() {
 
 #[test]
 fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
-    let mut rig = Rig::new(YOURARM);
+    let mut rig = Rig::new(JOINTS_ONLY);
     let terminal = Terminal::new(80, 24);
     let jog = terminal.start(&rig.home, "jog arm");
     // There is no task for the end effector: it begins with joints and says why.
@@ -346,7 +354,7 @@ tasks:
 fn what_is_missing_is_said_before_the_screen_is_taken() {
     let home = Home::new();
     home.dimos("jog arm").with(2).says(&["error: jog reads keys from a terminal", "hint: `dimos task stream"]);
-    let _run = home.run("coordinator-yourarm --no-record");
+    let _run = home.run("coordinator-mock --no-record");
     let terminal = Terminal::new(100, 24);
     terminal.start(&home, "jog arm").wait().with(2);
     terminal.until("no task of the run lets the keyboard move arm");

@@ -12,15 +12,18 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link};
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::control::config::CoordinatorConfig;
+use dimos::control::config::{CartesianParams, CoordinatorConfig, TaskKind};
 use dimos::control::coordinator::Coordinator;
 use dimos::control::request::{Envelope, Request};
+use dimos::control::tasks::cartesian::Goal;
 use dimos::control::tick_loop::{self, Pulse, TickPorts};
 use dimos::hardware::arms::mock::SPEC;
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::AdapterConfig;
 use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
+use dimos::robot::kinematics::Kinematics;
+use dimos::robot::{Source, load};
 use dimos::rt::beat::Beat;
 use dimos::rt::slot::slot;
 use dimos::rt::wake::Wake;
@@ -87,6 +90,9 @@ fn the_count_sees_what_is_taken_grown_and_given_back() {
 
 #[test]
 fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() {
+    let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
+    let (kinematics, link) = (Kinematics::whole(&model).unwrap(), model.link_index("flange").unwrap());
+    let steered = Box::new(CartesianParams::new(kinematics, link));
     let tasks = vec![
         task("traj_left", trajectory(), 0..7, 10),
         task("traj_right", trajectory(), 7..13, 10),
@@ -94,11 +100,16 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
         task("servo", servo(), 0..7, 20),
         task("velocity", velocity(), 7..13, 20),
         task("servo_too", servo(), 5..7, 20),
+        task("poses", TaskKind::CartesianIk(steered.clone()), 7..13, 20),
+        task("twists", TaskKind::EefTwist(steered), 7..13, 25),
     ];
     let mut rig = Rig::two_arms(tasks);
     rig.arms[1].reports_velocity = false;
     rig.around = watch;
-    let (mut seen, mut id) = ([0u64; 7], 0);
+    let (mut seen, mut id) = ([0u64; 8], 0);
+    let pose = Goal::Pose { position: [0.3, 0.1, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
+    let nowhere = Goal::Pose { position: [0.3, f64::NAN, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
+    let twist = Goal::Twist { linear: [0.1, 0.0, 0.2], angular: [0.1, 0.0, 0.0], tool: true };
     for k in 0..100_000u64 {
         let (left, right) = (rig.arms[0].q[0].clamp(-1.9, 1.9), rig.arms[1].q[0].clamp(-1.9, 1.9));
         let to = if (k / 500).is_multiple_of(2) { 0.4 } else { -0.4 };
@@ -116,6 +127,9 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
             831..=860 => _ = rig.velocity(4, &[0.2 * to; 6]),
             870..=875 => _ = rig.servo(5, &[left; 2]),
             880 => _ = rig.servo(3, &[f64::NAN; 7]),
+            500..=540 => _ = rig.send(Request::Steer { task: 6, goal: pose }),
+            541..=590 => _ = rig.send(Request::Steer { task: 7, goal: twist }),
+            595 => _ = rig.send(Request::Steer { task: 6, goal: nowhere }),
             900 => _ = rig.servo(3, &[left + 0.01; 7]),
             901 => _ = rig.servo(3, &[left + 0.7; 7]),
             910 => _ = rig.send(Request::Gripper { arm: 0, opening: 0.03 }),
@@ -142,6 +156,7 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
                 Event::ModeConflict(..) => seen[4] += 1,
                 Event::Arm(_, Phase::Held, Cause::Fault(_) | Cause::Stale | Cause::Jump) => seen[5] += 1,
                 Event::Limited(..) => seen[6] += 1,
+                Event::Task(6 | 7, TaskState::Executing, _) => seen[7] += 1,
                 _ => {}
             }
         }

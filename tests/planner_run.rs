@@ -453,3 +453,76 @@ fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
     home.dimos("execute").with(1).says(&["PLAN_OUTDATED", "left/link", "right/link"]);
     home.dimos("plan left -1.3 0 0 0 0 0").with(1).says(&["left/link", "right/link"]);
 }
+
+#[test]
+fn several_arms_are_sent_together_from_the_command_line() {
+    let home = Home::new();
+    let mocks = "--set hardware.left.adapter_type=mock --set hardware.right.adapter_type=mock";
+    let _run = home.run(&format!("dual-yourarm-planner --no-record {mocks}"));
+    home.dimos("plan --goal left=named:home --goal right=0,-0.3,0.6,0,0.8,0").with(0).says(&["nothing has moved"]);
+    let preview = home.dimos("preview --json").with(0).json();
+    assert_eq!(preview["trajectory"]["joint_names"].as_array().unwrap().len(), 12);
+    let done = home.dimos("execute").with(0);
+    assert!(done.out.contains("left_joint1") && done.out.contains("right_joint6"), "{}", done.out);
+    // One straight line in the space of both: each has done the same part of its way at every moment.
+    home.dimos("move --goal left=0.8,-0.3,0.6,0,0.8,0 --goal right=-0.4,-0.3,0.6,0,0.8,0 --speed 0.2 --no-wait")
+        .with(0);
+    let mut between = 0;
+    eventually("it is half-way, seen several times", || {
+        let state = home.dimos("state --json").with(0).json();
+        let turned = |arm: usize| state["arms"][arm]["joints"][0]["position"].as_f64().unwrap();
+        let (left, right) = (turned(0) / 0.8, turned(1) / -0.4);
+        assert!((left - right).abs() < 0.03, "{left} of the way, and {right}");
+        between += usize::from((0.1..0.9).contains(&left));
+        between >= 3 || left > 0.99
+    });
+    assert!(between > 0, "they moved");
+    eventually("they arrive", || home.status()["tasks"][0]["state"] == "COMPLETED");
+    is_at(&home, "left", &[0.8, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    is_at(&home, "right", &[-0.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // Poses, each in its own way, and the ways to type it wrong.
+    home.dimos("plan --goal left=pose:0.35,0.4,0.3,3.14,0,0 --goal right=pose:0.35,-0.4,0.3").with(0);
+    home.dimos("plan --goal left=pose:0.35,0.4,0.3,1,0,0,0").with(0);
+    for (arguments, words) in [
+        ("plan --goal left", "must be ROBOT=GOAL"),
+        ("plan --goal left=home", "not a number"),
+        ("plan --goal left=pose:1,2", "a pose has 3, 6 or 7 numbers"),
+        ("plan --goal left=pos:1,2,3", "must be ROBOT=GOAL"),
+        ("plan left --goal right=named:home", "cannot be used with"),
+        ("move --goal left=named:home --direct", "cannot be used with"),
+        ("plan --goal left=named:home --named home", "cannot be used with"),
+        ("plan --goal left=named:home --goal left=named:home", "left has a goal already"),
+        ("plan", "required"),
+    ] {
+        home.dimos(arguments).with(2).says(&[words]);
+    }
+}
+
+#[test]
+fn a_goal_at_a_limit_is_refused_when_it_is_planned() {
+    let (home, _run) = up();
+    home.dimos("down").with(0);
+    home.write(
+        "lab.yaml",
+        &BLUEPRINT.replace("adapter_type: mock", "adapter_type: mock, limits: {position: [-1.5, 1.5]}"),
+    );
+    let _run = home.run("lab.yaml --no-record");
+    // The model reaches to 2.967 rad, this arm to 1.5, and commands stay 0.01 rad inside.
+    let words = ["goal: arm_joint1 at 1.4950 rad is outside its limits -1.4900 … 1.4900", "hint: "];
+    home.dimos("plan arm 1.495 -0.3 0.6 0 0.8 0").with(1).says(&words);
+    let robot = home.client().call(dimos::rpc::api::Planner {}).unwrap().robots.remove(0);
+    assert_eq!(robot.limits[0], [-1.49, 1.49]);
+    home.dimos("move arm 1.49 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    is_at(&home, "arm", &[1.49, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // No solution of a pose lies outside either.
+    for side in ["0.1 0.35 0.3", "-0.2 0.35 0.3"] {
+        let planned = home.dimos(&format!("plan arm --pose {side} --json"));
+        if planned.code == Some(0) {
+            let goal = planned.json()["summary"]["goal"].take();
+            assert!(goal.as_array().unwrap().iter().all(|q| q.as_f64().unwrap().abs() <= 1.49 + 1e-9), "{goal}");
+            home.dimos("execute").with(0);
+        } else {
+            planned.with(1).says(&["the pose is not reached"]);
+        }
+    }
+}

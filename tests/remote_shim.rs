@@ -8,6 +8,7 @@ mod program;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{IpAddr, Ipv4Addr, TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -324,7 +325,7 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
         return;
     }
     for (trouble, parts) in [
-        ("nan", &["Out of range float values are not JSON compliant"][..]),
+        ("nan", &["read_joint_positions() answers nan for joint "][..]),
         ("read_enabled", &["cannot be enabled: enabled, but the motors do not come on"]),
     ] {
         let home = Home::new();
@@ -333,13 +334,104 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
         assert_eq!(ended.err.lines().filter(|l| l.starts_with("error: ")).count(), 1, "{}", ended.err);
     }
     let home = Home::new();
-    let ended = shim(&home, "tcp:127.0.0.1:1", &["--dof", "6"], &[("TROUBLE", "connect")]).wait().with(1);
-    assert!(ended.err.contains("connect() said no") || ended.err.contains("Permission"), "{}", ended.err);
+    let fails = |at: &str, environment: &[(&str, &str)], part: &str| {
+        let ended = shim(&home, at, &["--dof", "6"], environment).wait().with(1);
+        assert!(ended.err.starts_with(&format!("error: sim_arm:SimArmAdapter --at {at}: ")), "{}", ended.err);
+        assert!(ended.err.contains(part) && ended.err.lines().count() == 1, "{}", ended.err);
+    };
     for at in ["tcp:0.0.0.0:7450", "nonsense", "tcp:127.0.0.1:x"] {
-        let ended = shim(&home, at, &[], &[]).wait().with(1);
-        assert!(ended.err.starts_with(&format!("error: --at {at}: ")), "{}", ended.err);
-        assert!(ended.err.contains("not a loopback address"), "{}", ended.err);
+        fails(at, &[], "not a loopback address");
     }
+    home.write("notes", "kept");
+    let at = format!("unix:{}/notes", home.path().display());
+    fails(&at, &[], "Address already in use");
+    assert_eq!(std::fs::read_to_string(home.path().join("notes")).unwrap(), "kept");
+    let at = format!("unix:{}/arm.sock", home.path().display());
+    fails(&at, &[("TROUBLE", "connect")], "connect() said no");
+    let shim = in_tree("assets/python/dimos_shim.py");
+    for (adapter, part) in [("no_such:Arm", "No module named 'no_such'"), ("json:NoArm", "has no attribute 'NoArm'")] {
+        let mut command = Command::new("python3");
+        home.settle(command.args([&shim, adapter, "--at", &at]));
+        let ended = Started::of(&mut command).wait().with(1);
+        assert!(ended.err.contains(part) && ended.err.lines().count() == 1, "{}", ended.err);
+    }
+}
+
+/// A client that speaks the protocol by itself.
+struct Client(BufReader<UnixStream>, u32);
+
+impl Client {
+    fn connect(home: &Home) -> Self {
+        let stream = UnixStream::connect(home.path().join("arm.sock")).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        Self(BufReader::new(stream), 0)
+    }
+
+    fn say(&mut self, line: &str) -> String {
+        self.0.get_mut().write_all(format!("{line}\n").as_bytes()).unwrap();
+        let mut reply = String::new();
+        self.0.read_line(&mut reply).unwrap();
+        reply
+    }
+
+    fn ask(&mut self, rest: &str) -> String {
+        self.1 += 1;
+        self.say(&format!(r#"{{"id":{},"do":{rest}}}"#, self.1))
+    }
+
+    /// Begins a motion.
+    fn command(&mut self) {
+        for request in [
+            r#""hello","version":1,"dof":6"#,
+            r#""activate","args":[]"#,
+            r#""set_control_mode","args":["servo_position"]"#,
+            r#""cycle","command":{"mode":"servo_position","values":[0.1,0,0,0,0,0],"velocity":1.0}"#,
+        ] {
+            let reply = self.ask(request);
+            assert!(!reply.contains("error\":\"") && !reply.contains("refused\":\""), "{request}: {reply}");
+        }
+    }
+}
+
+#[test]
+fn who_knocks_at_the_shim_or_talks_nonsense_to_it_leaves_no_arm_in_motion() {
+    if !has_python() {
+        return;
+    }
+    let home = Home::new();
+    let (shim, _) = served(&home, &[]);
+    let mut client = Client::connect(&home);
+    let held = client.ask(r#""write_joint_velocities","args":[[1,0,0,0,0,0]]"#);
+    assert!(held.contains("write_joint_velocities is not for clients"), "{held}");
+    client.command();
+    for _ in 0..50 {
+        drop(UnixStream::connect(home.path().join("arm.sock")).unwrap());
+    }
+    let cycle = client.ask(r#""cycle""#);
+    assert!(cycle.contains("read_joint_positions"), "it goes on: {cycle}");
+    // Others that knock are no sign of life of the client.
+    let knocking = std::thread::scope(|scope| {
+        let knock = || {
+            (0..200).take_while(|_| !shim.out().contains("no request came for 0.5 s: stopping the arm")).for_each(
+                |_| {
+                    drop(UnixStream::connect(home.path().join("arm.sock")).unwrap());
+                    std::thread::sleep(Duration::from_millis(100));
+                },
+            );
+        };
+        scope.spawn(knock).join()
+    });
+    assert!(knocking.is_ok());
+    assert!(shim.out().contains("no request came for 0.5 s: stopping the arm"), "{}", shim.out());
+    for nonsense in ["null", "[]", "{}", "7", "GET / HTTP/1.1"] {
+        drop(client);
+        client = Client::connect(&home);
+        client.command();
+        let before = shim.out().matches("stopping the arm").count();
+        assert_eq!(client.say(nonsense), "", "{nonsense} ends the connection");
+        eventually("the arm is stopped", || shim.out().matches("stopping the arm").count() > before);
+    }
+    shim.end(Signal::INT).with(0);
 }
 
 #[test]
@@ -349,7 +441,7 @@ fn one_client_at_a_time() {
     }
     let home = Home::new();
     let (_shim, _) = served(&home, &[]);
-    let first = std::os::unix::net::UnixStream::connect(home.path().join("arm.sock")).unwrap();
+    let first = UnixStream::connect(home.path().join("arm.sock")).unwrap();
     home.dimos("run remote.yaml").with(3).says(&["error: arm: ", "it serves another client already"]);
     drop(first);
     home.run("remote.yaml").end(Signal::INT).with(130);

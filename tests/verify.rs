@@ -10,14 +10,17 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use dimos::blueprint::{Blueprint, Overrides};
-use dimos::control::config::{ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams};
+use dimos::control::config::{CartesianParams, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams};
 use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::Request;
+use dimos::control::tasks::cartesian::Goal;
 use dimos::hardware::registry::Registry;
 use dimos::joint::{JointLimits, joints_of, make_joints};
 use dimos::recording::messages::{JointState, Text, Tick};
 use dimos::replay::recorded::RecordedError;
 use dimos::replay::verify::{Finding, Verification, verify};
+use dimos::robot::kinematics::Kinematics;
+use dimos::robot::{Source, load};
 use dimos::rpc::api;
 use dimos::rpc::client::Client;
 use dimos::rpc::place::RunFolder;
@@ -123,6 +126,53 @@ fn whatever_happens_to_an_arm_comes_out_the_same_again() {
     let found = reproducible(&log);
     assert_eq!(found.ticks, ticks);
     assert!(found.requests > 100 && found.events > 130, "{found:?}");
+}
+
+/// An end effector that is taken to poses and moved with twists, past everything that can stop it.
+#[test]
+fn motions_of_an_end_effector_come_out_the_same_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = one_arm(6);
+    let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
+    let (kinematics, link) = (Kinematics::whole(&model).unwrap(), model.link_index("flange").unwrap());
+    let steered = Box::new(CartesianParams::new(kinematics, link));
+    for (name, kind, priority) in
+        [("poses", TaskKind::CartesianIk(steered.clone()), 20), ("twists", TaskKind::EefTwist(steered.clone()), 30)]
+    {
+        config.tasks.push(TaskConfig {
+            name: name.into(),
+            kind,
+            joints: (0..6).collect(),
+            priority,
+            auto_start: false,
+        });
+    }
+    let log = folder.path().join("steered.mcap");
+    let mut run = VirtualRun::start(&config, &log);
+    run.states[0].position = joints_of(&[0.1, -0.3, 0.6, 0.0, 0.8, 0.2]);
+    run.step();
+    run.ask(Request::Ready { arm: 0 });
+    (0..40).for_each(|_| run.step());
+    for k in 0..400u32 {
+        let (turn, t) = (0.1 * f64::from(k), f64::from(k) * 0.01);
+        let pose = Goal::Pose { position: [0.3 + 0.05 * t.sin(), 0.1 * t, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
+        let linear = [0.1 * turn.cos(), 0.1 * turn.sin(), if k == 333 { f64::NAN } else { 0.02 }];
+        match k % 200 {
+            0..100 if k % 2 == 0 => run.ask(Request::Steer { task: 1, goal: pose }),
+            120..180 => run.ask(Request::Steer {
+                task: 2,
+                goal: Goal::Twist { linear, angular: [0.1 + 0.2, 0.0, -0.0], tool: k > 200 },
+            }),
+            185 => run.ask(Request::Cancel { task: Some(2) }),
+            _ => {}
+        }
+        run.step();
+    }
+    let moved = run.states[0].position;
+    assert!((moved[0] - 0.1).abs() > 0.05, "nothing moved: {moved:?}");
+    run.finish();
+    let found = reproducible(&log);
+    assert!(found.ticks > 400 && found.requests > 200, "{found:?}");
 }
 
 /// The next number in the direction of infinity.

@@ -279,6 +279,20 @@ class Client:
         """Sends a velocity task its next target [rad/s]; as `servo`."""
         self._target("velocity", {"task": task, "velocities": list(velocities)})
 
+    def twist(self, task: str, linear: Sequence[float], angular: Sequence[float] = (0, 0, 0), frame: str = "base") -> None:
+        """Sends an eef_twist task the next velocity of its end effector [m/s, rad/s], in the axes of the robot's "base"
+        or of the "tool" itself; as `servo`."""
+        self._target("twist", {"task": task, "linear": list(linear), "angular": list(angular), "frame": frame})
+
+    def pose(
+        self, task: str, xyz: Sequence[float],
+        rpy: Optional[Sequence[float]] = None, quat: Optional[Sequence[float]] = None,
+    ) -> None:
+        """Sends a cartesian_ik task the next pose of its end effector: [m], and roll, pitch, yaw [rad] or a quaternion
+        x, y, z, w; as `servo`."""
+        turn = {"rpy": rpy and list(rpy), "quat": quat and list(quat)}
+        self._target("pose", {"task": task, "xyz": list(xyz), **turn})
+
     def _target(self, method: str, params: Dict[str, Any]) -> None:
         self._read(0.0)
         while self._targets and (len(self._targets) >= IN_FLIGHT or self._targets[0] in self._replies):

@@ -1,30 +1,30 @@
 """Serves a Python arm adapter, one with the guide's methods, to dimos (`adapter_type: remote`; docs/remote-adapter.md):
-    python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock
-"""
-import argparse, enum, importlib, json, os, select, signal, socket, sys, time, types
+    python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock"""
+import argparse, contextlib, enum, errno, importlib, itertools, json, math, os, pathlib, select, signal, socket
+import sys, time
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after so long without a request [s]; bytes of a line
 FEEDBACK, EXTRAS = ["read_joint_velocities", "read_joint_efforts"], ["modes", "gripper_range", "holds_when_disabled"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",
          "read_cartesian_position", "read_force_torque", *FEEDBACK]
+ACTS = ["activate", "deactivate", "write_enable", "set_control_mode", "write_stop", "write_clear_errors"]
+MOTIONS = ["write_gripper_position", "write_cartesian_position"]
 INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these
 DISABLED = "it was stopped by itself or is not enabled: enable it first"
 
-def control_modes():
-    """The ControlMode of dimos; where that is not installed, an object stands in for what adapters import from it."""
-    name, bag = "dimos.hardware.manipulators", types.SimpleNamespace
-    try:
+def control_modes():  # of dimos; where that is not installed, an object stands in for what adapters import from it
+    name, bag = "dimos.hardware.manipulators", argparse.Namespace
+    with contextlib.suppress(ImportError):
         return importlib.import_module(name + ".spec").ControlMode
-    except ImportError:
-        modes = "position servo_position velocity torque cartesian cartesian_velocity impedance".split()
-        spec = bag(ControlMode=enum.Enum("ControlMode", {mode.upper(): mode for mode in modes}), ManipulatorInfo=bag,
-                   JointLimits=bag, ManipulatorAdapter=object, AdapterRegistry=object)
-        sys.modules.update(dict.fromkeys(["dimos", "dimos.hardware", name, name + ".spec", name + ".registry"], spec))
-        return spec.ControlMode
+    modes = "position servo_position velocity torque cartesian cartesian_velocity impedance".split()
+    spec = bag(ControlMode=enum.Enum("ControlMode", {mode.upper(): mode for mode in modes}), ManipulatorInfo=bag,
+               JointLimits=bag, ManipulatorAdapter=object, AdapterRegistry=object)
+    sys.modules.update(dict.fromkeys(["dimos", "dimos.hardware", name, name + ".spec", name + ".registry"], spec))
+    return spec.ControlMode
 
 class Arm:  # the adapter, called from one thread only
     def __init__(self, adapter, modes, dof, hz):
         self.adapter, self.modes, self.hz, self.state, self.measured = adapter, modes, hz, {}, set()
-        self.commanded, self.held, self.turn, self.due = False, True, 0, 0.0
+        self.commanded, self.held, self.turns, self.due = False, True, itertools.cycle(READS[:-2]), 0.0
         self.call("connect")
         self.dof, began = dof or adapter.get_dof(), time.monotonic()
         self.read(*READS)
@@ -38,34 +38,31 @@ class Arm:  # the adapter, called from one thread only
         name, args = (name, args) if hasattr(self.adapter, name) else INSTEAD.get(name, (name, args))
         answer = getattr(self.adapter, name)(*args)
         if answer is not None and not answer:
-            self.read(*READS[:not self.lost()])
-            code, text = self.state.get("read_error") or (0, "")
+            code, text = (0, "") if self.lost() else self.adapter.read_error()
             raise RuntimeError(f"{name}() said no" + (f" (error {code}: {text})" if code else ""))
     def hello(self, **_):
         self.held = True
-        if self.lost():
-            self.call("connect")
+        if self.lost(): self.call("connect")
         return {"version": 1, "dof": self.dof, "native_rate": self.hz, "info": vars(self.adapter.get_info()),
                 "limits": vars(self.adapter.get_limits()), "parts": [k for k, v in self.state.items() if v is not None],
                 **{k: getattr(self.adapter, k, None) for k in EXTRAS}}
     def act(self, do, args=()):
-        if "position" in do and self.held or not do.startswith(("activate", "deactivate", "write_", "set_control")):
-            raise RuntimeError(DISABLED if "position" in do else f"{do} is not for clients")
+        if do not in ACTS + MOTIONS or self.held and do in MOTIONS:
+            raise RuntimeError(DISABLED if do in MOTIONS else f"{do} is not for clients")
         self.commanded |= do == "write_cartesian_position"
         self.call(do, *([self.modes[args[0].upper()]] if do == "set_control_mode" else args))
-        if do in ("activate", "write_enable"):
-            self.held = not (do == "activate" or args[0])
+        if do in ("activate", "write_enable"): self.held = not (do == "activate" or args[0])
         self.commanded &= do not in ("write_stop", "deactivate") and not self.held
         self.due = 0.0
-        self.read(*READS[:3])
+        self.read("read_error", "read_enabled", "get_control_mode")
     def stop(self, why):
-        print(f"{why}: stopping the arm", flush=True)
         self.held = True
         try:
             self.call("write_stop")
-            self.commanded = False
+            self.commanded, how = False, ""
         except Exception as e:
-            print(f"the stop failed, it will be tried again: {e!r}", flush=True)
+            how = f", which failed and will be tried again: {e!r}"
+        print(f"{why}: stopping the arm{how}", flush=True)
     def cycle(self, command=None):  # one command, one reading; its time is when the SDK had read the positions
         refused = DISABLED if command and self.held else None
         if command and not refused:
@@ -77,11 +74,13 @@ class Arm:  # the adapter, called from one thread only
                 refused = str(e) or repr(e)
         time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # who asks again waits for something new
         if time.monotonic() >= self.due:
-            self.state["read_joint_positions"] = self.adapter.read_joint_positions()
+            self.read("read_joint_positions")
             self.state["time"], self.due = time.monotonic_ns(), time.monotonic() + 0.5 / self.hz
-            self.turn = (self.turn + 1) % (len(READS) - len(FEEDBACK))
-            self.read(*READS if self.quick else [READS[self.turn]])
+            self.read(*READS if self.quick else [next(self.turns)])
         unknown = [name for name in FEEDBACK if not self.quick or name not in self.measured]
+        for name in "read_joint_positions", *FEEDBACK:
+            for joint, value in enumerate(self.state.get(name) or [], 1):
+                if not math.isfinite(value): raise RuntimeError(f"{name}() answers {value} for joint {joint}")
         return {"state": {**self.state, "held": self.held, **dict.fromkeys(unknown)}, "refused": refused}
     def reply(self, line):
         request = json.loads(line)
@@ -95,37 +94,36 @@ class Arm:  # the adapter, called from one thread only
             return json.dumps({"id": id, "error": error, "text": (str(e) or repr(e))[:1000]}).encode() + b"\n"
 
 def serve(arm, listener):
-    client, data = None, b""
+    client, data, heard = None, b"", 0.0
     while True:
-        ready = select.select([listener, client] if client else [listener], [], [], SILENCE)[0]
-        if not ready and arm.commanded:
-            arm.stop(f"no request came for {SILENCE} s")
+        ready = select.select([listener, client] if client else [listener], [], [], SILENCE / 5)[0]
         if client in ready:
             try:
                 arrived = client.recv(LONGEST)
                 *lines, data = (data + arrived).split(b"\n")
-                if not arrived or len(data) > LONGEST:
-                    raise OSError("it has gone" if not arrived else "a line without end")
-                for line in lines:
-                    client.sendall(arm.reply(line))
-            except (OSError, ValueError, LookupError) as e:  # it has gone, or speaks something else
-                client, data = client.close(), b""
-                arm.commanded and arm.stop(f"the client's connection ended ({e})")
+                if not arrived or len(data) > LONGEST: raise OSError("a line without end" if arrived else "it has gone")
+                for line in lines: client.sendall(arm.reply(line))
+                heard = time.monotonic()
+            except Exception as e:  # it has gone, or speaks something else
+                client.close()
+                client, data = None, b""
+                if arm.commanded: arm.stop(f"the client's connection ended ({e!r})")
+        if arm.commanded and time.monotonic() - heard >= SILENCE: arm.stop(f"no request came for {SILENCE} s")
         if listener in ready:
-            another = listener.accept()[0]
-            another.settimeout(1.0)
-            if client:
-                another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
-            client = client or another
+            with contextlib.suppress(OSError):  # who knocked may have gone already
+                another = listener.accept()[0]
+                another.settimeout(1.0)
+                if client: another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
+                client = client or another
 
 def listen(at):
     if not at.startswith("unix:"):
         host, _, port = at.replace("tcp:", "", 1).rpartition(":")
         if not host.startswith("127.") or not port.isdigit():
-            sys.exit(f"error: --at {at}: it is no unix:/PATH, and not a loopback address, tcp:127.0.0.1:PORT")
+            raise OSError("it is no unix:/PATH, and not a loopback address, tcp:127.0.0.1:PORT")
         return socket.create_server((host, int(port)))
-    if os.path.exists(at[5:]) and socket.socket(socket.AF_UNIX).connect_ex(at[5:]):
-        os.unlink(at[5:])  # of a shim that is gone
+    refused = socket.socket(socket.AF_UNIX).connect_ex(at[5:]) == errno.ECONNREFUSED  # by a shim that is gone
+    if refused and pathlib.Path(at[5:]).is_socket(): os.unlink(at[5:])
     os.umask(0o177)  # for this user only
     return socket.create_server(at[5:], family=socket.AF_UNIX)
 
@@ -137,14 +135,16 @@ if __name__ == "__main__":
     parser.add_argument("--dof", type=int, default=argparse.SUPPRESS, help="given to the adapter")
     parser.add_argument("--hz", type=float, default=100.0, help="how often the arm has a new state (100)")
     given = vars(parser.parse_args())
-    (module, _, name), at, hz = given.pop("adapter").partition(":"), given.pop("at"), given.pop("hz")
-    [signal.signal(end, signal.default_int_handler) for end in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    adapter, at, hz = given.pop("adapter"), given.pop("at"), given.pop("hz")
+    for end in signal.SIGINT, signal.SIGTERM, signal.SIGHUP: signal.signal(end, lambda *_: sys.exit(0))
     sys.path.insert(0, os.getcwd())
-    modes, listener = control_modes(), listen(at)
-    arm = Arm(getattr(importlib.import_module(module), name)(**given), modes, given.get("dof"), hz)
-    print(f"serving {name} at {at}; Ctrl-C ends it", flush=True)
+    try:
+        (module, _, name), modes, listener = adapter.partition(":"), control_modes(), listen(at)
+        arm = Arm(getattr(importlib.import_module(module), name)(**given), modes, given.get("dof"), hz)
+    except Exception as e: sys.exit(f"error: {adapter} --at {at}: {str(e) or repr(e)}")
+    print(f"serving {adapter} at {at}; Ctrl-C ends it", flush=True)
     try:
         serve(arm, listener)
-    except KeyboardInterrupt:
-        arm.commanded and arm.stop("the shim ends")
+    finally:  # asked to end, or a mistake in here
+        if arm.commanded: arm.stop("the shim ends")
         arm.adapter.disconnect()

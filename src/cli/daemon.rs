@@ -47,6 +47,9 @@ pub struct Up {
     pub text_log: PathBuf,
     /// Its socket, if it has one.
     pub socket: Option<PathBuf>,
+    /// The run that it attached to, where it is a planner and no run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub attached: Option<String>,
 }
 
 /// What the new process says when it is up, or cannot be.
@@ -140,8 +143,13 @@ fn print(up: &Up, json: bool) {
         return output::json(up);
     }
     let simulated = if up.simulated { "  SIMULATED" } else { "" };
-    output::line(format_args!("run       {}{simulated}", up.run));
+    let what = if up.attached.is_some() { "planner " } else { "run     " };
+    output::line(format_args!("{what}  {}{simulated}", up.run));
     output::line(format_args!("pid       {}", up.pid));
+    if let Some(run) = &up.attached {
+        output::line(format_args!("text log  {}", up.text_log.display()));
+        return output::note(format_args!("attached to run {run}; dimos down {} ends it", up.run));
+    }
     for (arm, phase) in &up.arms {
         output::line(format_args!("arm       {arm}: {phase}"));
     }
@@ -170,8 +178,8 @@ impl Starter {
         Ok(Self { stream, text_log: text_log.to_owned() })
     }
 
-    /// Says that the run is up; `false` when nobody waits for it any more.
-    pub fn up(self, report: &StatusReport, socket: Option<&Path>) -> bool {
+    /// Says that the run is up, or the planner attached to that run; `false` when nobody waits for it any more.
+    pub fn up(self, report: &StatusReport, socket: Option<&Path>, attached: Option<&str>) -> bool {
         let text_log = self.text_log.clone();
         let up = Up {
             run: report.run.clone(),
@@ -181,6 +189,7 @@ impl Starter {
             log: report.log.clone(),
             text_log,
             socket: socket.map(PathBuf::from),
+            attached: attached.map(str::to_owned),
         };
         self.say(&Word::Up(up)).is_ok()
     }

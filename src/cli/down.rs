@@ -1,7 +1,8 @@
-//! `dimos down`: ends a run exactly like SIGTERM.
+//! `dimos down`: ends a run exactly like SIGTERM, or a planner that attached to one.
 
 use std::time::{Duration, Instant};
 
+use super::attach;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{Fate, RunRecord};
@@ -17,7 +18,7 @@ const INTERVAL: Duration = Duration::from_millis(20);
 /// Arguments of `down`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The run to end; needed only when several are live
+    /// The run to end, or the planner that attached to one; needed only when several runs are live
     pub name: Option<String>,
     /// The same
     #[arg(long, value_name = "NAME", conflicts_with = "name")]
@@ -27,7 +28,12 @@ pub struct Args {
 /// Runs the verb: asks, waits until the run is gone, and says what became of it.
 pub fn run(args: &Args) -> Result {
     let folder = RunFolder::standard();
-    let found = find(&folder, args.name.as_deref().or(args.run.as_deref()))?;
+    let name = args.name.as_deref().or(args.run.as_deref());
+    let found = match find(&folder, name) {
+        Ok(found) => found,
+        // A planner in a process of its own is no run, but has a name as well.
+        Err(failure) => return attach::find(name).map_or(Err(failure), |planner| attach::end(&planner)),
+    };
     Client::connect(&found.name, &found.socket)?.call(Shutdown {})?;
     let asked = Instant::now();
     // The name is free before the process has written its last words.

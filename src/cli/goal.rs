@@ -35,6 +35,43 @@ pub struct Goal {
     /// One of its named poses
     #[arg(long, value_name = "NAME", conflicts_with = "pose")]
     pub named: Option<String>,
+    /// Where one robot of several shall go, all in one motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
+    /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
+    #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "pose", "named"])]
+    pub several: Vec<PlanGoal>,
+}
+
+/// A robot and its goal, as `--goal` takes them.
+fn robot_goal(text: &str) -> std::result::Result<PlanGoal, String> {
+    let form = "must be ROBOT=GOAL, such as left=named:home or left=0.1,-0.3,0.6,0,0.8,0";
+    let (robot, goal) =
+        text.split_once('=').filter(|(robot, goal)| !robot.is_empty() && !goal.is_empty()).ok_or(form)?;
+    let numbers = |list: &str| -> std::result::Result<Vec<f64>, String> {
+        list.split(',').map(|n| finite(n.trim()).map_err(|e| format!("{n:?}: {e}"))).collect()
+    };
+    let mut planned = PlanGoal { robot: robot.to_owned(), ..PlanGoal::default() };
+    match goal.split_once(':') {
+        None => planned.joints = Some(numbers(goal)?),
+        Some(("named", name)) => planned.named = Some(name.to_owned()),
+        Some(("pose", list)) => {
+            let (mut rpy, mut quat) = (None, None);
+            let xyz = match *numbers(list)? {
+                [x, y, z] => [x, y, z],
+                [x, y, z, roll, pitch, yaw] => {
+                    rpy = Some([roll, pitch, yaw]);
+                    [x, y, z]
+                }
+                [x, y, z, qx, qy, qz, qw] => {
+                    quat = Some([qx, qy, qz, qw]);
+                    [x, y, z]
+                }
+                _ => return Err("a pose has 3, 6 or 7 numbers: x,y,z, then roll,pitch,yaw or qx,qy,qz,qw".into()),
+            };
+            planned.pose = Some(PoseSpec { xyz, rpy, quat });
+        }
+        Some(_) => return Err(form.into()),
+    }
+    Ok(planned)
 }
 
 /// How to search and how fast to go.
@@ -60,20 +97,21 @@ impl Goal {
         (!self.joints.is_empty()).then_some(&self.joints)
     }
 
-    /// The goal of a robot, as the planner takes it.
-    pub fn of(&self, robot: &str, search: &Search) -> PlanGoal {
+    /// The goals, as the planner takes them; `robot` is whom positions, pose and name are for.
+    pub fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
+        let Some(robot) = robot else { return self.several.clone() };
         let pose = self.pose.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
             xyz,
             rpy: self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok()),
             quat: self.quat.as_deref().and_then(|quat| quat.try_into().ok()),
         });
-        PlanGoal {
+        vec![PlanGoal {
             robot: robot.to_owned(),
             joints: self.joints().map(<[f64]>::to_vec),
             pose,
             named: self.named.clone(),
             linear: search.linear,
-        }
+        }]
     }
 }
 
@@ -84,11 +122,11 @@ impl Search {
     }
 }
 
-/// Whether the run has a planner.
+/// Whether the run has a planner. One that had a planner until it went away is an error.
 pub fn has_planner(client: &mut Client) -> Result<bool> {
     match client.call(Planner {}) {
         Ok(_) => Ok(true),
-        Err(ClientError::Refused(RpcError { code: Code::NoPlanner, .. })) => Ok(false),
+        Err(ClientError::Refused(RpcError { code: Code::NoPlanner, data: None, .. })) => Ok(false),
         Err(e) => Err(e.into()),
     }
 }

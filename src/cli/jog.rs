@@ -36,7 +36,8 @@ of the tool. Tab: single joints: 1-9 choose one, +/- or the arrows move it. [ ] 
 leave. A motion fades within 0.25 s after the last key, so that a key must be held; where the terminal tells when keys go
 up (kitty keyboard protocol), it ends then.
 
-Needs a task of type eef_twist, and velocity (or servo) for single joints; the blueprints keyboard-teleop-… have them.
+Needs a task of type eef_twist, and one of type velocity (or servo) for single joints; the blueprints keyboard-teleop-…
+have both.
 Not collision-checked. An operational control and no safety function: keep the arm's own stop at hand.")]
 pub struct Args {
     /// The arm's name in the blueprint

@@ -3,6 +3,7 @@
 pub mod adapter;
 pub mod arguments;
 pub mod arm;
+mod attach;
 pub mod banner;
 pub mod cancel;
 pub mod check;
@@ -73,7 +74,7 @@ enum Command {
     State(state::Args),
     /// Move an arm to joint positions, and wait until it is there
     Move(move_to::Args),
-    /// Plan a collision-free motion and show it; moves nothing
+    /// Plan a collision-free motion of one robot or several and show it; moves nothing
     Plan(plan::Args),
     /// Show a plan moment by moment, or write its trajectory to a file
     Preview(preview::Args),

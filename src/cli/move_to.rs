@@ -1,4 +1,4 @@
-//! `dimos move ARM …`: a motion to joint positions, a pose or a named pose. With a planner in the run it is planned and
+//! `dimos move ARM …`: a motion to joint positions, a pose or a named pose, of one arm or of several together. With a planner in the run it is planned and
 //! collision-free; without one it is direct.
 
 use super::arguments::Target;
@@ -12,8 +12,9 @@ use crate::rpc::client::Client;
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The arm's hardware_id, which is also the robot's name in the planner
-    pub arm: String,
+    /// The arm's hardware_id, which is also the robot's name in the planner; several have --goal each
+    #[arg(required_unless_present = "several", conflicts_with = "several")]
+    pub arm: Option<String>,
     /// Where it shall go
     #[command(flatten)]
     pub goal: Goal,
@@ -21,7 +22,7 @@ pub struct Args {
     #[command(flatten)]
     pub search: Search,
     /// Move straight in joint space although the run has a planner: not collision-checked
-    #[arg(long, conflicts_with_all = ["pose", "named"])]
+    #[arg(long, conflicts_with_all = ["pose", "named", "several"])]
     pub direct: bool,
     /// Return when the motion has begun
     #[arg(long)]
@@ -50,7 +51,7 @@ pub fn run(args: &Args) -> Result {
 type Begun = (u64, String, serde_json::Value);
 
 fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
-    let request = args.search.plan(vec![args.goal.of(&args.arm, &args.search)]);
+    let request = args.search.plan(args.goal.of(args.arm.as_deref(), &args.search));
     let planned = plan(client, request, signals)?;
     if !args.target_run.json {
         show(&planned);
@@ -62,11 +63,11 @@ fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result
 }
 
 fn begin_direct(args: &Args, client: &mut Client) -> Result<Begun> {
-    let Some(target) = args.goal.joints() else {
-        let failure = Failure::new(Exit::Failed, "this run has no planner, which poses and names need");
+    let (Some(arm), Some(target)) = (&args.arm, args.goal.joints()) else {
+        let failure = Failure::new(Exit::Failed, "this run has no planner, which poses, names and --goal need");
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
-    let begun = client.call(Move { arm: args.arm.clone(), target: target.to_vec(), speed: args.search.speed })?;
+    let begun = client.call(Move { arm: arm.clone(), target: target.to_vec(), speed: args.search.speed })?;
     output::note(format_args!(
         "motion {} on {}: {:.2} s, direct, not collision-checked",
         begun.motion, begun.task, begun.duration

@@ -1,4 +1,4 @@
-//! `dimos plan ROBOT …`: a collision-free motion, planned and shown, not carried out.
+//! `dimos plan ROBOT …`: a collision-free motion of one robot or several, planned and shown, not carried out.
 
 use super::arguments::Target;
 use super::exit::{Exit, Result};
@@ -12,10 +12,12 @@ use super::output;
 Then `dimos preview` shows the plan and `dimos execute` carries it out. `dimos move` does all in one go.
   dimos plan arm 0.3 -0.2 0.5 0 0.4 0
   dimos plan arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
-  dimos plan arm --named home")]
+  dimos plan arm --named home
+  dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0     both at once, in one motion")]
 pub struct Args {
-    /// The robot's name in the planner
-    pub robot: String,
+    /// The robot's name in the planner; several have --goal each
+    #[arg(required_unless_present = "several", conflicts_with = "several")]
+    pub robot: Option<String>,
     /// Where it shall go
     #[command(flatten)]
     pub goal: Goal,
@@ -31,7 +33,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
     let signals = Signals::watch();
-    let request = args.search.plan(vec![args.goal.of(&args.robot, &args.search)]);
+    let request = args.search.plan(args.goal.of(args.robot.as_deref(), &args.search));
     let planned = plan(&mut client, request, &signals)?;
     if args.target_run.json {
         output::json(&serde_json::json!({

@@ -1,7 +1,9 @@
-//! `dimos run NAME|PATH`: starts a run and keeps it up until a signal, its time, `dimos down` or a fault ends it.
+//! `dimos run NAME|PATH`: starts a run and keeps it up until a signal, its time, `dimos down` or a fault ends it. A
+//! planner whose arms are in a run already attaches to that one ([`attach`]).
 //! With `--daemon` a process of its own does that ([`daemon`]).
 
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::Sender;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -9,6 +11,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
 
 use super::arguments::{duration, setting};
+use super::attach::{self, Attached};
 use super::daemon::Starter;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::RunRecord;
@@ -43,6 +46,12 @@ pub struct Args {
     /// Name of the run; without it the blueprint's name
     #[arg(long, value_name = "RUN")]
     pub name: Option<String>,
+    /// Start a run of its own, even if a live run has the planner's arms
+    #[arg(long, conflicts_with = "attach")]
+    pub standalone: bool,
+    /// Attach the blueprint's planner to this live run; without it, to the one that has its arms and tasks, if there is one
+    #[arg(long, value_name = "RUN")]
+    pub attach: Option<String>,
     /// Start the run in the background, without this terminal; return when the arms are up
     #[arg(short, long)]
     pub daemon: bool,
@@ -80,11 +89,16 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
     match &args.text_log {
         None if args.daemon => daemon::start(args, registry),
-        None => {
-            let (run, signals, terminal) = bring_up(args, registry)?;
-            let record = RunRecord::begin(&run.status(), None);
-            keep_up(run, signals, &terminal, args.duration, args.json, Some(record))
-        }
+        None => match bring_up(args, registry)? {
+            (Up::Run(run), signals, terminal) => {
+                let record = RunRecord::begin(&run.status(), None);
+                keep_up(*run, signals, &terminal, args.duration, args.json, Some(record))
+            }
+            (Up::Planner(planner), signals, terminal) => {
+                watch(signals, planner.endings())?;
+                planner.keep_up(&terminal, args, None)
+            }
+        },
         Some(text_log) => in_background(args, registry, text_log),
     }
 }
@@ -92,28 +106,51 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 /// What a run in the background does: it tells whoever started it that it is up, or why not.
 fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
     let starter = Starter::detach(text_log)?;
-    let (run, signals, terminal) = match bring_up(args, registry) {
+    let (up, signals, terminal) = match bring_up(args, registry) {
         Ok(up) => up,
         Err(failure) => {
             starter.failed(&failure);
             return Err(failure);
         }
     };
-    let record = RunRecord::begin(&run.status(), Some(text_log));
-    if !starter.up(&run.status(), run.socket()) {
+    let (endings, told) = match &up {
+        Up::Run(run) => (run.endings(), starter.up(&run.status(), run.socket(), None)),
+        Up::Planner(planner) => (planner.endings(), starter.up(&planner.report(), None, Some(planner.run()))),
+    };
+    if !told {
         terminal.note("whoever started this run has gone before it was up");
-        let _ = run.endings().send(Ending::Asked);
+        let _ = endings.send(Ending::Asked);
     }
+    let run = match up {
+        Up::Run(run) => *run,
+        Up::Planner(planner) => {
+            watch(signals, endings)?;
+            return planner.keep_up(&terminal, args, Some(text_log));
+        }
+    };
+    let record = RunRecord::begin(&run.status(), Some(text_log));
     keep_up(run, signals, &terminal, args.duration, false, Some(record))
 }
 
-fn bring_up(args: &Args, registry: &Registry) -> Result<(Run, Signals, Terminal)> {
+/// What `dimos run` keeps up.
+enum Up {
+    /// A run.
+    Run(Box<Run>),
+    /// A planner that is attached to one.
+    Planner(Attached),
+}
+
+fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)> {
     let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     // Taken before anything is connected: a signal during the start ends the run as soon as it is up, controlled.
     let signals = signals()?;
     let terminal = terminal()?;
+    if let Some(run) = attach::chosen(args, blueprint)? {
+        let planner = Attached::start(args, blueprint, run, &terminal).inspect_err(|_| terminal.flush())?;
+        return Ok((Up::Planner(planner), signals, terminal));
+    }
     let run = Run::start(blueprint, args.options()).map_err(|error| {
         terminal.flush();
         if let Some(manager) = ServiceManager::from_env() {
@@ -122,7 +159,7 @@ fn bring_up(args: &Args, registry: &Registry) -> Result<(Run, Signals, Terminal)
         let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
         Failure::new(exit, error.to_string()).hint(error.hint())
     })?;
-    Ok((run, signals, terminal))
+    Ok((Up::Run(Box::new(run)), signals, terminal))
 }
 
 /// Keeps a run up until a signal, its time, `dimos down` or a fault ends it, and stops it: what `dimos run` does with
@@ -148,7 +185,7 @@ fn keep_up(
     json: bool,
     record: Option<RunRecord>,
 ) -> Result {
-    watch(signals, &run)?;
+    watch(signals, run.endings())?;
     let report = run.status();
     let in_terminal = record.as_ref().is_none_or(|record| record.text_log.is_none());
     let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
@@ -172,9 +209,8 @@ fn keep_up(
     Ok(exit)
 }
 
-/// Hands signals to the run for as long as the process lives: a second one is taken note of and changes nothing.
-fn watch(mut signals: Signals, run: &Run) -> Result<()> {
-    let endings = run.endings();
+/// Hands signals to what is up for as long as the process lives: a second one is taken note of and changes nothing.
+fn watch(mut signals: Signals, endings: Sender<Ending>) -> Result<()> {
     let watching = std::thread::Builder::new().name("signals".into()).spawn(move || {
         for signal in signals.forever() {
             let _ = endings.send(Ending::Signal(signal));
@@ -183,7 +219,8 @@ fn watch(mut signals: Signals, run: &Run) -> Result<()> {
     watching.map(|_| ()).map_err(|e| Failure::new(Exit::Failed, format!("no thread for signals: {e}")))
 }
 
-fn why(ending: &Ending) -> String {
+/// Why something ended, in a word or a few.
+pub(super) fn why(ending: &Ending) -> String {
     match ending {
         Ending::Signal(signal) => match *signal {
             SIGINT => "SIGINT".to_owned(),

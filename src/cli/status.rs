@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::arguments::Target;
+use super::attach;
 use super::banner::at_exit;
 use super::exit::{Exit, Result};
 use super::output::{self, Table, Tone, number, span, toned};
@@ -10,7 +11,7 @@ use super::run_record::{Fate, RunRecord};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::LiveRun;
-use crate::rpc::report::{ArmReport, Percentiles, StatusReport, TaskReport};
+use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
@@ -25,8 +26,17 @@ pub struct Args {
 #[serde(untagged)]
 enum Found {
     Answered(Box<StatusReport>),
-    Silent { run: String, pid: u32, error: String },
+    Silent {
+        run: String,
+        pid: u32,
+        error: String,
+    },
     Fallen(Fallen),
+    /// A planner in a process of its own whose run is gone.
+    Waits {
+        planner: String,
+        pid: u32,
+    },
 }
 
 /// A run that crashed or that a fault ended, and that nobody has started again since.
@@ -87,7 +97,10 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
         Ok(report) => Found::Answered(Box::new(report)),
         Err(error) => Found::Silent { run: run.name, pid: run.pid, error: error.to_string() },
     });
-    let found: Vec<Found> = answers.chain(fallen.into_iter().map(Found::Fallen)).collect();
+    let mut found: Vec<Found> = answers.chain(fallen.into_iter().map(Found::Fallen)).collect();
+    let waiting =
+        waiting(found.iter().filter_map(|found| if let Found::Answered(r) = found { Some(&**r) } else { None }));
+    found.extend(waiting.into_iter().map(|p| Found::Waits { planner: p.name, pid: p.pid }));
     if json {
         return output::json(&found);
     }
@@ -114,9 +127,19 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
                 let [run, pid, blueprint] = [record.run.clone(), record.pid.to_string(), record.blueprint.clone()];
                 table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how, log.into()]);
             }
+            Found::Waits { planner, pid } => {
+                let pid = pid.to_string();
+                table.row([planner.as_str(), &pid, "-", "-", "a planner that waits for its run", "-"]);
+            }
         }
     }
     table.print();
+    let answered = found.iter().filter_map(|found| if let Found::Answered(r) = found { Some(r) } else { None });
+    let planners: Vec<_> = answered.filter_map(|r| Some((r.run.as_str(), r.planner.as_ref()?))).collect();
+    if !planners.is_empty() {
+        output::line("");
+        print_planners(planners.into_iter());
+    }
     for found in &found {
         if let Found::Fallen(fallen) = found {
             print_fallen(fallen);
@@ -143,7 +166,38 @@ fn print(r: &StatusReport) {
     output::line("");
     print_tasks(&r.tasks);
     output::line("");
+    if let Some(planner) = &r.planner {
+        print_planners([(r.run.as_str(), planner)].into_iter());
+        output::line("");
+    }
     print_timing(r);
+}
+
+/// The planners in processes of their own that are attached to none of these runs.
+fn waiting<'r>(runs: impl Iterator<Item = &'r StatusReport>) -> Vec<LiveRun> {
+    let attached = runs.filter_map(|run| run.planner.as_ref()?.attached.as_ref()?.pid).collect::<Vec<_>>();
+    attach::live().into_iter().filter(|planner| !attached.contains(&(planner.pid as i32))).collect()
+}
+
+/// The planners of runs in a table, which run's if there are several.
+fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus)>) {
+    let mut table = Table::new(&["PLANNER", "STATE", "RUN", "ROBOTS"]);
+    let mut errors = Vec::new();
+    for (run, planner) in planners {
+        let tone = match planner.state.as_str() {
+            "FAULT" => Tone::Bad,
+            "PLANNING" => Tone::Warning,
+            _ => Tone::Good,
+        };
+        let name = planner.attached.as_ref().map_or_else(
+            || "the run's own".to_owned(),
+            |process| process.pid.map_or(process.name.clone(), |pid| format!("{} (pid {pid})", process.name)),
+        );
+        table.row([name.into(), toned(&planner.state, tone), run.into(), planner.robots.join(", ").into()]);
+        errors.extend(planner.error.as_ref());
+    }
+    table.print();
+    errors.iter().for_each(|error| output::line(format_args!("  {error}")));
 }
 
 fn print_arms(arms: &[ArmReport]) {

@@ -15,7 +15,25 @@ const AHEAD: usize = 1;
 
 /// How many numbers a target has.
 #[derive(Debug, Clone, Copy)]
-pub struct Width(pub usize);
+pub enum Width {
+    /// One for each of so many joints.
+    Joints(usize),
+    /// Six: linear and angular velocity.
+    Twist,
+    /// Six, or seven: position, and roll, pitch, yaw or a quaternion.
+    Pose,
+}
+
+impl Width {
+    fn check(self, given: usize) -> std::result::Result<(), String> {
+        match (self, given) {
+            (Self::Joints(joints), _) if given != joints => Err(format!("{given} numbers for {joints} joints")),
+            (Self::Twist, _) if given != 6 => Err(format!("{given} numbers for a twist, which has 6")),
+            (Self::Pose, _) if given != 6 && given != 7 => Err(format!("{given} numbers for a pose, which has 6 or 7")),
+            _ => Ok(()),
+        }
+    }
+}
 
 /// Where targets come from.
 pub struct Source {
@@ -104,10 +122,7 @@ impl<R: Read> Iterator for Lines<R> {
             if text.is_empty() || text.starts_with('#') {
                 continue;
             }
-            let target = numbers(text).and_then(|numbers| match (numbers.len(), self.width.0) {
-                (given, wanted) if given == wanted => Ok(numbers),
-                (given, wanted) => Err(format!("{given} numbers for {wanted} joints")),
-            });
+            let target = numbers(text).and_then(|numbers| self.width.check(numbers.len()).map(|()| numbers));
             return Some(target.map_err(|what| self.mistake(what)));
         }
     }
@@ -131,7 +146,7 @@ mod tests {
     use super::*;
 
     fn all(text: &str, width: usize) -> Vec<std::result::Result<Vec<f64>, String>> {
-        let lines = Lines::new(text.as_bytes(), "t".into(), Width(width));
+        let lines = Lines::new(text.as_bytes(), "t".into(), Width::Joints(width));
         lines.map(|target| target.map_err(|failure| failure.what)).collect()
     }
 
@@ -149,6 +164,13 @@ mod tests {
         ] {
             let last = all(text, 2).pop().unwrap().unwrap_err();
             assert!(last.starts_with(expected), "{text:?}: {last}");
+        }
+        for (width, fits, text) in
+            [(Width::Twist, 6, "a twist, which has 6"), (Width::Pose, 7, "a pose, which has 6 or 7")]
+        {
+            assert!(width.check(fits).is_ok() && width.check(6).is_ok());
+            assert_eq!(width.check(5), Err(format!("5 numbers for {text}")));
+            assert_eq!(width.check(8), Err(format!("8 numbers for {text}")));
         }
         assert!(all(&"1 ".repeat(40_000), 2)[0].as_ref().unwrap_err().contains("too long"));
         assert!(all("\u{fffd}", 2)[0].is_err());

@@ -10,7 +10,7 @@ use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
 use super::targets::{Source, Width};
 use super::{output, status};
-use crate::rpc::api::{Cancel, Servo, Status, Velocity};
+use crate::rpc::api::{Cancel, Pose, Servo, Status, Twist, TwistFrame, Velocity};
 use crate::rpc::client::Client;
 use crate::rpc::report::TaskReport;
 use crate::rpc::{Code, RpcError};
@@ -43,11 +43,13 @@ enum Action {
         #[command(flatten)]
         target_run: Target,
     },
-    /// Stream targets to a servo or velocity task, one per line, from a file or stdin
+    /// Stream targets to a task that follows them, one per line, from a file or stdin
     #[command(after_help = "\
 A line is a JSON array or numbers between blanks or commas: one per joint of the task, rad for a servo task, rad/s for a
-velocity task. Empty lines and those that begin with # are skipped. At most one target per tick takes effect.
-At the end of the stream a servo task holds the last target, a velocity task slows down to zero.")]
+velocity task; for an eef_twist task x y z [m/s] and the angular velocity about x y z [rad/s], in the base's axes; for a
+cartesian_ik task x y z [m] and roll pitch yaw [rad] or a quaternion x y z w. Empty lines and those that begin with # are
+skipped. At most one target per tick takes effect. At the end of the stream a servo task holds the last target, all others
+slow down to rest.")]
     Stream {
         /// The task's name
         task: String,
@@ -86,7 +88,11 @@ pub fn run(args: &Args) -> Result {
         Action::Stream { task, file, rate, target_run } => {
             let mut client = target_run.connect()?;
             let report = find(&mut client, task)?;
-            let width = Width(report.joints.len());
+            let width = match report.kind.as_str() {
+                "eef_twist" => Width::Twist,
+                "cartesian_ik" => Width::Pose,
+                _ => Width::Joints(report.joints.len()),
+            };
             let (source, rate) = match file.as_deref().filter(|path| path.as_os_str() != "-") {
                 Some(path) => (Source::file(path, width)?, rate.or(Some(FILE_RATE))),
                 None => (Source::stdin(width), *rate),
@@ -132,14 +138,10 @@ fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
 
 /// Sends targets until they end or a signal comes.
 fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Option<f64>, json: bool) -> Result {
-    let positions = match task.kind.as_str() {
-        "servo" => true,
-        "velocity" => false,
-        kind => {
-            let text = format!("{} is a {kind} task, and follows no stream", task.name);
-            return Err(refusal(RpcError::new(Code::WrongTask, text).hint("`dimos task list` shows the types")));
-        }
-    };
+    if task.kind == "trajectory" {
+        let text = format!("{} is a trajectory task, and follows no stream", task.name);
+        return Err(refusal(RpcError::new(Code::WrongTask, text).hint("`dimos task list` shows the types")));
+    }
     let signals = Signals::watch();
     let period = rate.map(|rate| Duration::from_secs_f64(1.0 / rate));
     let (began, mut sent, mut beat) = (Instant::now(), 0_u64, Instant::now());
@@ -161,11 +163,7 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
                 return Err(mistake);
             }
         };
-        let name = task.name.clone();
-        match positions {
-            true => client.call(Servo { task: name, positions: target })?,
-            false => client.call(Velocity { task: name, velocities: target })?,
-        };
+        send(client, task, target)?;
         sent += 1;
         if let Some(period) = period {
             beat = (beat + period).max(Instant::now() - period);
@@ -177,7 +175,7 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
         let failure = Failure::new(Exit::Failed, format!("{}: {} after {sent} targets: {why}", now.name, now.state));
         return Err(failure.hint("`dimos status` shows what the arm waits for"));
     }
-    if ended.is_some() || !positions {
+    if ended.is_some() || task.kind != "servo" {
         end(client, task)?;
     }
     let seconds = began.elapsed().as_secs_f64();
@@ -187,6 +185,25 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
         output::line(format_args!("{}: {sent} targets in {seconds:.2} s", task.name));
     }
     Ok(ended.map_or(Exit::Ok, Exit::by_signal))
+}
+
+/// Sends a target of the width that fits the task's type.
+fn send(client: &mut Client, task: &TaskReport, target: Vec<f64>) -> Result<()> {
+    let name = task.name.clone();
+    let three = |from: usize| std::array::from_fn(|i| target.get(from + i).copied().unwrap_or_default());
+    match task.kind.as_str() {
+        "servo" => client.call(Servo { task: name, positions: target })?,
+        "velocity" => client.call(Velocity { task: name, velocities: target })?,
+        "eef_twist" => {
+            client.call(Twist { task: name, linear: three(0), angular: three(3), frame: TwistFrame::Base })?
+        }
+        _ => {
+            let quat = target.get(3..7).map(|q| std::array::from_fn(|i| q.get(i).copied().unwrap_or_default()));
+            let rpy = quat.is_none().then(|| three(3));
+            client.call(Pose { task: name, xyz: three(0), rpy, quat })?
+        }
+    };
+    Ok(())
 }
 
 /// Ends the stream's task at once; without that it would go on until its timeout, or keep its joints at zero.

@@ -50,6 +50,17 @@ pub struct RobotConfig {
     pub named_poses: BTreeMap<String, Vec<f64>>,
 }
 
+/// How far and how fast those who execute a motion let one joint go.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct JointBounds {
+    /// Lowest and highest position [rad].
+    pub position: [f64; 2],
+    /// Highest speed [rad/s].
+    pub velocity: f64,
+    /// Highest acceleration [rad/s²].
+    pub acceleration: f64,
+}
+
 /// An object in the world.
 #[derive(Debug, Clone)]
 pub struct ObjectConfig {

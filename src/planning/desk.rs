@@ -1,5 +1,6 @@
-//! The planner's thread: takes one request at a time, can be cancelled at once, keeps the newest plans. A panic in a
-//! request costs that request only.
+//! The planner's thread: takes one request at a time, can be cancelled at once, keeps the newest plans. A request that
+//! panics, or that does not end when its time is over, costs that request only: what hangs is left behind, and the next
+//! request gets a thread of its own.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -19,6 +20,16 @@ use crate::collision::world::World;
 const KEPT: usize = 16;
 /// Stack of the planner's thread: collision checks of large meshes recurse.
 const STACK: usize = 8 << 20;
+
+/// How long a request may go on when its time is over or it is cancelled, before it is taken to hang.
+const OVERTIME: Duration = Duration::from_secs(5);
+/// So many threads that hang are left behind before nothing new is begun.
+const MAX_HANGING: usize = 4;
+/// How long the last owner waits for the thread.
+const FAREWELL: Duration = Duration::from_secs(2);
+
+/// What answers a request: [`solve`], or what stands in its place.
+pub type Solver = Arc<dyn Fn(&Setup, &World, &Request, &Stop) -> Result<Found, Failure> + Send + Sync>;
 
 /// How a request stands.
 #[derive(Debug, Clone)]
@@ -40,6 +51,14 @@ pub struct Job {
     pub request: Arc<Request>,
     /// How it stands.
     pub progress: Progress,
+    /// When it must end.
+    deadline: Instant,
+}
+
+impl Job {
+    fn is_planning(&self) -> bool {
+        matches!(self.progress, Progress::Planning(_))
+    }
 }
 
 struct Order {
@@ -61,15 +80,30 @@ pub struct Desk {
     setup: Arc<Setup>,
     world: Mutex<World>,
     shared: Arc<Shared>,
-    orders: Mutex<Option<Sender<Order>>>,
+    solver: Solver,
     timeout: Duration,
-    thread: Mutex<Option<JoinHandle<()>>>,
+    worker: Mutex<Worker>,
 }
 
-/// Another request is being planned.
+/// The thread that plans.
+struct Worker {
+    /// Dropped to end it.
+    orders: Option<Sender<Order>>,
+    thread: Option<JoinHandle<()>>,
+    /// How many before it hang.
+    hanging: usize,
+}
+
+/// Why a request is not begun.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("the planner is busy with another request")]
-pub struct Busy;
+pub enum NotBegun {
+    /// Another one is being planned.
+    #[error("the planner is busy with another request")]
+    Busy,
+    /// Too many before it never ended.
+    #[error("the planner hangs in {MAX_HANGING} requests that never ended: a defect of the program")]
+    Hangs,
+}
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -78,21 +112,15 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Desk {
     /// Starts the thread.
     pub fn start(setup: Setup, timeout: Duration) -> std::io::Result<Self> {
-        Self::with(setup, timeout, solve)
+        Self::with(setup, timeout, Arc::new(solve))
     }
 
     /// Starts the thread with what answers each request.
-    fn with(setup: Setup, timeout: Duration, solver: impl Solver) -> std::io::Result<Self> {
-        let (orders, receiver) = channel();
+    pub fn with(setup: Setup, timeout: Duration, solver: Solver) -> std::io::Result<Self> {
         let world = Mutex::new(setup.world.clone());
         let (setup, shared) = (Arc::new(setup), Arc::new(Shared::default()));
-        let (its_setup, its_shared) = (setup.clone(), shared.clone());
-        let thread = std::thread::Builder::new()
-            .name("planner".into())
-            .stack_size(STACK)
-            .spawn(move || work(solver, &its_setup, &its_shared, &receiver))?;
-        let (orders, thread) = (Mutex::new(Some(orders)), Mutex::new(Some(thread)));
-        Ok(Self { setup, world, shared, orders, timeout, thread })
+        let worker = Mutex::new(Worker::start(&setup, &shared, &solver, 0)?);
+        Ok(Self { setup, world, shared, solver, timeout, worker })
     }
 
     /// The robots.
@@ -106,34 +134,64 @@ impl Desk {
     }
 
     /// Begins a request with this number. It ends by itself after `timeout`, or the planner's own.
-    pub fn begin(&self, id: u64, request: Request, timeout: Option<Duration>) -> Result<(), Busy> {
+    pub fn begin(&self, id: u64, request: Request, timeout: Option<Duration>) -> Result<(), NotBegun> {
+        self.leave_what_hangs();
         let mut jobs = lock(&self.shared.jobs);
-        if jobs.iter().any(|job| matches!(job.progress, Progress::Planning(_))) {
-            return Err(Busy);
+        if jobs.iter().any(Job::is_planning) {
+            return Err(NotBegun::Busy);
         }
+        let worker = lock(&self.worker);
+        let Some(orders) = &worker.orders else { return Err(NotBegun::Hangs) };
         let (now, request) = (Instant::now(), Arc::new(request));
+        let deadline = now + timeout.unwrap_or(self.timeout);
         let cancelled = Arc::new(AtomicBool::new(false));
-        let stop = Stop::new(Some(now + timeout.unwrap_or(self.timeout)), Some(cancelled.clone()));
+        let stop = Stop::new(Some(deadline), Some(cancelled.clone()));
         *lock(&self.shared.cancel) = Some(cancelled);
-        jobs.push_back(Job { id, request: request.clone(), progress: Progress::Planning(now) });
+        jobs.push_back(Job { id, request: request.clone(), progress: Progress::Planning(now), deadline });
         if jobs.len() > KEPT {
             jobs.pop_front();
         }
         let order = Order { id, request, world: lock(&self.world).clone(), stop };
-        if let Some(orders) = &*lock(&self.orders) {
-            // The thread ends with this sender only.
-            let _ = orders.send(order);
-        }
+        // The thread ends with this sender only.
+        let _ = orders.send(order);
         Ok(())
     }
 
     /// Ends the request that is being planned, if there is one. `true`: there was.
     pub fn cancel(&self) -> bool {
-        let planning = lock(&self.shared.jobs).iter().any(|job| matches!(job.progress, Progress::Planning(_)));
         if let Some(cancel) = &*lock(&self.shared.cancel) {
             cancel.store(true, Ordering::Relaxed);
         }
+        let mut jobs = lock(&self.shared.jobs);
+        let mut planning = false;
+        for job in jobs.iter_mut().filter(|job| job.is_planning()) {
+            job.deadline = job.deadline.min(Instant::now());
+            planning = true;
+        }
         planning
+    }
+
+    /// Forgets all plans: their numbers were given by a run that is gone.
+    pub fn forget(&self) {
+        self.cancel();
+        lock(&self.shared.jobs).retain(Job::is_planning);
+    }
+
+    /// Fails the request that goes on long after it should have ended, and gives the next one a thread of its own.
+    fn leave_what_hangs(&self) {
+        let mut jobs = lock(&self.shared.jobs);
+        let hangs = |job: &&mut Job| job.is_planning() && job.deadline.elapsed() > OVERTIME;
+        let Some(job) = jobs.iter_mut().find(hangs) else { return };
+        let Progress::Planning(since) = job.progress else { return };
+        let failure = Failure::new("the planner did not end when its time was over: a defect of the program");
+        job.progress = Progress::Failed(failure, since.elapsed());
+        let mut worker = lock(&self.worker);
+        let hanging = worker.hanging + 1;
+        let fresh = (hanging < MAX_HANGING).then(|| Worker::start(&self.setup, &self.shared, &self.solver, hanging));
+        *worker = match fresh {
+            Some(Ok(fresh)) => fresh,
+            _ => Worker { orders: None, thread: None, hanging },
+        };
     }
 
     /// Checks a plan's motion in the world as it is now, with all robots where they are now [rad]: work for another
@@ -150,32 +208,48 @@ impl Desk {
 
     /// A request by its number.
     pub fn job(&self, id: u64) -> Option<Job> {
-        lock(&self.shared.jobs).iter().find(|job| job.id == id).cloned()
+        self.leave_what_hangs();
+        lock(&self.shared.jobs).iter().rev().find(|job| job.id == id).cloned()
     }
 
     /// The newest request, or the newest that led to a motion.
     pub fn newest(&self, found: bool) -> Option<Job> {
+        self.leave_what_hangs();
         let jobs = lock(&self.shared.jobs);
         jobs.iter().rev().find(|job| !found || matches!(job.progress, Progress::Found(..))).cloned()
+    }
+}
+
+impl Worker {
+    fn start(setup: &Arc<Setup>, shared: &Arc<Shared>, solver: &Solver, hanging: usize) -> std::io::Result<Self> {
+        let (orders, receiver) = channel();
+        let (setup, shared, solver) = (setup.clone(), shared.clone(), solver.clone());
+        let thread = std::thread::Builder::new()
+            .name("planner".into())
+            .stack_size(STACK)
+            .spawn(move || work(&solver, &setup, &shared, &receiver))?;
+        Ok(Self { orders: Some(orders), thread: Some(thread), hanging })
     }
 }
 
 impl Drop for Desk {
     fn drop(&mut self) {
         self.cancel();
-        lock(&self.orders).take();
-        if let Some(thread) = lock(&self.thread).take() {
+        let mut worker = lock(&self.worker);
+        worker.orders = None;
+        let Some(thread) = worker.thread.take() else { return };
+        let began = Instant::now();
+        while !thread.is_finished() && began.elapsed() < FAREWELL {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        // One that hangs is left behind: it must not keep the arms from being released.
+        if thread.is_finished() {
             let _ = thread.join();
         }
     }
 }
 
-/// What answers a request: [`solve`], or what a test puts in its place.
-trait Solver: Fn(&Setup, &World, &Request, &Stop) -> Result<Found, Failure> + Send + 'static {}
-
-impl<S: Fn(&Setup, &World, &Request, &Stop) -> Result<Found, Failure> + Send + 'static> Solver for S {}
-
-fn work(solver: impl Solver, setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
+fn work(solver: &Solver, setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
     while let Ok(order) = orders.recv() {
         let began = Instant::now();
         let outcome = catch_unwind(AssertUnwindSafe(|| solver(setup, &order.world, &order.request, &order.stop)));
@@ -187,7 +261,7 @@ fn work(solver: impl Solver, setup: &Setup, shared: &Shared, orders: &Receiver<O
                 Progress::Failed(Failure::new("the planner failed at this request: a defect of the program"), took)
             }
         };
-        if let Some(job) = lock(&shared.jobs).iter_mut().find(|job| job.id == order.id) {
+        if let Some(job) = lock(&shared.jobs).iter_mut().find(|job| job.id == order.id && job.is_planning()) {
             job.progress = progress;
         }
     }
@@ -270,7 +344,7 @@ mod tests {
             assert!(request.seed != 13, "a defect");
             solve(setup, world, request, stop)
         };
-        let desk = Desk::with(yourarm(Vec::new()), PATIENCE, breaks).unwrap();
+        let desk = Desk::with(yourarm(Vec::new()), PATIENCE, Arc::new(breaks)).unwrap();
         found(&desk, 1, turn(0.0, 0.5, 0));
         desk.begin(2, turn(0.0, 0.5, 13), None).unwrap();
         let failed = outcome(&desk, 2);
@@ -278,6 +352,26 @@ mod tests {
         found(&desk, 3, turn(0.0, 0.5, 0));
         assert_eq!(desk.newest(true).unwrap().id, 3);
         assert!(matches!(desk.job(1).unwrap().progress, Progress::Found(..)));
+    }
+
+    #[test]
+    fn a_request_that_never_ends_costs_one_request_and_not_the_end_of_its_desk() {
+        let hangs = |setup: &Setup, world: &World, request: &Request, stop: &Stop| {
+            while request.seed == 13 {
+                std::thread::sleep(Duration::from_millis(50)); // and never looks whether it shall stop
+            }
+            solve(setup, world, request, stop)
+        };
+        let desk = Desk::with(yourarm(Vec::new()), PATIENCE, Arc::new(hangs)).unwrap();
+        desk.begin(1, turn(0.0, 0.5, 13), Some(Duration::from_millis(10))).unwrap();
+        assert_eq!(desk.begin(2, turn(0.0, 0.5, 0), None), Err(NotBegun::Busy));
+        let failed = outcome(&desk, 1);
+        assert!(matches!(&failed, Progress::Failed(f, took) if f.what.contains("did not end") && *took > OVERTIME));
+        found(&desk, 2, turn(0.0, 0.5, 0));
+        desk.begin(3, turn(0.0, 0.5, 13), None).unwrap();
+        let began = Instant::now();
+        drop(desk);
+        assert!(began.elapsed() < PATIENCE / 2);
     }
 
     #[test]
@@ -316,7 +410,7 @@ mod tests {
         let desk = Desk::start(walled(), PATIENCE).unwrap();
         assert!(!desk.cancel());
         desk.begin(1, turn(1.5, -1.5, 0), None).unwrap();
-        assert_eq!(desk.begin(2, turn(1.5, 1.4, 0), None), Err(Busy));
+        assert_eq!(desk.begin(2, turn(1.5, 1.4, 0), None), Err(NotBegun::Busy));
         assert!(desk.cancel());
         let cancelled = outcome(&desk, 1);
         assert!(

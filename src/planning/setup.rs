@@ -1,12 +1,12 @@
 //! From a planner's configuration to robots and a world that can be planned in: descriptions read, joints and links
 //! found, shapes made.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
 use glamx::DVec3;
 
-use super::config::{CLOUD_RADIUS, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::timing::DEFAULT_ACCELERATION;
 use crate::collision::always::always_touching;
 use crate::collision::body::{MeshMode, of_mesh, solids};
@@ -71,6 +71,16 @@ impl Setup {
         let mut setup = Self { robots, world, always_touching: Vec::new() };
         setup.leave_out_what_always_touches();
         Ok(setup)
+    }
+
+    /// The same with the limits of those who execute the motions on top of its own, by the coordinator's joint names:
+    /// what is planned is then never refused for a limit. An error names the joint that is left no room.
+    pub fn within(mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<Self, String> {
+        for robot in &mut self.robots {
+            robot.narrow(bounds).map_err(|e| format!("robot {:?}: {e}", robot.config.name))?;
+        }
+        self.world = self.world.with_robots(self.robots.iter().map(|robot| robot.body.clone()).collect());
+        Ok(self)
     }
 
     /// The robot of a name.
@@ -142,6 +152,30 @@ impl PlannedRobot {
             }
         }
         Ok(Self { config: config.clone(), model, joints, end_effector, limits, body })
+    }
+
+    fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
+        let mut model = (*self.model).clone();
+        for (&index, name) in self.joints.iter().zip(&self.config.coordinator_joints) {
+            let (Some(joint), Some(b)) = (model.joints.get_mut(index), bounds.get(name)) else { continue };
+            let (own, [lower, upper]) = (joint.limits, b.position);
+            if own.upper.min(upper) <= own.lower.max(lower) {
+                return Err(format!(
+                    "{name} goes from {:.3} to {:.3} rad in the model and from {lower:.3} to {upper:.3} rad in the \
+                     coordinator: nothing is in both",
+                    own.lower, own.upper
+                ));
+            }
+            joint.limits.lower = own.lower.max(lower);
+            joint.limits.upper = own.upper.min(upper);
+            joint.limits.velocity = own.velocity.min(b.velocity);
+            joint.limits.acceleration = Some(own.acceleration.map_or(b.acceleration, |a| a.min(b.acceleration)));
+        }
+        let kinematics = Kinematics::new(&model, &self.joints, &[]).map_err(|e| e.to_string())?;
+        self.limits = kinematics.limits().to_vec();
+        self.model = Arc::new(model);
+        self.body = Robot { model: self.model.clone(), kinematics: Arc::new(kinematics), ..self.body.clone() };
+        Ok(())
     }
 
     /// A pose in the middle of things: zero, or where zero is outside the limits the nearest that is inside.

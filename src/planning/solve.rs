@@ -80,7 +80,8 @@ pub struct Failure {
 }
 
 impl Failure {
-    pub(super) fn new(what: impl Into<String>) -> Self {
+    /// A failure without a hint.
+    pub fn new(what: impl Into<String>) -> Self {
         Self { what: what.into(), hint: None, cancelled: false }
     }
 
@@ -179,7 +180,7 @@ fn told(stage: &Stage<'_>, error: &PlanError) -> Failure {
         PlanError::Outside { which, joint, position, lower, upper } => {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
             Failure::new(format!("{which}: {name} at {position:.4} rad is outside its limits {lower:.4} … {upper:.4}"))
-                .hint("`dimos state` shows where the joints are, `dimos model info` their limits")
+                .hint("limits are the model's and the arm's, the narrower counts, and commands stay 0.01 rad inside the arm's; `dimos state` shows where the joints are")
         }
         PlanError::Collides { which: "start", .. } => Failure::new(error.to_string())
             .hint("move out of it with `dimos move … --direct` or by hand, or correct the world"),

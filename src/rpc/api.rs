@@ -4,17 +4,20 @@
 
 use std::future::Future;
 use std::pin::Pin;
+use std::sync::Arc;
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use super::arm_api::*;
+pub use super::attach_api::*;
 pub use super::cartesian_api::*;
 use super::error::{Code, RpcError};
 use super::lease::Subject;
 pub use super::motion_api::*;
 pub use super::planner_api::*;
+use super::planner_line::PlannerLine;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::streams::Streams;
 
@@ -38,6 +41,16 @@ pub trait Backend: Send + Sync + 'static {
     /// The arms that `subject` is about, by `hardware_id`; none where it names something that is not there. Who
     /// moves an arm needs its lease.
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String>;
+    /// The number of a plan, the newest without one, and the coordinator's joints that it moves.
+    fn plan_of(&self, plan: Option<u64>) -> BoxFuture<'_, Result<(u64, Vec<String>), RpcError>> {
+        let _ = plan;
+        Box::pin(async { Err(RpcError::new(Code::NoPlanner, "this run has no planner")) })
+    }
+    /// Lets the process at the other end of `line` be the run's planner.
+    fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
+        let _ = (planner, line);
+        Err(RpcError::new(Code::Unsupported, "this run takes no planner"))
+    }
     /// What the run publishes.
     fn streams(&self) -> &Streams;
 }
@@ -67,7 +80,19 @@ macro_rules! methods {
         pub enum Reply { $($(#[$doc])* $variant($reply),)* }
 
         /// Names of all methods, those that the connection itself answers at the end.
-        pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe", "lease", "release"];
+        pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe", "lease", "release",
+            "register_planner", "planner_answer"];
+
+        impl Reply {
+            /// Reads what came back from a method.
+            pub fn read(method: &str, reply: Value) -> Result<Self, RpcError> {
+                let unlike = |e: serde_json::Error| RpcError::new(Code::Internal, format!("reply to {method:?}: {e}"));
+                match method {
+                    $($name => serde_json::from_value::<$reply>(reply).map(Self::$variant).map_err(unlike),)*
+                    _ => Err(RpcError::unknown(Code::UnknownMethod, "method", method, METHODS)),
+                }
+            }
+        }
 
         $(impl Method for $variant {
             const NAME: &'static str = $name;
@@ -76,6 +101,14 @@ macro_rules! methods {
         })*
 
         impl Request {
+            /// The method's name and its parameters, as they travel.
+            pub fn written(&self) -> (&'static str, Value) {
+                // Plain structs with string keys always encode.
+                match self {
+                    $(Self::$variant(params) => ($name, serde_json::to_value(params).unwrap_or_default()),)*
+                }
+            }
+
             /// Reads the parameters of a method; refuses unknown methods, unknown or ill-formed parameters.
             pub fn read(method: &str, params: Value) -> Result<Self, RpcError> {
                 match method {

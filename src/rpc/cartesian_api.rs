@@ -64,7 +64,7 @@ impl Pose {
         if self.rpy.is_none() && self.quat.is_none() {
             return Err("the orientation is missing: give rpy or quat".into());
         }
-        self.spec().valid("the target")
+        self.spec().valid("target")
     }
 }
 

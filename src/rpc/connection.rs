@@ -21,10 +21,12 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
 use super::api::{
-    Backend, Done, Lease, LeaseReply, MAX_LINE, MAX_SUBSCRIPTIONS, Method, Release, Reply, Request, read_params,
+    Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, Method, PlannerAnswer, RegisterPlanner,
+    Registered, Release, Reply, Request, read_params,
 };
 use super::error::{Code, RpcError};
 use super::lease::{Lessee, Subject};
+use super::planner_line::PlannerLine;
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
 use super::subscription::{Pace, Subscription};
@@ -51,6 +53,7 @@ pub(super) async fn serve(stream: UnixStream, backend: Arc<dyn Backend>, lessee:
         running: JoinSet::new(),
         subscriptions: BTreeMap::new(),
         next: 1,
+        planner: None,
     };
     connection.converse(&mut from_client).await;
     if timeout(FAREWELL, &mut writer).await.is_err() {
@@ -77,6 +80,16 @@ struct Connection {
     running: JoinSet<()>,
     subscriptions: BTreeMap<u64, AbortHandle>,
     next: u64,
+    /// The line to the planner that registered here.
+    planner: Option<Arc<PlannerLine>>,
+}
+
+impl Drop for Connection {
+    fn drop(&mut self) {
+        if let Some(planner) = &self.planner {
+            planner.close();
+        }
+    }
 }
 
 /// The answer to a request, when it comes.
@@ -89,6 +102,7 @@ impl Connection {
     async fn converse(mut self, from: &mut (impl AsyncBufRead + Unpin)) {
         let mut line = Vec::new();
         loop {
+            let longest = self.longest();
             let read = tokio::select! {
                 biased;
                 done = oldest(&mut self.in_flight), if !self.in_flight.is_empty() => {
@@ -98,7 +112,7 @@ impl Connection {
                     continue;
                 }
                 // Begins again where it was when an answer came first: what it read so far is in `line`.
-                read = read_line(from, &mut line), if self.in_flight.len() < IN_FLIGHT => read,
+                read = read_line(from, &mut line, longest), if self.in_flight.len() < IN_FLIGHT => read,
             };
             match read {
                 Line::Whole => {}
@@ -107,7 +121,7 @@ impl Connection {
                     return;
                 }
                 Line::TooLong => {
-                    let error = RpcError::new(Code::TooLarge, format!("the line is longer than {MAX_LINE} bytes"));
+                    let error = RpcError::new(Code::TooLarge, format!("the line is longer than {longest} bytes"));
                     let error = error.hint("send less at once; the connection is closed now");
                     let _ = self.reply::<Done>(&Value::Null, Err(error)).await;
                     let _ = timeout(FAREWELL, skip_line(from)).await;
@@ -149,6 +163,14 @@ impl Connection {
                 let result = self.release(params);
                 self.reply(&id, result).await
             }
+            RegisterPlanner::NAME => {
+                let result = self.register_planner(params);
+                self.reply(&id, result).await
+            }
+            PlannerAnswer::NAME => {
+                let result = self.planner_answer(params);
+                self.reply(&id, result).await
+            }
             _ => match Request::read(&method, params) {
                 Ok(request) => self.request(id, method, request).await,
                 Err(error) => self.reply::<Done>(&id, Err(error)).await,
@@ -157,9 +179,10 @@ impl Connection {
     }
 
     async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Gone> {
-        if let Err(refusal) = self.lessee.admit(&request, &*self.backend) {
-            return self.reply::<Done>(&id, Err(refusal)).await;
-        }
+        let request = match self.lessee.admit(request, &*self.backend).await {
+            Ok(request) => request,
+            Err(refusal) => return self.reply::<Done>(&id, Err(refusal)).await,
+        };
         let is_target =
             matches!(request, Request::Servo(_) | Request::Velocity(_) | Request::Twist(_) | Request::Pose(_));
         let mut answer = self.call(method, request);
@@ -208,6 +231,27 @@ impl Connection {
     async fn reply<T: Serialize>(&mut self, id: &Value, result: Result<T, RpcError>) -> Result<(), Gone> {
         self.settle().await?;
         self.send(wire::reply(id, result)).await
+    }
+
+    /// Longest line that is taken.
+    fn longest(&self) -> usize {
+        if self.planner.is_some() { MAX_ANSWER } else { MAX_LINE }
+    }
+
+    fn register_planner(&mut self, params: Value) -> Result<Registered, RpcError> {
+        let planner: RegisterPlanner = read_params(params)?;
+        let line = Arc::new(PlannerLine::new(self.queue.clone(), self.lessee.pid()));
+        let registered = self.backend.register_planner(planner, line.clone())?;
+        self.planner = Some(line);
+        Ok(registered)
+    }
+
+    fn planner_answer(&self, params: Value) -> Result<Done, RpcError> {
+        match &self.planner {
+            Some(planner) => planner.answered(read_params(params)?),
+            None => return Err(RpcError::new(Code::InvalidParams, "this connection registered no planner")),
+        }
+        Ok(Done {})
     }
 
     fn lease(&self, params: Value) -> Result<LeaseReply, RpcError> {
@@ -277,8 +321,8 @@ enum Line {
     TooLong,
 }
 
-/// Reads a line of at most [`MAX_LINE`] bytes. What comes after the last newline is no line.
-async fn read_line(from: &mut (impl AsyncBufRead + Unpin), line: &mut Vec<u8>) -> Line {
+/// Reads a line of at most `longest` bytes. What comes after the last newline is no line.
+async fn read_line(from: &mut (impl AsyncBufRead + Unpin), line: &mut Vec<u8>, longest: usize) -> Line {
     loop {
         let chunk = match from.fill_buf().await {
             Ok([]) | Err(_) => return Line::End,
@@ -288,7 +332,7 @@ async fn read_line(from: &mut (impl AsyncBufRead + Unpin), line: &mut Vec<u8>) -
             Some(at) => (at + 1, true),
             None => (chunk.len(), false),
         };
-        if line.len() + take > MAX_LINE {
+        if line.len() + take > longest {
             return Line::TooLong;
         }
         line.extend(chunk.iter().take(take));

@@ -36,6 +36,8 @@ pub enum Code {
     LeaseHeld,
     /// The run has no planner.
     NoPlanner,
+    /// The run has a planner, and takes no second one.
+    HasPlanner,
     /// No such robot in the planner.
     UnknownRobot,
     /// No such plan, or one too long ago.

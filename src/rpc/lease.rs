@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use super::api::{Backend, Reply, Request};
+use super::api::{Backend, ExecutePlan, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
 
@@ -25,8 +25,6 @@ pub enum Subject<'a> {
     Task(&'a str),
     /// The arms of these joints.
     Joints(&'a [String]),
-    /// The arms that a plan moves; without a number, the newest.
-    Plan(Option<u64>),
 }
 
 /// What a request needs.
@@ -36,6 +34,8 @@ pub(super) enum Need<'a> {
     Nothing,
     /// The lease, which it takes where it is free: it moves an arm.
     Lease(Subject<'a>),
+    /// The leases of the arms that a plan moves; without a number, the newest plan.
+    Plan(Option<u64>),
     /// That nobody else commands the arm: it changes what the arm is ready for.
     Peace(Subject<'a>),
 }
@@ -54,7 +54,7 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmEnable(a) => Need::Peace(Subject::Arm(&a.arm)),
         Request::ArmDisable(a) => Need::Peace(Subject::Arm(&a.arm)),
         Request::Status(_) | Request::State(_) | Request::Motion(_) => Need::Nothing,
-        Request::ExecutePlan(e) => Need::Lease(Subject::Plan(e.plan)),
+        Request::ExecutePlan(e) => Need::Plan(e.plan),
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
         Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,
         Request::Attach(_) | Request::Detach(_) => Need::Nothing,
@@ -113,18 +113,30 @@ impl Lessee {
         Self { leases, connection, pid }
     }
 
+    /// The process at the connection's other end, where the system tells.
+    pub fn pid(&self) -> Option<i32> {
+        self.pid
+    }
+
     /// The leases of the run.
     pub fn leases(&self) -> &Arc<Leases> {
         &self.leases
     }
 
-    /// Lets a request through, or says who is in its way.
-    pub fn admit(&self, request: &Request, backend: &dyn Backend) -> Result<(), RpcError> {
-        match need(request) {
-            Need::Nothing => Ok(()),
-            Need::Lease(subject) => self.take(&backend.arms_of(subject)),
-            Need::Peace(subject) => self.check(&backend.arms_of(subject), &self.leases.lock()),
+    /// Lets a request through, or says who is in its way. The newest plan is named by its number from here on, so that
+    /// the plan whose arms are leased is the one that is carried out.
+    pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<Request, RpcError> {
+        match need(&request) {
+            Need::Nothing => {}
+            Need::Lease(subject) => self.take(&backend.arms_of(subject))?,
+            Need::Peace(subject) => self.check(&backend.arms_of(subject), &self.leases.lock())?,
+            Need::Plan(plan) => {
+                let (plan, joints) = backend.plan_of(plan).await?;
+                self.take(&backend.arms_of(Subject::Joints(&joints)))?;
+                return Ok(Request::ExecutePlan(ExecutePlan { plan: Some(plan) }));
+            }
         }
+        Ok(request)
     }
 
     /// Takes the leases of arms: all of them, or none.

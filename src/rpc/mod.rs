@@ -15,6 +15,7 @@
 
 pub mod api;
 mod arm_api;
+mod attach_api;
 mod cartesian_api;
 pub mod client;
 mod connection;
@@ -23,6 +24,8 @@ mod lease;
 mod motion_api;
 pub mod place;
 mod planner_api;
+pub mod planner_end;
+pub mod planner_line;
 pub mod report;
 pub mod server;
 pub mod streams;

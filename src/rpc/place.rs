@@ -102,6 +102,11 @@ impl RunFolder {
         Self(path.into())
     }
 
+    /// The same for planners in processes of their own: they have names and live, but no socket.
+    pub fn planners(&self) -> Self {
+        Self(self.0.join("planners"))
+    }
+
     /// Where it is.
     pub fn path(&self) -> &Path {
         &self.0

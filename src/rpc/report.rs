@@ -36,6 +36,31 @@ pub struct StatusReport {
     pub arms: Vec<ArmReport>,
     /// The tasks, in the blueprint's order.
     pub tasks: Vec<TaskReport>,
+    /// The planner; absent where there is none.
+    #[serde(default)]
+    pub planner: Option<PlannerStatus>,
+}
+
+/// The planner in `status`.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct PlannerStatus {
+    /// `IDLE`, `PLANNING`, `EXECUTING`, `COMPLETED`, `FAULT`.
+    pub state: String,
+    /// Why it is in `FAULT`.
+    pub error: Option<String>,
+    /// The robots that it plans for.
+    pub robots: Vec<String>,
+    /// The process that it attached from; absent where it is part of the run.
+    pub attached: Option<AttachedReport>,
+}
+
+/// A planner in a process of its own.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct AttachedReport {
+    /// What it is called.
+    pub name: String,
+    /// Its process; absent where the system does not tell.
+    pub pid: Option<i32>,
 }
 
 /// One real-time measure.

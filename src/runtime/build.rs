@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::arms::{self, BroughtUp};
 use super::dispatch::{Courier, Dispatcher, REQUEST_RING, log_of};
+use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
@@ -24,6 +25,8 @@ use crate::control::request::Request;
 use crate::control::tick_loop::{self, Pulse, TickPorts};
 use crate::hardware::device;
 use crate::joint::MAX_DOF;
+use crate::planning::config::PlannerConfig;
+use crate::planning::setup::Setup;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
@@ -53,18 +56,11 @@ impl Run {
         let log = log_path(blueprint, &options, &name, wall)?;
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
-        let planner =
-            blueprint.planner.as_ref().map(PlannerPort::start).transpose().map_err(|what| StartError::Blueprint {
-                what,
-                hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
-            })?;
+        let robots = blueprint.planner.as_ref().map(robots).transpose()?;
         let kinds = task_kinds(blueprint).map_err(|what| StartError::Blueprint {
             what,
             hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
         })?;
-        for (robot, [a, b]) in planner.iter().flat_map(PlannerPort::always_touching) {
-            tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
-        }
         let pulse = Arc::new(Pulse::default());
         let (notes, noted) = channel();
 
@@ -75,6 +71,16 @@ impl Run {
         let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
         let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
         let config = coordinator_config(blueprint, &connected, kinds);
+        let limits = command_limits(&names, &config);
+        let planner = blueprint.planner.as_ref().zip(robots);
+        let planner = planner.map(|(config, setup)| PlannerPort::start(config, setup, &limits, options.solver.take()));
+        let planner = planner.transpose().map_err(|what| {
+            arms.release();
+            StartError::other(
+                what,
+                "the model's limits, the arm's, and `limits` in the blueprint must have room in common",
+            )
+        })?;
 
         let samples = ring_size(&config);
         let (mut sample_producer, mut sample_consumer) = rtrb::RingBuffer::new(samples);
@@ -227,6 +233,18 @@ impl Run {
         }
         Ok(())
     }
+}
+
+/// The planner's robots, with what must be said of them.
+pub(super) fn robots(config: &PlannerConfig) -> Result<Setup, StartError> {
+    let setup = Setup::load(config).map_err(|what| StartError::Blueprint {
+        what,
+        hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
+    })?;
+    for (robot, [a, b]) in &setup.always_touching {
+        tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
+    }
+    Ok(setup)
 }
 
 /// What the watchdog does at each look that finds the tick alive.

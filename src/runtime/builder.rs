@@ -4,6 +4,7 @@ use super::{Options, Record, Run, StartError};
 use crate::assets::{Cache, Quiet};
 use crate::blueprint::{self, FindError, Found, Loaded, Overrides, Source};
 use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::planning::desk::Solver;
 use crate::rpc::place::RunFolder;
 
 /// A run that is not up yet. What is not said is as the blueprint says.
@@ -86,6 +87,13 @@ impl Builder {
     /// Adapters besides those in the box, which win over those of the same name.
     pub fn adapters(mut self, more: &[AdapterSpec]) -> Self {
         self.adapters = Registry::with(more);
+        self
+    }
+
+    /// What answers the planner's requests in the place of this program's own planner; it is called on the planner's
+    /// thread.
+    pub fn solver(mut self, solver: Solver) -> Self {
+        self.options.solver = Some(solver);
         self
     }
 

@@ -8,6 +8,7 @@
 
 mod arm_requests;
 mod arms;
+mod attached;
 mod build;
 mod builder;
 pub(crate) mod device_lock;
@@ -17,6 +18,7 @@ mod in_process;
 mod motion_requests;
 mod motions;
 mod plan_requests;
+mod planner_link;
 mod planner_port;
 mod repeats;
 mod reports;
@@ -34,6 +36,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+pub use attached::{AttachedPlanner, Turn};
 pub use builder::Builder;
 pub use device_lock::DeviceTaken;
 pub use dispatch::log_of;
@@ -43,6 +46,7 @@ pub use service_manager::ServiceManager;
 use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
+use crate::planning::desk::Solver;
 use crate::recording::recorder::Recorder;
 use crate::rpc::place::RunFolder;
 use crate::rpc::server::Server;
@@ -80,6 +84,8 @@ pub struct Options {
     pub folder: RunFolder,
     /// Called at each tick; for tests and benchmarks.
     pub probe: Option<Probe>,
+    /// What answers the planner's requests in the place of this program's own planner.
+    pub solver: Option<Solver>,
     /// Whether idle states of the processor are held off.
     pub hold_latency: bool,
     /// Who is told when the run is up, beats and ends: systemd, for a run that is a service.
@@ -93,6 +99,7 @@ impl Default for Options {
             record: Record::AsBlueprint,
             folder: RunFolder::standard(),
             probe: None,
+            solver: None,
             hold_latency: true,
             service_manager: None,
         }

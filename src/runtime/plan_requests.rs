@@ -4,36 +4,39 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::dispatch::lock;
-use super::planner_port::{PlannerPort, apart, isometry, robot_index};
-use super::service::{Service, internal};
+use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index};
+use super::service::internal;
 use crate::collision::Stop;
-use crate::planning::desk::{Job, Progress};
+use crate::planning::desk::{Job, NotBegun, Progress};
 use crate::planning::path::length;
 use crate::planning::setup::{PlannedRobot, Setup};
 use crate::planning::solve::{Found, Goal, Request};
-use crate::rpc::api::{self, PlanSummary, Reply};
+use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
 use crate::rpc::{Code, RpcError};
 
 /// The longest time to find out whether a plan is still free; then it is not carried out.
 const REVIEW_LIMIT: Duration = Duration::from_secs(2);
 
-impl Service {
-    pub(super) fn begin_plan(&self, port: &PlannerPort, plan: &api::Plan) -> Result<api::PlanReply, RpcError> {
-        let setup = port.desk.setup();
+impl PlannerPort {
+    pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
+        let setup = self.desk.setup();
         let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
-        let positions = self.robot_positions(setup)?;
+        let positions = all_positions(setup, moment)?;
         let request = Request { goals, positions, speed: plan.speed, seed: plan.seed };
-        let id = self.parts.dispatcher.number();
-        port.desk
-            .begin(id, request, plan.timeout.map(Duration::from_secs_f64))
-            .map_err(|busy| RpcError::new(Code::Planning, busy.to_string()).hint("wait for it, or `dimos cancel`"))?;
+        let id = moment.plan;
+        self.desk.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
+            let error = RpcError::new(Code::Planning, why.to_string());
+            match why {
+                NotBegun::Busy => error.hint("wait for it, or `dimos cancel`"),
+                NotBegun::Hangs => error.hint("start the planner again"),
+            }
+        })?;
         Ok(api::PlanReply { plan: id })
     }
 
-    pub(super) fn preview(&self, port: &PlannerPort, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
-        let (job, found) = found(port, plan)?;
-        let setup = port.desk.setup();
+    pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
+        let (job, found) = found(self, plan)?;
+        let setup = self.desk.setup();
         let mut end_effectors = BTreeMap::new();
         let mut first = 0;
         for &index in &found.robots {
@@ -53,43 +56,35 @@ impl Service {
         Ok(api::PreviewReply { plan: job.id, summary, trajectory: travelling(&found), end_effectors })
     }
 
-    pub(super) async fn execute_plan(&self, port: &PlannerPort, plan: Option<u64>) -> Result<Reply, RpcError> {
-        let (job, found) = found(port, plan)?;
-        let setup = port.desk.setup();
+    /// A plan for the coordinator to execute, if it is still free.
+    pub(super) async fn release(&self, plan: Option<u64>, moment: &Moment) -> Result<ReleasedPlan, RpcError> {
+        let (job, found) = found(self, plan)?;
+        let setup = self.desk.setup();
         // Several robots move in one trajectory: one task must have the joints of all.
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
         let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
         let task = task.map(|task| (*task).clone());
-        self.still_free(port, &job, &found).await?;
-        let reply = self.execute(api::Execute { trajectory: travelling(&found), task }).await?;
-        if let Reply::Execute(begun) = &reply {
-            *lock(&port.executed) = Some((job.id, begun.motion));
-            return Ok(Reply::ExecutePlan(begun.clone()));
-        }
-        Ok(reply)
+        self.still_free(&job, &found, moment).await?;
+        Ok(ReleasedPlan { plan: job.id, trajectory: travelling(&found), task })
     }
 
     /// The world may have changed since a plan was made, or a robot that it does not move may have moved.
-    async fn still_free(&self, port: &PlannerPort, job: &Job, found: &Arc<Found>) -> Result<(), RpcError> {
-        let positions = self.robot_positions(port.desk.setup())?;
+    async fn still_free(&self, job: &Job, found: &Arc<Found>, moment: &Moment) -> Result<(), RpcError> {
+        let positions = all_positions(self.desk.setup(), moment)?;
         let stop = Stop::new(Some(Instant::now() + REVIEW_LIMIT), None);
-        apart(port.desk.review(found.clone(), positions, stop)).await?.map_err(|failure| {
+        apart(self.desk.review(found.clone(), positions, stop)).await?.map_err(|failure| {
             let what = format!("plan {} is no longer free: {}", job.id, failure.what);
             RpcError::new(Code::PlanOutdated, what).hint("plan again: the world is not as it was")
         })
     }
 
-    pub(super) fn planner_report(&self, port: &PlannerPort) -> api::PlannerReport {
-        let newest = port.desk.newest(false);
-        let motion = lock(&port.executed).and_then(|(_, motion)| self.motion(motion).ok());
-        let (state, error) = match (&newest, &motion) {
-            (Some(Job { progress: Progress::Planning(_), .. }), _) => ("PLANNING", None),
-            (_, Some(motion)) if !motion.done => ("EXECUTING", None),
-            (Some(Job { progress: Progress::Failed(failure, _), .. }), _) if !failure.cancelled => {
+    /// What the planner is and does. How a motion goes is for the run to know.
+    pub(super) fn report(&self) -> api::PlannerReport {
+        let (state, error) = match &self.desk.newest(false) {
+            Some(Job { progress: Progress::Planning(_), .. }) => ("PLANNING", None),
+            Some(Job { progress: Progress::Failed(failure, _), .. }) if !failure.cancelled => {
                 ("FAULT", Some(failure.what.clone()))
             }
-            (_, Some(motion)) if motion.state == "COMPLETED" => ("COMPLETED", None),
-            (_, Some(motion)) => ("FAULT", motion.error.clone()),
             _ => ("IDLE", None),
         };
         let robot = |robot: &PlannedRobot| api::RobotReport {
@@ -101,17 +96,23 @@ impl Service {
             named_poses: robot.config.named_poses.clone(),
         };
         let mut always_touching: BTreeMap<String, Vec<[String; 2]>> = BTreeMap::new();
-        for (name, pair) in port.always_touching() {
+        for (name, pair) in &self.desk.setup().always_touching {
             always_touching.entry(name.clone()).or_default().push(pair.clone());
         }
         api::PlannerReport {
             state: state.to_owned(),
             error,
-            robots: port.desk.setup().robots.iter().map(robot).collect(),
-            plan: port.desk.newest(true).map(|job| job.id),
+            robots: self.desk.setup().robots.iter().map(robot).collect(),
+            plan: self.desk.newest(true).map(|job| job.id),
             always_touching,
         }
     }
+}
+
+/// Where every robot is [rad], in the setup's order.
+fn all_positions(setup: &Setup, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
+    let configs = setup.robots.iter().map(|robot| &robot.config);
+    configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
 }
 
 fn goal_of(setup: &Setup, goal: &api::PlanGoal) -> Result<(usize, Goal), RpcError> {

@@ -55,6 +55,7 @@ impl Service {
             }),
             arms: (0..parts.config.arms.len()).filter_map(|i| self.arm_report(i)).collect(),
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
+            planner: None, // asked when somebody waits for the answer
         }
     }
 

@@ -13,6 +13,7 @@ use serde_json::Value;
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::Motions;
+use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
 use super::repeats::Repeats;
 use crate::arm::{ArmState, Link};
@@ -23,8 +24,10 @@ use crate::control::request::Request;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Device};
 use crate::recording::recorder::{Notice, RecorderStats};
-use crate::rpc::api::{self, Backend, BoxFuture, Done, Reply, Request as Call};
+use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
 use crate::rpc::place::Claim;
+use crate::rpc::planner_line::PlannerLine;
+use crate::rpc::report::StatusReport;
 use crate::rpc::streams::Streams;
 use crate::rpc::{Code, RpcError, Subject};
 use crate::rt::host::Grant;
@@ -66,6 +69,10 @@ pub struct Service {
     pub(super) repeats: Repeats,
     /// Ticks done when the joint state was published last.
     pub(super) published: AtomicU64,
+    /// The planner that is attached, or was.
+    pub(super) attached: Mutex<Option<Arc<Attached>>>,
+    /// The plan that was carried out last, and its motion.
+    pub(super) executed: Mutex<Option<(u64, u64)>>,
     closed: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
@@ -79,6 +86,8 @@ impl Service {
             recorder: OnceLock::new(),
             repeats: Repeats::default(),
             published: AtomicU64::new(0),
+            attached: Mutex::default(),
+            executed: Mutex::default(),
             closed: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
@@ -206,7 +215,6 @@ impl Service {
     }
 
     async fn cancel(&self, call: api::Cancel) -> Result<Reply, RpcError> {
-        let planning = call.task.is_none() && self.cancel_planning();
         let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
         let task = call.task.as_deref().map(|t| self.task_index(t)).transpose()?;
         let moves = |joints: &[u16]| arm.is_none_or(|a| joints.iter().any(|j| self.joints_of_arm(a).contains(j)));
@@ -217,6 +225,8 @@ impl Service {
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }
         }
+        // Behind what moves: a planner in another process may take its time.
+        let planning = call.task.is_none() && self.cancel_planning().await;
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
     }
 
@@ -244,7 +254,10 @@ impl Service {
             return self.refusal(&Outcome::ShuttingDown).map_or_else(|| Err(internal()), Err);
         }
         match call {
-            Call::Status(_) => Ok(Reply::Status(self.status())),
+            Call::Status(_) => {
+                let planner = self.planner_status().await;
+                Ok(Reply::Status(StatusReport { planner, ..self.status() }))
+            }
             Call::State(_) => Ok(Reply::State(self.state())),
             Call::Motion(m) => self.motion(m.motion).map(Reply::Motion),
             Call::Move(m) => self.move_arm(m).await,
@@ -293,7 +306,6 @@ impl Backend for Service {
             Subject::All => true,
             Subject::Arm(id) => arm.hardware_id == id,
             Subject::Joints(joints) => joints.iter().any(|j| arm.joints.contains(j)),
-            Subject::Plan(plan) => self.joints_of_plan(plan).iter().any(|j| arm.joints.contains(j)),
             Subject::Task(name) => {
                 let range = self.joints_of_arm(*i as u16);
                 tasks.iter().any(|t| t.name == name && t.joints.iter().any(|j| range.contains(j)))
@@ -301,6 +313,14 @@ impl Backend for Service {
         };
         let arms = self.parts.names.arms.iter().enumerate().filter(is_meant);
         arms.map(|(_, arm)| arm.hardware_id.clone()).collect()
+    }
+
+    fn plan_of(&self, plan: Option<u64>) -> BoxFuture<'_, Result<(u64, Vec<String>), RpcError>> {
+        Box::pin(self.plan_and_its_joints(plan))
+    }
+
+    fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
+        self.register(planner, line)
     }
 
     fn streams(&self) -> &Streams {

@@ -6,27 +6,27 @@ use std::path::PathBuf;
 use nalgebra::Isometry3;
 
 use super::dispatch::lock;
-use super::planner_port::{PlannerPort, apart, isometry, robot_index, spec};
-use super::service::{Service, internal};
+use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index, spec};
+use super::service::internal;
 use crate::collision::Solid;
 use crate::collision::world::{Attached, Obstacle, World};
 use crate::planning::config::{ObjectConfig, ObjectShape};
 use crate::planning::setup::{PlannedRobot, obstacle};
 use crate::robot::kinematics::{frame, pose};
-use crate::rpc::api::{self, Done, ShapeSpec, WorldObject};
+use crate::rpc::api::{self, Done, Moment, ShapeSpec, WorldObject};
 use crate::rpc::{Code, RpcError};
 
-impl Service {
-    pub(super) fn attach(&self, port: &PlannerPort, call: &api::Attach) -> Result<Done, RpcError> {
-        let setup = port.desk.setup();
+impl PlannerPort {
+    pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<Done, RpcError> {
+        let setup = self.desk.setup();
         let index = robot_index(setup, &call.robot)?;
         let robot = setup.robots.get(index).ok_or_else(internal)?;
-        let mut object = named(port, &call.name)?;
+        let mut object = named(self, &call.name)?;
         let link = call.link.clone().unwrap_or_else(|| robot.config.end_effector_link.clone());
         for link in &call.touch_links {
             link_index(robot, link)?;
         }
-        let at = self.link_pose(robot, &link)?.inverse() * isometry(&object.pose);
+        let at = link_pose(robot, &link, moment)?.inverse() * isometry(&object.pose);
         let held = |world: &mut World| {
             let stood = world.remove(&call.name)?;
             let solid = Solid { frame: frame(&at), ..stood.solid.clone() };
@@ -44,21 +44,21 @@ impl Service {
             }
             taken
         };
-        port.desk.world(held).map_err(|e| wrong(e.to_string()))?;
+        self.desk.world(held).map_err(|e| wrong(e.to_string()))?;
         object.pose = spec(&at);
         object.held_by = Some([call.robot.clone(), link]);
-        lock(&port.objects).insert(call.name.clone(), object);
+        lock(&self.objects).insert(call.name.clone(), object);
         Ok(Done {})
     }
 
-    pub(super) fn detach(&self, port: &PlannerPort, name: &str) -> Result<Done, RpcError> {
-        let mut object = known(port, name)?;
+    pub(super) fn detach(&self, name: &str, moment: &Moment) -> Result<Done, RpcError> {
+        let mut object = known(self, name)?;
         let Some([robot, link]) = object.held_by.take() else {
             return Err(wrong(format!("nobody holds {name}")));
         };
-        let setup = port.desk.setup();
+        let setup = self.desk.setup();
         let robot = setup.robots.get(robot_index(setup, &robot)?).ok_or_else(internal)?;
-        let at = self.link_pose(robot, &link)? * isometry(&object.pose);
+        let at = link_pose(robot, &link, moment)? * isometry(&object.pose);
         let let_go = |world: &mut World| {
             let held = world.detach(name)?;
             let solids = held.solids.into_iter();
@@ -66,20 +66,55 @@ impl Service {
                 .map(|solid| Solid { frame: frame(&at), ..solid })
                 .try_for_each(|solid| world.add(Obstacle { name: name.to_owned(), solid, padding: held.padding }))
         };
-        port.desk.world(let_go).map_err(|e| wrong(e.to_string()))?;
+        self.desk.world(let_go).map_err(|e| wrong(e.to_string()))?;
         object.pose = spec(&at);
-        lock(&port.objects).insert(name.to_owned(), object);
+        lock(&self.objects).insert(name.to_owned(), object);
         Ok(Done {})
     }
 
-    /// Where a robot's link is now, in the frame `map`.
-    fn link_pose(&self, robot: &PlannedRobot, link: &str) -> Result<Isometry3<f64>, RpcError> {
-        let index = link_index(robot, link)?;
-        let kinematics = &robot.body.kinematics;
-        let mut frames = kinematics.frames();
-        kinematics.forward_from(&robot.body.base, &self.positions_of(&robot.config.coordinator_joints)?, &mut frames);
-        Ok(pose(&kinematics.link_frame(index, &frames)))
+    /// Puts an object into the world. Its file is read beside everything else: it may be large.
+    pub(super) async fn put(&self, object: WorldObject) -> Result<Done, RpcError> {
+        not_held(self, &object.name)?;
+        let config = configured(&object, isometry(&object.pose));
+        let made = apart(move || obstacle(&config)).await?.map_err(wrong)?;
+        // Somebody may have attached it meanwhile.
+        not_held(self, &object.name)?;
+        self.desk.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
+        lock(&self.objects).insert(object.name.clone(), object);
+        Ok(Done {})
     }
+
+    pub(super) fn move_to(&self, call: &api::WorldMove) -> Result<Done, RpcError> {
+        let mut object = named(self, &call.name)?;
+        let at = frame(&isometry(&call.pose));
+        self.desk.world(|world| world.move_to(&call.name, at)).map_err(|e| wrong(e.to_string()))?;
+        object.pose = call.pose;
+        lock(&self.objects).insert(call.name.clone(), object);
+        Ok(Done {})
+    }
+
+    pub(super) fn remove(&self, name: Option<&str>) -> Result<Done, RpcError> {
+        let mut gone: Vec<String> = Vec::new();
+        match name {
+            Some(name) => gone.push(named(self, name)?.name),
+            None => gone.extend(lock(&self.objects).values().filter(|o| o.held_by.is_none()).map(|o| o.name.clone())),
+        }
+        for name in gone {
+            self.desk.world(|world| world.remove(&name)).map_err(|e| wrong(e.to_string()))?;
+            lock(&self.objects).remove(&name);
+        }
+        Ok(Done {})
+    }
+}
+
+/// Where a robot's link is now, in the frame `map`.
+fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isometry3<f64>, RpcError> {
+    let index = link_index(robot, link)?;
+    let kinematics = &robot.body.kinematics;
+    let mut frames = kinematics.frames();
+    let joints = positions_of(&robot.config.name, &robot.config.coordinator_joints, moment)?;
+    kinematics.forward_from(&robot.body.base, &joints, &mut frames);
+    Ok(pose(&kinematics.link_frame(index, &frames)))
 }
 
 fn wrong(what: impl Into<String>) -> RpcError {
@@ -117,40 +152,6 @@ fn not_held(port: &PlannerPort, name: &str) -> Result<(), RpcError> {
         }
         None => Ok(()),
     }
-}
-
-/// Puts an object into the world. Its file is read beside everything else: it may be large.
-pub(super) async fn put(port: &PlannerPort, object: WorldObject) -> Result<Done, RpcError> {
-    not_held(port, &object.name)?;
-    let config = configured(&object, isometry(&object.pose));
-    let made = apart(move || obstacle(&config)).await?.map_err(wrong)?;
-    // Somebody may have attached it meanwhile.
-    not_held(port, &object.name)?;
-    port.desk.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
-    lock(&port.objects).insert(object.name.clone(), object);
-    Ok(Done {})
-}
-
-pub(super) fn move_to(port: &PlannerPort, call: &api::WorldMove) -> Result<Done, RpcError> {
-    let mut object = named(port, &call.name)?;
-    let at = frame(&isometry(&call.pose));
-    port.desk.world(|world| world.move_to(&call.name, at)).map_err(|e| wrong(e.to_string()))?;
-    object.pose = call.pose;
-    lock(&port.objects).insert(call.name.clone(), object);
-    Ok(Done {})
-}
-
-pub(super) fn remove(port: &PlannerPort, name: Option<&str>) -> Result<Done, RpcError> {
-    let mut gone: Vec<String> = Vec::new();
-    match name {
-        Some(name) => gone.push(named(port, name)?.name),
-        None => gone.extend(lock(&port.objects).values().filter(|o| o.held_by.is_none()).map(|o| o.name.clone())),
-    }
-    for name in gone {
-        port.desk.world(|world| world.remove(&name)).map_err(|e| wrong(e.to_string()))?;
-        lock(&port.objects).remove(&name);
-    }
-    Ok(Done {})
 }
 
 fn configured(object: &WorldObject, pose: Isometry3<f64>) -> ObjectConfig {

@@ -95,9 +95,8 @@ class XArmAdapter:
         sdk_mode = mode_map.get(mode)
         if sdk_mode is None:
             return False  # Unsupported mode
-        # While the arm is ready, its controller takes a new mode only after motion_enable.
-        success = self._sdk.motion_enable(True) == 0
-        success = success and self._sdk.set_mode(sdk_mode) == 0 and self._sdk.set_state(0) == 0
+        # A controller that is ready may fall back to mode 0 instead: it takes a new mode in state 4, stopped.
+        success = all(code == 0 for code in (self._sdk.set_state(4), self._sdk.set_mode(sdk_mode), self._sdk.set_state(0)))
         if success:
             self._control_mode = mode
         return success
@@ -154,7 +153,9 @@ class XArmAdapter:
     def write_enable(self, enable: bool) -> bool:
         if not self._sdk:
             return False
-        return self.set_control_mode(self._control_mode) if enable else self._sdk.motion_enable(False) == 0
+        if self._sdk.motion_enable(enable) != 0:
+            return False
+        return self.set_control_mode(self._control_mode) if enable else True
 
     def read_enabled(self) -> bool:
         if not self._sdk:

@@ -108,7 +108,7 @@ impl Backend for FakeBackend {
 
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String> {
         let is_meant = match subject {
-            Subject::All | Subject::Joints(_) | Subject::Plan(_) => true,
+            Subject::All | Subject::Joints(_) => true,
             Subject::Arm(name) => name == "arm",
             Subject::Task(name) => name == "traj_arm" || name == "t",
         };
@@ -184,6 +184,7 @@ pub fn status() -> StatusReport {
             progress: Some(0.42),
             ..Default::default()
         }],
+        planner: None,
     }
 }
 

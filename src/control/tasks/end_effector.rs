@@ -97,6 +97,7 @@ impl EndEffector {
         way: Option<&Velocity>,
         claims: &mut Vec<Claim>,
     ) {
+        let before = self.velocity;
         self.approach(wanted, cx.dt);
         let Velocity { linear, angular } = self.velocity;
         let horizon = way.map_or(f64::INFINITY, |way| {
@@ -116,6 +117,11 @@ impl EndEffector {
             };
         }
         let step = self.stepper.step(&mut self.joints, &Wish { linear, angular, horizon }, &self.bounds, cx.dt);
+        // It changes its velocity no faster than the joints can follow, so that it keeps its direction.
+        if step.share < 1.0 {
+            self.velocity.linear = before.linear + (linear - before.linear) * step.share;
+            self.velocity.angular = before.angular + (angular - before.angular) * step.share;
+        }
         let index = |j: usize| joints.get(j).copied().unwrap_or_default();
         self.bound = match step.bound {
             Bounded::None => Bound::None,

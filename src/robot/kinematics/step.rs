@@ -97,6 +97,8 @@ pub struct Step {
     pub bound: Bound,
     /// Smallest singular value [m/rad].
     pub singular_value: f64,
+    /// The part of the change of the joints' speeds that their accelerations allowed, 0–1.
+    pub share: f64,
 }
 
 /// Makes steps for one link; keeps its buffers.
@@ -130,7 +132,7 @@ impl Stepper {
     /// allow. With nothing to compute with the joints slow down. A joint outside its range may stay or come in.
     pub fn step(&mut self, joints: &mut JointMotion, wish: &Wish, bounds: &[JointBounds], dt: f64) -> Step {
         let n = self.kinematics.dof().min(MAX_DOF);
-        let (step, speeds) = match self.speeds(&joints.position, wish, bounds, n) {
+        let (mut step, speeds) = match self.speeds(&joints.position, wish, bounds, n) {
             Some((speeds, found)) => (self.pace(&joints.position, &speeds, found, wish, bounds, dt), speeds),
             None => (Step { bound: Bound::Invalid, ..Step::default() }, [0.0; MAX_DOF]),
         };
@@ -142,6 +144,7 @@ impl Stepper {
                 share = b.acceleration * dt / change;
             }
         }
+        step.share = share;
         let each = joints.position.iter_mut().zip(&mut joints.velocity).zip(&speeds).zip(bounds).take(n);
         for (((q, v), speed), b) in each {
             let aimed = speed * step.pace;
@@ -184,11 +187,11 @@ impl Stepper {
         let blocked = unblocked(columns, q, bounds, &wanted, damping, &mut speeds)?;
         // At a singularity the way out must stay open: motion is slowed down to a tenth, never to nothing.
         let bound = if near > 0.0 { Bound::Singularity } else { Bound::None };
-        let mut found = Step { pace: 1.0 - 0.9 * near, bound, singular_value: value };
+        let mut found = Step { pace: 1.0 - 0.9 * near, bound, singular_value: value, share: 1.0 };
         if let Some(joint) = blocked
             && goes_astray(columns, &speeds, &wanted)
         {
-            found = Step { pace: 0.0, bound: Bound::Position(joint), singular_value: value };
+            found = Step { pace: 0.0, bound: Bound::Position(joint), ..found };
         }
         Some((speeds, found))
     }

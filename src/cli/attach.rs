@@ -1,0 +1,262 @@
+//! `dimos run` of a planner's blueprint beside a run that owns its arms: the planner attaches to that run and starts no
+//! hardware of its own. Ends by a signal, by its time, or by `dimos down` with its name; the run goes on.
+
+use std::path::Path;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::Duration;
+
+use serde_json::json;
+
+use super::exit::{Exit, Failure, Result};
+use super::run::Args;
+use super::run_record::RunRecord;
+use super::text_log::Terminal;
+use crate::blueprint::Blueprint;
+use crate::planning::config::RobotConfig;
+use crate::rpc::api::Status;
+use crate::rpc::client::{self, Client, ClientError};
+use crate::rpc::place::{Claim, LiveRun, RunFolder};
+use crate::rpc::report::StatusReport;
+use crate::runtime::{AttachedPlanner, Ending, Turn};
+
+/// A planner that is attached to a run, as a process of its own.
+pub struct Attached {
+    name: String,
+    blueprint: String,
+    run: LiveRun,
+    planner: AttachedPlanner,
+    /// Its name among the planners; given back when it ends.
+    _claim: Claim,
+    ending: (Sender<Ending>, Receiver<Ending>),
+}
+
+/// The run that a blueprint's planner attaches to; none where it starts a run of its own.
+pub fn chosen(args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
+    let folder = RunFolder::standard();
+    let run = match (&args.attach, &blueprint.planner) {
+        (Some(_), None) => {
+            return Err(Failure::usage(format!("{} has no planner that could be attached", blueprint.name))
+                .hint("`dimos list-blueprints` shows those with planners"));
+        }
+        (Some(name), _) => Some(insisted(client::find(&folder, Some(name))?, args, blueprint)?),
+        (None, None) => None,
+        (None, Some(_)) if args.standalone => None,
+        (None, Some(_)) => fitting(folder.runs().map_err(ClientError::from)?, args, blueprint)?,
+    };
+    if run.is_some() && args.record.is_some() {
+        let failure = Failure::usage("an attached planner writes no log: the run that it attaches to does");
+        return Err(failure.hint("leave --record out, or start a run of its own with --standalone"));
+    }
+    Ok(run)
+}
+
+fn insisted(run: LiveRun, args: &Args, blueprint: &Blueprint) -> Result<LiveRun> {
+    let status = Client::connect(&run.name, &run.socket)?.call(Status {})?;
+    let Unfit { lacks, .. } = unfit(&status, args, blueprint);
+    if lacks.is_empty() {
+        return Ok(run);
+    }
+    let what = format!("the planner of {} does not fit run {}: {}", blueprint.name, run.name, lacks.join("; "));
+    Err(Failure::new(Exit::Failed, what).hint(format!("`dimos status --run {}` shows what the run has", run.name)))
+}
+
+fn fitting(runs: Vec<LiveRun>, args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
+    let mut fit: Vec<(LiveRun, StatusReport)> = Vec::new();
+    for run in runs {
+        // A run that does not answer is starting, or ending.
+        let asked = Client::connect(&run.name, &run.socket).and_then(|mut client| client.call(Status {}));
+        let Ok(status) = asked else { continue };
+        let Unfit { lacks, differs } = unfit(&status, args, blueprint);
+        if lacks.is_empty() && differs.is_empty() {
+            fit.push((run, status));
+        }
+    }
+    let names: Vec<&str> = fit.iter().map(|(run, _)| run.name.as_str()).collect();
+    if fit.len() > 1 {
+        return Err(Failure::usage(format!("several runs own the planner's arms: {}", names.join(", ")))
+            .hint("say which with --attach RUN, or start a run of its own with --standalone"));
+    }
+    let Some((run, status)) = fit.pop() else { return Ok(None) };
+    match status.planner.and_then(|planner| planner.attached) {
+        None => Ok(Some(run)),
+        Some(other) => {
+            let process = other.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
+            let what = format!("run {} has a planner already: {}{process}", run.name, other.name);
+            let hint = format!("`dimos down {}` ends that one; --standalone starts a run of its own", other.name);
+            Err(Failure::new(Exit::Failed, what).hint(hint))
+        }
+    }
+}
+
+/// Why a run is not the one for a planner.
+struct Unfit {
+    /// What it lacks.
+    lacks: Vec<String>,
+    /// What is there, but is something else. Who insists may attach all the same.
+    differs: Vec<String>,
+}
+
+fn unfit(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Unfit {
+    let mut unfit = Unfit { lacks: Vec::new(), differs: Vec::new() };
+    let robots = blueprint.planner.iter().flat_map(|planner| &planner.robots);
+    let moved = |arm: &&crate::blueprint::Arm| {
+        let joints = robots.clone().flat_map(|robot| &robot.coordinator_joints);
+        arm.joints.iter().any(|joint| joints.clone().any(|j| j == joint))
+    };
+    for arm in blueprint.arms.iter().filter(moved) {
+        let id = &arm.hardware_id;
+        match run.arms.iter().find(|a| a.hardware_id == *id) {
+            None => unfit.lacks.push(format!("it has no arm {id}")),
+            Some(its) if its.adapter != arm.adapter_type => {
+                unfit.differs.push(format!("its {id} is of the type {}, not {}", its.adapter, arm.adapter_type));
+            }
+            Some(its) if args.sim && !its.simulated => unfit.differs.push(format!("its {id} is not simulated")),
+            Some(_) => {}
+        }
+    }
+    unfit.lacks.extend(robots.clone().filter_map(|robot| lacks_task(run, robot)));
+    if run.planner.as_ref().is_some_and(|planner| planner.attached.is_none()) {
+        unfit.lacks.push("it has a planner of its own".to_owned());
+    }
+    unfit
+}
+
+fn lacks_task(run: &StatusReport, robot: &RobotConfig) -> Option<String> {
+    let name = robot.task.as_ref()?;
+    let Some(task) = run.tasks.iter().find(|task| task.name == *name && task.kind == "trajectory") else {
+        return Some(format!("it has no trajectory task {name}"));
+    };
+    let missing = robot.coordinator_joints.iter().find(|joint| !task.joints.contains(joint))?;
+    Some(format!("its task {name} does not move {missing}"))
+}
+
+impl Attached {
+    /// Attaches a blueprint's planner to a run.
+    pub fn start(args: &Args, blueprint: &Blueprint, run: LiveRun, terminal: &Terminal) -> Result<Self> {
+        let name = args.name.clone().unwrap_or_else(|| blueprint.name.clone());
+        let claim = RunFolder::standard().planners().claim(&name);
+        let claim = claim.map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
+        let config = blueprint.planner.clone().unwrap_or_default();
+        let (terminal, json) = (terminal.clone(), args.json);
+        let told = {
+            let (name, run) = (name.clone(), run.name.clone());
+            move |turn: Turn| {
+                let (event, line, why) = match turn {
+                    Turn::Back => ("attached", format!("attached to run {run} again"), None),
+                    Turn::Fault(why) => {
+                        let line = format!("planner {name}: FAULT: run {run}: {why}; it tries again until it can");
+                        ("fault", line, Some(why))
+                    }
+                };
+                terminal.note(line);
+                if json {
+                    terminal.json(&json!({"event": event, "planner": name, "run": run, "why": why}));
+                }
+            }
+        };
+        let planner = AttachedPlanner::start(&name, &config, &run.socket, told)
+            .map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
+        Ok(Self { name, blueprint: blueprint.name.clone(), run, planner, _claim: claim, ending: channel() })
+    }
+
+    /// The planner as those know it who keep records of runs.
+    pub fn report(&self) -> StatusReport {
+        StatusReport {
+            run: self.name.clone(),
+            pid: std::process::id(),
+            version: crate::VERSION.to_owned(),
+            blueprint: self.blueprint.clone(),
+            ..StatusReport::default()
+        }
+    }
+
+    /// The run that it attached to.
+    pub fn run(&self) -> &str {
+        &self.run.name
+    }
+
+    /// Lets other threads end it.
+    pub fn endings(&self) -> Sender<Ending> {
+        self.ending.0.clone()
+    }
+
+    /// Keeps it up until a signal or its time ends it.
+    pub fn keep_up(self, terminal: &Terminal, args: &Args, text_log: Option<&Path>) -> Result {
+        let record = RunRecord::begin(&self.report(), text_log);
+        self.say_hello(terminal, args.json && text_log.is_none());
+        let ending = match args.duration {
+            Some(limit) => self.ending.1.recv_timeout(limit),
+            None => self.ending.1.recv().map_err(|_| RecvTimeoutError::Disconnected),
+        };
+        let ending = ending.unwrap_or(Ending::Duration);
+        let exit = match &ending {
+            Ending::Signal(signal) => Exit::by_signal(*signal),
+            _ => Exit::Ok,
+        };
+        let why = super::run::why(&ending);
+        if args.json && text_log.is_none() {
+            terminal.json(&json!({"event": "ended", "planner": self.name, "run": self.run.name, "why": why}));
+        } else {
+            terminal.note(format_args!("{why}: planner {} ended; run {} goes on without it", self.name, self.run.name));
+        }
+        record.end(exit, why);
+        terminal.flush();
+        Ok(exit)
+    }
+
+    fn say_hello(&self, terminal: &Terminal, json: bool) {
+        let pid = std::process::id();
+        if json {
+            let robots: Vec<&str> = self.planner.robots().iter().map(|robot| robot.name.as_str()).collect();
+            return terminal.json(
+                &json!({"event": "attached", "planner": self.name, "run": self.run.name, "pid": pid, "robots": robots}),
+            );
+        }
+        terminal.note(format_args!("planner {}  (pid {pid}, dimos {})", self.name, crate::VERSION));
+        terminal.note(format_args!("  attached to run {}", self.run.name));
+        for robot in self.planner.robots() {
+            let task = robot.task.as_deref().unwrap_or("whichever task has its joints");
+            terminal.note(format_args!("  robot      {}: {} joints, moved by {task}", robot.name, robot.joints.len()));
+        }
+        terminal.note("Ctrl-C ends it; the run goes on. In another terminal: dimos plan");
+    }
+}
+
+/// How long a planner that is asked to end may take.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// The planner of a name that is attached, or waits for its run; without a name, the only one.
+pub fn find(name: Option<&str>) -> Option<LiveRun> {
+    let mut all = live();
+    match name {
+        Some(name) => all.into_iter().find(|planner| planner.name == name),
+        None if all.len() == 1 => all.pop(),
+        None => None,
+    }
+}
+
+/// The planners in processes of their own that live.
+pub fn live() -> Vec<LiveRun> {
+    RunFolder::standard().planners().runs().unwrap_or_default()
+}
+
+/// Ends a planner, as a signal from its terminal would.
+pub fn end(planner: &LiveRun) -> Result {
+    use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
+    let failed = |what: String| Failure::new(Exit::Failed, format!("planner {}: {what}", planner.name));
+    let pid = Pid::from_raw(planner.pid as i32).ok_or_else(|| failed("it is just starting".into()))?;
+    // A handle on the process first, then a look whether it still is the planner: a number may be used again.
+    let process = pidfd_open(pid, PidfdFlags::empty()).map_err(|e| failed(e.to_string()))?;
+    if live().contains(planner) {
+        pidfd_send_signal(&process, Signal::TERM).map_err(|e| failed(e.to_string()))?;
+    }
+    let asked = std::time::Instant::now();
+    while live().contains(planner) {
+        if asked.elapsed() > PATIENCE {
+            return Err(failed(format!("it was asked to end, but pid {} still lives", planner.pid)));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    super::output::note(format_args!("planner {} ended", planner.name));
+    Ok(Exit::Ok)
+}

@@ -1,0 +1,121 @@
+//! The planner's end of the line: connects to a run, registers, and answers what the run asks, each request beside the
+//! others, until the run is gone.
+
+use std::future::Future;
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::UnixStream;
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::Semaphore;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+
+use super::api::{Method, PLANNER_REQUESTS, PlannerAnswer, PlannerRequest, RegisterPlanner, Registered};
+use super::error::RpcError;
+use super::wire::Incoming;
+
+/// Time for a run to answer a registration.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// Longest line that a run sends its planner [bytes].
+const MAX_REQUEST: u64 = 1 << 20;
+/// Requests that are worked on at once.
+const AT_ONCE: usize = 32;
+
+/// Why there is no line to a run.
+#[derive(Debug, thiserror::Error)]
+pub enum NoLine {
+    /// The run cannot be reached, or went away.
+    #[error("{0}")]
+    Io(#[from] io::Error),
+    /// The run refused the planner.
+    #[error(transparent)]
+    Refused(RpcError),
+}
+
+/// A line to a run, the planner registered.
+pub struct PlannerEnd {
+    from: BufReader<OwnedReadHalf>,
+    to: OwnedWriteHalf,
+    /// What the run said.
+    pub registered: Registered,
+}
+
+impl PlannerEnd {
+    /// Connects to a run's socket and registers.
+    pub async fn register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, NoLine> {
+        let late = |_| io::Error::new(io::ErrorKind::TimedOut, format!("no answer within {} s", PATIENCE.as_secs()));
+        timeout(PATIENCE, Self::try_register(socket, planner)).await.map_err(late)?
+    }
+
+    async fn try_register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, NoLine> {
+        let (from, mut to) = UnixStream::connect(socket).await?.into_split();
+        let mut from = BufReader::new(from);
+        let line = json!({"id": 1, "method": RegisterPlanner::NAME, "params": planner}).to_string() + "\n";
+        to.write_all(line.as_bytes()).await?;
+        let incoming = read(&mut from).await?;
+        if let Some(refusal) = incoming.error {
+            return Err(NoLine::Refused(refusal));
+        }
+        let unlike = |e: serde_json::Error| io::Error::new(io::ErrorKind::InvalidData, e.to_string());
+        let registered = serde_json::from_value(incoming.result).map_err(unlike)?;
+        Ok(Self { from, to, registered })
+    }
+
+    /// Answers requests until the run closes the line; says how it ended. Must run within a `LocalSet` or a runtime.
+    pub async fn serve<F>(self, answer: impl Fn(PlannerRequest) -> F) -> io::Error
+    where
+        F: Future<Output = Result<Value, RpcError>> + Send + 'static,
+    {
+        let Self { mut from, to, .. } = self;
+        let (answers, waiting) = mpsc::channel(AT_ONCE);
+        let room = Arc::new(Semaphore::new(AT_ONCE));
+        let mut working = JoinSet::new();
+        working.spawn(write(to, waiting));
+        loop {
+            let incoming = match read(&mut from).await {
+                Ok(incoming) => incoming,
+                Err(error) => return error,
+            };
+            while working.try_join_next().is_some() {}
+            if incoming.stream.as_deref() != Some(PLANNER_REQUESTS) {
+                continue; // the reply to an answer
+            }
+            let Ok(asked) = serde_json::from_value::<PlannerRequest>(incoming.data) else { continue };
+            let Ok(seat) = room.clone().acquire_owned().await else { continue };
+            let (request, answer, answers) = (asked.request, answer(asked), answers.clone());
+            working.spawn(async move {
+                let (result, error) = match answer.await {
+                    Ok(result) => (Some(result), None),
+                    Err(error) => (None, Some(error)),
+                };
+                let answer = PlannerAnswer { request, result, error };
+                let line = json!({"id": null, "method": PlannerAnswer::NAME, "params": answer}).to_string() + "\n";
+                let _ = answers.send(line).await; // a run that is gone is noticed by the reader
+                drop(seat);
+            });
+        }
+    }
+}
+
+async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) {
+    while let Some(line) = waiting.recv().await {
+        if to.write_all(line.as_bytes()).await.is_err() {
+            return;
+        }
+    }
+}
+
+async fn read(from: &mut BufReader<OwnedReadHalf>) -> io::Result<Incoming> {
+    let mut line = Vec::new();
+    (&mut *from).take(MAX_REQUEST).read_until(b'\n', &mut line).await?;
+    if line.last() != Some(&b'\n') {
+        return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the run closed the connection"));
+    }
+    serde_json::from_slice(&line).map_err(|e| io::Error::new(io::ErrorKind::InvalidData, e.to_string()))
+}

@@ -1,0 +1,166 @@
+//! A planner in a process of its own, attached to a run: it registers over the run's socket, answers what the run asks,
+//! and when the run goes away it tries again until it is back.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Sender, channel};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::sync::oneshot;
+
+use super::StartError;
+use super::build::robots;
+use super::planner_link::answer_travelling;
+use super::planner_port::{PlannerPort, registered};
+use crate::planning::config::PlannerConfig;
+use crate::planning::setup::Setup;
+use crate::rpc::api::{RegisterPlanner, RegisteredRobot};
+use crate::rpc::planner_end::{NoLine, PlannerEnd};
+
+/// First pause before a run that is gone is tried again; each is twice as long as the one before.
+const FIRST_PAUSE: Duration = Duration::from_millis(200);
+/// The longest pause.
+const LONGEST_PAUSE: Duration = Duration::from_secs(3);
+
+/// What becomes of the line to the run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Turn {
+    /// The run is back, and the planner attached to it again.
+    Back,
+    /// The run is gone, or refuses the planner since it is back: why. The planner goes on trying.
+    Fault(String),
+}
+
+/// A planner that is attached. Ends when it is dropped.
+pub struct AttachedPlanner {
+    robots: Vec<RegisteredRobot>,
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl AttachedPlanner {
+    /// Reads the robots' descriptions and attaches to the run of that socket, as `name`. `told` hears what becomes of it
+    /// from then on, on a thread of the planner's.
+    pub fn start(
+        name: &str,
+        config: &PlannerConfig,
+        socket: &Path,
+        told: impl FnMut(Turn) + Send + 'static,
+    ) -> Result<Self, StartError> {
+        let setup = robots(config)?;
+        let robots = registered(&setup);
+        let registration = RegisterPlanner { name: name.to_owned(), robots: robots.clone() };
+        let process = Process { config: config.clone(), registration, socket: socket.to_owned() };
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build();
+        let runtime = runtime.map_err(|e| StartError::other(e, "see ulimit -n"))?;
+        let (stop, stopped) = oneshot::channel();
+        let (ready, begun) = channel();
+        let thread = std::thread::Builder::new().name("attached".into()).spawn(move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = process.live(setup, &ready, told) => {}
+                    _ = stopped => {}
+                }
+            });
+            // A large file that is still being read keeps nobody from ending.
+            runtime.shutdown_background();
+        });
+        let thread = thread.map_err(|e| StartError::other(e, "see ulimit -u"))?;
+        match begun.recv() {
+            Ok(Ok(())) => Ok(Self { robots, stop: Some(stop), thread: Some(thread) }),
+            Ok(Err(error)) => Err(error),
+            Err(_) => Err(StartError::other("the planner's thread ended: a defect of the program", "see `dimos logs`")),
+        }
+    }
+
+    /// The robots that it plans for.
+    pub fn robots(&self) -> &[RegisteredRobot] {
+        &self.robots
+    }
+}
+
+impl Drop for AttachedPlanner {
+    fn drop(&mut self) {
+        if let Some(stop) = self.stop.take() {
+            let _ = stop.send(());
+        }
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+struct Process {
+    config: PlannerConfig,
+    registration: RegisterPlanner,
+    socket: PathBuf,
+}
+
+impl Process {
+    /// Attaches, says so, and answers for as long as it is let.
+    async fn live(self, setup: Setup, ready: &Sender<Result<(), StartError>>, mut told: impl FnMut(Turn)) {
+        let begun = async {
+            let end = PlannerEnd::register(&self.socket, &self.registration).await.map_err(refused)?;
+            let limits = &end.registered.limits;
+            let port = PlannerPort::start(&self.config, setup, limits, None).map_err(|what| {
+                let hint = "the model's limits and the run's must have room in common: is it the model of this arm?";
+                StartError::other(what, hint)
+            })?;
+            Ok((end, Arc::new(port)))
+        };
+        let (mut end, port) = match begun.await {
+            Ok(begun) => begun,
+            Err(error) => return drop(ready.send(Err(error))),
+        };
+        let limits = end.registered.limits.clone();
+        let _ = ready.send(Ok(()));
+        loop {
+            let answering = port.clone();
+            let lost = end.serve(move |asked| {
+                let port = answering.clone();
+                async move { answer_travelling(&port, asked).await }
+            });
+            let lost = lost.await;
+            // Its numbers mean nothing to the run that comes next.
+            port.desk.forget();
+            told(Turn::Fault(format!("the run is gone ({lost})")));
+            end = self.again(&limits, &mut told).await;
+            port.desk.forget();
+            told(Turn::Back);
+        }
+    }
+
+    /// Tries until the run is back and takes the planner. A run that refuses is told of once.
+    async fn again(&self, limits: &Limits, told: &mut impl FnMut(Turn)) -> PlannerEnd {
+        let (mut pause, mut last) = (FIRST_PAUSE, String::new());
+        loop {
+            tokio::time::sleep(pause).await;
+            pause = (2 * pause).min(LONGEST_PAUSE);
+            let why = match PlannerEnd::register(&self.socket, &self.registration).await {
+                Ok(end) if end.registered.limits == *limits => return end,
+                Ok(_) => "the run has other limits now: start the planner again".to_owned(),
+                Err(NoLine::Io(_)) => continue,
+                Err(NoLine::Refused(refusal)) => refusal.message,
+            };
+            if why != last {
+                told(Turn::Fault(why.clone()));
+                last = why;
+            }
+        }
+    }
+}
+
+type Limits = std::collections::BTreeMap<String, crate::rpc::api::CommandLimits>;
+
+fn refused(why: NoLine) -> StartError {
+    match why {
+        NoLine::Io(error) => {
+            StartError::other(format!("the run cannot be reached: {error}"), "`dimos status` shows it")
+        }
+        NoLine::Refused(refusal) => {
+            let hint = refusal.hint.clone().unwrap_or_else(|| "`dimos status` shows what the run has".to_owned());
+            StartError::other(format!("{} [{}]", refusal.message, refusal.code.name()), hint)
+        }
+    }
+}

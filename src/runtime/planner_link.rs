@@ -1,0 +1,273 @@
+//! A run and its planner, which is in the same process or attached from another: what the run adds to a request, how
+//! long it waits, and what it does itself. The tick knows nothing of any of this.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::Value;
+
+use super::dispatch::lock;
+use super::planner_port::PlannerPort;
+use super::service::{Service, internal};
+use crate::control::config::{CoordinatorConfig, TaskKind};
+use crate::control::limit::Bounds;
+use crate::rpc::api::{
+    self, CommandLimits, Moment, PlannerReport, RegisterPlanner, Registered, ReleasedPlan, Reply, Request as Call,
+};
+use crate::rpc::planner_line::{PlannerLine, gone};
+use crate::rpc::report::{AttachedReport, PlannerStatus};
+use crate::rpc::{Code, RpcError};
+use crate::telemetry::describe::Names;
+
+/// A state older than this is no place to plan from.
+const FRESH: Duration = Duration::from_secs(1);
+/// How long an attached planner may take to answer what costs it nothing.
+const QUICK: Duration = Duration::from_secs(3);
+/// The same where it reads files or checks a motion.
+const LONG: Duration = Duration::from_secs(9);
+/// How long `status` waits for it.
+const GLANCE: Duration = Duration::from_millis(500);
+
+/// A planner in a process of its own.
+pub(super) struct Attached {
+    name: String,
+    robots: Vec<api::RegisteredRobot>,
+    line: Arc<PlannerLine>,
+}
+
+/// Where a run's planner is.
+enum Planner<'a> {
+    Own(&'a PlannerPort),
+    Attached(Arc<Attached>),
+}
+
+impl Planner<'_> {
+    async fn answer(&self, call: Call, moment: Moment, limit: Duration) -> Result<Reply, RpcError> {
+        match self {
+            Self::Own(port) => port.answer(call, &moment).await,
+            Self::Attached(planner) => {
+                let (method, params) = call.written();
+                Reply::read(method, planner.line.ask(method, params, moment, limit).await?)
+            }
+        }
+    }
+
+    async fn release(&self, plan: Option<u64>, moment: Moment) -> Result<ReleasedPlan, RpcError> {
+        match self {
+            Self::Own(port) => port.release(plan, &moment).await,
+            Self::Attached(planner) => {
+                let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan }).written();
+                let released = planner.line.ask(method, params, moment, LONG).await?;
+                serde_json::from_value(released)
+                    .map_err(|e| RpcError::new(Code::Internal, format!("the planner released no plan: {e}")))
+            }
+        }
+    }
+}
+
+impl Service {
+    fn planner(&self) -> Result<Planner<'_>, RpcError> {
+        if let Some(port) = &self.parts.planner {
+            return Ok(Planner::Own(port));
+        }
+        match &*lock(&self.attached) {
+            Some(planner) if planner.line.is_closed() => Err(gone()),
+            Some(planner) => Ok(Planner::Attached(planner.clone())),
+            None => Err(RpcError::new(Code::NoPlanner, "this run has no planner")
+                .hint("run a planner blueprint, such as yourarm-planner: beside this run, it attaches to it")),
+        }
+    }
+
+    /// Answers the planner's methods.
+    pub(super) async fn planner_call(&self, call: Call) -> Result<Reply, RpcError> {
+        let planner = self.planner()?;
+        let limit = if matches!(call, Call::WorldAdd(_)) { LONG } else { QUICK };
+        match call {
+            Call::ExecutePlan(execute) => {
+                let released = planner.release(execute.plan, self.moment(0)).await?;
+                self.execute_released(released).await
+            }
+            Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
+            Call::Plan(_) => planner.answer(call, self.moment(self.parts.dispatcher.number()), limit).await,
+            Call::Attach(_) | Call::Detach(_) => planner.answer(call, self.moment(0), limit).await,
+            _ => planner.answer(call, Moment::default(), limit).await,
+        }
+    }
+
+    async fn execute_released(&self, released: ReleasedPlan) -> Result<Reply, RpcError> {
+        let ReleasedPlan { plan, trajectory, task } = released;
+        // What comes from another process is checked like what comes from any client.
+        let execute = api::Execute { trajectory, task };
+        api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
+        match self.execute(execute).await? {
+            Reply::Execute(begun) => {
+                *lock(&self.executed) = Some((plan, begun.motion));
+                Ok(Reply::ExecutePlan(begun))
+            }
+            other => Ok(other),
+        }
+    }
+
+    /// Ends planning, where something is being planned.
+    pub(super) async fn cancel_planning(&self) -> bool {
+        let Ok(planner) = self.planner() else { return false };
+        let cancelled = planner.answer(Call::Cancel(api::Cancel::default()), Moment::default(), QUICK).await;
+        matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
+    }
+
+    /// The number of a plan, the newest without one, and the coordinator's joints that it moves.
+    pub(super) async fn plan_and_its_joints(&self, plan: Option<u64>) -> Result<(u64, Vec<String>), RpcError> {
+        let planner = self.planner()?;
+        let answer = |call| planner.answer(call, Moment::default(), QUICK);
+        let number = match plan {
+            Some(number) => number,
+            None => match answer(Call::Planner(api::Planner {})).await? {
+                Reply::Planner(PlannerReport { plan: Some(newest), .. }) => newest,
+                _ => {
+                    let none = RpcError::new(Code::UnknownPlan, "there is no plan yet");
+                    return Err(none.hint("`dimos plan` makes one"));
+                }
+            },
+        };
+        match answer(Call::Planning(api::Planning { plan: number })).await? {
+            Reply::Planning(report) => Ok((number, report.summary.map(|s| s.joints).unwrap_or_default())),
+            _ => Err(internal()),
+        }
+    }
+
+    /// What the planner is and does, and how its last motion goes.
+    async fn planner_report(&self, planner: &Planner<'_>, limit: Duration) -> Result<PlannerReport, RpcError> {
+        let Reply::Planner(mut report) =
+            planner.answer(Call::Planner(api::Planner {}), Moment::default(), limit).await?
+        else {
+            return Err(internal());
+        };
+        let motion = lock(&self.executed).and_then(|(_, motion)| self.motion(motion).ok());
+        let (state, error) = match (report.state.as_str(), &motion) {
+            ("PLANNING", _) => return Ok(report),
+            (_, Some(motion)) if !motion.done => ("EXECUTING", None),
+            ("FAULT", _) | (_, None) => return Ok(report),
+            (_, Some(motion)) if motion.state == "COMPLETED" => ("COMPLETED", None),
+            (_, Some(motion)) => ("FAULT", motion.error.clone()),
+        };
+        (report.state, report.error) = (state.to_owned(), error);
+        Ok(report)
+    }
+
+    /// The planner in `status`; none where there is none.
+    pub(super) async fn planner_status(&self) -> Option<PlannerStatus> {
+        let own = |e: &RpcError| PlannerStatus {
+            state: "FAULT".into(),
+            error: Some(e.message.clone()),
+            ..Default::default()
+        };
+        let planner = match self.planner() {
+            Ok(planner) => planner,
+            Err(_) => return None,
+        };
+        let mut status = match self.planner_report(&planner, GLANCE).await {
+            Ok(report) => PlannerStatus {
+                robots: report.robots.into_iter().map(|robot| robot.name).collect(),
+                state: report.state,
+                error: report.error,
+                attached: None,
+            },
+            Err(e) => own(&e),
+        };
+        if let Planner::Attached(planner) = planner {
+            status.robots = planner.robots.iter().map(|robot| robot.name.clone()).collect();
+            status.attached = Some(AttachedReport { name: planner.name.clone(), pid: planner.line.pid() });
+        }
+        Some(status)
+    }
+
+    /// Lets a process at the other end of a connection be this run's planner.
+    pub(super) fn register(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
+        let has = |whose: String| {
+            RpcError::new(Code::HasPlanner, format!("run {} has a planner already: {whose}", self.parts.run))
+                .hint("end that one first: a run has one planner")
+        };
+        if self.parts.planner.is_some() {
+            return Err(has("its blueprint's own".into()));
+        }
+        for robot in &planner.robots {
+            self.fits(robot)?;
+        }
+        let joints = planner.robots.iter().flat_map(|robot| &robot.joints);
+        let mut limits = command_limits(&self.parts.names, &self.parts.config);
+        limits.retain(|joint, _| joints.clone().any(|j| j == joint));
+        let mut attached = lock(&self.attached);
+        if let Some(other) = attached.as_ref().filter(|other| !other.line.is_closed()) {
+            let process = other.line.pid().map(|pid| format!(" (pid {pid})")).unwrap_or_default();
+            return Err(has(format!("{}{process}", other.name)));
+        }
+        tracing::info!("planner {} attached", planner.name);
+        *attached = Some(Arc::new(Attached { name: planner.name, robots: planner.robots, line }));
+        *lock(&self.executed) = None;
+        Ok(Registered { run: self.parts.run.clone(), limits })
+    }
+
+    /// Whether this run has the joints of a robot, and the task that shall move them.
+    fn fits(&self, robot: &api::RegisteredRobot) -> Result<(), RpcError> {
+        let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
+        let index = |name: &String| {
+            let place = all.iter().position(|joint| *joint == name);
+            place.ok_or_else(|| RpcError::unknown(Code::InvalidParams, "joint", name, &all))
+        };
+        let joints = robot.joints.iter().map(index).collect::<Result<Vec<_>, _>>()?;
+        let Some(name) = &robot.task else { return Ok(()) };
+        let task = &self.parts.config.tasks[self.task_index(name)? as usize];
+        let has = |joint: &usize| task.joints.iter().any(|j| *j as usize == *joint);
+        match (&task.kind, joints.iter().all(has)) {
+            (TaskKind::Trajectory(_), true) => Ok(()),
+            (TaskKind::Trajectory(_), false) => {
+                let what = format!("task {name} does not have all joints of robot {}", robot.name);
+                Err(RpcError::new(Code::NoTrajectoryTask, what))
+            }
+            _ => Err(RpcError::new(Code::WrongTask, format!("task {name} executes no trajectories"))),
+        }
+    }
+
+    /// What a planner needs to know of this run now.
+    fn moment(&self, plan: u64) -> Moment {
+        let (now, mut positions) = (self.now(), BTreeMap::new());
+        for (index, arm) in self.parts.names.arms.iter().enumerate() {
+            let fresh = |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= FRESH;
+            let Some(view) = self.arm_view(index).filter(fresh) else { continue };
+            let commanded = view.command.mode.is_some_and(|mode| mode.is_position());
+            let values = if commanded { view.command.values } else { view.state.position };
+            let known = arm.joints.iter().cloned().zip(values).filter(|(_, value)| value.is_finite());
+            positions.extend(known);
+        }
+        Moment { plan, positions }
+    }
+}
+
+/// How far and how fast each joint may be commanded, as [`Service::begin`] checks it.
+pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTreeMap<String, CommandLimits> {
+    let mut all = BTreeMap::new();
+    for (arm, named) in config.arms.iter().zip(&names.arms) {
+        let l = &arm.limits;
+        let bounds = l.position_lower.iter().zip(&l.position_upper).zip(&l.velocity_max).zip(&l.acceleration_max);
+        for (joint, (((lower, upper), velocity), acceleration)) in named.joints.iter().zip(bounds) {
+            let b = Bounds::inside(*lower, *upper, *velocity, *acceleration);
+            let limits =
+                CommandLimits { position: [b.lower, b.upper], velocity: b.velocity, acceleration: b.acceleration };
+            all.insert(joint.clone(), limits);
+        }
+    }
+    all
+}
+
+/// A planner in a process of its own: answers what a run asks, as it travels.
+pub(super) async fn answer_travelling(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
+    let encoded = |e: serde_json::Error| RpcError::new(Code::Internal, e.to_string());
+    match Call::read(&asked.method, asked.params)? {
+        Call::ExecutePlan(execute) => {
+            let released = port.release(execute.plan, &asked.moment).await?;
+            serde_json::to_value(released).map_err(encoded)
+        }
+        call => serde_json::to_value(port.answer(call, &asked.moment).await?).map_err(encoded),
+    }
+}
