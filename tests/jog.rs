@@ -116,7 +116,7 @@ fn a_held_key_moves_the_arm_and_letting_go_stops_it() {
     rig.rest();
     terminal.keys("\x1b");
     jog.wait().with(0);
-    assert!(terminal.is_as_before(), "{}", terminal.text());
+    eventually("the terminal is given back", || terminal.is_as_before());
     assert!(rig.arm().commander.is_none());
 }
 
@@ -212,7 +212,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
     }
     eventually("what is good is green", || terminal.has_colour());
     jog.end(Signal::TERM).with(143);
-    assert!(terminal.is_as_before());
+    eventually("the terminal is given back", || terminal.is_as_before());
 
     let terminal = Terminal::new(80, 24);
     let jog = terminal.start_with(&rig.home, "jog arm", &[("NO_COLOR", "1")]);
@@ -220,7 +220,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
     assert!(!terminal.has_colour());
     terminal.keys("\x03");
     jog.wait().with(130);
-    assert!(terminal.is_as_before());
+    eventually("the terminal is given back", || terminal.is_as_before());
 }
 
 #[test]
@@ -259,7 +259,7 @@ fn a_run_that_ends_gives_the_terminal_back() {
     terminal.until("ready");
     rig.run.take().unwrap().end(Signal::TERM).with(143);
     jog.wait().with(1);
-    assert!(terminal.is_as_before());
+    eventually("the terminal is given back", || terminal.is_as_before());
     terminal.until("error: run \"jogged\"");
 }
 
@@ -359,7 +359,7 @@ fn what_is_missing_is_said_before_the_screen_is_taken() {
     terminal.start(&home, "jog arm").wait().with(2);
     terminal.until("no task of the run lets the keyboard move arm");
     terminal.until("- {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}");
-    assert!(terminal.is_as_before());
+    eventually("the terminal is given back", || terminal.is_as_before());
     let terminal = Terminal::new(100, 24);
     terminal.start(&home, "jog rarm").wait().with(2);
     terminal.until("did you mean `arm`?");
@@ -373,5 +373,5 @@ fn an_arm_that_somebody_else_commands_is_left_alone() {
     let terminal = Terminal::new(100, 24);
     terminal.start(&rig.home, "jog arm").wait().with(1);
     terminal.until("[LEASE_HELD]");
-    assert!(terminal.is_as_before());
+    eventually("the terminal is given back", || terminal.is_as_before());
 }
