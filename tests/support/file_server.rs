@@ -31,8 +31,9 @@ impl FileServer {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
         let (ranges, over) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
-        let (told, end, mut misdeeds) = (ranges.clone(), over.clone(), misdeeds.to_vec().into_iter());
+        let (told, end, misdeeds) = (ranges.clone(), over.clone(), misdeeds.to_vec());
         std::thread::spawn(move || {
+            let mut misdeeds = misdeeds.into_iter();
             for client in listener.incoming() {
                 if end.load(Ordering::Relaxed) {
                     return;

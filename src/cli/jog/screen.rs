@@ -281,7 +281,7 @@ mod tests {
             state: Some(ArmStateReport {
                 age_ms: Some(4.0),
                 joints: (0..joints).map(joint).collect(),
-                pose: Some(PoseReport { xyz: [0.25, 0.0, 0.36], rpy: [3.14, 0.47, 3.14] }),
+                pose: Some(PoseReport { xyz: [0.25, 0.0, 0.36], rpy: [3.0, 0.47, 3.0] }),
                 gripper: Some(0.04),
                 ..Default::default()
             }),

@@ -200,7 +200,7 @@ impl Session {
         let arm = self.setting.arm.clone();
         let text = match self.client.call(Stop { arm: Some(arm.clone()) }) {
             Ok(reply) => {
-                let said = reply.arms.get(&arm).map_or_else(|| "unknown".to_owned(), |how| word(how));
+                let said = reply.arms.get(&arm).map_or_else(|| "unknown".to_owned(), word);
                 format!("stop of {arm}: {said}; to go on: `dimos arm reset {arm}`, `dimos arm enable {arm}`")
             }
             Err(error) => refusal(Err(error))?.unwrap_or_default(),
