@@ -43,6 +43,8 @@ pub mod rt;
 
 pub mod robot;
 
+pub mod assets;
+
 pub mod collision;
 
 pub mod hardware;

@@ -16,6 +16,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("yaml", &[]),
     ("rt", &[]),
     ("robot", &[]),
+    ("assets", &[]),
     ("collision", &["robot"]),
     ("hardware", &["rt"]),
     // The public test doubles belong to the hardware layer.
@@ -25,7 +26,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("rpc", &["robot", "collision"]),
     ("recording", &["rt", "robot"]),
     ("view", &["robot", "collision", "rpc"]),
-    ("blueprint", &["robot", "collision", "hardware"]),
+    ("blueprint", &["robot", "assets", "collision", "hardware"]),
     ("runtime", ALL),
     ("replay", ALL),
     ("cli", ALL),

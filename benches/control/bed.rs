@@ -6,10 +6,13 @@ use std::time::Duration;
 use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
 use dimos::clock::Mono;
 use dimos::control::config::{
-    ArmConfig, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
+    ArmConfig, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
 };
 use dimos::control::request::{Envelope, Motion, Request};
+use dimos::control::tasks::cartesian::Goal;
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
+use dimos::robot::kinematics::Kinematics;
+use dimos::robot::{Source, load};
 use dimos::telemetry::{TaskState, TaskView};
 use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
@@ -29,6 +32,8 @@ pub enum Load {
     Servo,
     /// All follow streams of velocities, with a new target in every tick.
     Velocity,
+    /// All move their end effectors with streams of twists, with a new twist in every tick.
+    Twist,
     /// One after the other: trajectory, servo, velocity.
     EveryType,
 }
@@ -57,6 +62,7 @@ impl Bed {
             TaskKind::Trajectory(TrajectoryParams::default()),
             TaskKind::Servo(ServoParams::default()),
             TaskKind::Velocity(VelocityParams::default()),
+            TaskKind::EefTwist(Box::new(xarm7())),
         ];
         let task = |i: usize| TaskConfig {
             name: format!("task{i}"),
@@ -64,6 +70,7 @@ impl Bed {
                 Load::Hold | Load::Trajectory => 0,
                 Load::Servo => 1,
                 Load::Velocity => 2,
+                Load::Twist => 3,
                 Load::EveryType => i % 3,
             }]
             .clone(),
@@ -103,6 +110,9 @@ impl Bed {
                 }
                 TaskKind::Servo(_) => Request::Servo { task, target: swing(tick as f64 / 100.0).0 },
                 TaskKind::Velocity(_) => Request::Velocity { task, target: swing(tick as f64 / 100.0).1 },
+                TaskKind::CartesianIk(_) | TaskKind::EefTwist(_) => {
+                    Request::Steer { task, goal: circle(tick as f64 / 100.0) }
+                }
             };
             self.send(request, queue);
         }
@@ -117,6 +127,19 @@ impl Bed {
     pub fn is_busy(&self, tasks: &[TaskView]) -> bool {
         self.holds || tasks.iter().all(|t| t.state == TaskState::Executing)
     }
+}
+
+/// An arm of 7 joints and its flange.
+fn xarm7() -> CartesianParams {
+    let model = load(&Source::new("builtin:xarm7")).into_model().expect("the description in the box");
+    let link = model.link_index("link7").expect("its last link");
+    CartesianParams::new(Kinematics::whole(&model).expect("a tree of joints"), link)
+}
+
+/// A twist along a circle, once around in 4 s.
+fn circle(time: f64) -> Goal {
+    let turn = time * std::f64::consts::TAU / 4.0;
+    Goal::Twist { linear: [0.02 * turn.cos(), 0.02 * turn.sin(), 0.0], angular: [0.0; 3], tool: false }
 }
 
 /// Positions and velocities of a swing of 0.2 rad that takes 4 s.

@@ -106,7 +106,8 @@ fn task_types(effort: Effort) {
         ("two trajectories", 2, Load::Trajectory),
         ("two servo streams, a target each tick", 2, Load::Servo),
         ("two velocity streams, a target each tick", 2, Load::Velocity),
-        ("three arms, one of each type", 3, Load::EveryType),
+        ("two end effectors, a twist each tick", 2, Load::Twist),
+        ("three arms: trajectory, servo, velocity", 3, Load::EveryType),
     ] {
         let alone = repeat(effort.of(3, 5), || tick::coordinator(arms, load, Pace::Free, ticks));
         rows.push(Measure::new(format!("{name}, p50"), "µs", micros(&alone, 0.5)));

@@ -2,13 +2,14 @@
 
 use serde::Serialize;
 
+use crate::blueprint::assets::Assets;
 use crate::blueprint::include::{Includer, RULES};
 use crate::blueprint::json_schema::home_of;
 use crate::blueprint::registry::{Found, SearchPath};
 use crate::blueprint::resolve::{Blueprint, Checker, resolve};
 use crate::blueprint::schema::BlueprintFile;
 use crate::hardware::registry::{Registry, SIM};
-use crate::yaml::{self, Diag, Label, Missing, NodeId, Report, Severity, Tree, quote, read};
+use crate::yaml::{self, Diag, Keyed, Label, Missing, NodeId, Report, Severity, Tree, quote, read};
 
 /// What the command line changes in a blueprint.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -137,7 +138,8 @@ fn read_blueprint(
     }
     let missing = if incomplete { Missing::Ignore } else { Missing::Report };
     let (file, lost) = read::<BlueprintFile>(tree, root, missing);
-    let checker = Checker { tree, root, lost, adapters, incomplete };
+    let assets = Assets::of(Keyed::default());
+    let checker = Checker { tree, root, lost, adapters, assets, incomplete };
     let mut blueprint = resolve(checker, file?, &found.name);
     blueprint.sources = sources;
     if tree.has_errors() {

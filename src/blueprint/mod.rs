@@ -6,6 +6,7 @@
 //! ```
 
 mod arms;
+mod assets;
 mod include;
 mod json_schema;
 mod limits;
@@ -30,6 +31,6 @@ pub use load::{Loaded, Overrides, load, load_from};
 pub use params::CartesianParams;
 pub use reference::reference;
 pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list};
-pub use resolve::{Arm, Blueprint, Task, TaskKind, TaskRobot};
+pub use resolve::{Arm, Blueprint, Task, TaskKind, TaskRobot, UsedAsset};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

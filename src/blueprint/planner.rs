@@ -39,9 +39,10 @@ impl Default for PlannerConfig {
 pub struct RobotConfig {
     /// Unique name of the robot: letters, digits, `_` and `-`.
     pub name: Located<String>,
-    /// The robot's `.urdf` or `.xacro` file, as seen from this file; or `builtin:NAME`, a description in the box.
+    /// The robot's `.urdf` or `.xacro` file, as seen from this file; `builtin:NAME`, a description in the box; or
+    /// `asset:NAME/path`, a file of an asset.
     pub model_path: Located<String>,
-    /// Folders that `package://NAME` stands for, by name.
+    /// Folders that `package://NAME` stands for, by name; `asset:NAME` or `asset:NAME/path` for those of an asset.
     #[serde(default)]
     pub package_paths: BTreeMap<String, String>,
     /// Arguments of the xacro file.

@@ -1,11 +1,11 @@
-//! Checks what `planner`, `view` and `assets` refer to.
+//! Checks what `planner` and `view` refer to.
 
 use crate::blueprint::arms::Found;
 use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ShapeEntry, ViewConfig};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
-use crate::blueprint::schema::{AssetEntry, JointNames, TaskEntry};
-use crate::yaml::{Diag, Keyed, Located, did_you_mean, quote};
+use crate::blueprint::schema::{JointNames, TaskEntry};
+use crate::yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(
     checker: &mut Checker<'_>,
@@ -180,23 +180,6 @@ fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, describe
         if pose.len() != count && !checker.lost.contains(pose.at) {
             let diag = Diag::error(format!("{} positions for {count} joints", pose.len()));
             checker.error(pose.at, diag.hint("give one for each of `joint_names`, in the same order"));
-        }
-    }
-}
-
-/// Addresses and check sums of files that are fetched.
-pub(super) fn assets(checker: &mut Checker<'_>, assets: &Keyed<AssetEntry>) {
-    for (name, asset) in &assets.0 {
-        checker.check_name(name, "asset's name");
-        let (url, sum) = (&asset.url, &asset.sha256);
-        let schemes = ["https://", "http://", "file://"];
-        if !url.is_empty() && !schemes.iter().any(|s| url.starts_with(s)) {
-            let diag = Diag::error(format!("{} is no address of a file", quote(url)));
-            checker.error(url.at, diag.hint("it starts with https://, http:// or file://"));
-        }
-        if !sum.is_empty() && (sum.len() != 64 || !sum.chars().all(|c| c.is_ascii_hexdigit())) {
-            let diag = Diag::error("a SHA-256 has 64 hexadecimal digits");
-            checker.error(sum.at, diag.hint("`sha256sum FILE` prints it"));
         }
     }
 }

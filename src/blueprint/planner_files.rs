@@ -83,10 +83,13 @@ fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> Ob
     ObjectConfig { name: name.to_owned(), shape, pose: pose(&entry.pose), padding: entry.padding }
 }
 
-/// A path as seen from the file that names it; from here, where that file is one of those in the box.
+/// A path into an asset; or as seen from the file that names it; from here, where that file is one of those in the box.
 pub(super) fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
     if path.starts_with(crate::robot::builtin::PREFIX) {
         return path.into();
+    }
+    if let Some(path) = checker.assets.path(path) {
+        return path;
     }
     let source = checker.tree.source(checker.tree.label(at).source).map(|source| Path::new(&source.name));
     let folder = source.filter(|file| file.is_file()).and_then(Path::parent);

@@ -1,5 +1,6 @@
 //! Checks the planner's robots against their descriptions, so that `dimos check` finds what a run would fail at: files
-//! that are not there, joints, groups and links that the model does not have, poses outside its limits.
+//! that are not there, joints, groups and links that the model does not have, poses outside its limits. What lies in an
+//! asset that has not been fetched yet is checked once it has been.
 
 use std::path::Path;
 
@@ -46,6 +47,7 @@ pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, described: &[Descr
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
         if let (ShapeEntry::Mesh(_) | ShapeEntry::Cloud(_), ObjectShape::Mesh(path) | ObjectShape::Cloud(path)) =
             (&entry.shape.value, &object.shape)
+            && !checker.assets.awaited(path)
         {
             file(checker, entry.shape.at, path);
         }
@@ -68,6 +70,9 @@ fn description(checker: &mut Checker<'_>, robot: &Located<TypedRobot>) -> (Optio
         return (None, Semantics::default());
     }
     let source = planner_files::source(checker, robot);
+    if checker.assets.source_awaited(&source) {
+        return (None, Semantics::default());
+    }
     let loaded = load(&source);
     let reports = loaded.reports();
     let check = command(&source);

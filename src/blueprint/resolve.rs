@@ -2,19 +2,19 @@
 
 use serde::Serialize;
 
+use crate::assets::{Asset, Cache};
+use crate::blueprint::assets::Assets;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::planner::ViewConfig;
-use crate::blueprint::schema::{
-    AssetEntry, BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig,
-};
+use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
-use crate::blueprint::{arms, planner_check, planner_files, planner_models, tasks};
+use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
-use crate::yaml::{Diag, Keyed, Located, Lost, NOWHERE, NodeId, Tree, quote};
+use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Tree, quote};
 
 /// A blueprint without mistakes.
 #[derive(Debug, Clone)]
@@ -37,8 +37,8 @@ pub struct Blueprint {
     pub recording: RecordingConfig,
     /// The socket.
     pub rpc: RpcConfig,
-    /// Files that are fetched on first use, by name.
-    pub assets: Keyed<AssetEntry>,
+    /// Files that are fetched on first use.
+    pub assets: Vec<UsedAsset>,
     /// The whole blueprint as one YAML text, includes and arguments merged in: what the log keeps.
     pub source_yaml: String,
     /// The files it was read from: name and text, the main one first.
@@ -46,10 +46,25 @@ pub struct Blueprint {
 }
 
 impl Blueprint {
+    /// The assets that it uses and that have not been fetched yet.
+    pub fn awaited_assets(&self) -> Vec<&Asset> {
+        let cache = Cache::standard();
+        self.assets.iter().filter(|a| a.used && !cache.has(&a.asset.sha256)).map(|a| &a.asset).collect()
+    }
+
     /// The names of all joints, arm by arm: what [`Task::joints`] counts.
     pub fn joint_names(&self) -> Vec<&str> {
         self.arms.iter().flat_map(|arm| arm.joints.iter().map(String::as_str)).collect()
     }
+}
+
+/// An asset of a blueprint.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct UsedAsset {
+    /// What it is.
+    pub asset: Asset,
+    /// Whether any path of the blueprint leads into it.
+    pub used: bool,
 }
 
 /// An arm.
@@ -159,6 +174,8 @@ pub(super) struct Checker<'t> {
     pub(super) root: NodeId,
     pub(super) lost: Lost,
     pub(super) adapters: &'t Registry,
+    /// Files that paths may lead into.
+    pub(super) assets: Assets,
     /// A file could not be read: names may be missing for that reason.
     pub(super) incomplete: bool,
 }
@@ -213,7 +230,8 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     }
     let found = arms::resolve(&mut checker, &file.hardware);
     let mut tasks = tasks::resolve(&mut checker, &file.tasks, &found);
-    planner_check::assets(&mut checker, &file.assets);
+    checker.assets = Assets::of(file.assets);
+    assets::check(&mut checker, &file.tasks, file.planner.as_ref());
     let planner = file.planner.as_ref().map(|planner| {
         let described = planner_models::read(&mut checker, planner);
         planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &found);
@@ -222,6 +240,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         config
     });
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
+    let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
     Blueprint {
         name: name.value,
@@ -233,7 +252,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         view: view.map(|v| v.value),
         recording: file.recording,
         rpc: file.rpc,
-        assets: file.assets,
+        assets,
         source_yaml: String::new(),
         sources: Vec::new(),
     }

@@ -38,7 +38,8 @@ pub struct BlueprintFile {
     pub recording: RecordingConfig,
     /// The socket by which other programs talk to the run.
     pub rpc: RpcConfig,
-    /// Files that are fetched on first use, by name.
+    /// Files that are fetched on first use, by name: archives of robot descriptions, meshes, point clouds. Wherever a
+    /// robot or an obstacle names a file or a folder, `asset:NAME/path` is one in there; see `docs/models.md`.
     pub assets: Keyed<AssetEntry>,
 }
 
@@ -315,11 +316,11 @@ impl Default for RpcConfig {
     }
 }
 
-/// A file that is fetched on first use.
+/// A file that is fetched on first use. A tar.gz, zip or wheel is unpacked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AssetEntry {
-    /// Where it is: `https://`, `http://` or `file://`.
+    /// Where it is: `https://`, `http://` or `file://` with a full path.
     pub url: Located<String>,
     /// SHA-256 of the file, 64 hexadecimal digits.
     pub sha256: Located<String>,

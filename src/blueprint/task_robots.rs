@@ -166,6 +166,9 @@ fn mapping(
 
 /// Checks a task's robot against its description.
 fn check(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, ours: &[String]) {
+    if checker.assets.source_awaited(&robot.source) {
+        return;
+    }
     let loaded = load(&robot.source);
     let first = loaded.reports().into_iter().find(|report| report.severity == Severity::Error);
     // That of a planner's robot is told there.

@@ -6,6 +6,7 @@ use serde_json::json;
 
 use super::arguments::setting;
 use super::exit::{Exit, Failure, Result};
+use super::fetch;
 use super::output::{self, Table};
 use crate::blueprint::{self, Limit, Loaded, OnExit, Overrides, Summary};
 use crate::hardware::registry::Registry;
@@ -37,6 +38,15 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 pub fn load(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
     let found = blueprint::find(name).map_err(|e| Failure::usage(e.message).hint(e.hint))?;
     Ok(blueprint::load(&found, overrides, registry))
+}
+
+/// The same for a run: fetches what the blueprint uses and what is not here yet, and then checks that too.
+pub fn load_to_run(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
+    let loaded = load(name, overrides, registry)?;
+    match &loaded.blueprint {
+        Some(blueprint) if fetch::missing(blueprint)? => load(name, overrides, registry),
+        _ => Ok(loaded),
+    }
 }
 
 /// Why a blueprint cannot be run: all its mistakes, shown.
@@ -74,6 +84,10 @@ pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: b
     robots.iter().for_each(robots::print);
     output::line("");
     output::line("no mistakes");
+    let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
+    for asset in awaited {
+        output::note(format_args!("{} is not fetched yet: what lies in it was not checked", asset.name));
+    }
     Ok(Exit::Ok)
 }
 

@@ -63,7 +63,7 @@ enum Word {
 /// Starts the run in a process of its own, and waits until it is up.
 pub fn start(args: &Args, registry: &Registry) -> Result {
     // Mistakes are shown here, where someone looks, with the colours of a terminal.
-    let loaded = check::load(&args.blueprint, &args.overrides(), registry)?;
+    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let run = args.name.as_ref().unwrap_or(&blueprint.name);

@@ -13,8 +13,10 @@ pub mod doctor;
 pub mod down;
 pub mod execute;
 pub mod exit;
+mod fetch;
 mod follow;
 mod goal;
+pub mod jog;
 pub mod list_adapters;
 pub mod list_blueprints;
 pub mod logs;
@@ -87,6 +89,8 @@ enum Command {
     Stop(stop::Args),
     /// Enable, disable or reset an arm, or move its gripper
     Arm(arm::Args),
+    /// Drive an arm from the keyboard, in the terminal
+    Jog(jog::Args),
     /// List tasks, ask something of one, or stream targets to it
     Task(task::Args),
     /// End a run, controlled: decelerate, release the arms, close the log
@@ -193,6 +197,7 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Cancel(args) => cancel::run(args),
         Command::Stop(args) => stop::run(args),
         Command::Arm(args) => arm::run(args),
+        Command::Jog(args) => jog::run(args),
         Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),
         Command::Logs(args) => logs::run(args),
@@ -203,7 +208,7 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
-        Command::Model(args) => model::run(args),
+        Command::Model(args) => model::run(args, registry),
         Command::Schema(args) => schema::run(args, registry),
         Command::Replay(args) => {
             return match replay::run(args, registry) {

@@ -1,5 +1,6 @@
 //! `dimos model …`: look into robot descriptions. Needs no run.
 
+mod assets;
 mod check;
 mod fk;
 mod ik;
@@ -9,6 +10,7 @@ use std::path::PathBuf;
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
+use crate::hardware::registry::Registry;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Loaded, RobotModel, Source, load};
 
@@ -33,6 +35,8 @@ enum Verb {
     Fk(fk::Args),
     /// Joint positions for a pose of a link
     Ik(ik::Args),
+    /// The files that a blueprint fetches on first use: list, fetch, clean
+    Assets(assets::Args),
 }
 
 /// A description, and what it needs.
@@ -99,7 +103,7 @@ impl File {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args) -> Result {
+pub fn run(args: &Args, registry: &Registry) -> Result {
     match &args.verb {
         Verb::Info(file) => info::info(file),
         Verb::Tree(file) => info::tree(file),
@@ -107,6 +111,7 @@ pub fn run(args: &Args) -> Result {
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
         Verb::Ik(args) => ik::run(args),
+        Verb::Assets(args) => assets::run(args, registry),
     }
 }
 

@@ -141,7 +141,7 @@ enum Up {
 }
 
 fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)> {
-    let loaded = check::load(&args.blueprint, &args.overrides(), registry)?;
+    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     // Taken before anything is connected: a signal during the start ends the run as soon as it is up, controlled.

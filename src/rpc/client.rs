@@ -190,6 +190,11 @@ impl Client {
         }
     }
 
+    /// The next message that came while a reply was awaited, if there is one: waits for nothing.
+    pub fn kept_message(&mut self) -> Option<Message> {
+        self.kept.pop_front()
+    }
+
     fn read(&mut self) -> Result<Incoming, ClientError> {
         let mut line = String::new();
         match self.from.read_line(&mut line) {

@@ -150,6 +150,9 @@ pub struct ArmReport {
     /// How far its gripper closes and opens [m]; absent without a gripper, or where its adapter does not say.
     #[serde(default)]
     pub gripper_range: Option<[f64; 2]>,
+    /// How far its joints go: lowest and highest position [rad], in their order.
+    #[serde(default)]
+    pub position_limits: Vec<[f64; 2]>,
     /// What happens to it when the run ends: `hold` or `disable`.
     pub on_exit: String,
     /// Whether it keeps its pose when its motors are disabled, or falls.

@@ -1,6 +1,7 @@
 //! A run from a blueprint's name or text, for programs: what `dimos run` does with its arguments.
 
 use super::{Options, Record, Run, StartError};
+use crate::assets::{Cache, Quiet};
 use crate::blueprint::{self, FindError, Found, Loaded, Overrides, Source};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::planning::desk::Solver;
@@ -107,9 +108,22 @@ impl Builder {
         blueprint::load(&self.found, &self.overrides, &self.adapters)
     }
 
-    /// Starts the run; its arms are up then. When this fails nothing has moved, and all that was connected is
+    /// Fetches the assets that the blueprint uses and that are not in the user's cache yet.
+    pub fn fetch(&self) -> Result<(), StartError> {
+        let loaded = self.check();
+        for asset in loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets()) {
+            Cache::standard().fetch(asset, &mut Quiet).map_err(|error| StartError::Blueprint {
+                what: error.what,
+                hint: error.hint.unwrap_or_else(|| "nothing was connected".to_owned()),
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Starts the run; assets that it needs are fetched first, its arms are up then. When this fails nothing has moved, and all that was connected is
     /// disconnected again.
     pub fn start(self) -> Result<Run, StartError> {
+        self.fetch()?;
         let loaded = self.check();
         match &loaded.blueprint {
             Some(blueprint) => Run::start(blueprint, self.options),

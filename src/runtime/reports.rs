@@ -94,6 +94,7 @@ impl Service {
             faults: faults.collect(),
             commander: None, // the connections know
             gripper_range: gripper_range.map(|(closed, open)| [closed, open]),
+            position_limits: self.position_limits(index),
             on_exit: match arm.on_exit {
                 OnExit::Hold => "hold".to_owned(),
                 OnExit::Disable => "disable".to_owned(),
@@ -101,6 +102,13 @@ impl Service {
             holds_when_disabled: info.holds_when_disabled,
             counters: counters.into_iter().map(|(name, n)| (name.to_owned(), n.load(Relaxed))).collect(),
         })
+    }
+
+    /// Lowest and highest position of an arm's joints [rad].
+    fn position_limits(&self, arm: usize) -> Vec<[f64; 2]> {
+        let Some(config) = self.parts.config.arms.get(arm) else { return Vec::new() };
+        let limits = &config.limits;
+        limits.position_lower.iter().zip(&limits.position_upper).map(|(lower, upper)| [*lower, *upper]).collect()
     }
 
     fn task_report(&self, index: usize) -> Option<TaskReport> {

@@ -31,9 +31,11 @@ struct Joint {
     jerk: Option<f64>,
 }
 
-/// The robots of a blueprint; the error says what a run would fail at.
+/// The robots of a blueprint, none while it waits for assets; the error says what a run would fail at.
 pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
-    let Some(planner) = &blueprint.planner else { return Ok(Vec::new()) };
+    let Some(planner) = blueprint.planner.as_ref().filter(|_| blueprint.awaited_assets().is_empty()) else {
+        return Ok(Vec::new());
+    };
     let setup = Setup::load(planner)?;
     Ok(setup.robots.iter().map(|planned| robot(planned, &setup)).collect())
 }

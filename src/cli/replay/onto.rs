@@ -37,7 +37,7 @@ const REST: Duration = Duration::from_secs(10);
 /// Drives the arms of a blueprint along a part of a log.
 pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Registry) -> Result {
     let set = args.onto.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let loaded = check::load(onto, &Overrides { set, sim: args.onto.sim }, registry)?;
+    let loaded = check::load_to_run(onto, &Overrides { set, sim: args.onto.sim }, registry)?;
     let Some(mut blueprint) = loaded.blueprint.clone() else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let motion = RecordedMotion::read(log, span.from, span.to).map_err(split)?;

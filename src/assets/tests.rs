@@ -1,0 +1,274 @@
+use std::io::Write;
+use std::path::Path;
+use std::sync::Barrier;
+
+use super::*;
+
+#[path = "../../tests/support/file_server.rs"]
+mod file_server;
+
+use file_server::{FileServer, Misdeed};
+
+/// Remembers what it was told.
+#[derive(Default)]
+struct Told {
+    notes: Vec<String>,
+    most: u64,
+}
+
+impl Progress for Told {
+    fn at(&mut self, bytes: u64, _: Option<u64>) {
+        self.most = self.most.max(bytes);
+    }
+
+    fn note(&mut self, text: &str) {
+        self.notes.push(text.to_owned());
+    }
+}
+
+fn sum(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+fn asset(url: &str, bytes: &[u8]) -> Asset {
+    Asset { name: "arm".into(), url: url.into(), sha256: sum(bytes), place: "cell.yaml:3:5".into() }
+}
+
+/// Bytes that no compressor makes small.
+fn noise(count: usize) -> Vec<u8> {
+    let mut state = 1_u64;
+    let mut next = || {
+        state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+        (state >> 56) as u8
+    };
+    (0..count).map(|_| next()).collect()
+}
+
+/// A tar.gz of these entries: name, type, what is in it or where it leads.
+fn tar_gz(entries: &[(&str, tar::EntryType, &str)]) -> Vec<u8> {
+    let mut archive = tar::Builder::new(flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast()));
+    for (name, kind, content) in entries {
+        let mut header = tar::Header::new_gnu();
+        header.set_entry_type(*kind);
+        header.set_mode(0o644);
+        let body = if kind.is_file() { content.as_bytes() } else { &[] };
+        header.set_size(body.len() as u64);
+        if kind.is_symlink() || kind.is_hard_link() {
+            header.set_link_name(content).unwrap();
+        }
+        // The crate refuses to write some of the names that it must refuse to read.
+        let raw = &mut header.as_old_mut().name;
+        raw[..name.len()].copy_from_slice(name.as_bytes());
+        header.set_cksum();
+        archive.append(&header, body).unwrap();
+    }
+    archive.into_inner().unwrap().finish().unwrap()
+}
+
+fn zip_of(entries: &[(&str, &str)]) -> Vec<u8> {
+    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for (name, content) in entries {
+        archive.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
+        archive.write_all(content.as_bytes()).unwrap();
+    }
+    archive.finish().unwrap().into_inner()
+}
+
+fn cache() -> (tempfile::TempDir, Cache) {
+    let folder = tempfile::tempdir().unwrap();
+    let cache = Cache::at(folder.path().join("assets"));
+    (folder, cache)
+}
+
+fn put(folder: &Path, name: &str, bytes: &[u8]) -> String {
+    let path = folder.join(name);
+    fs::write(&path, bytes).unwrap();
+    format!("file://{}", path.display())
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut all: Vec<_> =
+        fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    all.sort();
+    all
+}
+
+const FILE: tar::EntryType = tar::EntryType::Regular;
+
+#[test]
+fn archives_are_unpacked_and_plain_files_are_put_there() {
+    let (folder, cache) = cache();
+    let tar = tar_gz(&[("arm/", tar::EntryType::Directory, ""), ("./arm/arm.urdf", FILE, "<robot/>")]);
+    let zip = zip_of(&[("arm/arm.urdf", "<robot/>"), ("arm-1.0.dist-info/RECORD", "")]);
+    for (name, bytes) in [("a.tar.gz", tar), ("no ending", zip.clone()), ("arm-1.0-py3-none-any.whl", zip)] {
+        let asset = asset(&put(folder.path(), name, &bytes).replace(' ', "%20"), &bytes);
+        let mut told = Told::default();
+        let at = cache.fetch(&asset, &mut told).unwrap();
+        assert_eq!(told.most, bytes.len() as u64, "{name}");
+        assert_eq!(fs::read_to_string(at.join("arm/arm.urdf")).unwrap(), "<robot/>", "{name}");
+        assert!(cache.has(&asset.sha256.to_uppercase()) && cache.size(&asset.sha256) == 8, "{name}");
+        assert_eq!(cache.remove(&asset), Ok(true));
+        assert_eq!((cache.has(&asset.sha256), cache.remove(&asset)), (false, Ok(false)));
+    }
+    // A compressed file that is no archive stays as it is.
+    let mut gz = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    gz.write_all(b"solid").unwrap();
+    for (name, bytes) in [("hand.stl", b"solid".to_vec()), ("hand.stl.gz", gz.finish().unwrap())] {
+        let asset = asset(&put(folder.path(), name, &bytes), &bytes);
+        let at = cache.fetch(&asset, &mut Quiet).unwrap();
+        assert_eq!((names(&at), fs::read(at.join(name)).unwrap()), (vec![name.to_owned()], bytes));
+    }
+    let left = names(&cache.0);
+    assert!(left.iter().all(|name| !name.ends_with(".part") && !name.ends_with(".new")), "{left:?}");
+}
+
+#[test]
+fn what_is_there_is_not_fetched_again() {
+    let (_folder, cache) = cache();
+    let server = FileServer::new(b"<robot/>".to_vec(), &[]);
+    let asset = asset(&server.url("a%20b.urdf?raw=1"), b"<robot/>");
+    for _ in 0..3 {
+        assert!(cache.fetch(&asset, &mut Quiet).unwrap().join("a b.urdf").is_file());
+    }
+    assert_eq!(server.ranges().len(), 1);
+}
+
+#[test]
+fn a_download_that_breaks_goes_on_where_it_was() {
+    let (_folder, cache) = cache();
+    let file = noise(300_000);
+    let misdeeds = [Misdeed::Cut(100_000), Misdeed::Status(503), Misdeed::Cut(50_000)];
+    let server = FileServer::new(file.clone(), &misdeeds);
+    let asset = asset(&server.url("arm.bin"), &file);
+    let mut told = Told::default();
+    let at = cache.fetch(&asset, &mut told).unwrap();
+    assert_eq!(fs::read(at.join("arm.bin")).unwrap(), file);
+    assert_eq!(server.ranges(), ["", "bytes=100000-", "bytes=100000-", "bytes=150000-"]);
+    assert!(told.notes[0].contains("broke"), "{:?}", told.notes);
+}
+
+#[test]
+fn what_an_earlier_process_left_is_used_and_checked() {
+    let (_folder, cache) = cache();
+    let file = noise(10_000);
+    let fetch = |left: &[u8], misdeeds: &[Misdeed]| {
+        let server = FileServer::new(file.clone(), misdeeds);
+        let asset = asset(&server.url("arm.bin"), &file);
+        fs::create_dir_all(&cache.0).unwrap();
+        fs::write(cache.file(&asset.sha256, ".part"), left).unwrap();
+        assert_eq!(cache.part(&asset.sha256), Some(left.len() as u64));
+        let at = cache.fetch(&asset, &mut Quiet).unwrap();
+        assert_eq!(fs::read(at.join("arm.bin")).unwrap(), file);
+        cache.remove(&asset).unwrap();
+        server.ranges()
+    };
+    assert_eq!(fetch(&file[..4_000], &[]), ["bytes=4000-"]);
+    assert_eq!(fetch(&file, &[]), ["bytes=10000-"], "all was there");
+    assert_eq!(fetch(&file[..4_000], &[Misdeed::NoRanges]), ["bytes=4000-"], "begun anew by the server");
+    assert_eq!(fetch(&file[..4_000], &[Misdeed::WrongRange]), ["bytes=4000-", ""]);
+    assert_eq!(fetch(&[7; 4_000], &[]), ["bytes=4000-", ""], "another file's beginning");
+    assert_eq!(fetch(&[7; 20_000], &[]), ["bytes=20000-", ""], "another, longer file");
+}
+
+#[test]
+fn another_file_is_refused_and_nothing_of_it_is_kept() {
+    let (folder, cache) = cache();
+    let mut asset = asset(&put(folder.path(), "arm.urdf", b"<robot/>"), b"another");
+    let error = cache.fetch(&asset, &mut Quiet).unwrap_err();
+    assert!(error.what.starts_with("cell.yaml:3:5: the asset `arm`: file://"), "{error}");
+    assert!(error.what.contains(&sum(b"<robot/>")) && error.what.contains(&sum(b"another")), "{error}");
+    assert!(!cache.has(&asset.sha256) && cache.part(&asset.sha256).is_none());
+    asset.sha256 = "../../../etc".into();
+    assert!(cache.fetch(&asset, &mut Quiet).unwrap_err().what.contains("64 hexadecimal digits"));
+}
+
+#[test]
+fn a_server_that_cannot_be_reached_or_has_no_file_is_said() {
+    let (folder, cache) = cache();
+    let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let error = cache.fetch(&asset(&format!("http://{nobody}/a.zip"), b""), &mut Quiet).unwrap_err();
+    assert!(error.what.contains(&nobody.to_string()), "{error}");
+    assert!(error.hint.unwrap().contains("dimos model assets fetch"));
+
+    let server = FileServer::new(Vec::new(), &[Misdeed::Status(404)]);
+    let error = cache.fetch(&asset(&server.url("a.zip"), b""), &mut Quiet).unwrap_err();
+    assert!(error.what.contains("404"), "{error}");
+    assert_eq!(server.ranges().len(), 1, "no use to try again");
+
+    let server =
+        FileServer::new(noise(9_000), &[Misdeed::Cut(5_000), Misdeed::Cut(0), Misdeed::Cut(0), Misdeed::Cut(0)]);
+    let broken = asset(&server.url("a.zip"), &noise(9_000));
+    let error = cache.fetch(&broken, &mut Quiet).unwrap_err();
+    assert!(error.what.contains("5000 bytes are kept"), "{error}");
+    assert!(cache.fetch(&broken, &mut Quiet).is_ok(), "the next try goes on");
+    assert_eq!(server.ranges().last().unwrap(), "bytes=5000-");
+
+    for (url, what) in
+        [(format!("file://{}", folder.path().display()), "is no file"), ("file:///nowhere/a".into(), "No such file")]
+    {
+        let error = cache.fetch(&asset(&url, b""), &mut Quiet).unwrap_err();
+        assert!(error.what.contains(what), "{error}");
+    }
+}
+
+#[test]
+fn archives_that_lead_out_of_their_folder_or_hold_links_are_refused() {
+    let (folder, cache) = cache();
+    let link = tar::EntryType::Symlink;
+    let long = "d/".repeat(49) + "f";
+    for (what, bytes) in [
+        ("leads out", tar_gz(&[("ok", FILE, "1"), ("../evil", FILE, "2")])),
+        ("leads out", tar_gz(&[("a/../../evil", FILE, "2")])),
+        ("leads out", tar_gz(&[("/evil", FILE, "2")])),
+        ("is a link", tar_gz(&[("a", link, "/etc/passwd")])),
+        ("is a link", tar_gz(&[("a", link, ".."), ("a/evil", FILE, "2")])),
+        ("is a link", tar_gz(&[("a", tar::EntryType::Link, "/etc/passwd")])),
+        ("neither file nor folder", tar_gz(&[("a", tar::EntryType::Fifo, "")])),
+        ("leads out", zip_of(&[("ok", "1"), ("../evil", "2")])),
+        ("leads out", zip_of(&[("/evil", "2")])),
+        ("damaged", [b"PK\x03\x04".to_vec(), noise(100)].concat()),
+        ("damaged", tar_gz(&[(&long, FILE, &"1".repeat(600_000))])[..900].to_vec()),
+    ] {
+        let asset = asset(&put(folder.path(), "evil.bin", &bytes), &bytes);
+        let error = cache.fetch(&asset, &mut Quiet).unwrap_err();
+        assert!(
+            error.what.contains(what) || what == "damaged" && error.what.contains("cannot be unpacked"),
+            "{what}: {error}"
+        );
+        assert!(!cache.has(&asset.sha256) && cache.part(&asset.sha256).is_none(), "{what}");
+        let left: Vec<_> = names(&cache.0).into_iter().filter(|name| !name.ends_with(".lock")).collect();
+        assert!(left.is_empty(), "{what}: {left:?}");
+        assert!(!folder.path().join("evil").exists() && !cache.0.join("evil").exists(), "{what}");
+    }
+    let mut link = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    link.add_symlink("a", "/etc/passwd", zip::write::SimpleFileOptions::default()).unwrap();
+    let bytes = link.finish().unwrap().into_inner();
+    let error = cache.fetch(&asset(&put(folder.path(), "l.zip", &bytes), &bytes), &mut Quiet).unwrap_err();
+    assert!(error.what.contains("is a link"), "{error}");
+}
+
+#[test]
+fn two_who_want_the_same_asset_fetch_it_once() {
+    let (_folder, cache) = cache();
+    let file = noise(200_000);
+    let server = FileServer::new(file.clone(), &[]);
+    let asset = asset(&server.url("arm.bin"), &file);
+    let start = Barrier::new(4);
+    std::thread::scope(|scope| {
+        for _ in 0..4 {
+            scope.spawn(|| {
+                start.wait();
+                let at = cache.fetch(&asset, &mut Quiet).unwrap();
+                assert_eq!(fs::read(at.join("arm.bin")).unwrap(), file);
+            });
+        }
+    });
+    assert_eq!(server.ranges().len(), 1);
+}
+
+#[test]
+fn paths_into_assets_are_split() {
+    assert_eq!(split("asset:panda/urdf/panda.urdf"), Some(("panda", "urdf/panda.urdf")));
+    assert_eq!(split("asset:panda"), Some(("panda", "")));
+    assert_eq!(split("panda.urdf"), None);
+}

@@ -1,0 +1,268 @@
+//! What moves the arm: the tasks that jog may stream to, and the stream itself.
+
+use std::time::{Duration, Instant};
+
+use crate::cli::exit::{Failure, Result};
+use crate::rpc::api::{Cancel, Servo, Twist, TwistFrame, Velocity};
+use crate::rpc::client::{Client, ClientError};
+use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
+
+/// A servo target may be ahead of where its joint is by so much [rad]: an arm that is held back is not wound up.
+const LEAD: f64 = 0.15;
+/// Commands stay inside a joint's limits by so much [rad].
+const MARGIN: f64 = 0.01;
+
+/// How single joints are moved.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// By an `eef_twist` task: the end effector.
+    Twist,
+    /// By a velocity task.
+    Velocity,
+    /// By a servo task: positions that jog moves on.
+    Servo,
+}
+
+/// A task to stream to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Drive {
+    /// What it follows.
+    pub kind: Kind,
+    /// Its name.
+    pub task: String,
+    /// Its joints.
+    pub joints: Vec<String>,
+}
+
+/// The tasks that move an arm.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Drives {
+    /// The end effector.
+    pub tool: Option<Drive>,
+    /// Single joints.
+    pub joints: Option<Drive>,
+}
+
+impl Drives {
+    /// The tasks of a run that move joints of this arm and of no other: of several the one of the highest priority. A
+    /// velocity task goes before a servo task, whose targets jog has to make up.
+    pub fn of(tasks: &[TaskReport], joints: &[String]) -> Self {
+        let find = |name: &str, kind: Kind| {
+            let ours = |task: &&TaskReport| {
+                task.kind == name && !task.joints.is_empty() && task.joints.iter().all(|joint| joints.contains(joint))
+            };
+            let task = tasks.iter().filter(ours).max_by_key(|task| task.priority)?;
+            Some(Drive { kind, task: task.name.clone(), joints: task.joints.clone() })
+        };
+        let single = find("velocity", Kind::Velocity).or_else(|| find("servo", Kind::Servo));
+        Self { tool: find("eef_twist", Kind::Twist), joints: single }
+    }
+
+    /// The one for a mode.
+    pub fn get(&self, joint_mode: bool) -> Option<&Drive> {
+        if joint_mode { self.joints.as_ref() } else { self.tool.as_ref() }
+    }
+
+    /// Why an arm without any cannot be moved, and what to add.
+    pub fn missing(arm: &str) -> Failure {
+        let what = format!("no task of the run lets the keyboard move {arm}");
+        let lines = format!("{}\n        {}", line(arm, true), line(arm, false));
+        Failure::usage(what).hint(format!("add to `tasks` of the blueprint, and start the run again:\n        {lines}"))
+    }
+}
+
+/// The line to add to a blueprint's tasks, for a mode.
+pub fn line(arm: &str, joint_mode: bool) -> String {
+    match joint_mode {
+        true => format!("- {{name: velocity_{arm}, type: velocity, joint_names: {{hardware: {arm}}}, priority: 20}}"),
+        // Where the planner has the arm its description is known, and `params` can be left out.
+        false => format!(
+            "- {{name: twist_{arm}, type: eef_twist, joint_names: {{hardware: {arm}}}, priority: 20, params: \
+             {{model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: {arm}_}}}}"
+        ),
+    }
+}
+
+/// A motion that is asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Demand {
+    /// Of the end effector: x, y, z [m/s], about x, y, z [rad/s].
+    Tool([f64; 3], [f64; 3], TwistFrame),
+    /// Of a task's joint of this index [rad/s].
+    Joint(usize, f64),
+}
+
+/// What the arm was seen to do and may do, for servo targets.
+#[derive(Debug, Clone, Copy)]
+pub struct Sight<'a> {
+    /// Its joints.
+    pub state: Option<&'a ArmStateReport>,
+    /// Its limits.
+    pub arm: Option<&'a ArmReport>,
+}
+
+/// A stream to one task.
+#[derive(Debug)]
+pub struct Stream {
+    drive: Drive,
+    /// Servo targets that were sent last [rad], and when.
+    targets: Vec<f64>,
+    sent: Option<Instant>,
+}
+
+impl Stream {
+    /// A stream that has not begun.
+    pub fn new(drive: Drive) -> Self {
+        Self { drive, targets: Vec::new(), sent: None }
+    }
+
+    /// The task that follows it.
+    pub fn drive(&self) -> &Drive {
+        &self.drive
+    }
+
+    /// Sends the next target.
+    pub fn send(&mut self, client: &mut Client, demand: Demand, sight: Sight<'_>, now: Instant) -> Sent {
+        let task = self.drive.task.clone();
+        let width = self.drive.joints.len();
+        match (self.drive.kind, demand) {
+            (Kind::Twist, Demand::Tool(linear, angular, frame)) => {
+                client.call(Twist { task, linear, angular, frame })?;
+            }
+            (Kind::Velocity, Demand::Joint(index, speed)) => {
+                let velocities = (0..width).map(|k| if k == index { speed } else { 0.0 }).collect();
+                client.call(Velocity { task, velocities })?;
+            }
+            (Kind::Servo, Demand::Joint(index, speed)) => {
+                let passed = self.sent.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
+                if let Some(positions) = self.advance(index, speed, passed, sight) {
+                    client.call(Servo { task, positions })?;
+                }
+            }
+            _ => {}
+        }
+        self.sent = Some(now);
+        Ok(())
+    }
+
+    /// Asks for rest: zero, for a task that follows velocities. A servo task rests at its last target.
+    pub fn rest(&self, client: &mut Client) -> Sent {
+        let task = self.drive.task.clone();
+        match self.drive.kind {
+            Kind::Twist => {
+                client.call(Twist { task, linear: [0.0; 3], angular: [0.0; 3], frame: TwistFrame::Base })?;
+            }
+            Kind::Velocity => {
+                client.call(Velocity { task, velocities: vec![0.0; self.drive.joints.len()] })?;
+            }
+            Kind::Servo => {}
+        }
+        Ok(())
+    }
+
+    /// Ends the task: its joints come to rest by themselves and are free for others.
+    pub fn end(&self, client: &mut Client) -> Sent {
+        client.call(Cancel { task: Some(self.drive.task.clone()), arm: None })?;
+        Ok(())
+    }
+
+    /// The next servo targets: where the joints are commanded to be, moved on by what the time since the last allows.
+    fn advance(&mut self, index: usize, speed: f64, passed: Duration, sight: Sight<'_>) -> Option<Vec<f64>> {
+        let seen = |name: &String| sight.state?.joints.iter().find(|joint| joint.name == *name);
+        if self.targets.is_empty() {
+            // In another mode a command is no position.
+            let positions = sight.arm.is_some_and(|arm| arm.mode.ends_with("position"));
+            let from = |name: &String| seen(name).and_then(|j| j.command.filter(|_| positions).or(j.position));
+            self.targets = self.drive.joints.iter().map(from).collect::<Option<_>>()?;
+        }
+        let name = self.drive.joints.get(index)?;
+        let measured = seen(name)?.position?;
+        let place = sight.state?.joints.iter().position(|joint| joint.name == *name)?;
+        let target = self.targets.get_mut(index)?;
+        let next = (*target + speed * passed.as_secs_f64()).clamp(measured - LEAD, measured + LEAD);
+        // A joint that begins outside its limits may go back in.
+        let limits = sight
+            .arm
+            .and_then(|arm| arm.position_limits.get(place))
+            .map_or((f64::MIN, f64::MAX), |[l, u]| ((l + MARGIN).min(*target), (u - MARGIN).max(*target)));
+        *target = next.max(limits.0).min(limits.1);
+        Some(self.targets.clone())
+    }
+}
+
+/// Result of a request.
+pub type Sent = std::result::Result<(), ClientError>;
+
+/// A refusal is for the screen; everything else ends jog.
+pub fn refusal(sent: Sent) -> Result<Option<String>> {
+    match sent {
+        Ok(()) => Ok(None),
+        Err(ClientError::Refused(error)) => Ok(Some(match error.hint {
+            Some(hint) => format!("{}; {hint}", error.message),
+            None => error.message,
+        })),
+        Err(lost) => Err(lost.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rpc::report::JointReport;
+
+    fn task(name: &str, kind: &str, joints: &[&str], priority: i32) -> TaskReport {
+        let joints = joints.iter().map(|j| (*j).to_owned()).collect();
+        TaskReport { name: name.into(), kind: kind.into(), joints, priority, ..Default::default() }
+    }
+
+    #[test]
+    fn tasks_of_this_arm_alone_are_taken_and_velocity_goes_before_servo() {
+        let arm = ["a".to_owned(), "b".to_owned()];
+        let both = task("both", "velocity", &["a", "b", "other"], 90);
+        let servo = task("servo", "servo", &["a", "b"], 50);
+        let (low, high) = (task("low", "velocity", &["a"], 10), task("high", "velocity", &["a", "b"], 20));
+        let drives = Drives::of(&[both.clone(), servo.clone(), low, high, task("t", "eef_twist", &["a"], 1)], &arm);
+        assert_eq!(drives.joints.unwrap().task, "high");
+        assert_eq!(drives.tool.unwrap().task, "t");
+        let drives = Drives::of(&[both, servo], &arm);
+        assert_eq!((drives.joints.unwrap().kind, drives.tool), (Kind::Servo, None));
+        assert_eq!(Drives::of(&[task("traj", "trajectory", &["a", "b"], 10)], &arm), Drives::default());
+    }
+
+    fn state(positions: [f64; 2]) -> ArmStateReport {
+        let joint = |(name, position): (&str, f64)| JointReport {
+            name: name.into(),
+            position: Some(position),
+            command: Some(position + 0.02),
+            ..Default::default()
+        };
+        ArmStateReport { joints: ["a", "b"].into_iter().zip(positions).map(joint).collect(), ..Default::default() }
+    }
+
+    #[test]
+    fn servo_targets_begin_at_the_command_and_stay_near_the_arm_and_inside_its_limits() {
+        let drive = Drive { kind: Kind::Servo, task: "s".into(), joints: vec!["a".into(), "b".into()] };
+        let mut stream = Stream::new(drive);
+        let arm = ArmReport {
+            mode: "servo_position".into(),
+            position_limits: vec![[-1.0, 1.0], [-0.2, 0.2]],
+            ..Default::default()
+        };
+        let (state, tenth) = (state([0.5, 0.1]), Duration::from_millis(100));
+        let sight = Sight { state: Some(&state), arm: Some(&arm) };
+        let mut step = |index, speed, passed| stream.advance(index, speed, passed, sight).unwrap();
+        let near = |got: &[f64], want: [f64; 2]| got.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-12);
+        let first = step(0, 0.5, Duration::ZERO);
+        assert!(near(&first, [0.52, 0.12]), "{first:?}");
+        let next = step(0, 0.5, tenth);
+        assert!(near(&next, [0.57, 0.12]), "{next:?}");
+        let ahead = step(0, 0.5, 10 * tenth);
+        assert!(near(&ahead, [0.65, 0.12]), "no more than {LEAD} ahead: {ahead:?}");
+        let limited = step(1, 0.5, 10 * tenth);
+        assert!(near(&limited, [0.65, 0.19]), "{limited:?}");
+        let back = step(1, -0.5, tenth);
+        assert!(near(&back, [0.65, 0.14]), "{back:?}");
+        let blind = Sight { state: None, arm: Some(&arm) };
+        assert_eq!(stream.advance(0, 0.5, tenth, blind), None, "without a state there is no target");
+    }
+}

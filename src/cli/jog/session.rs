@@ -1,0 +1,347 @@
+//! The loop of jog: keys in, targets out, the screen anew.
+
+use std::time::{Duration, Instant};
+
+use crossterm::event::{Event, KeyEvent, KeyEventKind};
+
+use super::drive::{self, Demand, Drives, Kind, Sight, Stream, refusal};
+use super::hold::Held;
+use super::keys::{Motion, Wish, meaning};
+use super::screen::{self, View};
+use super::terminal::Terminal;
+use super::watch::{Seen, Watch};
+use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::follow::Signals;
+use crate::rpc::api::{Release, State, Stop, TwistFrame};
+use crate::rpc::client::Client;
+
+/// Time between two targets.
+const BEAT: Duration = Duration::from_millis(20);
+/// Beats between two drawings.
+const PER_DRAWING: u32 = 3;
+/// A motion that has been over for so long lets its task go, so that others may move the joints.
+const LET_GO: Duration = Duration::from_millis(500);
+/// Speeds to choose from, as fractions of the highest.
+const SPEEDS: [f64; 9] = [0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0];
+/// The one to begin with.
+const FIRST_SPEED: usize = 4;
+
+/// What was asked for on the command line.
+#[derive(Debug, Clone)]
+pub struct Setting {
+    /// The run's name.
+    pub run: String,
+    /// The arm's name.
+    pub arm: String,
+    /// Whether single joints are moved.
+    pub joint_mode: bool,
+    /// Whether motions are along the tool's axes.
+    pub tool_frame: bool,
+    /// Highest speed of the end effector [m/s].
+    pub linear: f64,
+    /// Highest turning speed of the end effector [rad/s].
+    pub angular: f64,
+    /// Highest speed of a joint [rad/s].
+    pub joint: f64,
+}
+
+/// Names of an arm's joints, in order.
+pub fn joints_of(client: &mut Client, arm: &str) -> Result<Vec<String>> {
+    let state = client.call(State {})?.arms.into_iter().find(|state| state.hardware_id == arm);
+    Ok(state.map(|state| state.joints.into_iter().map(|joint| joint.name).collect()).unwrap_or_default())
+}
+
+/// An arm that is being jogged.
+pub struct Session {
+    client: Client,
+    watch: Watch,
+    drives: Drives,
+    setting: Setting,
+    held: Held,
+    speed: usize,
+    /// Index of the chosen joint in its task.
+    joint: usize,
+    stream: Option<Stream>,
+    /// Since when nothing moves.
+    resting: Option<Instant>,
+    message: Option<(String, bool)>,
+}
+
+impl Session {
+    /// A session at rest. A mode that the run has no task for is not begun with.
+    pub fn new(client: Client, watch: Watch, drives: Drives, mut setting: Setting) -> Self {
+        let mut message = None;
+        if drives.get(setting.joint_mode).is_none() {
+            setting.joint_mode = !setting.joint_mode;
+            message = Some((lacking(&setting.arm, !setting.joint_mode), false));
+        }
+        let (held, speed) = (Held::default(), FIRST_SPEED);
+        Self { client, watch, drives, setting, held, speed, joint: 0, stream: None, resting: None, message }
+    }
+
+    /// Jogs until somebody leaves, a signal comes, or the terminal or the run is lost. The arm comes to rest, the
+    /// terminal is given back, whatever the end.
+    pub fn run(&mut self, mut terminal: Terminal, signals: &Signals) -> Result {
+        let ended = self.follow_keys(&mut terminal, signals);
+        self.held.clear();
+        let rested = self.rest();
+        drop(terminal);
+        let exit = ended?;
+        rested.map(|()| exit)
+    }
+
+    fn follow_keys(&mut self, terminal: &mut Terminal, signals: &Signals) -> Result {
+        let (mut beat, mut beats) = (Instant::now(), 0_u32);
+        loop {
+            if let Some(signal) = signals.last() {
+                return Ok(Exit::by_signal(signal));
+            }
+            beat = (beat + BEAT).max(Instant::now());
+            loop {
+                let patience = beat.saturating_duration_since(Instant::now());
+                match terminal.event(patience).map_err(no_terminal)? {
+                    Some((Event::Key(key), at)) => {
+                        if let Some(exit) = self.key(&key, at)? {
+                            return Ok(exit);
+                        }
+                    }
+                    // Without the keyboard there are no key-ups.
+                    Some((Event::FocusLost, _)) => self.held.clear(),
+                    _ => {}
+                }
+                if Instant::now() >= beat {
+                    break;
+                }
+            }
+            let seen = self.watch.seen();
+            if let Some(lost) = &seen.lost {
+                return Err(lost.clone());
+            }
+            self.command(&seen)?;
+            beats = beats.wrapping_add(1);
+            if beats.is_multiple_of(PER_DRAWING) {
+                if !terminal.is_there() {
+                    return Err(no_terminal(std::io::ErrorKind::UnexpectedEof.into()));
+                }
+                let size = terminal.size().map_err(no_terminal)?;
+                let lines = screen::lines(&self.view(&seen), size);
+                terminal.draw(lines).map_err(no_terminal)?;
+            }
+        }
+    }
+
+    fn key(&mut self, key: &KeyEvent, now: Instant) -> Result<Option<Exit>> {
+        let Some(wish) = meaning(key, self.setting.joint_mode) else { return Ok(None) };
+        match (wish, key.kind) {
+            (Wish::Move(motion), KeyEventKind::Press) => {
+                self.message = None;
+                self.held.press(motion, now);
+            }
+            (Wish::Move(motion), KeyEventKind::Repeat) => self.held.repeat(motion, now),
+            (Wish::Move(motion), KeyEventKind::Release) => self.held.release(motion, now),
+            (_, KeyEventKind::Release) => {}
+            (Wish::Leave { interrupted }, _) => {
+                return Ok(Some(if interrupted { Exit::Interrupted } else { Exit::Ok }));
+            }
+            (Wish::Speed(faster), _) => {
+                let next = if faster { self.speed + 1 } else { self.speed.saturating_sub(1) };
+                self.speed = next.min(SPEEDS.len() - 1);
+            }
+            (Wish::Frame, _) => {
+                self.held.clear();
+                self.setting.tool_frame = !self.setting.tool_frame;
+            }
+            (Wish::Joint(index), _) => self.choose(index),
+            (Wish::Step(forward), _) => {
+                self.choose(if forward { self.joint + 1 } else { self.joint.saturating_sub(1) });
+            }
+            (Wish::Mode, _) => self.change_mode()?,
+            (Wish::Rest, _) => self.rest()?,
+            (Wish::Stop, _) => self.stop()?,
+        }
+        Ok(None)
+    }
+
+    fn choose(&mut self, joint: usize) {
+        if self.drives.joints.as_ref().is_some_and(|drive| joint < drive.joints.len()) {
+            self.held.clear();
+            self.joint = joint;
+        }
+    }
+
+    fn change_mode(&mut self) -> Result<()> {
+        let other = !self.setting.joint_mode;
+        if self.drives.get(other).is_none() {
+            self.message = Some((lacking(&self.setting.arm, other), true));
+            return Ok(());
+        }
+        self.rest()?;
+        self.message = None;
+        self.setting.joint_mode = other;
+        Ok(())
+    }
+
+    /// Comes to rest now, and lets the task go.
+    fn rest(&mut self) -> Result<()> {
+        self.held.clear();
+        self.resting = None;
+        let Some(stream) = self.stream.take() else { return Ok(()) };
+        // A task that refuses to rest rests already; letting it go is tried all the same.
+        let refused = refusal(stream.rest(&mut self.client))?;
+        self.message =
+            refusal(stream.end(&mut self.client))?.or(refused).map(|text| (text, true)).or(self.message.take());
+        Ok(())
+    }
+
+    /// The latched operational stop. The lease is given back: whoever resets the arm needs it free.
+    fn stop(&mut self) -> Result<()> {
+        self.held.clear();
+        (self.stream, self.resting) = (None, None);
+        let arm = self.setting.arm.clone();
+        let text = match self.client.call(Stop { arm: Some(arm.clone()) }) {
+            Ok(reply) => {
+                let said = reply.arms.get(&arm).map_or_else(|| "unknown".to_owned(), word);
+                format!("stop of {arm}: {said}; to go on: `dimos arm reset {arm}`, `dimos arm enable {arm}`")
+            }
+            Err(error) => refusal(Err(error))?.unwrap_or_default(),
+        };
+        self.message = Some((text, true));
+        self.give_back_lease()
+    }
+
+    fn give_back_lease(&mut self) -> Result<()> {
+        let released = self.client.call(Release { arm: Some(self.setting.arm.clone()) }).map(|_| ());
+        refusal(released).map(|_| ())
+    }
+
+    /// Sends the next target, or brings what moved to rest.
+    fn command(&mut self, seen: &Seen) -> Result<()> {
+        let now = Instant::now();
+        match self.demand(now) {
+            Some(demand) => self.go(demand, seen, now),
+            None => self.fade_out(now),
+        }
+    }
+
+    fn go(&mut self, demand: Demand, seen: &Seen, now: Instant) -> Result<()> {
+        let Some(drive) = self.drives.get(self.setting.joint_mode).cloned() else { return Ok(()) };
+        self.resting = None;
+        let mut stream = match self.stream.take() {
+            Some(stream) if *stream.drive() == drive => stream,
+            _ => Stream::new(drive),
+        };
+        let sight = Sight { state: seen.state.as_ref(), arm: seen.arm.as_ref() };
+        match refusal(stream.send(&mut self.client, demand, sight, now))? {
+            None => self.stream = Some(stream),
+            Some(refused) => {
+                self.held.clear();
+                self.message = Some((refused, true));
+                // Whatever holds the arm may need the lease free to be put right.
+                self.give_back_lease()?;
+            }
+        }
+        Ok(())
+    }
+
+    fn fade_out(&mut self, now: Instant) -> Result<()> {
+        let Some(stream) = &self.stream else { return Ok(()) };
+        match self.resting {
+            None => {
+                self.resting = Some(now);
+                let refused = refusal(stream.rest(&mut self.client))?;
+                self.message = refused.map(|text| (text, true)).or(self.message.take());
+                // The next motion of a servo task begins where the arm is then.
+                if stream.drive().kind == Kind::Servo {
+                    self.stream = self.stream.take().map(|stream| Stream::new(stream.drive().clone()));
+                }
+            }
+            Some(since) if now.saturating_duration_since(since) > LET_GO => self.rest()?,
+            Some(_) => {}
+        }
+        Ok(())
+    }
+
+    /// The motion that the held keys ask for.
+    fn demand(&mut self, now: Instant) -> Option<Demand> {
+        let alive = self.held.alive(now);
+        if alive.is_empty() {
+            return None;
+        }
+        let speed = SPEEDS.get(self.speed).copied().unwrap_or(0.0);
+        let signed = |up: bool, strength: f64| if up { strength * speed } else { -strength * speed };
+        let (mut axes, mut single) = ([0.0; 6], 0.0);
+        for (motion, strength) in alive {
+            match motion {
+                Motion::Axis { axis, up } => {
+                    if let Some(value) = axes.get_mut(axis) {
+                        *value += signed(up, strength);
+                    }
+                }
+                Motion::Joint { up } => single += signed(up, strength),
+            }
+        }
+        if self.setting.joint_mode {
+            return Some(Demand::Joint(self.joint, single * self.setting.joint));
+        }
+        let [x, y, z, roll, pitch, yaw] = axes;
+        let frame = if self.setting.tool_frame { TwistFrame::Tool } else { TwistFrame::Base };
+        let linear = [x, y, z].map(|v: f64| v * self.setting.linear);
+        Some(Demand::Tool(linear, [roll, pitch, yaw].map(|v: f64| v * self.setting.angular), frame))
+    }
+
+    fn view<'a>(&'a mut self, seen: &'a Seen) -> View<'a> {
+        let moving = self.demand(Instant::now()).map(|demand| in_words(&demand)).unwrap_or_default();
+        let share = SPEEDS.get(self.speed).copied().unwrap_or(0.0);
+        let percent = share * 100.0;
+        let speed = match self.setting.joint_mode {
+            true => format!("{percent:.0} %: {:.3} rad/s", share * self.setting.joint),
+            false => {
+                let (linear, angular) = (share * self.setting.linear, share * self.setting.angular);
+                format!("{percent:.0} %: {linear:.3} m/s, {angular:.3} rad/s")
+            }
+        };
+        let joint = self.drives.joints.as_ref().and_then(|drive| drive.joints.get(self.joint));
+        View {
+            run: &self.setting.run,
+            arm: &self.setting.arm,
+            seen,
+            since: seen.at.map(|at| at.elapsed()),
+            joint_mode: self.setting.joint_mode,
+            tool_frame: self.setting.tool_frame,
+            task: self.drives.get(self.setting.joint_mode).map(|drive| drive.task.as_str()),
+            joint: joint.map(String::as_str),
+            speed,
+            moving,
+            message: self.message.as_ref().map(|(text, bad)| (text.as_str(), *bad)),
+            releases: self.held.knows_releases(),
+        }
+    }
+}
+
+fn no_terminal(error: std::io::Error) -> Failure {
+    Failure::new(Exit::Failed, format!("the terminal is gone: {error}"))
+}
+
+/// Why a mode is not there.
+fn lacking(arm: &str, joint_mode: bool) -> String {
+    let what = if joint_mode { "single joints" } else { "the end effector" };
+    format!("no task of the run moves {what} of {arm}; add to `tasks`: {}", drive::line(arm, joint_mode))
+}
+
+fn word(how: &impl serde::Serialize) -> String {
+    let text = serde_json::to_value(how).ok();
+    text.and_then(|v| v.as_str().map(|s| s.replace('_', " "))).unwrap_or_else(|| "unknown".to_owned())
+}
+
+/// A motion as people say it: `+x -yaw`.
+fn in_words(demand: &Demand) -> String {
+    let sign = |v: f64| if v < 0.0 { '-' } else { '+' };
+    match demand {
+        Demand::Joint(_, speed) => format!("{}{:.3} rad/s", sign(*speed), speed.abs()),
+        Demand::Tool(linear, angular, _) => {
+            let named = linear.iter().chain(angular).zip(super::keys::AXES);
+            let parts = named.filter(|(v, _)| **v != 0.0).map(|(v, (_, _, name))| format!("{}{name}", sign(*v)));
+            parts.collect::<Vec<_>>().join(" ")
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! `dimos model assets list|fetch|clean`: the files that a blueprint fetches, and those that are here.
+
+use std::collections::BTreeSet;
+
+use clap::Subcommand;
+use serde_json::json;
+
+use crate::assets::{Asset, Cache};
+use crate::blueprint::{Blueprint, Overrides};
+use crate::cli::arguments::setting;
+use crate::cli::exit::{Exit, Result};
+use crate::cli::output::{self, Table, Tone, toned};
+use crate::cli::{check, fetch};
+use crate::hardware::registry::Registry;
+
+/// Arguments of `model assets`.
+#[derive(Debug, clap::Args)]
+pub(super) struct Args {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// List a blueprint's assets: where they come from, whether they are here
+    List(Of),
+    /// Fetch those that are not here: for a computer that is offline later
+    Fetch(Of),
+    /// Remove those that are here
+    Clean(Of),
+}
+
+/// Of which blueprint.
+#[derive(Debug, clap::Args)]
+struct Of {
+    /// The blueprint: a name that `list-blueprints` shows, or a file
+    #[arg(value_name = "BLUEPRINT")]
+    blueprint: String,
+    /// Change a field of the blueprint first: assets.panda.url=file:///mnt/panda.zip (repeatable)
+    #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
+    set: Vec<(String, String)>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl Of {
+    fn load(&self, registry: &Registry) -> Result<Blueprint> {
+        let set = self.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
+        let loaded = check::load(&self.blueprint, &Overrides { set, sim: false }, registry)?;
+        match loaded.blueprint {
+            Some(blueprint) => Ok(blueprint),
+            None => Err(check::refuse(&loaded)),
+        }
+    }
+}
+
+/// Runs the verb.
+pub(super) fn run(args: &Args, registry: &Registry) -> Result {
+    match &args.verb {
+        Verb::List(of) => {
+            let blueprint = of.load(registry)?;
+            show(&blueprint, of.json);
+        }
+        Verb::Fetch(of) => {
+            let blueprint = of.load(registry)?;
+            let cache = Cache::standard();
+            for asset in blueprint.assets.iter().map(|used| &used.asset).filter(|asset| !cache.has(&asset.sha256)) {
+                fetch::one(asset)?;
+            }
+            // What was not there before is checked now: paths into it, the descriptions in it.
+            show(&of.load(registry)?, of.json);
+        }
+        Verb::Clean(of) => clean(of, registry)?,
+    }
+    Ok(Exit::Ok)
+}
+
+/// Removes the assets. What two names mean is removed once; a mistake in a description that lies in an asset is none
+/// here.
+fn clean(of: &Of, registry: &Registry) -> Result<()> {
+    let (blueprint, cache) = (of.load(registry)?, Cache::standard());
+    let mut seen = BTreeSet::new();
+    let mut removed = Vec::new();
+    for asset in blueprint.assets.iter().map(|used| &used.asset) {
+        if seen.insert(&asset.sha256) && cache.remove(asset).map_err(fetch::failure)? {
+            removed.push(asset.name.as_str());
+        }
+    }
+    match of.json {
+        true => output::json(&json!({"removed": removed})),
+        false if removed.is_empty() => output::line("nothing was there"),
+        false => output::line(format_args!("removed {}", removed.join(", "))),
+    }
+    Ok(())
+}
+
+fn show(blueprint: &Blueprint, as_json: bool) {
+    let cache = Cache::standard();
+    let state = |asset: &Asset| match (cache.has(&asset.sha256), cache.part(&asset.sha256)) {
+        (true, _) => ("here", Some(cache.size(&asset.sha256))),
+        (false, Some(part)) => ("partly", Some(part)),
+        (false, None) => ("not here", None),
+    };
+    if as_json {
+        let all = blueprint.assets.iter().map(|used| {
+            let (asset, (state, bytes)) = (&used.asset, state(&used.asset));
+            let folder = (state == "here").then(|| cache.folder(&asset.sha256));
+            json!({"name": asset.name, "url": asset.url, "sha256": asset.sha256, "used": used.used, "state": state,
+                "bytes": bytes, "folder": folder})
+        });
+        return output::json(&all.collect::<Vec<_>>());
+    }
+    if blueprint.assets.is_empty() {
+        return output::line("the blueprint has no assets");
+    }
+    let mut table = Table::new(&["ASSET", "STATE", ">BYTES", "USED", "FROM", "FOLDER"]);
+    for used in &blueprint.assets {
+        let (asset, (state, bytes)) = (&used.asset, state(&used.asset));
+        let tone = if state == "here" { Tone::Good } else { Tone::Warning };
+        let folder = if state == "here" { cache.folder(&asset.sha256).display().to_string() } else { "-".to_owned() };
+        table.row([
+            asset.name.as_str().into(),
+            toned(state, tone),
+            bytes.map_or_else(|| "-".to_owned(), |bytes| bytes.to_string()).into(),
+            if used.used { "yes" } else { "no" }.into(),
+            asset.url.as_str().into(),
+            folder.into(),
+        ]);
+    }
+    table.print();
+}
