@@ -43,6 +43,8 @@ const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
 const VELOCITIES_IN_DEGREES: u8 = 24;
 const OBEYS_WITHOUT_POWER: u8 = 25;
 const ALLOCATES_FOR_NEWS: u8 = 26;
+const GRIPPER_GOES_ON: u8 = 27;
+const STOP_LOCKS_GRIPPER: u8 = 28;
 const NO_MISTAKE: u8 = 255;
 
 /// An arm with one mistake.
@@ -52,6 +54,8 @@ struct Wrong<const MISTAKE: u8> {
     connections: u32,
     /// It was stopped once.
     stopped: bool,
+    /// Where the gripper was sent [m].
+    gripper: f64,
     /// The last reading.
     last: Option<JointReading>,
     /// The next reading is to be the last once more.
@@ -83,7 +87,7 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
     const FALLING: AdapterSpec = AdapterSpec { holds_when_disabled: false, ..Self::SPEC };
 
     fn around(inner: Inner) -> Self {
-        Self { inner, connections: 0, stopped: false, last: None, repeat: false }
+        Self { inner, connections: 0, stopped: false, gripper: 0.0, last: None, repeat: false }
     }
 
     fn spoil(values: &mut [f64]) {
@@ -219,6 +223,11 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             CONFIRMS_ALWAYS => self.inner.write_stop().or(Ok(Stop::Confirmed)),
             STOP_DROPS_POWER => self.inner.write_enable(false).map(|()| Stop::Confirmed),
             STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
+            // The arm's own stop holds the gripper too; this one does not.
+            GRIPPER_GOES_ON | STOP_LOCKS_GRIPPER => {
+                let stop = self.inner.write_stop()?;
+                self.inner.write_gripper_position(self.gripper).map(|()| stop)
+            }
             _ => self.inner.write_stop(),
         }
     }
@@ -227,6 +236,20 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     }
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.inner.write_clear_errors()
+    }
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.inner.read_gripper_position()
+    }
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.inner.get_gripper_range()
+    }
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        match MISTAKE {
+            GRIPPER_GOES_ON if self.stopped => return Ok(()),
+            STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
+            _ => self.gripper = position,
+        }
+        self.inner.write_gripper_position(position)
     }
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
         if MISTAKE == FAILS_WITHOUT_SENSOR { Err(AdapterError::Unsupported) } else { Ok(None) }
@@ -259,6 +282,8 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<STOP_DROPS_POWER>::SPEC, "stop_ends_streaming"),
         (Wrong::<STOP_CLEARS_ERRORS>::WIRED, "stop_in_error_is_harmless"),
         (Wrong::<STOP_IS_FINAL>::WIRED, "stop_is_no_fault"),
+        (Wrong::<GRIPPER_GOES_ON>::WIRED, "stop_holds_the_gripper"),
+        (Wrong::<STOP_LOCKS_GRIPPER>::SPEC, "stop_holds_the_gripper"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "cut_when_disabled"),
         (Wrong::<CLAIMS_TO_BE_CONNECTED>::WIRED, "cut_when_enabled"),
         (Wrong::<OLD_NEWS_AFTER_CONNECT>::WIRED, "cut_when_enabled"),

@@ -2,6 +2,7 @@
 
 mod check;
 mod fk;
+mod ik;
 mod info;
 
 use std::path::PathBuf;
@@ -30,6 +31,8 @@ enum Verb {
     Expand(File),
     /// Where a link is at joint positions
     Fk(fk::Args),
+    /// Joint positions for a pose of a link
+    Ik(ik::Args),
 }
 
 /// A description, and what it needs.
@@ -103,6 +106,7 @@ pub fn run(args: &Args) -> Result {
         Verb::Check(file) => check::run(file),
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
+        Verb::Ik(args) => ik::run(args),
     }
 }
 

@@ -3,6 +3,7 @@
 use serde_json::{Map, Value};
 
 use super::super::exit::{Exit, Failure, Result};
+use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
 use crate::hardware::spec::AdapterError;
 use crate::joint::MAX_DOF;
@@ -38,19 +39,28 @@ impl Choice {
         Err(names.iter().find(close).map_or(failure.clone(), |name| failure.hint(format!("did you mean {name}?"))))
     }
 
-    /// The numbers of joints to try, the likeliest first.
-    pub fn dofs(&self, row: &AdapterSpec) -> Result<Vec<usize>> {
+    /// What the adapter is made from: with the joints that were asked for, else with the most that fit the options.
+    pub fn config(&self, row: &AdapterSpec, address: &str) -> Result<AdapterConfig> {
         let (least, most) = row.dof;
-        match self.dof.map(usize::from) {
-            Some(dof) if (least..=most).contains(&dof) => Ok(vec![dof]),
-            Some(dof) => Err(Failure::usage(format!("{} has {}, not {dof}", row.name, joints(row)))),
-            // Which of them a model has, only the adapter knows.
-            None => Ok((least..=most).rev().collect()),
+        let dofs = match self.dof.map(usize::from) {
+            Some(dof) if (least..=most).contains(&dof) => dof..=dof,
+            Some(dof) => return Err(Failure::usage(format!("{} has {}, not {dof}", row.name, joints(row)))),
+            None => least..=most,
+        };
+        let mut refusal = None;
+        for dof in dofs.rev() {
+            let config = self.with_dof(address, dof)?;
+            match (row.fit)(&config) {
+                Ok(_) => return Ok(config),
+                // With another number of joints it may be the model that was asked for.
+                Err(misfit) => refusal = refusal.or(Some(misfit)),
+            }
         }
+        let refusal = refusal.unwrap_or_else(|| Misfit::new("", format!("{} has no joints", row.name)));
+        Err(Failure { hint: refusal.hint, ..Failure::usage(refusal.what) })
     }
 
-    /// What the adapter is made from.
-    pub fn config(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
+    fn with_dof(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
         let mut options = Map::new();
         let model = self.model.iter().map(|model| ("model", model.as_str()));
         for (path, text) in self.options.iter().map(|(path, text)| (path.as_str(), text.as_str())).chain(model) {
@@ -91,6 +101,12 @@ pub fn failure(exit: Exit, error: &AdapterError) -> Failure {
         Some((what, hint)) => Failure::new(exit, what).hint(hint),
         None => Failure::new(exit, text),
     }
+}
+
+/// Why an emulator does not start: what was asked for cannot be, or the computer does not give what it needs.
+pub fn not_started(error: AdapterError) -> Failure {
+    let exit = if matches!(error, AdapterError::Rejected(_)) { Exit::Usage } else { Exit::Hardware };
+    failure(exit, &error)
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use rustix::io::Errno;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
-use super::choice::{Choice, failure};
+use super::choice::{Choice, failure, not_started};
 use super::report::{Arm, Limits, Report, Row};
 use crate::hardware::conformance::{Check, Made, Subject, checks, figures, gently, run_all};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry, SIM};
@@ -156,38 +156,22 @@ impl Args {
 
     /// A configuration from which an adapter can be made.
     fn made(&self, row: &AdapterSpec, address: &str) -> Result<AdapterConfig> {
-        let dofs = self.choice.dofs(row)?;
-        let mut refusal = None;
-        for dof in &dofs {
-            let config = self.choice.config(address, *dof)?;
-            match (row.create)(&config) {
-                Ok(_) if dofs.len() > 1 && row.address.required && address != SIM && self.choice.model.is_none() => {
-                    let what = format!("how many joints has it? {} allows {}", row.name, super::choice::joints(row));
-                    return Err(Failure::usage(what).hint(format!("--dof {dof}, say")));
-                }
-                Ok(_) => return Ok(config),
-                Err(error) => refusal = refusal.or(Some(failure(Exit::Usage, &error))),
-            }
+        let config = self.choice.config(row, address)?;
+        let several = self.choice.dof.is_none() && row.dof.0 != row.dof.1;
+        if several && row.address.required && self.choice.model.is_none() {
+            let what = format!("how many joints has it? {} allows {}", row.name, super::choice::joints(row));
+            return Err(Failure::usage(what).hint(format!("--dof {}, say", config.dof)));
         }
-        Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+        Ok(config)
     }
 
     /// Starts the emulator, and says what an adapter for it is made from.
     fn emulate(&self, row: &AdapterSpec) -> Result<(Box<dyn Emulator>, AdapterConfig)> {
-        let mut refusal = None;
-        for dof in self.choice.dofs(row)? {
-            let mut config = self.choice.config(SIM, dof)?;
-            let emulator =
-                row.emulate.ok_or(AdapterError::Unsupported).and_then(|start| start(&config, &Place::InProcess));
-            match emulator {
-                Ok(emulator) => {
-                    config.address = emulator.address();
-                    return Ok((emulator, config));
-                }
-                Err(error) => refusal = refusal.or(Some(failure(Exit::Usage, &error))),
-            }
-        }
-        Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+        let mut config = self.choice.config(row, SIM)?;
+        let start = row.emulate.ok_or(AdapterError::Unsupported);
+        let emulator = start.and_then(|start| start(&config, &Place::InProcess)).map_err(not_started)?;
+        config.address = emulator.address();
+        Ok((emulator, config))
     }
 
     /// Makes the checks, showing how far it is.

@@ -16,7 +16,7 @@ use super::picture::{Counts, Picture};
 use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
-use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
@@ -54,9 +54,7 @@ impl PiperAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("piper has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let options: Options = config.options()?;
         let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
@@ -156,7 +154,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     /// The data sheet's limits, narrowed by those that the controller has been given.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        let mut limits = limits(DOF);
+        let mut limits = limits();
         let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
         let all = positions.zip(&mut limits.velocity_max).zip(&self.arm.picture.limits);
         for (((lower, upper), speed), own) in all {

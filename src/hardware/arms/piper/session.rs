@@ -238,7 +238,7 @@ impl Session {
                     .into(),
             ));
         }
-        let limits = limits(DOF);
+        let limits = limits();
         let range = limits.position_lower.iter().zip(&limits.position_upper);
         for (i, (wire, (lower, upper))) in self.picture.joints.iter().zip(range).enumerate() {
             let value = radians(*wire);

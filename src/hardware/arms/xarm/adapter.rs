@@ -12,7 +12,7 @@ pub use super::control::Counts;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
 use super::session::Session;
-use super::{HOLDS_WHEN_DISABLED, MODES, Options, model_of};
+use super::{HOLDS_WHEN_DISABLED, MODES, Options, fit, model_of};
 use crate::arm::Pose;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
@@ -53,8 +53,9 @@ impl XArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
+        config.fit(fit)?;
         let options: Options = config.options()?;
-        let model = model_of(&options, config.dof).map_err(rejected)?;
+        let model = model_of(&options, config.dof)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         Ok(Self { address, model, options, session: None, target: None })
     }

@@ -387,9 +387,11 @@ impl Session {
         self.motion.state == 1 && !self.motion.velocity.is_some_and(still)
     }
 
-    /// Stops all motion of the joints. The arm stays stopped until it is activated.
+    /// Stops all motion of the joints. The arm stays stopped until it is activated. The gripper knows no stop: it can be
+    /// held where it is.
     pub fn stop(&mut self) -> AdapterResult<Stop> {
         (self.change, self.halted) = (None, true);
+        self.known.gripper.stopped(MonotonicClock.now());
         self.ask(&Command::SetState(STOP))?;
         let state = self.ask(&Command::GetState)?.data().first().copied();
         Ok(if matches!(state, Some(4..=6)) { Stop::Confirmed } else { Stop::Sent })

@@ -386,3 +386,12 @@ fn wrong_configurations_are_refused() {
         assert!(error.contains(part), "{error}");
     }
 }
+
+#[test]
+fn a_stop_holds_a_moving_gripper() {
+    let check = checks().find(|check| check.name == "stop_holds_the_gripper").unwrap();
+    for gripper in ["xarm", "xarm_g2"] {
+        let subject = Subject { config: config("", 6, json!({ "gripper": gripper })), ..Subject::emulated(&SPEC) };
+        assert_eq!(run_on(&subject, check).0, Outcome::Passed, "{gripper}");
+    }
+}

@@ -13,6 +13,7 @@ use super::SimOptions;
 use super::kinematics;
 use super::wire::{self, Request, Status};
 use crate::clock::Mono;
+use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::sim::faults::{Fault, FaultKind, FaultScript};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Plant, Tracking};
@@ -98,7 +99,7 @@ impl Controller {
         let mut firmware = [0; 8];
         firmware.iter_mut().zip(options.firmware.bytes()).for_each(|(to, byte)| *to = byte);
         Self {
-            plant: Plant::new(&limits(DOF), initial, Tracking::Lag(LAG), 0.0),
+            plant: Plant::new(&limits(), initial, Tracking::Lag(LAG), 0.0),
             gripper: Gripper::new(gripper.stroke().unwrap_or_default(), GRIPPER_SPEED),
             has_gripper: gripper != GripperKind::None,
             gripper_on: false,
@@ -255,7 +256,10 @@ impl Controller {
     /// Does what a frame says; answers go into `out`.
     pub fn handle(&mut self, frame: &CanFrame, now: Mono, out: &mut Vec<CanFrame>) {
         self.advance(now);
-        self.first_frame.get_or_insert(now);
+        if self.first_frame.is_none() {
+            self.first_frame = Some(now);
+            diary::note(Happening::Came);
+        }
         if let Some(trace) = &mut self.trace
             && trace.len() < TRACE
         {

@@ -15,6 +15,7 @@ use super::controller::{Controller, Delivery};
 use super::report::Kind;
 use super::wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::transport::tcp::Scan;
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -250,6 +251,7 @@ impl Floor {
         let Ok(copy) = stream.try_clone() else { return };
         let mut line = lock(&self.shared.line);
         if line.closing || self.sessions.len() >= CLIENTS {
+            diary::note(Happening::TurnedAway);
             return;
         }
         line.clients.push(copy);
@@ -258,7 +260,9 @@ impl Floor {
         let session = std::thread::Builder::new().name("xarm-sim-client".into()).spawn(move || {
             host::enter_realtime(host::EMULATOR_PRIORITY);
             let peer = stream.peer_addr().ok();
+            diary::note(Happening::Came);
             serve(&shared, stream);
+            diary::note(Happening::Gone);
             lock(&shared.line).clients.retain(|client| client.peer_addr().ok() != peer);
         });
         self.sessions.extend(session);
