@@ -18,6 +18,7 @@ install:
 check:
 	cargo fmt --check
 	cargo clippy --all-targets --locked -- -D warnings
+	cargo clippy --no-default-features --locked -- -D warnings
 
 # Installs nothing: tests whose tools are missing are skipped.
 test:

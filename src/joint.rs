@@ -106,6 +106,18 @@ impl JointLimits {
         }
     }
 
+    /// Limits as a data sheet has them: lowest and highest position [deg] and top speed [deg/s] of each joint.
+    pub fn of_degrees(sheet: &[(f64, f64, f64)]) -> Self {
+        let radians = |part: fn(&(f64, f64, f64)) -> f64| sheet.iter().map(|joint| part(joint).to_radians()).collect();
+        Self {
+            position_lower: radians(|joint| joint.0),
+            position_upper: radians(|joint| joint.1),
+            velocity_max: radians(|joint| joint.2),
+            acceleration_max: Vec::new(),
+            jerk_max: Vec::new(),
+        }
+    }
+
     /// The same limits with the defaults in place of what the arm does not state.
     pub fn with_defaults(mut self) -> Self {
         let dof = self.position_lower.len();

@@ -59,7 +59,31 @@ fn a_scripted_fault_strikes() {
     });
     assert_eq!(error.0, 3);
     adapter.disconnect();
-    emulator.end(Signal::TERM).with(143);
+    emulator.until("the client is gone");
+    let told = emulator.end(Signal::TERM).with(143).err;
+    let at = |what: &str| {
+        let line = told.lines().find(|line| line.ends_with(what)).unwrap_or_else(|| panic!("{what}: {told}"));
+        line.split_whitespace().find_map(|word| word.parse::<f64>().ok()).unwrap()
+    };
+    let (came, struck) = (at(" s  a client connected"), at(" s  the fault error_code strikes"));
+    assert!(struck >= came + 0.5 && at(" s  the client is gone") >= struck, "{told}");
+    assert!(!told.contains("estop"), "{told}");
+}
+
+#[test]
+fn the_faults_of_an_arm_are_listed() {
+    let home = Home::new();
+    let listed = |arm: &str| home.dimos(&format!("adapter emulate {arm} --fault list")).with(0).out;
+    let (yourarm, remote) = (listed("yourarm"), listed("remote"));
+    assert!(yourarm.contains("power_loss") && yourarm.contains("garbage") && !yourarm.contains("leader"), "{yourarm}");
+    assert!(
+        remote.contains("frozen") && !remote.contains("garbage") && remote.contains("time stamps and all"),
+        "{remote}"
+    );
+    if cfg!(feature = "can") {
+        let piper = listed("piper");
+        assert!(piper.contains("leader") && !piper.contains("bus_off"), "{piper}");
+    }
 }
 
 #[test]
@@ -118,6 +142,7 @@ fn a_program_finds_the_address_and_an_end() {
     );
     // Its port is free again, and taken while it is used.
     let first = emulate(&home, &format!("yourarm --bind {address}"));
-    home.dimos(&format!("adapter emulate yourarm --bind {address} --duration 1s")).with(2).says(&["cannot listen at"]);
+    let again = format!("adapter emulate yourarm --bind {address} --duration 1s");
+    home.dimos(&again).with(3).says(&["cannot listen at", "hint: take another address"]);
     first.end(Signal::INT).with(130);
 }

@@ -8,7 +8,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use program::{Home, Started};
+use program::{Home, Started, UP};
+use rustix::process::Signal;
 use serde_json::json;
 
 const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
@@ -54,7 +55,7 @@ fn a_crate_of_its_own_is_built_tested_and_run() {
     let home = Home::new();
     let made = home.dimos("adapter new acme-arm --dof 7 --transport tcp").with(0);
     let next: Vec<&str> = made.out.lines().skip_while(|line| *line != "next:").skip(1).collect();
-    assert_eq!(next.len(), 3, "{}", made.out);
+    assert_eq!(next.len(), 4, "{}", made.out);
     assert!(next[0].contains("cd acme-arm && cargo test"), "{}", made.out);
     let folder = home.path().join("acme-arm");
     let programs = cargo_test(&folder);
@@ -75,6 +76,41 @@ fn a_crate_of_its_own_is_built_tested_and_run() {
     acme("check coordinator-acme-arm", home.path());
     let listed = acme("list-blueprints", home.path()).out;
     assert!(listed.contains("coordinator-acme-arm") && listed.contains("coordinator-yourarm"), "{listed}");
+    plans_and_moves(&home, &programs.join("acme-arm"));
+}
+
+/// The new arm's description and its planner, from anywhere, before anything in them has been changed.
+fn plans_and_moves(home: &Home, program: &Path) {
+    let start = |arguments: &str| {
+        let mut command = Command::new(program);
+        Started::of(home.settle(command.args(arguments.split_whitespace())).stdin(Stdio::null()))
+    };
+    let acme = |arguments: &str| start(arguments).wait().with(0);
+    let checked = acme("model check builtin:acme_arm");
+    assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
+    let tip = acme("model fk builtin:acme_arm 0 0 0 0 0 0 0 --link flange --json").json();
+    assert!((tip["xyz"][2].as_f64().unwrap() - 1.1).abs() < 1e-9, "it stands straight up: {tip}");
+    let checked = acme("check acme-arm-planner");
+    assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
+
+    let run = start("run acme-arm-planner --sim --no-record");
+    run.until(UP);
+    let planned = acme("plan arm --named home").out;
+    assert!(planned.contains("clearance"), "{planned}");
+    acme("preview");
+    acme("execute");
+    is_at(home, &[0.0, 0.53, 0.0, 0.53, 0.0, 0.53, 0.0]);
+    acme("move arm --named zero --speed 1");
+    is_at(home, &[0.0; 7]);
+    acme("move arm --pose 0.4 0.2 0.4 --speed 1");
+    let refused = start("plan arm --pose 0.3 0 -0.2").wait().with(1);
+    assert!(refused.err.contains("hint: "), "{}", refused.err);
+    run.end(Signal::INT).with(130);
+}
+
+fn is_at(home: &Home, goal: &[f64]) {
+    let is = home.positions("arm");
+    assert!(is.len() == goal.len() && is.iter().zip(goal).all(|(is, goal)| (is - goal).abs() < 0.01), "{is:?}");
 }
 
 /// The conformance suite over the table of that checkout.
@@ -113,7 +149,7 @@ fn checkout(at: &Path) {
         ),
         (
             "src/lib.rs",
-            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{registry, sim, spec, \
+            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{fit, kit, registry, sim, spec, \
              transport};\n}\n"
                 .into(),
         ),
@@ -123,6 +159,7 @@ fn checkout(at: &Path) {
                 .into(),
         ),
         ("src/hardware/arms/nothing.rs", String::new()),
+        ("src/robot/builtin.rs", "\nrobots!(\n    \"lite6\",\n    \"piper\"\n);\n".into()),
         ("tests/conformance.rs", SUITE.into()),
     ] {
         let path = at.join(path);
@@ -145,12 +182,22 @@ fn arms_in_the_tree_are_built_and_tested() {
     for (name, transport, dof) in [("otto", "serial", 16), ("acme", "tcp", 1), ("penny-2", "can", 5)] {
         let line = format!("adapter new {name} --dof {dof} --transport {transport} --in-tree --path tree --json");
         let report = home.dimos(&line).with(0).json();
-        assert_eq!(report["changed"], json!(["tree/src/hardware/arms/mod.rs"]));
-        assert_eq!(report["written"].as_array().unwrap().len(), 6, "{report}");
+        assert_eq!(report["changed"], json!(["tree/src/hardware/arms/mod.rs", "tree/src/robot/builtin.rs"]));
+        let files = if transport == "can" { 8 } else { 9 };
+        assert_eq!(report["written"].as_array().unwrap().len(), files, "{report}");
         let blueprint = fs::read_to_string(tree.join(format!("blueprints/coordinator-{name}.yaml"))).unwrap();
         assert!(blueprint.contains(&format!("count: {dof}}}")), "{blueprint}");
-        assert!(blueprint.contains(&format!("adapter_type: {}\n", name.replace('-', "_"))), "{blueprint}");
+        let snake = name.replace('-', "_");
+        assert!(blueprint.contains(&format!("adapter_type: {snake}\n")), "{blueprint}");
+        home.dimos(&format!("model check tree/assets/robots/{snake}.urdf")).with(0);
+        let planner = fs::read_to_string(tree.join(format!("blueprints/{name}-planner.yaml"))).unwrap();
+        assert!(planner.contains(&format!("model_path: builtin:{snake} #")), "{planner}");
     }
+    let robots = fs::read_to_string(tree.join("src/robot/builtin.rs")).unwrap();
+    assert!(
+        robots.contains("    \"acme\",\n    \"lite6\",\n    \"otto\",\n    \"penny_2\",\n    \"piper\"\n);"),
+        "{robots}"
+    );
     let table = fs::read_to_string(tree.join("src/hardware/arms/mod.rs")).unwrap();
     assert!(table.contains("pub mod acme;\npub mod nothing;\npub mod otto;\npub mod penny_2;\n"), "{table}");
     assert!(table.contains("&[otto::SPEC, acme::SPEC, penny_2::SPEC];"), "{table}");
@@ -175,6 +222,7 @@ fn nothing_is_written_over_and_nothing_half() {
         ("planned --dof 6 --transport tcp --in-tree --path tree", "coordinator-planned.yaml is there already"),
         ("there --dof 6 --transport can --in-tree --path tree", "arms/there is there already"),
         ("nothing --dof 6 --transport can --in-tree --path tree", "it has `pub mod nothing;` already"),
+        ("lite6 --dof 6 --transport tcp --in-tree --path tree", "it has \"lite6\" already"),
         ("yourarm --dof 6 --transport serial", "there is an adapter yourarm already"),
         ("loop --dof 6 --transport serial", "it is a word of Rust"),
         ("../acme --dof 6 --transport serial", "begin it with a lower-case letter"),

@@ -4,7 +4,7 @@
 #[path = "support/program.rs"]
 mod program;
 
-use std::io::Read as _;
+use std::io::{Read as _, Write as _};
 
 use dimos::hardware::arms::yourarm::emulator::wire::Request;
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
@@ -53,7 +53,7 @@ fn a_real_arm_is_only_read() {
     let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
     let ended = home.dimos(&format!("adapter test yourarm --address {address}")).with(0);
-    for part in ["yourarm at 127.0.0.1:", "firmware     2.1.3", "nothing was moved", "skipped  36 more"] {
+    for part in ["yourarm at 127.0.0.1:", "firmware     2.1.3", "nothing was moved", "skipped  37 more"] {
         assert!(ended.out.contains(part), "no {part:?} in\n{}", ended.out);
     }
     let asked = requests(&emulator);
@@ -123,20 +123,32 @@ fn an_interruption_stops_the_arm() {
     assert_eq!(emulator.joints().0, before);
 }
 
-/// Reading a line goes on after a signal: the question must not.
+/// An arm that fails a check is not moved by the same adapter.
 #[test]
-fn an_interruption_at_the_question_is_a_no() {
+fn no_motion_when_a_check_failed() {
     let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
+    // When the arm has been reached and its state was watched, another one answers for a moment.
+    emulator.inject(Fault::new(FaultKind::WrongModel).at(1.9).times(3)).unwrap();
+    let line = format!("adapter test yourarm --address {address} --allow-motion --yes --report r.md");
+    let ended = home.dimos(&line).with(1).says(&["error: not moved: 3 checks failed"]);
+    assert!(ended.out.contains("3 failed") && ended.out.contains("; nothing was moved"), "{}", ended.out);
+    assert!(ended.out.contains("failed   "), "{}", ended.out);
+    assert!(std::fs::read_to_string(home.path().join("r.md")).unwrap().contains("| failed | "));
+    assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
+}
+
+/// The program at the question before the motion, and the other end of its terminal.
+fn asked(home: &Home, address: &str) -> (std::process::Child, std::fs::File) {
     let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
     unlockpt(&master).unwrap();
     let name = ptsname(&master, Vec::new()).unwrap();
     let terminal = std::fs::File::options().read(true).write(true).open(name.to_str().unwrap()).unwrap();
     let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_dimos"));
-    command.args(["adapter", "test", "yourarm", "--address", &address, "--only", "row", "--allow-motion"]);
+    command.args(["adapter", "test", "yourarm", "--address", address, "--only", "row", "--allow-motion"]);
     home.settle(&mut command);
     command.stdin(terminal.try_clone().unwrap()).stdout(std::process::Stdio::null()).stderr(terminal);
-    let mut test = command.spawn().unwrap();
+    let test = command.spawn().unwrap();
     drop(command);
     let (mut master, mut said) = (std::fs::File::from(master), String::new());
     while !said.contains("Type yes") {
@@ -144,13 +156,42 @@ fn an_interruption_at_the_question_is_a_no() {
         let count = master.read(&mut bytes).unwrap();
         said += &String::from_utf8_lossy(&bytes[..count]);
     }
-    rustix::process::kill_process(rustix::process::Pid::from_child(&test), Signal::INT).unwrap();
-    let mut code = None;
+    (test, master)
+}
+
+fn code(test: &mut std::process::Child) -> Option<i32> {
+    let mut status = None;
     program::eventually("it ends", || {
-        code = test.try_wait().unwrap();
-        code.is_some()
+        status = test.try_wait().unwrap();
+        status.is_some()
     });
-    assert_eq!(code.unwrap().code(), Some(130));
+    status.unwrap().code()
+}
+
+/// Much can happen to an arm while a question waits for its answer.
+#[test]
+fn what_speaks_against_the_motion_is_looked_for_again_after_the_question() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let (mut test, mut terminal) = asked(&home, &address);
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(2)).unwrap();
+    terminal.write_all(b"yes\n").unwrap();
+    assert_eq!(code(&mut test), Some(1));
+    let mut said = vec![0; 4096];
+    let count = terminal.read(&mut said).unwrap();
+    let said = String::from_utf8_lossy(&said[..count]);
+    assert!(said.contains("not moved: it is in error 2"), "{said}");
+    assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
+}
+
+/// Reading a line goes on after a signal: the question must not.
+#[test]
+fn an_interruption_at_the_question_is_a_no() {
+    let (emulator, address) = arm(&SimOptions::default());
+    let home = Home::new();
+    let (mut test, _terminal) = asked(&home, &address);
+    rustix::process::kill_process(rustix::process::Pid::from_child(&test), Signal::INT).unwrap();
+    assert_eq!(code(&mut test), Some(130));
     assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
 }
 

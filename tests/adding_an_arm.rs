@@ -2,8 +2,8 @@
 //!
 //! Blocks and what becomes of them: `console`: the lines after `$ ` are run by a shell, what stands below each is what
 //! they must say, loosely (`…`: anything). `console up=TERMINAL`: the same, and the last command goes on in that
-//! terminal until the next such block. `rust in=FILE`: these lines stand in FILE. `diff in=FILE`: the change is made there.
-//! `yaml file=NAME`, `python file=NAME`: the file is written. `checkout=NAME`: there is a copy of this checkout.
+//! terminal until the next such block. `rust in=FILE`, `xml in=FILE`: these lines stand in FILE. `diff in=FILE`: the change
+//! is made there. `yaml file=NAME`, `python …`, `xml …`: the file is written. `checkout=NAME`: a copy of this checkout.
 //! `needs=ARM`: only where the table has that arm.
 
 #[allow(dead_code, reason = "shared with other tests")]
@@ -259,9 +259,11 @@ fn the_page_is_true_from_beginning_to_end() {
                 commands.iter().for_each(|(command, expected)| reader.run(command, expected));
                 last.iter().for_each(|(terminal, (command, expected))| reader.up(terminal, command, expected));
             }
-            ("rust", Some(file), _) => stands_in(&reader.folder.join(file), &block.text),
+            ("rust" | "xml", Some(file), _) => stands_in(&reader.folder.join(file), &block.text),
             ("diff", Some(file), _) => change(&reader.folder.join(file), &block.text),
-            ("yaml" | "python", _, Some(file)) => std::fs::write(reader.folder.join(file), &block.text).unwrap(),
+            ("yaml" | "python" | "xml", _, Some(file)) => {
+                std::fs::write(reader.folder.join(file), &block.text).unwrap()
+            }
             ("text", None, None) => continue,
             _ => panic!("line {}: nothing is known of {:?} {:?}", block.line, block.kind, block.words),
         }

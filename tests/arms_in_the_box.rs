@@ -108,13 +108,11 @@ fn coordinator_dual_xarm() {
 }
 
 #[test]
-#[cfg(feature = "can")]
 fn coordinator_piper() {
     exercise("coordinator-piper", &[Arm { name: "arm", target: PIPER, gripper: Some(0.07) }]);
 }
 
 #[test]
-#[cfg(feature = "can")]
 fn coordinator_piper_xarm() {
     let arms = [
         Arm { name: "piper", target: PIPER, gripper: Some(0.07) },
@@ -138,7 +136,6 @@ fn a_piper_that_cannot_be_reached_or_leads_is_told_in_one_line() {
 }
 
 #[test]
-#[cfg(feature = "can")]
 fn a_piper_in_its_e_stop_is_told_with_one_hint_and_not_said_to_hold() {
     let home = Home::new();
     let piper = |faults: &str| {

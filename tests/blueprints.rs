@@ -44,6 +44,38 @@ fn shipped_blueprints_have_no_mistakes() {
     }
 }
 
+/// What the options' types cannot say, the arms in the box say: each at its place, like any other mistake.
+#[test]
+#[cfg(feature = "can")]
+fn options_that_do_not_fit_are_told_where_they_stand() {
+    let file = fixtures().join("misfits.yaml");
+    let found = SearchPath { folders: vec![fixtures()] }.find(file.to_str().unwrap()).unwrap();
+    let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin());
+    let got = loaded.render(false).replace(&format!("{}/", fixtures().display()), "");
+    if env::var_os("DIMOS_REGENERATE").is_some() {
+        fs::write(file.with_extension("txt"), &got).unwrap();
+    }
+    assert_eq!(got, fs::read_to_string(file.with_extension("txt")).unwrap());
+}
+
+/// The limits that `check` shows are those of the model, not of the number of joints.
+#[test]
+fn limits_are_those_of_the_model() {
+    let joint = |name: &str, overrides: &[&str]| {
+        let set = overrides.iter().map(|text| (*text).to_owned()).collect();
+        let loaded = load(&find(name).unwrap(), &Overrides { set, sim: true }, &Registry::builtin());
+        assert_eq!(loaded.render(false), "", "{name}");
+        let lower = Summary::of(&loaded.blueprint.unwrap()).arms[0].joints[2].position_lower.unwrap().value;
+        (lower * 1e6).round() / 1e6
+    };
+    assert_eq!(joint("coordinator-xarm6", &[]), -3.822271, "xArm 6, the narrower of its series");
+    assert_eq!(joint("coordinator-lite6", &[]), -0.061087);
+    assert_eq!(
+        joint("coordinator-xarm6", &["hardware.arm.options.gripper=none", "hardware.arm.options.model=xarm850"]),
+        -4.223697
+    );
+}
+
 #[test]
 fn every_broken_blueprint_gets_its_answer() {
     let mut files: Vec<PathBuf> = fs::read_dir(fixtures()).unwrap().map(|e| e.unwrap().path()).collect();
@@ -240,4 +272,76 @@ tasks:
         assert_eq!(loaded.errors(), errors, "{task}: {}", loaded.render(false));
         assert!(errors == 0 || loaded.render(false).contains("at most 16 joints, this one names 18"));
     }
+}
+
+/// A Cartesian task's robot: its own, or that of the planner; every mistake at its place.
+#[test]
+fn a_cartesian_task_has_a_robot_and_its_mistakes_have_their_places() {
+    let load_text = |task: &str, planner: bool| {
+        let planner = if planner {
+            "planner:
+  robots:
+    - {name: arm, model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: arm_,
+       base_pose: {xyz: [1, 0, 0]}, joint_names: [joint1, joint2, joint3, joint4, joint5, joint6]}
+"
+        } else {
+            ""
+        };
+        let text = format!(
+            "hardware:
+  - {{hardware_id: arm, joints: {{prefix: arm, count: 6}}, adapter_type: mock}}
+tasks:
+  - {task}
+{planner}"
+        );
+        let found = blueprint::Found { name: "cart".into(), source: Source::Embedded, bytes: text.into_bytes() };
+        load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin())
+    };
+    let task = |params: &str| format!("{{name: c, type: cartesian_ik, joint_names: {{hardware: arm}}, {params}}}");
+    let own = |more: &str| task(&format!("params: {{model_path: 'builtin:yourarm', {more}}}"));
+    let good = load_text(&own("end_effector_link: flange, joint_prefix: arm_"), false);
+    let robot = good.blueprint.unwrap().tasks[0].robot.clone().unwrap();
+    assert_eq!((robot.link.as_str(), robot.joints[5].as_str(), robot.base), ("flange", "joint6", None));
+    // The planner's robot, where none is given; of it, another link.
+    for (params, link) in [("params: {timeout: 1.0}", "flange"), ("params: {end_effector_link: link4}", "link4")] {
+        let planned = load_text(&task(params), true);
+        assert_eq!(planned.render(false), "");
+        let robot = planned.blueprint.unwrap().tasks[0].robot.clone().unwrap();
+        let (base, at) = robot.base.unwrap();
+        assert_eq!((robot.link.as_str(), base.as_str(), at.translation.x), (link, "base_link", 1.0));
+        assert_eq!(robot.joints[0], "joint1");
+    }
+    let mapped = "end_effector_link: flange, joint_name_mapping: {arm_joint1: joint2, arm_joint2: joint1}";
+    for (entry, said, place) in [
+        (task("params: {}"), "the description of the robot is missing", "4:21"),
+        (own(""), "the end effector is missing", "builtin:yourarm"),
+        (own("end_effector_link: flnge, joint_prefix: arm_"), "no link `flnge`", "flnge"),
+        (own("end_effector_link: base_link, joint_prefix: arm_"), "no joint of the task moves", "base_link"),
+        (own("end_effector_link: flange"), "the model has no joint `arm_joint1`", "4:"),
+        (own("end_effector_link: flange, joint_prefix: left_"), "does not begin with `left_`", "left_"),
+        (own(&format!("{mapped}, joint_prefix: arm_")), "both map the joints' names", "arm_"),
+        (own(mapped), "the model has no joint `arm_joint3`", "4:"),
+        (own("end_effector_link: flange, joint_prefix: arm_, timeout: -1"), "out of range", "-1"),
+        (own("end_effector_link: flange, joint_prefix: arm_, max_linear_velocity: 0"), "out of range", "0"),
+        (own("end_effector_link: flange, speed: 1"), "speed", "speed"),
+        (task("params: {model_path: 'builtin:nobody', end_effector_link: x}"), "cannot be used", "builtin:nobody"),
+        (task("params: {model_path: gone.urdf, end_effector_link: x}"), "cannot be used", "gone.urdf"),
+    ] {
+        let told = load_text(&entry, false);
+        let text = told.render(false);
+        assert!(told.errors() >= 1 && text.contains(said), "{entry}\n{text}");
+        assert!(text.contains("cart:4:") || text.contains(":4:"), "{text}");
+        let first = told.reports().into_iter().find(|r| r.message.contains(said)).unwrap();
+        if let Some((line, column)) = place.split_once(':').filter(|(line, _)| *line == "4") {
+            assert!(first.line == Some(line.parse().unwrap()), "{text}");
+            assert!(column.is_empty() || first.column == Some(column.parse().unwrap()), "{text}");
+        } else {
+            let written = "  - ".len() + entry.rfind(place).unwrap() + 1;
+            assert!(first.column.is_some_and(|c| c <= written && c + 2 >= written), "{written} {first:?}");
+        }
+    }
+    let part = "{name: c, type: eef_twist, joint_names: [arm_joint1, arm_joint2],
+     params: {model_path: 'builtin:yourarm', end_effector_link: flange, joint_prefix: arm_}}";
+    let text = load_text(part, false).render(false);
+    assert!(text.contains("`joint3` carries the end effector and is not of the task"), "{text}");
 }

@@ -133,17 +133,6 @@ fn unacknowledged_frames_wait_even_when_the_port_closes() {
 }
 
 #[test]
-fn purged_frames_never_arrive() {
-    let bus = Bus::new();
-    let mut arm = bus.attach().unwrap();
-    let mut port = port(&bus, &[]);
-    bus.withhold(8);
-    port.send(&[frame(1, 1), frame(1, 2)]).unwrap();
-    assert_eq!((bus.purge(), port.waiting(), bus.acknowledge()), (2, 0, 0));
-    assert_eq!(all(&mut arm), []);
-}
-
-#[test]
 fn an_interface_that_went_down_breaks_its_ports_for_good() {
     let bus = Bus::new();
     let mut arm = bus.attach().unwrap();

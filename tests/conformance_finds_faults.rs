@@ -1,7 +1,12 @@
 //! The conformance suite must be able to fail: adapters that are wrong in one way each, and the check that says so.
 
+#[path = "support/counting.rs"]
+mod counting;
+
+use std::os::fd::BorrowedFd;
+
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::hardware::arms::{mock, yourarm};
+use dimos::hardware::arms::{mock, xarm, yourarm};
 use dimos::hardware::conformance::gently::{Motion, move_gently, refusal};
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
@@ -36,6 +41,11 @@ const WRONG_SIGN_BOTH_WAYS: u8 = 21;
 const IGNORES_MODEL: u8 = 22;
 const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
 const VELOCITIES_IN_DEGREES: u8 = 24;
+const OBEYS_WITHOUT_POWER: u8 = 25;
+const ALLOCATES_FOR_NEWS: u8 = 26;
+const GRIPPER_GOES_ON: u8 = 27;
+const STOP_LOCKS_GRIPPER: u8 = 28;
+const NO_MISTAKE: u8 = 255;
 
 /// An arm with one mistake.
 struct Wrong<const MISTAKE: u8> {
@@ -44,6 +54,8 @@ struct Wrong<const MISTAKE: u8> {
     connections: u32,
     /// It was stopped once.
     stopped: bool,
+    /// Where the gripper was sent [m].
+    gripper: f64,
     /// The last reading.
     last: Option<JointReading>,
     /// The next reading is to be the last once more.
@@ -65,8 +77,17 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
         ..yourarm::SPEC
     };
 
+    /// Around an arm that sends its state by itself.
+    const PUSHED: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((xarm::SPEC.create)(config)?))),
+        ..xarm::SPEC
+    };
+    /// Around an arm that is said to fall without power.
+    const FALLING: AdapterSpec = AdapterSpec { holds_when_disabled: false, ..Self::SPEC };
+
     fn around(inner: Inner) -> Self {
-        Self { inner, connections: 0, stopped: false, last: None, repeat: false }
+        Self { inner, connections: 0, stopped: false, gripper: 0.0, last: None, repeat: false }
     }
 
     fn spoil(values: &mut [f64]) {
@@ -117,6 +138,9 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     fn get_info(&self) -> ManipulatorInfo {
         self.inner.get_info()
     }
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.inner.state_fd()
+    }
     fn get_dof(&self) -> usize {
         self.inner.get_dof()
     }
@@ -145,6 +169,9 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             (result, _) => result?,
         }
         Self::spoil(&mut reading.position[..6]);
+        if MISTAKE == ALLOCATES_FOR_NEWS && self.last.is_some_and(|last| last.stamp != reading.stamp) {
+            std::hint::black_box(reading.position.to_vec());
+        }
         if MISTAKE == ZERO_VELOCITIES {
             reading.velocity = Some(Default::default());
         }
@@ -178,11 +205,12 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if MISTAKE == STOP_IS_FINAL && self.stopped {
             return Err(AdapterError::Rejected("stopped".into()));
         }
-        let mut positions = positions.to_vec();
-        if MISTAKE == WRONG_SIGN_BOTH_WAYS && positions.len() == 6 {
+        if let (WRONG_SIGN_BOTH_WAYS, Ok(mut positions)) = (MISTAKE, <[f64; 6]>::try_from(positions)) {
             Self::spoil(&mut positions);
+            return self.inner.write_joint_positions(&positions, velocity);
         }
-        self.inner.write_joint_positions(&positions, velocity)
+        let result = self.inner.write_joint_positions(positions, velocity);
+        if MISTAKE == OBEYS_WITHOUT_POWER { Ok(()) } else { result }
     }
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         self.inner.write_joint_velocities(velocities)
@@ -195,6 +223,11 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             CONFIRMS_ALWAYS => self.inner.write_stop().or(Ok(Stop::Confirmed)),
             STOP_DROPS_POWER => self.inner.write_enable(false).map(|()| Stop::Confirmed),
             STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
+            // The arm's own stop holds the gripper too; this one does not.
+            GRIPPER_GOES_ON | STOP_LOCKS_GRIPPER => {
+                let stop = self.inner.write_stop()?;
+                self.inner.write_gripper_position(self.gripper).map(|()| stop)
+            }
             _ => self.inner.write_stop(),
         }
     }
@@ -203,6 +236,20 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     }
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.inner.write_clear_errors()
+    }
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.inner.read_gripper_position()
+    }
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.inner.get_gripper_range()
+    }
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        match MISTAKE {
+            GRIPPER_GOES_ON if self.stopped => return Ok(()),
+            STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
+            _ => self.gripper = position,
+        }
+        self.inner.write_gripper_position(position)
     }
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
         if MISTAKE == FAILS_WITHOUT_SENSOR { Err(AdapterError::Unsupported) } else { Ok(None) }
@@ -235,6 +282,8 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<STOP_DROPS_POWER>::SPEC, "stop_ends_streaming"),
         (Wrong::<STOP_CLEARS_ERRORS>::WIRED, "stop_in_error_is_harmless"),
         (Wrong::<STOP_IS_FINAL>::WIRED, "stop_is_no_fault"),
+        (Wrong::<GRIPPER_GOES_ON>::WIRED, "stop_holds_the_gripper"),
+        (Wrong::<STOP_LOCKS_GRIPPER>::SPEC, "stop_holds_the_gripper"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "cut_when_disabled"),
         (Wrong::<CLAIMS_TO_BE_CONNECTED>::WIRED, "cut_when_enabled"),
         (Wrong::<OLD_NEWS_AFTER_CONNECT>::WIRED, "cut_when_enabled"),
@@ -244,17 +293,32 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<CLEARS_ERRORS_ON_CONNECT>::WIRED, "cut_in_error"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "power_cut"),
         (Wrong::<CONFIRMS_ALWAYS>::WIRED, "stop_into_the_void"),
+        (Wrong::<OBEYS_WITHOUT_POWER>::SPEC, "disabled_arms_do_not_move"),
+        (Wrong::<OBEYS_WITHOUT_POWER>::FALLING, "disabled_arms_do_not_move"),
+        (Wrong::<ALLOCATES_FOR_NEWS>::PUSHED, "reads_do_not_allocate"),
     ];
     std::thread::scope(|scope| {
         for (row, name) in cases {
             scope.spawn(move || {
                 let check = checks().find(|check| check.name == *name).unwrap();
-                let outcome = run(row, check, None);
+                let outcome = run(row, check, Some(counting::allocations));
                 assert!(matches!(outcome, Outcome::Failed(_)), "{name}: {outcome:?}");
                 println!("{name}: {outcome:?}");
             });
         }
     });
+}
+
+/// What was found above was the mistake, and not the wrapping.
+#[test]
+fn without_a_mistake_the_same_checks_pass() {
+    for (row, name) in [
+        (Wrong::<NO_MISTAKE>::FALLING, "disabled_arms_do_not_move"),
+        (Wrong::<NO_MISTAKE>::PUSHED, "reads_do_not_allocate"),
+    ] {
+        let check = checks().find(|check| check.name == name).unwrap();
+        assert_eq!(run(&row, check, Some(counting::allocations)), Outcome::Passed, "{name}");
+    }
 }
 
 /// The small slow motion of a wrong arm, which begins to be interrupted at the `looks`th look.

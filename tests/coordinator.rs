@@ -98,6 +98,20 @@ fn cancel_slows_down_along_the_path() {
 }
 
 #[test]
+fn cancel_is_the_ordinary_end_of_a_stream() {
+    let mut rig = Rig::one_arm(vec![task("v", velocity(), 0..6, 5)]);
+    for _ in 0..4 {
+        rig.velocity(0, &[0.3; 6]);
+        rig.run_for(0.1);
+    }
+    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Executing, Reason::None));
+    assert_eq!(rig.ask(Request::Cancel { task: Some(0) }), Outcome::Cancelled);
+    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Idle, Reason::StreamEnded));
+    rig.run_for(0.5);
+    assert_eq!((rig.tasks[0].state, rig.speed(0)), (TaskState::Idle, 0.0), "at rest, and it stays so");
+}
+
+#[test]
 fn cancel_ends_a_trajectory_that_has_not_begun_to_move() {
     let mut rig = Rig::one_arm(vec![task("v", velocity(), 0..6, 5), task("t", trajectory(), 0..6, 10)]);
     rig.velocity(0, &[0.3; 6]);

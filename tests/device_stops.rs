@@ -7,8 +7,10 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link};
 use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
-use dimos::hardware::spec::AdapterError;
+use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::spec::{AdapterError, ManipulatorAdapter};
 use dimos::joint::ControlMode;
 use dimos::rt::beat::Beat;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
@@ -27,6 +29,11 @@ struct Bench {
 
 fn bench(native_rate: f64) -> Bench {
     let mock = MockAdapter::new(6);
+    bench_of(Box::new(mock.clone()), mock, native_rate)
+}
+
+/// A device thread with this adapter; `mock` is it, or stands idle.
+fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
     let beat = Arc::new(Beat::default());
     let (state_writer, states) = slot(ArmState::default());
     let (commands, command_reader) = slot(ArmCommand::default());
@@ -41,7 +48,7 @@ fn bench(native_rate: f64) -> Bench {
         clock: Arc::new(MonotonicClock),
         notes: Box::new(|_| {}),
     };
-    let device = Device::spawn(config, Box::new(mock.clone()), state_writer, command_reader).unwrap();
+    let device = Device::spawn(config, adapter, state_writer, command_reader).unwrap();
     device.connect().wait(LIMIT).unwrap();
     device.activate().wait(LIMIT).unwrap();
     Bench { device, beat, states, commands, command: ArmCommand::default(), mock }
@@ -145,4 +152,38 @@ fn a_change_of_mode_that_a_moving_arm_refuses_is_asked_for_again_and_is_no_fault
     bench.tick(|c| c.mode = Some(ControlMode::Velocity));
     bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
     bench.end();
+}
+
+/// The stop of an xArm does not reach its gripper: the device thread holds it.
+#[test]
+fn a_gripper_that_goes_on_after_a_stop_is_held() {
+    let options = serde_json::json!({ "gripper": "xarm" });
+    let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
+    let emulator = XArmEmulator::start(&config, &Place::InProcess).unwrap();
+    config.address = emulator.address();
+    let mut bench = bench_of((xarm::SPEC.create)(&config).unwrap(), MockAdapter::new(6), 250.0);
+    let send = |bench: &mut Bench, opening: f64| {
+        bench.tick(|command| (command.gripper, command.gripper_seq) = (opening, command.gripper_seq + 1));
+    };
+    // A machine that looks away for most of a second lets it arrive before the stop: then once more.
+    for _ in 0..5 {
+        send(&mut bench, 0.0);
+        bench.until("it is closed", |_| emulator.gripper() < 1e-4);
+        send(&mut bench, 0.085);
+        bench.until("it opens", |_| emulator.gripper() > 0.005);
+        bench.tick(|command| command.stop_seq += 1);
+        let sent = bench.command.stop_seq;
+        bench.until("the stop", |bench| bench.device.health().stop_sent.load(Relaxed) == sent);
+        let at_the_stop = emulator.gripper();
+        if at_the_stop < 0.06 {
+            std::thread::sleep(Duration::from_millis(1200));
+            let held = emulator.gripper();
+            std::thread::sleep(Duration::from_millis(300));
+            assert!(held < 0.0849, "stopped at {at_the_stop} m, it went on to {held} m");
+            assert!((emulator.gripper() - held).abs() < 1e-6, "held");
+            return bench.end();
+        }
+        bench.device.activate().wait(LIMIT).unwrap();
+    }
+    panic!("it was never stopped on its way");
 }

@@ -229,6 +229,39 @@ fn dimos(arguments: &[&str]) -> Ended {
 }
 
 #[test]
+fn joints_are_found_for_a_pose_and_what_is_missing_is_said() {
+    let pose = ["--pose", "0.35", "0.05", "0.3", "--rpy", "3.1", "-.1", "0.2"];
+    let ik = dimos(&[&["ik", "builtin:yourarm"], &pose[..]].concat());
+    assert_eq!(ik.code, 0, "{}", ik.err);
+    let joints: Vec<&str> = ik.out.lines().nth(1).unwrap().split_whitespace().collect();
+    let fk = dimos(&[&["fk", "builtin:yourarm"], &joints[..]].concat());
+    assert!(fk.out.contains("xyz   0.350000 0.050000 0.300000  m"), "{}", fk.out);
+    assert!(fk.out.contains("rpy   3.1000") && fk.out.contains(" 0.2000"), "{}", fk.out);
+    // From where the solution is nearest to: another seed, another arm of the same hand.
+    let seed: Vec<String> = joints.iter().map(|q| (q.parse::<f64>().unwrap() + 0.1).to_string()).collect();
+    let seed: Vec<&str> = seed.iter().map(String::as_str).collect();
+    let near = dimos(&[&["ik", "builtin:yourarm"], &pose[..], &["--json", "--seed"], &seed[..]].concat());
+    let near: serde_json::Value = serde_json::from_str(&near.out).unwrap();
+    assert!(near["reached"] == true && near["position_error"].as_f64().unwrap() < 1e-6, "{near}");
+    for (q, expected) in near["positions"].as_array().unwrap().iter().zip(&joints) {
+        assert!((q.as_f64().unwrap() - expected.parse::<f64>().unwrap()).abs() < 1e-3, "{near} {joints:?}");
+    }
+    let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3"]);
+    assert!(far.code == 1 && far.err.contains("is not reached") && far.err.contains("mm"), "{}", far.err);
+    let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3", "--json"]);
+    let told: serde_json::Value = serde_json::from_str(&far.out).unwrap();
+    assert!(far.code == 1 && told["reached"] == false && told["position_error"].as_f64().unwrap() > 1.0, "{told}");
+    for wrong in [
+        &["ik", "builtin:yourarm"][..],
+        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--quat", "0", "0", "0", "2"],
+        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--seed", "0"],
+        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--link", "flnge"],
+    ] {
+        assert_eq!(dimos(wrong).code, 2, "{wrong:?}");
+    }
+}
+
+#[test]
 fn verbs_show_a_robot() {
     let info = dimos(&["info", "builtin:xarm6_gripper"]);
     assert_eq!((info.code, info.err.as_str()), (0, ""));

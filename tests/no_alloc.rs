@@ -100,10 +100,11 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
         task("servo", servo(), 0..7, 20),
         task("velocity", velocity(), 7..13, 20),
         task("servo_too", servo(), 5..7, 20),
-        task("poses", TaskKind::CartesianIk(steered.clone()), 7..13, 20),
-        task("twists", TaskKind::EefTwist(steered), 7..13, 25),
+        task("poses", TaskKind::CartesianIk(steered.clone()), 13..19, 20),
+        task("twists", TaskKind::EefTwist(steered), 13..19, 25),
     ];
-    let mut rig = Rig::two_arms(tasks);
+    let mut rig = Rig::new(100.0, vec![arm("left", 7), arm("right", 6), arm("third", 6)], tasks);
+    rig.make_ready();
     rig.arms[1].reports_velocity = false;
     rig.around = watch;
     let (mut seen, mut id) = ([0u64; 8], 0);
@@ -138,7 +139,7 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
             945 => rig.arms[0].silent = true,
             960 => (rig.arms[1].error, rig.arms[0].silent) = (0, false),
             970 => {
-                for arm in 0..2 {
+                for arm in 0..3 {
                     rig.send(Request::Reset { arm });
                     rig.send(Request::Ready { arm });
                 }

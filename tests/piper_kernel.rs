@@ -87,8 +87,8 @@ fn at_the_full_rate_for_ten_seconds_nothing_is_lost() {
         println!("{:.0} frames/s for {seconds:.1} s: {sent} sent, {decoded} decoded, {wire:?}", sent as f64 / seconds);
         assert_eq!((sent, emulator.not_taken()), (decoded, 0));
         assert_eq!((counts.damaged, counts.other, wire.overflows, wire.not_taken), (0, 0, 0, 0));
-        // Fewer only where the guest gets too little of the machine: the emulator never makes up for a missed period.
-        assert!(sent > 24_000, "{sent} frames in {seconds} s");
+        // 3 040 frames/s: the emulator makes up for the periods in which the guest got nothing of the machine.
+        assert!(sent >= 29_000, "{sent} frames in {seconds} s");
     });
 }
 

@@ -1,8 +1,6 @@
 //! The vendor's own SDK (piper_sdk, in a Python process of its own) against the emulator, over slcan on a
 //! pseudo-terminal: the same program that talks to an arm reads the emulator's state and moves it.
 
-#![cfg(feature = "can")]
-
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};

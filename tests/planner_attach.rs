@@ -60,7 +60,7 @@ fn up() -> (Home, Started, Started) {
     let home = home();
     let run = home.run("cell.yaml --no-record");
     let planner = planner(&home, "");
-    home.dimos("move arm --named home --speed 1").with(0);
+    home.patiently("move arm --named home --speed 1").with(0);
     (home, run, planner)
 }
 
@@ -79,7 +79,7 @@ fn every_verb_goes_on_addressing_one_run() {
     assert!(preview["end_effectors"]["arm"].as_array().unwrap().len() > 2, "{preview}");
     home.dimos("execute").with(0).says(&["planned, collision-checked"]);
     is_at(&home, &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
-    home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
+    home.patiently("move arm --named home").with(0).says(&["planned, collision-checked"]);
     assert!(home.dimos("world list").with(0).out.contains("table"));
     home.dimos("world add cup --cylinder 0.03 0.1 --at 0.3 0.3 0.4").with(0);
     home.dimos("world attach cup arm").with(0);
@@ -122,9 +122,9 @@ fn every_verb_goes_on_addressing_one_run() {
         home.dimos(verb).with(1).says(&["NO_PLANNER", "the planner that was attached to this run has gone", "hint: "]);
     }
     assert_eq!(home.status()["planner"], Value::Null);
-    home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --direct --speed 1").with(0);
+    home.patiently("move arm 0 -0.3 0.6 0 0.8 0 --direct --speed 1").with(0);
     let planner = self::planner(&home, "--json");
-    home.dimos("move arm 0.2 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    home.patiently("move arm 0.2 -0.3 0.6 0 0.8 0 --speed 1").with(0);
     let ended = planner.end(Signal::INT).with(130);
     let events: Vec<Value> = ended.out.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!((&events[0]["event"], &events[0]["run"]), (&json!("attached"), &json!("cell")));
@@ -138,8 +138,8 @@ fn planning_is_cancelled_and_limits_are_the_runs() {
     let refused = home.dimos("plan arm 1.995 -0.3 0.6 0 0.8 0").with(1);
     let refused = refused.says(&["goal: arm_joint1 at 1.9950 rad is outside its limits -1.9900 … 1.9900", "hint: "]);
     assert!(!refused.err.contains("OUT_OF_LIMITS"), "{}", refused.err);
-    home.dimos("move arm 1.99 -0.3 0.6 0 0.8 0 --speed 1").with(0);
-    home.dimos("move arm 1.5 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    home.patiently("move arm 1.99 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    home.patiently("move arm 1.5 -0.3 0.6 0 0.8 0 --speed 1").with(0);
     WALLS.iter().for_each(|wall| drop(home.dimos(wall).with(0)));
     let planning = home.start("plan arm -1.5 -0.3 0.6 0 0.8 0 --timeout 60s");
     eventually("it plans", || home.status()["planner"]["state"] == "PLANNING");
@@ -166,7 +166,7 @@ fn a_run_that_goes_away_is_waited_for() {
     // The world is as it was; the plans of the run that is gone are gone with it.
     assert!(home.dimos("world list").with(0).out.contains("post"));
     home.dimos("execute").with(1).says(&["UNKNOWN_PLAN"]);
-    home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
+    home.patiently("move arm --named home").with(0).says(&["planned, collision-checked"]);
     // The same when the run has no time for a word, more than once.
     run.signal(Signal::KILL);
     drop(run.wait());
@@ -218,9 +218,9 @@ fn f23_a_planner_process_that_hangs_or_dies_holds_up_nobody() {
     home.dimos("world list").with(0);
     home.dimos("arm reset arm").with(0);
     home.dimos("arm enable arm").with(0);
-    home.dimos("move arm --named home --speed 1").with(0);
+    home.patiently("move arm --named home --speed 1").with(0);
     // And it dies in the middle of a request.
-    home.dimos("move arm 1.5 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    home.patiently("move arm 1.5 -0.3 0.6 0 0.8 0 --speed 1").with(0);
     WALLS.iter().for_each(|wall| drop(home.dimos(wall).with(0)));
     let planning = home.start("plan arm -1.5 -0.3 0.6 0 0.8 0 --timeout 60s");
     eventually("it plans", || home.status()["planner"]["state"] == "PLANNING");
@@ -230,7 +230,7 @@ fn f23_a_planner_process_that_hangs_or_dies_holds_up_nobody() {
     drop(planner.wait());
     let after = home.client().call(Status {}).unwrap();
     assert!(after.ticks.count > before && after.arms[0].phase == "ready");
-    home.dimos("move arm 1 -0.3 0.6 0 0.8 0 --direct --speed 1").with(0);
+    home.patiently("move arm 1 -0.3 0.6 0 0.8 0 --direct --speed 1").with(0);
     // Its name is free, and the run takes another.
     let _planner = self::planner(&home, "");
     home.dimos("plan arm --named home").with(0);

@@ -17,10 +17,10 @@ use dimos::planning::blend::curves;
 use dimos::planning::cartesian::{LineSettings, Shortfall, straight_line};
 use dimos::planning::path::{distance, tidy};
 use dimos::planning::planner::{PlanError, PlanSettings, plan};
+use dimos::planning::shortcut::{ShortcutSettings, shorten};
 use dimos::planning::timing::{TimingSettings, time};
 use dimos::planning::topp::{JointBound, parameterize};
 use dimos::robot::kinematics::Kinematics;
-use dimos::robot::packages::Packages;
 use dimos::robot::random::Random;
 use dimos::trajectory::{Cursor, Sample, Spline};
 use problems::{Arm, Problem, Shapes, load};
@@ -32,7 +32,7 @@ use shared::shared;
 fn panda() -> Option<(Arm, Vec<Problem>)> {
     let folder = shared("planning/panda")?;
     let srdf = folder.join("panda.srdf");
-    let arm = Arm::load(&folder.join("panda_spherized.urdf"), Some(&srdf), Packages::default()).unwrap();
+    let arm = Arm::load(&folder.join("panda_spherized.urdf"), Some(&srdf), std::collections::BTreeMap::new()).unwrap();
     let all = load(&folder.join("problems.jsonl"), None).unwrap();
     Some((arm, all.into_iter().skip(3).step_by(40).collect()))
 }
@@ -114,6 +114,14 @@ fn what_cannot_be_planned_is_said() {
     assert!(matches!(ask(start, &[0.0; 3], &Stop::never()), Err(PlanError::Shape("goal", 7))));
     let cancelled = Stop::new(None, Some(Arc::new(AtomicBool::new(true))));
     assert_eq!(ask(start, goal, &cancelled).unwrap_err(), PlanError::Cancelled);
+    let looked = checker.looks();
+    assert_eq!(plan(&mut checker, start, &[goal.to_vec()], &settings, &cancelled), Err(PlanError::Cancelled));
+    assert!(checker.looks() - looked <= 4, "{} looks after it was cancelled", checker.looks() - looked);
+    // Neither do shortening and timing go on.
+    let long: Vec<Vec<f64>> = (0..40).map(|k| start.iter().map(|x| x + 0.01 * f64::from(k % 7)).collect()).collect();
+    let looked = checker.looks();
+    shorten(&mut checker, &long, &ShortcutSettings::default(), 0, &cancelled);
+    assert_eq!(checker.looks(), looked);
 }
 
 #[test]
@@ -154,7 +162,7 @@ fn speeds_are_as_high_as_toppras() {
                 for k in usize::from(p > 0)..=steps {
                     let at = piece.length * k as f64 / steps as f64;
                     s.push(start + at);
-                    q.push((0..6).map(|j| piece.at(j, at).q).collect::<Vec<f64>>());
+                    q.push(piece.jets(at).map(|jet| jet.q).collect::<Vec<f64>>());
                 }
                 start += piece.length;
             }

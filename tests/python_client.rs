@@ -16,6 +16,10 @@ tasks:
   - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
   - {name: servo_arm, type: servo, joint_names: {hardware: arm}, priority: 20}
   - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 30}
+  - {name: twist_arm, type: eef_twist, joint_names: {hardware: arm}, priority: 40, params:
+      {model_path: 'builtin:yourarm', end_effector_link: flange, joint_prefix: arm_}}
+  - {name: pose_arm, type: cartesian_ik, joint_names: {hardware: arm}, priority: 50, params:
+      {model_path: 'builtin:yourarm', end_effector_link: flange, joint_prefix: arm_}}
 ";
 
 /// `python3 ARGUMENTS`, with the client to import; `None` where there is no Python.

@@ -33,33 +33,71 @@ fn in_tree(name: &str) -> String {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name).display().to_string()
 }
 
+/// Skips a test whose tools are missing; an error where nothing may be skipped.
+fn skip(what: &str) {
+    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{what}");
+    println!("SKIPPED: {what}");
+}
+
 /// Whether there is a Python; without one a test ends.
 fn has_python() -> bool {
     let found = Command::new("python3").arg("--version").stdout(Stdio::null()).status().is_ok();
     if !found {
-        assert!(std::env::var_os("DIMOS_NO_SKIP").is_none_or(|v| v != "1"), "python3 is missing");
-        println!("SKIPPED: python3 (make test-tools)");
+        skip("python3 (make test-tools)");
     }
     found
 }
 
-/// The shim around the simulated arm of `tests/python`, which stands at `at`.
-fn shim(home: &Home, at: &str, arguments: &[&str], environment: &[(&str, &str)]) -> Started {
-    let mut command = Command::new("python3");
-    command.args([&in_tree("assets/python/dimos_shim.py"), "sim_arm:SimArmAdapter", "--address", "sim", "--at", at]);
+/// The shim around a class of `tests/python`, which stands at `at`.
+fn shim_of(python: &str, class: &str, home: &Home, at: &str, arguments: &[&str]) -> Command {
+    let mut command = Command::new(python);
+    command.args([&in_tree("assets/python/dimos_shim.py"), class, "--at", at]);
     home.settle(command.args(arguments).stdin(Stdio::null()));
     command.current_dir(in_tree("tests/python")).env("PYTHONPYCACHEPREFIX", home.path());
-    command.envs(environment.iter().copied());
-    Started::of(&mut command)
+    command
 }
 
-/// A shim that serves, its address, and the blueprint `remote.yaml` of an arm behind it.
-fn served(home: &Home, environment: &[(&str, &str)]) -> (Started, String) {
-    let address = format!("unix:{}/arm.sock", home.path().display());
-    let shim = shim(home, &address, &["--dof", "6"], environment);
+/// The shim around the simulated arm.
+fn shim(home: &Home, at: &str, arguments: &[&str], environment: &[(&str, &str)]) -> Started {
+    let mut command = shim_of("python3", "sim_arm:SimArmAdapter", home, at, &["--address", "sim"]);
+    Started::of(command.args(arguments).envs(environment.iter().copied()))
+}
+
+/// Where a shim stands in a test.
+fn socket(home: &Home) -> String {
+    format!("unix:{}/arm.sock", home.path().display())
+}
+
+/// Waits until a shim serves, and writes the blueprint `remote.yaml` of an arm behind it.
+fn serving(home: &Home, shim: Started) -> Started {
     shim.until("Ctrl-C ends it");
-    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", &address));
-    (shim, address)
+    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", &socket(home)));
+    shim
+}
+
+/// A shim that serves the simulated arm.
+fn served(home: &Home, environment: &[(&str, &str)]) -> Started {
+    serving(home, shim(home, &socket(home), &["--dof", "6"], environment))
+}
+
+/// An arm behind a shim, a run of it, and the arm on its way far away; `None` without Python.
+fn on_its_way() -> Option<(Home, Started, Started)> {
+    if !has_python() {
+        return None;
+    }
+    let home = Home::new();
+    let shim = served(&home, &[]);
+    let run = home.run("remote.yaml");
+    home.dimos("move arm 2.5 0 0 0 0 0 --speed 0.3 --no-wait").with(0);
+    eventually("it moves", || home.positions("arm")[0] > 0.1);
+    Some((home, shim, run))
+}
+
+/// Makes a held arm ready, and moves it.
+fn moves_again(home: &Home, to: &str) {
+    home.dimos("arm reset arm").with(0);
+    home.dimos("arm enable arm").with(0);
+    home.dimos(&format!("move arm {to}")).with(0);
 }
 
 // --- The conformance suite ---
@@ -94,7 +132,7 @@ fn python_row() -> AdapterSpec {
     AdapterSpec {
         emulate: Some(|config, _| {
             let home = Home::new();
-            let address = format!("unix:{}/arm.sock", home.path().display());
+            let address = socket(&home);
             let shim = shim(&home, &address, &["--dof", &config.dof.to_string()], &[]);
             shim.until("Ctrl-C ends it");
             Ok(Box::new(PythonArm { shim, address, _home: home }))
@@ -138,7 +176,7 @@ fn a_run_moves_reads_and_stops_an_arm_behind_the_shim() {
         return;
     }
     let home = Home::new();
-    let (shim, _) = served(&home, &[]);
+    let shim = served(&home, &[]);
     let mode = std::fs::metadata(home.path().join("arm.sock")).unwrap().permissions().mode();
     assert_eq!(mode & 0o777, 0o600, "for its user only");
     let run = home.run("remote.yaml");
@@ -158,45 +196,25 @@ fn a_run_moves_reads_and_stops_an_arm_behind_the_shim() {
     shim.end(Signal::INT).with(0);
 }
 
-/// Moves far and slowly, and waits until the arm is on its way.
-fn on_its_way(home: &Home) {
-    home.dimos("move arm 2.5 0 0 0 0 0 --speed 0.3 --no-wait").with(0);
-    eventually("it moves", || home.positions("arm")[0] > 0.1);
-}
-
 #[test]
 fn a_shim_that_is_killed_in_motion_is_told_and_the_arm_latched() {
-    if !has_python() {
-        return;
-    }
-    let home = Home::new();
-    let (shim, address) = served(&home, &[]);
-    let run = home.run("remote.yaml");
-    on_its_way(&home);
+    let Some((home, shim, run)) = on_its_way() else { return };
     drop(shim.end(Signal::KILL));
     run.until("closed the connection");
     eventually("it is latched", || home.status()["arms"][0]["phase"] != "ready");
     home.dimos("move arm 0 0 0 0 0 0").with(1);
     // A new shim takes the dead one's place, and the run finds it by itself; but nothing moves without `enable`.
-    let (again, _) = served(&home, &[]);
+    let again = served(&home, &[]);
     eventually("the link is up again", || home.status()["arms"][0]["link"] == "up");
-    assert!(home.positions("arm")[0].abs() < 0.01, "{address}: a new simulated arm, at rest");
-    home.dimos("arm reset arm").with(0);
-    home.dimos("arm enable arm").with(0);
-    home.dimos("move arm 0.1 0 0 0 0 0").with(0);
+    assert!(home.positions("arm")[0].abs() < 0.01, "a new simulated arm, at rest");
+    moves_again(&home, "0.1 0 0 0 0 0");
     run.end(Signal::INT).with(130);
     drop(again);
 }
 
 #[test]
 fn a_shim_that_hangs_is_told_and_stops_the_arm_when_it_wakes() {
-    if !has_python() {
-        return;
-    }
-    let home = Home::new();
-    let (shim, _) = served(&home, &[]);
-    let run = home.run("remote.yaml");
-    on_its_way(&home);
+    let Some((home, shim, run)) = on_its_way() else { return };
     shim.signal(Signal::STOP);
     run.until("did not answer within");
     run.until("has stopped answering");
@@ -211,13 +229,7 @@ fn a_shim_that_hangs_is_told_and_stops_the_arm_when_it_wakes() {
 
 #[test]
 fn an_arm_whose_run_is_killed_is_stopped_by_the_shim() {
-    if !has_python() {
-        return;
-    }
-    let home = Home::new();
-    let (shim, _) = served(&home, &[]);
-    let run = home.run("remote.yaml");
-    on_its_way(&home);
+    let Some((home, shim, run)) = on_its_way() else { return };
     drop(run.end(Signal::KILL));
     shim.until("the client's connection ended");
     assert!(!shim.out().contains("the stop failed"), "{}", shim.out());
@@ -230,20 +242,12 @@ fn an_arm_whose_run_is_killed_is_stopped_by_the_shim() {
 
 #[test]
 fn a_frozen_run_is_noticed_by_the_shim() {
-    if !has_python() {
-        return;
-    }
-    let home = Home::new();
-    let (shim, _) = served(&home, &[]);
-    let run = home.run("remote.yaml");
-    on_its_way(&home);
+    let Some((home, shim, run)) = on_its_way() else { return };
     run.signal(Signal::STOP);
     shim.until("no request came for 0.5 s: stopping the arm");
     run.signal(Signal::CONT);
     eventually("its commands are refused", || home.status()["arms"][0]["phase"] != "ready");
-    home.dimos("arm reset arm").with(0);
-    home.dimos("arm enable arm").with(0);
-    home.dimos("move arm 0 0 0 0 0 0").with(0);
+    moves_again(&home, "0 0 0 0 0 0");
     run.end(Signal::INT).with(130);
 }
 
@@ -253,23 +257,15 @@ fn a_slow_sdk_keeps_its_own_pace() {
         return;
     }
     let home = Home::new();
-    let address = format!("unix:{}/arm.sock", home.path().display());
     // 30 ms a call: a command and two reads fill a period of 100 ms, and all reads in each cycle would not.
-    let shim = shim(&home, &address, &["--dof", "6", "--hz", "10"], &[("ROUND_TRIP", "0.03")]);
-    shim.until("Ctrl-C ends it");
-    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", &address));
+    let slow = shim(&home, &socket(&home), &["--dof", "6", "--hz", "10"], &[("ROUND_TRIP", "0.03")]);
+    let _shim = serving(&home, slow);
     let run = home.run("remote.yaml");
     home.dimos("move arm 0.3 0 0 0 0 0 --speed 0.2").with(0);
     assert!((home.positions("arm")[0] - 0.3).abs() < 0.02);
     let rate = home.status()["arms"][0]["measured_rate_hz"].as_f64().unwrap();
     assert!((1.0..25.0).contains(&rate), "{rate}");
     run.end(Signal::INT).with(130);
-}
-
-/// Skips a test whose tools are missing; an error where nothing may be skipped.
-fn skip(what: &str) {
-    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{what}");
-    println!("SKIPPED: {what}");
 }
 
 #[test]
@@ -288,14 +284,9 @@ fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
     };
     let start = emulator.joints().0;
     let home = Home::new();
-    let address = format!("unix:{}/arm.sock", home.path().display());
-    let mut command = Command::new(python);
-    command.args([&in_tree("assets/python/dimos_shim.py"), "xarm_guide:XArmAdapter", "--address", &ip.to_string()]);
-    home.settle(command.args(["--dof", "6", "--hz", "20", "--at", &address]).stdin(Stdio::null()));
-    command.current_dir(in_tree("tests/python")).env("PYTHONPYCACHEPREFIX", home.path());
-    let shim = Started::of(&mut command);
-    shim.until("Ctrl-C ends it");
-    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", &address));
+    let arguments = ["--address", &ip.to_string(), "--dof", "6", "--hz", "20"];
+    let mut command = shim_of(&python, "xarm_guide:XArmAdapter", &home, &socket(&home), &arguments);
+    let shim = serving(&home, Started::of(&mut command));
     let run = home.run("remote.yaml");
     assert_eq!(home.positions("arm").len(), 6);
     for (now, then) in emulator.joints().0.iter().zip(start) {
@@ -325,11 +316,12 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
         return;
     }
     for (trouble, parts) in [
-        ("nan", &["read_joint_positions() answers nan for joint "][..]),
+        ("nan", &["error: arm: ", "read_joint_positions() answers nan for joint 3"][..]),
+        ("short", &["error: arm: ", "read_joint_positions() answers 5 values for 6 joints"]),
         ("read_enabled", &["cannot be enabled: enabled, but the motors do not come on"]),
     ] {
         let home = Home::new();
-        let (_shim, _) = served(&home, &[("TROUBLE", trouble)]);
+        let _shim = served(&home, &[("TROUBLE", trouble)]);
         let ended = home.dimos("run remote.yaml").with(3).says(parts);
         assert_eq!(ended.err.lines().filter(|l| l.starts_with("error: ")).count(), 1, "{}", ended.err);
     }
@@ -346,15 +338,8 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     let at = format!("unix:{}/notes", home.path().display());
     fails(&at, &[], "Address already in use");
     assert_eq!(std::fs::read_to_string(home.path().join("notes")).unwrap(), "kept");
-    let at = format!("unix:{}/arm.sock", home.path().display());
-    fails(&at, &[("TROUBLE", "connect")], "connect() said no");
-    let shim = in_tree("assets/python/dimos_shim.py");
-    for (adapter, part) in [("no_such:Arm", "No module named 'no_such'"), ("json:NoArm", "has no attribute 'NoArm'")] {
-        let mut command = Command::new("python3");
-        home.settle(command.args([&shim, adapter, "--at", &at]));
-        let ended = Started::of(&mut command).wait().with(1);
-        assert!(ended.err.contains(part) && ended.err.lines().count() == 1, "{}", ended.err);
-    }
+    fails(&socket(&home), &[("TROUBLE", "connect")], "connect() said no");
+    fails(&socket(&home), &[("TROUBLE", "infinite")], "read_joint_velocities() answers -inf for joint 2");
 }
 
 /// A client that speaks the protocol by itself.
@@ -399,7 +384,7 @@ fn who_knocks_at_the_shim_or_talks_nonsense_to_it_leaves_no_arm_in_motion() {
         return;
     }
     let home = Home::new();
-    let (shim, _) = served(&home, &[]);
+    let shim = served(&home, &[]);
     let mut client = Client::connect(&home);
     let held = client.ask(r#""write_joint_velocities","args":[[1,0,0,0,0,0]]"#);
     assert!(held.contains("write_joint_velocities is not for clients"), "{held}");
@@ -435,12 +420,30 @@ fn who_knocks_at_the_shim_or_talks_nonsense_to_it_leaves_no_arm_in_motion() {
 }
 
 #[test]
+fn what_cannot_be_imported_is_told_in_a_line_with_what_to_do() {
+    if !has_python() {
+        return;
+    }
+    for (class, what) in [
+        ("nosuch:Arm", "No module named 'nosuch'\n"),
+        ("sim_arm:NoArm", "module 'sim_arm' has no attribute 'NoArm'\n"),
+        ("sim_arm", "module 'sim_arm' has no attribute ''\n"),
+    ] {
+        let home = Home::new();
+        let ended = Started::of(&mut shim_of("python3", class, &home, &socket(&home), &[])).wait().with(1);
+        let what = format!("error: {class} --at {}: {what}", socket(&home));
+        let hint = ended.err.strip_prefix(&what).unwrap_or_else(|| panic!("{}", ended.err));
+        assert!(hint.starts_with("hint: give MODULE:CLASS") && hint.lines().count() == 1, "{}", ended.err);
+    }
+}
+
+#[test]
 fn one_client_at_a_time() {
     if !has_python() {
         return;
     }
     let home = Home::new();
-    let (_shim, _) = served(&home, &[]);
+    let _shim = served(&home, &[]);
     let first = UnixStream::connect(home.path().join("arm.sock")).unwrap();
     home.dimos("run remote.yaml").with(3).says(&["error: arm: ", "it serves another client already"]);
     drop(first);

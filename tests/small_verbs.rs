@@ -123,6 +123,8 @@ fn targets_are_streamed_from_stdin_and_a_stream_that_ends_leaves_the_arm_at_rest
     });
     drop(input);
     assert!(stream.wait().with(0).out.starts_with("velocity_arm: "));
+    let task = home.dimos("task invoke velocity_arm state --json").with(0).json();
+    assert_eq!((&task["state"], &task["reason"]), (&"IDLE".into(), &"its stream was ended".into()), "no fault: {task}");
     eventually("the arm is at rest", || velocity().abs() < 1e-6);
     home.dimos("move arm 0 0").with(0);
 

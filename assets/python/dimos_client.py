@@ -64,8 +64,7 @@ class JointState:
 
     def only(self, names: Sequence[str]) -> JointState:
         """The same for these joints, in this order."""
-        at = [self.name.index(name) for name in names]
-        values = ([list_[i] for i in at] for list_ in (self.position, self.velocity, self.effort))
+        values = ([v[self.name.index(n)] for n in names] for v in (self.position, self.velocity, self.effort))
         return JointState(self.tick, self.stamp, list(names), *values, self.lost)
 
 
@@ -108,7 +107,7 @@ class Client:
     """A connection to a run."""
     def __init__(self, path: Union[str, Path], timeout: float = 15.0) -> None:
         """Connects to a socket. `timeout` [s] bounds every wait for the run."""
-        self.timeout, self._next_id = timeout, 0
+        self.timeout, self._next_id, self._unread, self._replies = timeout, 0, b"", {}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.settimeout(timeout)
         try:
@@ -116,8 +115,6 @@ class Client:
         except OSError as error:
             self._socket.close()
             raise ConnectionLost("NO_CONNECTION", f"{path}: {error}", "see `dimos status`") from None
-        self._unread = b""
-        self._replies: Dict[int, Dict[str, Any]] = {}
         self._targets: Deque[int] = deque()  # ids of targets that are not answered yet
         self._queues: Dict[int, Deque[Dict[str, Any]]] = {}
 
@@ -148,12 +145,11 @@ class Client:
     def _send(self, method: str, params: Dict[str, Any]) -> int:
         self._next_id += 1
         params = {key: value for key, value in params.items() if value is not None}
-        request = {"id": self._next_id, "method": method, "params": params}
         try:
-            line = json.dumps(request, allow_nan=False).encode() + b"\n"
+            told = json.dumps({"id": self._next_id, "method": method, "params": params}, allow_nan=False)
         except ValueError as error:
             raise Refused("INVALID_PARAMS", f"{method}: {error}", "all numbers must be finite") from None
-        if len(line) > MAX_LINE:
+        if len(line := told.encode() + b"\n") > MAX_LINE:
             raise Refused("TOO_LARGE", f"the request has {len(line)} bytes, and may have {MAX_LINE}")
         try:
             self._socket.settimeout(self.timeout)
@@ -170,8 +166,7 @@ class Client:
         reply = self._replies.pop(number)
         if "error" in reply:
             error = reply["error"]
-            kind = _REFUSALS.get(error["code"], Refused)
-            raise kind(error["code"], error["message"], error.get("hint"), error.get("data"))
+            raise _REFUSALS.get(error["code"], Refused)(*map(error.get, ("code", "message", "hint", "data")))
         return reply["result"]
 
     def _read(self, deadline: float) -> bool:
@@ -228,8 +223,7 @@ class Client:
     def state(self, arm: str) -> ArmState:
         """The latest state of an arm."""
         reply = self.call("state")
-        found = next((a for a in reply["arms"] if a["hardware_id"] == arm), None)
-        if found is None:
+        if (found := next((a for a in reply["arms"] if a["hardware_id"] == arm), None)) is None:
             raise Refused("UNKNOWN_ARM", f"no arm named {arm}", "`dimos status` lists the arms")
         values = [[j[key] for j in found["joints"]] for key in ("name", "position", "velocity", "effort")]
         pose, age = found["pose"] or {}, found["age_ms"]
@@ -271,27 +265,20 @@ class Client:
         return report
 
     def servo(self, task: str, positions: Sequence[float]) -> None:
-        """Sends a servo task its next target [rad]; repeat it within the task's timeout. Does not wait: a refusal is
-        raised by one of the next calls, or by `settle`."""
+        """Sends a servo task its next target [rad]. Does not wait: a later call, or `settle`, raises a refusal."""
         self._target("servo", {"task": task, "positions": list(positions)})
 
     def velocity(self, task: str, velocities: Sequence[float]) -> None:
         """Sends a velocity task its next target [rad/s]; as `servo`."""
         self._target("velocity", {"task": task, "velocities": list(velocities)})
 
-    def twist(self, task: str, linear: Sequence[float], angular: Sequence[float] = (0, 0, 0), frame: str = "base") -> None:
-        """Sends an eef_twist task the next velocity of its end effector [m/s, rad/s], in the axes of the robot's "base"
-        or of the "tool" itself; as `servo`."""
+    def twist(self, task: str, linear: Sequence[float], angular: Sequence[float], frame: str = "base") -> None:
+        """Sends an eef_twist task its next velocity [m/s, rad/s], along the axes of "base" or "tool"; as `servo`."""
         self._target("twist", {"task": task, "linear": list(linear), "angular": list(angular), "frame": frame})
 
-    def pose(
-        self, task: str, xyz: Sequence[float],
-        rpy: Optional[Sequence[float]] = None, quat: Optional[Sequence[float]] = None,
-    ) -> None:
-        """Sends a cartesian_ik task the next pose of its end effector: [m], and roll, pitch, yaw [rad] or a quaternion
-        x, y, z, w; as `servo`."""
-        turn = {"rpy": rpy and list(rpy), "quat": quat and list(quat)}
-        self._target("pose", {"task": task, "xyz": list(xyz), **turn})
+    def pose(self, task: str, xyz: Sequence[float], **turn: Sequence[float]) -> None:
+        """Sends a cartesian_ik task its next pose [m], with `rpy=` [rad] or `quat=` (x, y, z, w); as `servo`."""
+        self._target("pose", {"task": task, "xyz": list(xyz), **{key: list(turn[key]) for key in turn}})
 
     def _target(self, method: str, params: Dict[str, Any]) -> None:
         self._read(0.0)
@@ -319,8 +306,7 @@ class Client:
                 while (now := time.monotonic()) < beat:
                     self._read(beat)  # what comes meanwhile is taken in
                 worst = max(worst, now - beat)
-                target = policy(_joint_state(queue[-1]).only(names), beat - start)
-                if target is None:
+                if (target := policy(_joint_state(queue[-1]).only(names), beat - start)) is None:
                     break
                 self.servo(task, target)
                 sent += 1

@@ -9,7 +9,7 @@ READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_g
 ACTS = ["activate", "deactivate", "write_enable", "set_control_mode", "write_stop", "write_clear_errors"]
 MOTIONS = ["write_gripper_position", "write_cartesian_position"]
 INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these
-DISABLED = "it was stopped by itself or is not enabled: enable it first"
+DISABLED, MISSING = "it was stopped by itself or is not enabled: enable it first", (ModuleNotFoundError, AttributeError)
 
 def control_modes():  # of dimos; where that is not installed, an object stands in for what adapters import from it
     name, bag = "dimos.hardware.manipulators", argparse.Namespace
@@ -32,8 +32,13 @@ class Arm:  # the adapter, called from one thread only
     def lost(self):
         return hasattr(self.adapter, "is_connected") and not self.adapter.is_connected()
     def read(self, *names):  # feedback of nothing but zeros since the start is the guide's word for "not measured"
-        self.state.update((name, getattr(self.adapter, name)()) for name in names if hasattr(self.adapter, name))
-        self.measured.update(name for name in FEEDBACK if any(self.state.get(name) or []))
+        for name, answer in [(name, getattr(self.adapter, name)()) for name in names if hasattr(self.adapter, name)]:
+            if name.startswith("read_joint_") and answer is not None:
+                odd = [f"{value} for joint {i}" for i, value in enumerate(answer, 1) if not math.isfinite(value)]
+                if len(answer) != self.dof: odd = [f"{len(answer)} values for {self.dof} joints"]
+                if odd: raise ValueError(f"{name}() answers {odd[0]}")
+                if any(answer): self.measured.add(name)
+            self.state[name] = answer
     def call(self, name, *args):
         name, args = (name, args) if hasattr(self.adapter, name) else INSTEAD.get(name, (name, args))
         answer = getattr(self.adapter, name)(*args)
@@ -52,24 +57,21 @@ class Arm:  # the adapter, called from one thread only
         self.commanded |= do == "write_cartesian_position"
         self.call(do, *([self.modes[args[0].upper()]] if do == "set_control_mode" else args))
         if do in ("activate", "write_enable"): self.held = not (do == "activate" or args[0])
-        self.commanded &= do not in ("write_stop", "deactivate") and not self.held
-        self.due = 0.0
+        self.commanded, self.due = self.commanded and do not in ("write_stop", "deactivate") and not self.held, 0.0
         self.read("read_error", "read_enabled", "get_control_mode")
     def stop(self, why):
-        self.held = True
+        self.held, how = True, ""
         try:
             self.call("write_stop")
-            self.commanded, how = False, ""
-        except Exception as e:
-            how = f", which failed and will be tried again: {e!r}"
+            self.commanded = False
+        except Exception as e: how = f", which failed and will be tried again: {e!r}"
         print(f"{why}: stopping the arm{how}", flush=True)
     def cycle(self, command=None):  # one command, one reading; its time is when the SDK had read the positions
         refused = DISABLED if command and self.held else None
         if command and not refused:
-            velocity, self.commanded = command["mode"] == "velocity", True
-            args = [command["values"]] if velocity else [command["values"], command["velocity"]]
+            planned, self.commanded = [command["velocity"]] if command["mode"] != "velocity" else [], True
             try:
-                self.call("write_joint_velocities" if velocity else "write_joint_positions", *args)
+                self.call("write_joint_positions" if planned else "write_joint_velocities", command["values"], *planned)
             except Exception as e:
                 refused = str(e) or repr(e)
         time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # who asks again waits for something new
@@ -78,9 +80,6 @@ class Arm:  # the adapter, called from one thread only
             self.state["time"], self.due = time.monotonic_ns(), time.monotonic() + 0.5 / self.hz
             self.read(*READS if self.quick else [next(self.turns)])
         unknown = [name for name in FEEDBACK if not self.quick or name not in self.measured]
-        for name in "read_joint_positions", *FEEDBACK:
-            for joint, value in enumerate(self.state.get(name) or [], 1):
-                if not math.isfinite(value): raise RuntimeError(f"{name}() answers {value} for joint {joint}")
         return {"state": {**self.state, "held": self.held, **dict.fromkeys(unknown)}, "refused": refused}
     def reply(self, line):
         request = json.loads(line)
@@ -119,8 +118,7 @@ def serve(arm, listener):
 def listen(at):
     if not at.startswith("unix:"):
         host, _, port = at.replace("tcp:", "", 1).rpartition(":")
-        if not host.startswith("127.") or not port.isdigit():
-            raise OSError("it is no unix:/PATH, and not a loopback address, tcp:127.0.0.1:PORT")
+        if not host.startswith("127.") or not port.isdigit(): raise OSError("not a loopback address or unix:/PATH")
         return socket.create_server((host, int(port)))
     refused = socket.socket(socket.AF_UNIX).connect_ex(at[5:]) == errno.ECONNREFUSED  # by a shim that is gone
     if refused and pathlib.Path(at[5:]).is_socket(): os.unlink(at[5:])
@@ -141,7 +139,9 @@ if __name__ == "__main__":
     try:
         (module, _, name), modes, listener = adapter.partition(":"), control_modes(), listen(at)
         arm = Arm(getattr(importlib.import_module(module), name)(**given), modes, given.get("dof"), hz)
-    except Exception as e: sys.exit(f"error: {adapter} --at {at}: {str(e) or repr(e)}")
+    except Exception as e:
+        hint = "\nhint: give MODULE:CLASS, a class in a file here or on PYTHONPATH" if type(e) in MISSING else ""
+        sys.exit(f"error: {adapter} --at {at}: {str(e) or repr(e)}{hint}")
     print(f"serving {adapter} at {at}; Ctrl-C ends it", flush=True)
     try:
         serve(arm, listener)

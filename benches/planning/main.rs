@@ -10,6 +10,8 @@ mod problems;
 #[path = "../support/machine.rs"]
 #[allow(dead_code, reason = "shared with other benchmarks")]
 mod machine;
+#[path = "../../tests/support/python.rs"]
+mod python;
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -95,6 +97,12 @@ struct Row {
     timing_us: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<String>,
+    /// Whether start and goal are inside the limits and free for this robot: if not, there is nothing to solve.
+    #[serde(skip)]
+    solvable: bool,
+    /// How long after its time was up the planner gave up.
+    #[serde(skip)]
+    late_us: Option<f64>,
 }
 
 fn main() -> ExitCode {
@@ -145,7 +153,9 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let stop = Stop::new(Some(began + Duration::from_secs_f64(arguments.timeout)), None);
     let found = plan(&mut checker, start, &[goal.to_vec()], &settings, &stop);
     let (total, cpu) = (began.elapsed(), cpu_time().saturating_sub(cpu));
+    let timeout = matches!(found, Err(PlanError::Timeout(_)));
     let mut row = row(problem, found, total, cpu);
+    row.late_us = timeout.then(|| (total.as_secs_f64() - arguments.timeout) * 1e6);
     if let Some(path) = &row.path {
         let bounds = bounds(kinematics.names(), kinematics.limits())?;
         let free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &Stop::never());
@@ -178,9 +188,12 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
             timing_us: None,
             path: Some(plan.path),
             why: None,
+            solvable: true,
+            late_us: None,
         },
         Err(error) => {
             eprintln!("{family} {index}: {error}");
+            let solvable = !matches!(error, PlanError::Outside { .. } | PlanError::Collides { .. });
             let why = Some(error.to_string());
             let none = None;
             Row {
@@ -197,6 +210,8 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
                 looks: None,
                 timing_us: None,
                 why,
+                solvable,
+                late_us: None,
             }
         }
     }
@@ -210,12 +225,13 @@ fn report(rows: &[Row], level: &Level) {
         "family", "solved", "plan", "simplify", "total", "p95", "max", "cost", "duration"
     );
     println!(
-        "{:<20} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}",
+        "{:<20} {:>11} {:>9} {:>9} {:>9} {:>9} {:>9} {:>9} {:>8} {:>8}",
         format!("{level:?}").to_lowercase(),
-        "",
+        "of solvable",
         "med ms",
         "med ms",
         "med ms",
+        "ms",
         "ms",
         "ms",
         "med rad",
@@ -225,13 +241,15 @@ fn report(rows: &[Row], level: &Level) {
         let own: Vec<&Row> = rows.iter().filter(|r| family == "all" || r.problem == family).collect();
         let of = |f: fn(&Row) -> Option<f64>, q: f64| quantile(own.iter().filter_map(|r| f(r)).collect(), q);
         let solved = own.iter().filter(|r| r.solved).count();
+        let solvable = own.iter().filter(|r| r.solvable).count();
         println!(
-            "{family:<20} {:>9} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>8.2} {:>8.2}",
-            format!("{solved}/{}", own.len()),
+            "{family:<20} {:>11} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>9.3} {:>8.2} {:>8.2}",
+            format!("{solved}/{solvable}/{}", own.len()),
             of(|r| r.plan_us, 0.5) / 1e3,
             of(|r| r.simplify_us, 0.5) / 1e3,
             of(|r| r.total_us, 0.5) / 1e3,
             of(|r| r.total_us, 0.95) / 1e3,
+            of(|r| r.total_us, 0.99) / 1e3,
             of(|r| r.total_us, 1.0) / 1e3,
             of(|r| r.cost, 0.5),
             of(|r| r.duration_s, 0.5),
@@ -239,6 +257,12 @@ fn report(rows: &[Row], level: &Level) {
     }
     let cpu = |q| quantile(rows.iter().filter_map(|r| r.cpu_us).collect(), q) / 1e3;
     let timing: Vec<f64> = rows.iter().filter_map(|r| r.timing_us).map(|us| us / 1e3).collect();
+    let late: Vec<f64> = rows.iter().filter_map(|r| r.late_us).collect();
+    if !late.is_empty() {
+        let worst = quantile(late.clone(), 1.0) / 1e3;
+        println!("{} ran out of time, and ended at most {worst:.2} ms after that", late.len());
+    }
+    println!("solved / solvable / all: solvable where start and goal are inside the limits and touch nothing");
     println!(
         "\ntiming, re-checks included: median {:.3} ms, p95 {:.3} ms",
         quantile(timing.clone(), 0.5),
@@ -247,9 +271,10 @@ fn report(rows: &[Row], level: &Level) {
     let mut looks: Vec<f64> = rows.iter().filter_map(|r| r.looks).map(|n| n as f64).collect();
     looks.sort_by(f64::total_cmp);
     println!(
-        "\nprocessor time: median {:.3} ms, p95 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
+        "\nprocessor time: median {:.3} ms, p95 {:.3} ms, p99 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
         cpu(0.5),
         cpu(0.95),
+        cpu(0.99),
         cpu(1.0),
         quantile(looks.clone(), 0.5),
         looks.iter().sum::<f64>() / looks.len().max(1) as f64

@@ -11,7 +11,8 @@ use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::RobotModel;
 use dimos::robot::random::Random;
 
-use crate::quantile;
+use crate::python::ask_python;
+use crate::{cpu_time, quantile};
 
 /// Solves `count` poses of link `tip`, each made from a random configuration, from another random one.
 pub fn ik(model: &RobotModel, tip: &str, count: u64, seed: u64) -> Result<(), Box<dyn Error>> {
@@ -45,25 +46,50 @@ pub fn ik(model: &RobotModel, tip: &str, count: u64, seed: u64) -> Result<(), Bo
     Ok(())
 }
 
-/// Times random paths of 100 waypoints and 7 joints.
+/// Times random paths of 100 waypoints and 7 joints; toppra times the same, where it is installed.
 pub fn timing(repeats: u64, seed: u64) -> Result<(), Box<dyn Error>> {
+    const VELOCITY: f64 = 2.0;
+    const ACCELERATION: f64 = 5.0;
     let names: Vec<String> = (0..7).map(|j| format!("joint{j}")).collect();
-    for (what, jerk) in [("without jerk limits", f64::INFINITY), ("with jerk limits", 50.0)] {
-        let bounds = [JointBound { velocity: 2.0, acceleration: 5.0, jerk }; 7];
-        let mut random = Random::new(seed);
-        let (mut times, mut durations) = (Vec::new(), Vec::new());
-        for _ in 0..repeats {
-            let path: Vec<Vec<f64>> = (0..100).map(|_| (0..7).map(|_| random.between(-1.5, 1.5)).collect()).collect();
-            let began = Instant::now();
-            let timed = time(&names, &path, &bounds, &TimingSettings::default(), |_, _| true)?;
+    let mut random = Random::new(seed);
+    let mut point = || (0..7).map(|_| random.between(-1.5, 1.5)).collect::<Vec<f64>>();
+    let paths: Vec<Vec<Vec<f64>>> = (0..repeats).map(|_| (0..100).map(|_| point()).collect()).collect();
+    let cases = [
+        ("no jerk limits", f64::INFINITY, 0.05, ", goal ≤ 1 ms"),
+        ("jerk ≤ 50 rad/s³", 50.0, 0.05, ""),
+        ("no jerk limits, corners within 1 mrad", f64::INFINITY, 1e-3, ""),
+        ("jerk ≤ 50 rad/s³, corners within 1 mrad", 50.0, 1e-3, ""),
+    ];
+    for (what, jerk, deviation, goal) in cases {
+        let bounds = [JointBound { velocity: VELOCITY, acceleration: ACCELERATION, jerk }; 7];
+        let settings = TimingSettings { deviation, speed: 1.0 };
+        let (mut times, mut cpu, mut durations) = (Vec::new(), Vec::new(), Vec::new());
+        for path in &paths {
+            let (began, cpu_began) = (Instant::now(), cpu_time());
+            let timed = time(&names, path, &bounds, &settings, |_, _| true)?;
             times.push(began.elapsed().as_secs_f64() * 1e3);
+            cpu.push((cpu_time() - cpu_began).as_secs_f64() * 1e3);
             durations.push(timed.duration);
         }
         println!(
-            "timing    100 waypoints, 7 joints, {what}: median {:.2} ms, p95 {:.2} ms; duration {:.1} s (goal: ≤ 1 ms)",
+            "timing    100 waypoints, 7 joints, {what}: median {:.2} ms (of the processor {:.2} ms{goal}), p95 {:.2} ms; motion {:.1} s",
             quantile(times.clone(), 0.5),
+            quantile(cpu, 0.5),
             quantile(times, 0.95),
             quantile(durations, 0.5),
+        );
+    }
+    let few = &paths[..paths.len().min(20)];
+    let question = serde_json::json!({ "paths": few, "velocity": VELOCITY, "acceleration": ACCELERATION });
+    if let Some(answer) = ask_python("timing_speed.py", "toppra", &question) {
+        let of = |key: &str| -> Vec<f64> {
+            answer[key].as_array().into_iter().flatten().filter_map(serde_json::Value::as_f64).collect()
+        };
+        println!(
+            "peer      toppra {} (Python), the same waypoints as a spline, a grid point each, no jerk limits: median {:.1} ms; motion {:.1} s",
+            answer["version"].as_str().unwrap_or_default(),
+            quantile(of("times"), 0.5) * 1e3,
+            quantile(of("durations"), 0.5),
         );
     }
     Ok(())

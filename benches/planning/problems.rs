@@ -3,18 +3,15 @@
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use dimos::collision::body::{MeshMode, solids};
 use dimos::collision::world::{Obstacle, Robot};
 use dimos::collision::{Scene, Solid, World};
+use dimos::robot::Source;
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::model::{JointKind, RobotModel};
-use dimos::robot::packages::Packages;
-use dimos::robot::urdf::{Meshes, read};
-use dimos::robot::xml::{Calls, parse};
-use dimos::yaml::{Tree, render};
 use glamx::{DAffine3, DQuat, DVec3};
 use serde::Deserialize;
 
@@ -69,21 +66,17 @@ pub struct Arm {
 
 impl Arm {
     /// Reads a URDF, and the pairs that may touch from an SRDF.
-    pub fn load(urdf: &Path, srdf: Option<&Path>, packages: Packages) -> Result<Self, Box<dyn Error>> {
-        let text = fs::read_to_string(urdf).map_err(|e| format!("{}: {e}", urdf.display()))?;
-        let mut tree = Tree::new();
-        let source = tree.add_source(urdf.display().to_string(), &text);
-        let resolve = |uri: &str| packages.resolve(uri, urdf.parent().unwrap_or(Path::new(".")));
-        let root = parse(&mut tree, source);
-        let model = root.and_then(|d| read(&d.root, &mut tree, &Calls::default(), Meshes::Find, &resolve));
-        let Some(model) = model else {
-            let lines: Vec<String> = tree.diags().iter().map(|d| render(&tree, d, false)).collect();
-            return Err(lines.join("\n").into());
-        };
+    pub fn load(urdf: &Path, srdf: Option<&Path>, packages: BTreeMap<String, PathBuf>) -> Result<Self, Box<dyn Error>> {
+        let source = Source { path: urdf.to_owned(), packages, srdf: srdf.map(Path::to_owned), ..Source::default() };
+        let mut loaded = dimos::robot::load(&source);
+        let allowed: Vec<_> = std::mem::take(&mut loaded.semantics).disabled_pairs().collect();
+        let model = loaded.into_model()?;
         let solids = solids(&model, MeshMode::Hull)?;
-        let allowed = srdf.map(allowed_pairs).transpose()?.unwrap_or_default();
-        let known = |(a, b): &(String, String)| model.link_index(a).is_some() && model.link_index(b).is_some();
-        let allowed = allowed.into_iter().filter(known).collect();
+        let all = allowed.len();
+        let allowed: Vec<_> = allowed.into_iter().filter_map(|pair| own_pair(&model, &pair)).collect();
+        if allowed.len() < all {
+            println!("note      {} of the SRDF's {all} pairs name links that {} has", allowed.len(), model.name);
+        }
         Ok(Self { model: Arc::new(model), solids, allowed })
     }
 
@@ -111,6 +104,12 @@ impl Arm {
                 .ok_or(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
         };
         let joints = problem.joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
+        for (i, joint) in joints.iter().enumerate() {
+            if let Some(twin) = joints[..i].iter().position(|j| j == joint) {
+                let (a, b) = (&problem.joints[twin], &problem.joints[i]);
+                return Err(format!("joints {a:?} and {b:?} of the problems are one joint of the robot's").into());
+            }
+        }
         // Sliding joints of the others are a gripper's: it is open.
         let open = |j: &dimos::robot::Joint| if j.kind == JointKind::Prismatic { j.limits.upper } else { 0.0 };
         let mut rest: Vec<f64> = self.model.joints.iter().map(open).collect();
@@ -168,23 +167,28 @@ fn solid(thing: &Thing, family: &str, shapes: Shapes) -> Result<Solid, Box<dyn E
     Ok(made?)
 }
 
-/// The pairs of `disable_collisions` in an SRDF.
-fn allowed_pairs(srdf: &Path) -> Result<Vec<(String, String)>, Box<dyn Error>> {
-    let text = fs::read_to_string(srdf).map_err(|e| format!("{}: {e}", srdf.display()))?;
-    let document = roxmltree::Document::parse(&text)?;
-    let pairs = document.descendants().filter(|n| n.has_tag_name("disable_collisions"));
-    let name = |n: &roxmltree::Node, key: &str| n.attribute(key).unwrap_or_default().to_owned();
-    Ok(pairs.map(|n| (name(&n, "link1"), name(&n, "link2"))).collect())
+/// A pair of links as the model has them: by name, else by an ending that only one link has.
+fn own_pair(model: &RobotModel, (a, b): &(String, String)) -> Option<(String, String)> {
+    let own = |name: &String| {
+        let ends = |suffix: &str| match model.links.iter().filter(|l| l.name.ends_with(suffix)).collect::<Vec<_>>()[..]
+        {
+            [one] => Some(one.name.clone()),
+            _ => None,
+        };
+        let exact = model.link_index(name).map(|_| name.clone());
+        exact.or_else(|| name.match_indices(['_', '/', '-']).find_map(|(at, _)| ends(&name[at..])))
+    };
+    Some((own(a)?, own(b)?))
 }
 
 /// `NAME=DIR` arguments.
-pub fn packages(arguments: &[String]) -> Result<Packages, Box<dyn Error>> {
+pub fn packages(arguments: &[String]) -> Result<BTreeMap<String, PathBuf>, Box<dyn Error>> {
     let mut named = BTreeMap::new();
     for argument in arguments {
         let (name, folder) = argument.split_once('=').ok_or(format!("{argument:?} is not NAME=DIR"))?;
         named.insert(name.to_owned(), folder.into());
     }
-    Ok(Packages::named(named).with_environment())
+    Ok(named)
 }
 
 /// Length of the prefix that all names share, up to a separator.

@@ -26,7 +26,6 @@ pub fn measure(effort: Effort) -> Result<(), String> {
     });
     let mut measures =
         vec![Measure::new("xArm reports of port 30000", "k/s", xarm.collect()).goal(Goal::AtLeast(200.0))];
-    #[cfg(feature = "can")]
     measures
         .push(Measure::new("Piper frames, put together", "k/s", piper(repeats, packets)).goal(Goal::AtLeast(1000.0)));
     print("decoding, one thread", &measures);
@@ -34,7 +33,6 @@ pub fn measure(effort: Effort) -> Result<(), String> {
 }
 
 /// The frames of one burst of a Piper, over and over, decoded and put together to a picture of the arm.
-#[cfg(feature = "can")]
 fn piper(repeats: usize, packets: u64) -> Vec<f64> {
     use dimos::clock::{Clock, MonotonicClock};
     use dimos::hardware::arms::piper::picture::Picture;

@@ -123,7 +123,6 @@ fn streams(effort: Effort) -> Result<(), String> {
         let points = move || emulator.trace().iter().filter(|request| request.register == SET_POINT).count() as u64;
         Ok((arm, Box::new(points)))
     })?;
-    #[cfg(feature = "can")]
     stream("Piper at 200 Hz", 200, seconds, |period, beat, room| {
         use dimos::hardware::arms::piper;
         let settings = config("piper", "sim".into(), 6);

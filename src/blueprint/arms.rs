@@ -3,9 +3,9 @@
 use crate::blueprint::limits;
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
-use crate::hardware::registry::{AdapterSpec, SIM};
-use crate::joint::{MAX_DOF, make_joints};
-use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, SIM};
+use crate::joint::{JointLimits, MAX_DOF, make_joints};
+use crate::yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
 
 /// The arms, and what tasks may refer to.
 pub(super) struct Found {
@@ -84,14 +84,20 @@ fn arm(
     joints: &[String],
     joints_known: bool,
 ) -> Arm {
-    let fits = joints_known && dof(checker, entry, &row, joints.len());
-    if checker.has(entry.at, "options") {
-        let node = entry.options.as_ref().map(|o| o.at);
-        let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
-        (row.options.check)(checker.tree, node);
-    }
+    let counted = joints_known && dof(checker, entry, &row, joints.len());
+    let options = match entry.options.as_ref().map(|o| o.value.clone()) {
+        None | Some(serde_json::Value::Null) => serde_json::json!({}),
+        Some(options) => options,
+    };
+    let read = options_are_read(checker, entry, &row);
     let address = address(checker, entry, &row);
-    let own = fits.then(|| (row.limits)(joints.len()));
+    let config = AdapterConfig {
+        hardware_id: id.to_owned(),
+        address: address.clone(),
+        dof: joints.len(),
+        options: options.clone(),
+    };
+    let own = if counted && read { fit(checker, entry, &row, &config) } else { None };
     let limits = match joints_known {
         true => limits::resolve(checker, &entry.limits, joints, own.as_ref()),
         false => Vec::new(),
@@ -108,11 +114,43 @@ fn arm(
         auto_enable: entry.auto_enable,
         on_exit: entry.on_exit.unwrap_or(default_on_exit),
         on_exit_given: entry.on_exit.is_some(),
-        options: match entry.options.as_ref().map(|o| o.value.clone()) {
-            None | Some(serde_json::Value::Null) => serde_json::json!({}),
-            Some(options) => options,
-        },
+        options,
+        own_limits: own.unwrap_or_default(),
         limits,
+    }
+}
+
+/// Reports every mistake in the options that their type shows; `true` when there is none.
+fn options_are_read(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: &AdapterSpec) -> bool {
+    if !checker.has(entry.at, "options") {
+        return false;
+    }
+    let node = entry.options.as_ref().map(|o| o.at);
+    let node = node.unwrap_or_else(|| checker.tree.add_empty_map(entry.adapter_type.at));
+    let mistakes = |tree: &Tree| tree.diags().len() + tree.unlisted();
+    let before = mistakes(checker.tree);
+    (row.options.check)(checker.tree, node);
+    mistakes(checker.tree) == before
+}
+
+/// Asks the adapter whether joints and options go together, and reports what does not at the option. The arm's own
+/// limits.
+fn fit(
+    checker: &mut Checker<'_>,
+    entry: &Located<HardwareEntry>,
+    row: &AdapterSpec,
+    config: &AdapterConfig,
+) -> Option<JointLimits> {
+    match (row.fit)(config) {
+        Ok(fit) => Some(fit.limits),
+        Err(misfit) => {
+            let at = match &entry.options {
+                Some(options) if !misfit.option.is_empty() => checker.tree.nearest(options.at, &misfit.option),
+                _ => counted_at(entry),
+            };
+            checker.error(at, Diag::error(misfit.what).maybe_hint(misfit.hint));
+            None
+        }
     }
 }
 
@@ -207,20 +245,24 @@ fn adapter(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>) -> Option<
     row
 }
 
+/// Where the number of joints stands.
+fn counted_at(entry: &HardwareEntry) -> NodeId {
+    match &entry.joints.value {
+        Joints::Counted(counted) => counted.count.at,
+        Joints::Names(_) => entry.joints.at,
+    }
+}
+
 /// Whether the adapter takes that many joints.
 fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, count: usize) -> bool {
     let (fewest, most) = row.dof;
     if (fewest..=most).contains(&count) {
         return true;
     }
-    let at = match &entry.joints.value {
-        Joints::Counted(counted) => counted.count.at,
-        Joints::Names(_) => entry.joints.at,
-    };
     let takes = if fewest == most { format!("{fewest}") } else { format!("{fewest} to {most}") };
     let also = checker.tree.label(entry.adapter_type.at).with_text(format!("takes {takes} joints"));
     let diag = Diag::error(format!("{} cannot have {count} joints", quote(row.name))).also(also);
-    checker.error(at, diag.hint(format!("name {takes} joints, or choose another adapter")));
+    checker.error(counted_at(entry), diag.hint(format!("name {takes} joints, or choose another adapter")));
     false
 }
 

@@ -39,7 +39,8 @@ impl Assets {
 
     /// Whether anything of a description does.
     pub fn source_awaited(&self, source: &Source) -> bool {
-        self.awaited(&source.path) || source.packages.values().any(|path| self.awaited(path))
+        let files = [Some(&source.path), source.srdf.as_ref(), source.joint_limits.as_ref()];
+        files.into_iter().flatten().chain(source.packages.values()).any(|path| self.awaited(path))
     }
 }
 
@@ -108,7 +109,8 @@ fn paths(
     let robots = planner.iter().flat_map(|planner| planner.robots.iter()).map(|robot| robot.at);
     for owner in tasks.chain(robots) {
         let packages = tree.get(owner, "package_paths").map(|map| tree.entries(map)).unwrap_or_default();
-        let nodes = tree.get(owner, "model_path").into_iter().chain(packages.iter().map(|(_, path)| *path));
+        let files = ["model_path", "srdf_path", "joint_limits_path"].into_iter().filter_map(|key| tree.get(owner, key));
+        let nodes = files.chain(packages.iter().map(|(_, path)| *path));
         all.extend(nodes.filter_map(|at| Some((at, tree.text(at)?.to_owned()))));
     }
     for (_, object) in planner.iter().flat_map(|planner| planner.world.0.iter()) {

@@ -1,8 +1,11 @@
 //! The sections `planner` and `view` as they are typed.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
-use schemars::JsonSchema;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::blueprint::range::{non_negative, positive};
@@ -45,6 +48,12 @@ pub struct RobotConfig {
     /// Arguments of the xacro file.
     #[serde(default)]
     pub xacro_args: BTreeMap<String, Text>,
+    /// The robot's SRDF, as seen from this file: groups of joints, named poses, pairs of links that may touch.
+    #[serde(default)]
+    pub srdf_path: Option<Located<String>>,
+    /// The robot's `joint_limits.yaml` as MoveIt has it, as seen from this file: accelerations, jerks, narrower limits.
+    #[serde(default)]
+    pub joint_limits_path: Option<Located<String>>,
     /// Where the robot's base is, in the frame `map`.
     #[serde(default)]
     pub base_pose: Located<PoseEntry>,
@@ -53,8 +62,8 @@ pub struct RobotConfig {
     pub base_link: String,
     /// The link that pose goals are for.
     pub end_effector_link: Located<String>,
-    /// The joints that are planned for, as the model names them, base first.
-    pub joint_names: Located<Vec<Located<String>>>,
+    /// The joints that are planned for, as the model names them, base first; or `{group: NAME}`: a `group` of the SRDF.
+    pub joint_names: Located<RobotJoints>,
     /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
     #[serde(default)]
     pub joint_prefix: Option<Located<String>>,
@@ -67,7 +76,7 @@ pub struct RobotConfig {
     /// Pairs of links that may touch: `[[finger_left, finger_right]]`.
     #[serde(default)]
     pub collision_exclusion_pairs: Vec<(String, String)>,
-    /// Whether mesh files of other formats are converted for the planner.
+    /// Whether collision meshes may be Collada files, which are converted to triangles. STL and OBJ are read as they are.
     #[serde(default = "yes")]
     pub auto_convert_meshes: bool,
     /// Highest joint speed, on top of the model's own limits [rad/s].
@@ -81,6 +90,66 @@ pub struct RobotConfig {
     /// Poses with a name: one position for each of `joint_names` [rad].
     #[serde(default)]
     pub named_poses: Keyed<Located<Vec<f64>>>,
+}
+
+/// The joints of a robot that are planned for.
+#[derive(Debug, Clone)]
+pub enum RobotJoints {
+    /// Their names.
+    Names(Vec<Located<String>>),
+    /// Those of a group.
+    Group(GroupJoints),
+}
+
+/// The joints of a group.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GroupJoints {
+    /// The group's name in the robot's SRDF.
+    pub group: Located<String>,
+}
+
+impl<'de> Deserialize<'de> for RobotJoints {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(RobotJointsVisitor)
+    }
+}
+
+struct RobotJointsVisitor;
+
+impl<'de> Visitor<'de> for RobotJointsVisitor {
+    type Value = RobotJoints;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a list of joint names or {group: NAME}")
+    }
+
+    fn visit_unit<E>(self) -> Result<RobotJoints, E> {
+        Ok(RobotJoints::Names(Vec::new()))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<RobotJoints, A::Error> {
+        let mut names = Vec::new();
+        while let Some(name) = seq.next_element()? {
+            names.push(name);
+        }
+        Ok(RobotJoints::Names(names))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<RobotJoints, A::Error> {
+        GroupJoints::deserialize(MapAccessDeserializer::new(map)).map(RobotJoints::Group)
+    }
+}
+
+impl JsonSchema for RobotJoints {
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "RobotJoints".into()
+    }
+
+    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
+        let group = generator.subschema_for::<GroupJoints>();
+        json_schema!({ "anyOf": [{ "type": "array", "items": { "type": "string" }, "minItems": 1 }, group] })
+    }
 }
 
 fn yes() -> bool {

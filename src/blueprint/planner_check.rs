@@ -2,6 +2,7 @@
 
 use crate::blueprint::arms::Found;
 use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ShapeEntry, ViewConfig};
+use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
 use crate::yaml::{Diag, Located, did_you_mean, quote};
@@ -9,6 +10,7 @@ use crate::yaml::{Diag, Located, did_you_mean, quote};
 pub(super) fn check(
     checker: &mut Checker<'_>,
     planner: &Located<PlannerConfig>,
+    described: &[Described],
     view: Option<&Located<ViewConfig>>,
     tasks: &[Located<TaskEntry>],
     found: &Found,
@@ -19,7 +21,7 @@ pub(super) fn check(
         let at = checker.tree.entry(planner.at, "visualization").map_or(visualization.at, |(key, _)| key);
         checker.error(at, diag.hint("remove one of the two"));
     }
-    for (number, robot) in planner.robots.iter().enumerate() {
+    for (number, (robot, described)) in planner.robots.iter().zip(described).enumerate() {
         if checker.has(robot.at, "name") {
             checker.check_name(&robot.name, "robot's name");
             let twin = planner.robots.iter().take(number).find(|r| r.name.value == robot.name.value);
@@ -31,8 +33,8 @@ pub(super) fn check(
         }
         pose(checker, &robot.base_pose);
         let task = task(checker, robot, tasks);
-        joints(checker, robot, found, task);
-        named_poses(checker, robot);
+        joints(checker, robot, described, found, task);
+        named_poses(checker, robot, described);
     }
     for (name, entry) in &planner.world.0 {
         object(checker, name, entry);
@@ -96,12 +98,18 @@ fn task<'t>(
 }
 
 /// Whether the robot's joints are joints of the coordinator, and of the task.
-fn joints(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, found: &Found, task: Option<&Located<TaskEntry>>) {
-    let (model, mapping) = (&robot.joint_names, &robot.joint_name_mapping);
-    let good = checker.has(robot.at, "joint_names") && !checker.lost.contains(model.at);
+fn joints(
+    checker: &mut Checker<'_>,
+    robot: &Located<RobotConfig>,
+    described: &Described,
+    found: &Found,
+    task: Option<&Located<TaskEntry>>,
+) {
+    let mapping = &robot.joint_name_mapping;
+    let (model, good) = (described.joints.as_deref().unwrap_or_default(), described.joints.is_some());
     if good && model.is_empty() {
         let diag = Diag::error("the robot has no joints");
-        checker.error(model.at, diag.hint("name those of the model that are planned for, base first"));
+        checker.error(robot.joint_names.at, diag.hint("name those of the model that are planned for, base first"));
     }
     if let (Some(prefix), Some((first, _))) = (&robot.joint_prefix, mapping.0.first()) {
         let also = checker.tree.label(first.at).with_text("given here too");
@@ -124,7 +132,7 @@ fn joints(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, found: &Found
             return;
         }
         let prefix = robot.joint_prefix.as_ref();
-        for joint in &model.value {
+        for joint in model {
             let name = format!("{}{}", prefix.map_or("", |p| p.as_str()), joint.value);
             wanted.push(Located { at: prefix.map_or(joint.at, |p| p.at), value: name });
         }
@@ -166,11 +174,8 @@ fn joints(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, found: &Found
     }
 }
 
-fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotConfig>) {
-    let count = robot.joint_names.len();
-    if !checker.has(robot.at, "joint_names") || checker.lost.contains(robot.joint_names.at) {
-        return;
-    }
+fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, described: &Described) {
+    let Some(count) = described.joints.as_ref().map(Vec::len) else { return };
     for (_, pose) in &robot.named_poses.0 {
         if pose.len() != count && !checker.lost.contains(pose.at) {
             let diag = Diag::error(format!("{} positions for {count} joints", pose.len()));

@@ -9,21 +9,38 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use crate::blueprint::planner::{
     ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry,
 };
+use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
 /// What a planner is made from. Only of use when nothing was reported.
-pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed) -> PlannerConfig {
+pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Described]) -> PlannerConfig {
+    let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
-        robots: typed.robots.iter().map(|robot| self::robot(checker, robot)).collect(),
+        robots: robots.map(|(robot, described)| self::robot(checker, robot, described)).collect(),
         objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
     }
 }
 
-fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> RobotConfig {
-    let joints: Vec<String> = typed.joint_names.iter().map(|name| name.value.clone()).collect();
+/// The files of a robot's description.
+pub(super) fn source(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> Source {
+    let path = |path: &Located<String>| file(checker, path.at, path);
+    Source {
+        path: path(&typed.model_path),
+        packages: typed.package_paths.iter().map(|(n, p)| (n.clone(), file(checker, typed.at, p))).collect(),
+        xacro_args: typed.xacro_args.iter().map(|(name, value)| (name.clone(), value.0.clone())).collect(),
+        srdf: typed.srdf_path.as_ref().map(path),
+        joint_limits: typed.joint_limits_path.as_ref().map(path),
+        ..Source::default()
+    }
+}
+
+fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Described) -> RobotConfig {
+    let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
+    let source = source(checker, typed);
     let ours = |model: &String| {
         let mapped = typed.joint_name_mapping.0.iter().find(|(_, theirs)| theirs.value == *model);
         let prefix = typed.joint_prefix.as_ref().map_or("", |prefix| prefix.as_str());
@@ -31,9 +48,12 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> RobotConfig {
     };
     RobotConfig {
         name: typed.name.value.clone(),
-        model_path: file(checker, typed.model_path.at, &typed.model_path),
-        packages: typed.package_paths.iter().map(|(n, p)| (n.clone(), file(checker, typed.at, p))).collect(),
-        xacro_args: typed.xacro_args.iter().map(|(name, value)| (name.clone(), value.0.clone())).collect(),
+        model_path: source.path,
+        packages: source.packages,
+        xacro_args: source.xacro_args,
+        srdf: source.srdf,
+        joint_limits: source.joint_limits,
+        convert_meshes: typed.auto_convert_meshes,
         base_pose: pose(&typed.base_pose),
         base_link: typed.base_link.clone(),
         end_effector_link: typed.end_effector_link.value.clone(),

@@ -1,23 +1,47 @@
 //! Checks the planner's robots against their descriptions, so that `dimos check` finds what a run would fail at: files
-//! that are not there, joints and links that the model does not have, poses outside its limits. What lies in an asset
-//! that has not been fetched yet is checked once it has been.
+//! that are not there, joints, groups and links that the model does not have, poses outside its limits. What lies in an
+//! asset that has not been fetched yet is checked once it has been.
 
 use std::path::Path;
 
-use crate::blueprint::planner::{PlannerConfig as Typed, RobotConfig as TypedRobot, ShapeEntry};
+use crate::blueprint::planner::{PlannerConfig as Typed, RobotConfig as TypedRobot, RobotJoints, ShapeEntry};
+use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{ObjectShape, PlannerConfig, RobotConfig};
+use crate::planning::config::{ObjectShape, PlannerConfig};
 use crate::robot::model::RobotModel;
+use crate::robot::srdf::Semantics;
 use crate::robot::{Source, load};
-use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
+use crate::yaml::{Diag, Located, NodeId, Report, Severity, did_you_mean, quote};
 
-pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, config: &PlannerConfig) {
-    for (robot, config) in typed.robots.iter().zip(&config.robots) {
-        let known = checker.has(robot.at, "model_path") && !checker.lost.contains(robot.model_path.at);
-        if known && let Some(model) = model(checker, robot, config) {
-            names(checker, robot, &model);
-            exclusions(checker, robot, &model);
-            named_poses(checker, robot, &model);
+/// Warnings about one description that are shown; `dimos model check` shows all.
+const WARNINGS: usize = 5;
+
+/// A robot's description, as far as it could be read.
+pub(super) struct Described {
+    model: Option<RobotModel>,
+    semantics: Semantics,
+    /// The joints that are planned for, each with the place that names it; `None` where they are not known.
+    pub(super) joints: Option<Vec<Located<String>>>,
+}
+
+/// Reads the descriptions of all robots, and finds the joints of groups.
+pub(super) fn read(checker: &mut Checker<'_>, typed: &Typed) -> Vec<Described> {
+    let read = |robot| {
+        let (model, semantics) = description(checker, robot);
+        let joints = joints(checker, robot, model.as_ref(), &semantics);
+        Described { model, semantics, joints }
+    };
+    typed.robots.iter().map(read).collect()
+}
+
+/// Checks robots and objects against the files that they name.
+pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, described: &[Described], config: &PlannerConfig) {
+    for (robot, described) in typed.robots.iter().zip(described) {
+        if let Some(model) = &described.model {
+            names(checker, robot, described, model);
+            exclusions(checker, robot, model);
+            meshes(checker, robot, model);
+            named_poses(checker, robot, described, model);
         }
     }
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
@@ -37,33 +61,122 @@ fn file(checker: &mut Checker<'_>, at: NodeId, path: &Path) {
     }
 }
 
-/// The robot's description, where it has no mistakes.
-fn model(checker: &mut Checker<'_>, robot: &TypedRobot, config: &RobotConfig) -> Option<RobotModel> {
-    let source = Source {
-        path: config.model_path.clone(),
-        packages: config.packages.clone(),
-        xacro_args: config.xacro_args.clone(),
-        ..Source::default()
-    };
+/// The robot's description, where it has no mistakes. Its warnings are passed on.
+fn description(checker: &mut Checker<'_>, robot: &Located<TypedRobot>) -> (Option<RobotModel>, Semantics) {
+    let lost = |path: &Located<String>| checker.lost.contains(path.at);
+    let optional = [&robot.srdf_path, &robot.joint_limits_path];
+    let known = checker.has(robot.at, "model_path") && !lost(&robot.model_path);
+    if !known || optional.into_iter().flatten().any(lost) {
+        return (None, Semantics::default());
+    }
+    let source = planner_files::source(checker, robot);
     if checker.assets.source_awaited(&source) {
-        return None;
+        return (None, Semantics::default());
     }
     let loaded = load(&source);
-    let first = loaded.reports().into_iter().find(|report| report.severity == Severity::Error);
-    if let Some(first) = first {
-        let diag = Diag::error(format!("the robot's description cannot be used: {}", first.message));
-        let more = format!("`dimos model check {}` shows all that is wrong with it", config.model_path.display());
-        checker.error(robot.model_path.at, diag.hint(first.hint.unwrap_or(more)));
+    let reports = loaded.reports();
+    let check = command(&source);
+    let (errors, warnings): (Vec<_>, Vec<_>) = reports.iter().partition(|report| report.severity == Severity::Error);
+    if let Some(first) = errors.first() {
+        let (at, what) = place(robot, &source, first);
+        let diag = Diag::error(format!("the robot's description cannot be used: {what}"));
+        let more = format!("`{check}` shows all that is wrong with it");
+        checker.error(at, diag.hint(first.hint.clone().unwrap_or(more)));
     }
-    loaded.model
+    for report in warnings.iter().take(WARNINGS) {
+        let (at, what) = place(robot, &source, report);
+        checker.error(at, Diag::warning(what).maybe_hint(report.hint.clone()));
+    }
+    if let Some(more) = warnings.len().checked_sub(WARNINGS).filter(|more| *more > 0) {
+        let diag = Diag::warning(format!("{more} more warnings about the robot's description"));
+        checker.error(robot.model_path.at, diag.hint(format!("`{check}` shows them all")));
+    }
+    (loaded.model, loaded.semantics)
+}
+
+/// The command that checks a description alone.
+fn command(source: &Source) -> String {
+    let mut command = format!("dimos model check {}", source.path.display());
+    for (option, path) in [("--srdf", &source.srdf), ("--joint-limits", &source.joint_limits)] {
+        command += &path.as_ref().map_or(String::new(), |path| format!(" {option} {}", path.display()));
+    }
+    for (name, folder) in &source.packages {
+        command += &format!(" --package {name}={}", folder.display());
+    }
+    for (name, value) in &source.xacro_args {
+        command += &format!(" --xacro-arg {name}:={value}");
+    }
+    command
+}
+
+/// The key that names the file of a mistake, and the mistake with its own place in that file.
+fn place(robot: &TypedRobot, source: &Source, report: &Report) -> (NodeId, String) {
+    let what = match (&report.file, report.line, report.column) {
+        (Some(file), Some(line), Some(column)) => format!("{file}:{line}:{column}: {}", report.message),
+        _ => report.message.clone(),
+    };
+    let named = |path: &&Path| what.starts_with(&format!("{}:", path.display()));
+    let others = [(&robot.srdf_path, &source.srdf), (&robot.joint_limits_path, &source.joint_limits)];
+    let found = others.into_iter().find(|(_, path)| path.as_deref().as_ref().is_some_and(named));
+    (found.and_then(|(key, _)| key.as_ref()).map_or(robot.model_path.at, |key| key.at), what)
+}
+
+/// The joints that are planned for; those of a group where one is named.
+fn joints(
+    checker: &mut Checker<'_>,
+    robot: &Located<TypedRobot>,
+    model: Option<&RobotModel>,
+    semantics: &Semantics,
+) -> Option<Vec<Located<String>>> {
+    if !checker.has(robot.at, "joint_names") || checker.lost.contains(robot.joint_names.at) {
+        return None;
+    }
+    let group = match &robot.joint_names.value {
+        RobotJoints::Names(names) => return Some(names.clone()),
+        RobotJoints::Group(joints) => &joints.group,
+    };
+    if robot.srdf_path.is_none() {
+        let diag = Diag::error(format!("the group {} is not known: the robot has no SRDF", quote(group)));
+        checker.error(group.at, diag.hint("name its file by `srdf_path`, or list the joints"));
+        return None;
+    }
+    let model = model?;
+    let Some(found) = semantics.group_joints(model, group) else {
+        let groups: Vec<&str> = semantics.groups.iter().map(|group| group.name.as_str()).collect();
+        let diag = Diag::error(format!("the SRDF has no group {}", quote(group)));
+        checker.error(group.at, diag.maybe_hint(did_you_mean(group, groups, "its groups")));
+        return None;
+    };
+    if found.is_empty() {
+        let diag = Diag::error(format!("the group {} has no joints that move on their own", quote(group)));
+        checker.error(group.at, diag.hint("`dimos model info` with `--srdf` shows the groups and their joints"));
+        return None;
+    }
+    let names = found.into_iter().filter_map(|joint| model.joints.get(joint)).map(|joint| joint.name.clone());
+    Some(names.map(|value| Located { at: group.at, value }).collect())
 }
 
 /// Joints and links.
-fn names(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {
+fn names(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, described: &Described, model: &RobotModel) {
     let joints: Vec<&str> = model.joints.iter().map(|joint| joint.name.as_str()).collect();
-    for name in robot.joint_names.iter().filter(|name| !joints.contains(&name.as_str())) {
-        let diag = Diag::error(format!("the model has no joint {}", quote(name)));
-        checker.error(name.at, diag.maybe_hint(did_you_mean(name, joints.iter().copied(), "its joints")));
+    for (number, name) in described.joints.iter().flatten().enumerate() {
+        let diag = match model.joint_index(name).and_then(|index| model.joints.get(index)) {
+            None => Diag::error(format!("the model has no joint {}", quote(name))).maybe_hint(did_you_mean(
+                name,
+                joints.iter().copied(),
+                "its joints",
+            )),
+            Some(joint) if !joint.is_independent() => {
+                let why = if joint.is_movable() { "follows another joint" } else { "is fixed" };
+                Diag::error(format!("the joint {} {why}: it cannot be planned for", quote(name)))
+                    .hint("remove it; what follows moves with the joint that it follows")
+            }
+            Some(_) if described.joints.iter().flatten().take(number).any(|other| other.value == name.value) => {
+                Diag::error(format!("the joint {} is named twice", quote(name)))
+            }
+            Some(_) => continue,
+        };
+        checker.error(name.at, diag);
     }
     if checker.has(robot.at, "end_effector_link") && !checker.lost.contains(robot.end_effector_link.at) {
         link(checker, robot.end_effector_link.at, &robot.end_effector_link, model);
@@ -91,15 +204,36 @@ fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &Ro
     }
 }
 
-fn named_poses(checker: &mut Checker<'_>, robot: &TypedRobot, model: &RobotModel) {
+fn meshes(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {
+    let Some(at) = checker.tree.get(robot.at, "auto_convert_meshes") else { return };
+    if let Some((link, mesh)) = model.collada_collision().filter(|_| !robot.auto_convert_meshes) {
+        let diag = Diag::error(format!("the link {} collides by a Collada file: {}", quote(&link.name), mesh.uri));
+        checker.error(at, diag.hint("set auto_convert_meshes to true, or give the link an STL or OBJ file"));
+    }
+}
+
+/// Poses with a name, of the blueprint and of the SRDF, must be within the limits.
+fn named_poses(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Described, model: &RobotModel) {
+    let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
+    let outside = |pose: &[f64]| {
+        let joint = |name: &String| model.joint_index(name).and_then(|index| model.joints.get(index));
+        let mut limits = pose.iter().zip(&joints).filter_map(|(q, name)| Some((*q, name, joint(name)?)));
+        limits.find(|(q, _, joint)| !(joint.limits.lower..=joint.limits.upper).contains(q)).map(|(q, name, joint)| {
+            let (unit, limits) = (joint.kind.unit(), joint.limits);
+            let hint = format!("it goes from {:.4} to {:.4} {unit}", limits.lower, limits.upper);
+            (format!("{} at {q} {unit} is outside the model's limits", quote(name)), hint)
+        })
+    };
     for (_, pose) in &robot.named_poses.0 {
-        for (position, name) in pose.iter().zip(&robot.joint_names.value) {
-            let Some(joint) = model.joint_index(name).and_then(|index| model.joints.get(index)) else { continue };
-            let (lower, upper) = (joint.limits.lower, joint.limits.upper);
-            if !(lower..=upper).contains(position) && !checker.lost.contains(pose.at) {
-                let diag = Diag::error(format!("{} at {position} rad is outside the model's limits", quote(name)));
-                checker.error(pose.at, diag.hint(format!("it goes from {lower:.4} to {upper:.4} rad")));
-            }
+        if let Some((what, hint)) = outside(pose).filter(|_| !checker.lost.contains(pose.at)) {
+            checker.error(pose.at, Diag::error(what).hint(hint));
+        }
+    }
+    let Some(srdf) = &robot.srdf_path else { return };
+    for (name, pose) in described.semantics.poses_of(&joints) {
+        if let Some((what, hint)) = outside(&pose) {
+            let diag = Diag::warning(format!("the SRDF's pose {} cannot be used: {what}", quote(name)));
+            checker.error(srdf.at, diag.hint(hint));
         }
     }
 }

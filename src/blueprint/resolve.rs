@@ -11,6 +11,7 @@ use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, O
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
 use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
 use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Tree, quote};
@@ -91,6 +92,8 @@ pub struct Arm {
     pub on_exit_given: bool,
     /// The adapter's own options: an object.
     pub options: serde_json::Value,
+    /// The arm's own nominal limits, by its number of joints and its options.
+    pub own_limits: JointLimits,
     /// Limits narrower than the arm's own, one entry for each joint.
     pub limits: Vec<JointOverride>,
 }
@@ -229,12 +232,11 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     let mut tasks = tasks::resolve(&mut checker, &file.tasks, &found);
     checker.assets = Assets::of(file.assets);
     assets::check(&mut checker, &file.tasks, file.planner.as_ref());
-    if let Some(planner) = &file.planner {
-        planner_check::check(&mut checker, planner, file.view.as_ref(), &file.tasks, &found);
-    }
     let planner = file.planner.as_ref().map(|planner| {
-        let config = planner_files::resolve(&checker, planner);
-        planner_models::check(&mut checker, planner, &config);
+        let described = planner_models::read(&mut checker, planner);
+        planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &found);
+        let config = planner_files::resolve(&checker, planner, &described);
+        planner_models::check(&mut checker, planner, &described, &config);
         config
     });
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);

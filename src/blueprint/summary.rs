@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use crate::blueprint::resolve::{Arm, Blueprint, TaskKind};
 use crate::blueprint::schema::{CoordinatorConfig, OnExit};
-use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK, JointLimits};
+use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
 
 /// Where a value comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -143,7 +143,6 @@ impl Summary {
 }
 
 fn arm(arm: &Arm) -> ArmSummary {
-    let own = (arm.adapter.limits)(arm.joints.len());
     ArmSummary {
         hardware_id: arm.hardware_id.clone(),
         adapter: arm.adapter_type.clone(),
@@ -154,11 +153,12 @@ fn arm(arm: &Arm) -> ArmSummary {
         on_exit: arm.on_exit,
         on_exit_from: if arm.on_exit_given { Origin::Blueprint } else { Origin::Default },
         holds_when_disabled: arm.adapter.holds_when_disabled,
-        joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, &own, joint)).collect(),
+        joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, joint)).collect(),
     }
 }
 
-fn joint_summary(arm: &Arm, own: &JointLimits, joint: usize) -> JointSummary {
+fn joint_summary(arm: &Arm, joint: usize) -> JointSummary {
+    let own = &arm.own_limits;
     let given = arm.limits.get(joint).copied().unwrap_or_default();
     let pick = |given: Option<f64>, own: &[f64]| {
         let own = own.get(joint).map(|value| Limit { value: *value, from: Origin::Adapter });

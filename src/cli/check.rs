@@ -1,5 +1,7 @@
 //! `dimos check NAME|PATH`: every mistake of a blueprint at once, or what it comes to. Connects to nothing.
 
+mod robots;
+
 use serde_json::json;
 
 use super::arguments::setting;
@@ -64,19 +66,28 @@ pub fn print_warnings(loaded: &Loaded) {
 pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: bool) -> Result {
     let loaded = load(name, overrides, registry)?;
     let summary = loaded.blueprint.as_ref().map(Summary::of);
+    let robots = loaded.blueprint.as_ref().map(robots::of).unwrap_or_else(|| Ok(Vec::new()));
     if as_json {
         let mut document = loaded.to_json();
         document["blueprint"] = json!(summary);
+        match &robots {
+            Ok(robots) => document["robots"] = json!(robots),
+            Err(what) => document["valid"] = robots::refuse(&mut document["problems"], what),
+        }
         output::json(&document);
-        return Ok(if summary.is_some() { Exit::Ok } else { Exit::Usage });
+        return Ok(if summary.is_some() && robots.is_ok() { Exit::Ok } else { Exit::Usage });
     }
     let Some(summary) = summary else { return Err(refuse(&loaded)) };
     print_warnings(&loaded);
+    let robots = robots.map_err(Failure::usage)?;
     print(&summary);
+    robots.iter().for_each(robots::print);
     let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
     for asset in awaited {
         output::note(format_args!("{} is not fetched yet: what lies in it was not checked", asset.name));
     }
+    output::line("");
+    output::line("no mistakes");
     Ok(Exit::Ok)
 }
 
@@ -120,8 +131,6 @@ fn print(summary: &Summary) {
         table.row([task.name.clone(), kind, task.priority.to_string(), task.joints.join(" ")]);
     }
     table.print();
-    output::line("");
-    output::line("no mistakes");
 }
 
 /// Where a joint's limits come from, in the order of the columns; one word when it is the same for all.

@@ -4,7 +4,8 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::hardware::registry::{Absent, AdapterSpec, Registry};
+use crate::hardware::registry::{Absent, AdapterConfig, AdapterSpec, Registry};
+use crate::joint::JointLimits;
 
 /// Arguments of `list-adapters`.
 #[derive(Debug, clap::Args)]
@@ -24,6 +25,12 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         output::json(&registry.rows().iter().map(to_json).chain(registry.absent().map(lacking)).collect::<Vec<_>>());
         return Ok(Exit::Ok);
     }
+    lines(registry).iter().for_each(output::line);
+    Ok(Exit::Ok)
+}
+
+/// The table, and a paragraph for each adapter.
+fn lines(registry: &Registry) -> Vec<String> {
     let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS"]);
     for row in registry.rows() {
         table.row([
@@ -41,18 +48,22 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         let nothing = ["-"; 6].map(str::to_owned);
         table.row([absent.name.to_owned(), "not in this build".to_owned()].into_iter().chain(nothing));
     }
-    table.print();
+    let mut lines = table.lines();
     for row in registry.rows() {
-        output::line("");
-        output::line(format_args!("{}: {}", row.name, row.about));
-        output::line(format_args!("  modes: {}", modes(row).join(", ")));
+        lines.extend([String::new(), format!("{}: {}", row.name, row.about)]);
+        lines.push(format!("  modes: {}", modes(row).join(", ")));
+        if let Some((dof, limits)) = limits(row) {
+            let fastest = limits.velocity_max.iter().copied().fold(0.0, f64::max).to_degrees();
+            let joints = if dof == 1 { "joint" } else { "joints" };
+            lines.push(format!("  limits: {dof} {joints}, up to {fastest:.0}°/s"));
+        }
+        lines.push(format!("  options: {}", options(row).join(", ")));
     }
     for absent in registry.absent() {
-        output::line("");
-        output::line(format_args!("{}: {}", absent.name, absent.about));
-        output::line(format_args!("  not in this build: {}", absent.remedy));
+        lines.extend([String::new(), format!("{}: {}", absent.name, absent.about)]);
+        lines.push(format!("  not in this build: {}", absent.remedy));
     }
-    Ok(Exit::Ok)
+    lines
 }
 
 fn dof(row: &AdapterSpec) -> String {
@@ -64,6 +75,24 @@ fn dof(row: &AdapterSpec) -> String {
 
 fn modes(row: &AdapterSpec) -> Vec<&'static str> {
     row.modes.iter().map(|mode| mode.name()).collect()
+}
+
+/// The limits of the arm with the most joints and no options.
+fn limits(row: &AdapterSpec) -> Option<(usize, JointLimits)> {
+    let config = |dof| AdapterConfig {
+        hardware_id: row.name.to_owned(),
+        address: String::new(),
+        dof,
+        options: serde_json::Value::Null,
+    };
+    (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.fit)(&config(dof)).ok()?.limits)))
+}
+
+/// The names of its options.
+fn options(row: &AdapterSpec) -> Vec<String> {
+    let schema = (row.options.schema)(&mut schemars::SchemaGenerator::default());
+    let properties = schema.get("properties").and_then(|properties| properties.as_object());
+    properties.map(|properties| properties.keys().cloned().collect()).unwrap_or_default()
 }
 
 fn to_json(row: &AdapterSpec) -> serde_json::Value {
@@ -79,6 +108,13 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
         "native_rate_hz": row.native_rate,
         "address": {"form": row.address.form, "required": row.address.required},
         "holds_when_disabled": row.holds_when_disabled,
+        "options": options(row),
+        "limits": limits(row).map(|(dof, limits)| json!({
+            "dof": dof,
+            "position_lower": limits.position_lower,
+            "position_upper": limits.position_upper,
+            "velocity_max": limits.velocity_max,
+        })),
         "gripper": row.gripper,
         "emulator": row.emulate.is_some(),
     })
@@ -87,4 +123,20 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
 /// An adapter that is not in this build has a way to get it, and nothing else.
 fn lacking(absent: &Absent) -> serde_json::Value {
     json!({"name": absent.name, "about": absent.about, "in_this_build": false, "remedy": absent.remedy})
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_build_lacks_is_listed_with_the_way_to_get_it() {
+        let absent = Absent { name: "servobot", about: "a serial arm", remedy: "build with --features servobot" };
+        let lines = lines(&Registry::builtin().lacking(&[absent]));
+        assert!(lines.iter().any(|line| line.starts_with("servobot  not in this build")), "{lines:?}");
+        assert_eq!(lines.last().unwrap(), "  not in this build: build with --features servobot");
+        let rows = Registry::builtin();
+        let told = |name: &str| lines.iter().any(|line| line.starts_with(&format!("{name}: ")));
+        assert!(rows.rows().iter().all(|row| told(row.name)) && told("servobot"), "{lines:?}");
+    }
 }

@@ -46,6 +46,7 @@ use clap::{Parser, Subcommand};
 
 use crate::blueprint;
 use crate::hardware::registry::{Absent, AdapterSpec, Registry};
+use crate::robot::builtin;
 
 const AFTER_HELP: &str = "\
 Start with:  dimos run coordinator-yourarm
@@ -135,6 +136,7 @@ pub struct Program {
     adapters: Vec<AdapterSpec>,
     absent: Vec<Absent>,
     blueprints: Vec<(&'static str, &'static str)>,
+    robots: Vec<(&'static str, &'static str)>,
 }
 
 impl Program {
@@ -161,9 +163,16 @@ impl Program {
         self
     }
 
+    /// Adds a robot description that blueprints and `model` name `builtin:NAME`: its name, and its text, a URDF.
+    pub fn robot(mut self, name: &'static str, text: &'static str) -> Self {
+        self.robots.push((name, text));
+        self
+    }
+
     /// Runs the command line: what `main` does.
     pub fn main(self) -> ExitCode {
         blueprint::embed(self.blueprints);
+        builtin::embed(self.robots);
         command_line(&Registry::with(&self.adapters).lacking(&self.absent))
     }
 }

@@ -3,6 +3,7 @@
 mod assets;
 mod check;
 mod fk;
+mod ik;
 mod info;
 
 use std::path::PathBuf;
@@ -32,6 +33,8 @@ enum Verb {
     Expand(File),
     /// Where a link is at joint positions
     Fk(fk::Args),
+    /// Joint positions for a pose of a link
+    Ik(ik::Args),
     /// The files that a blueprint fetches on first use: list, fetch, clean
     Assets(assets::Args),
 }
@@ -107,6 +110,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         Verb::Check(file) => check::run(file),
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
+        Verb::Ik(args) => ik::run(args),
         Verb::Assets(args) => assets::run(args, registry),
     }
 }

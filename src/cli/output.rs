@@ -2,12 +2,16 @@
 
 use std::fmt::Display;
 use std::io::{self, IsTerminal, Write};
+use std::os::fd::AsFd;
 
 use comfy_table::presets::NOTHING;
 use comfy_table::{Attribute, Cell, CellAlignment, Color, ContentArrangement};
 use serde::Serialize;
 
 use super::exit::Failure;
+
+/// In fewer columns than these a table is not squeezed: the terminal breaks its lines.
+const NARROWEST: u16 = 40;
 
 /// Prints a line of data to stdout. That nobody reads it any more (`| head`) is no error.
 pub fn line(text: impl Display) {
@@ -60,6 +64,12 @@ pub fn toned(text: impl Display, tone: Tone) -> Cell {
     Cell::new(text).fg(colour)
 }
 
+/// Whether it is a terminal that says how wide it is, and is not too narrow for columns. One that a program has opened
+/// (`script`, a container) may say 0.
+fn has_width(out: impl AsFd) -> bool {
+    rustix::termios::tcgetwinsize(out).is_ok_and(|size| size.ws_col >= NARROWEST)
+}
+
 /// A table without lines: columns aligned, two spaces apart.
 pub struct Table(comfy_table::Table);
 
@@ -68,7 +78,7 @@ impl Table {
     pub fn new(headings: &[&str]) -> Self {
         let mut table = comfy_table::Table::new();
         table.load_style(NOTHING);
-        if io::stdout().is_terminal() {
+        if has_width(io::stdout()) {
             // What does not fit goes on below, in its own column.
             table.set_content_arrangement(ContentArrangement::Dynamic);
         }
@@ -124,5 +134,22 @@ pub fn span(seconds: f64) -> String {
         60..3600 => format!("{} min {} s", whole / 60, whole % 60),
         3600..86_400 => format!("{} h {} min", whole / 3600, whole / 60 % 60),
         _ => format!("{} d {} h", whole / 86_400, whole / 3600 % 24),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustix::termios::{Winsize, tcsetwinsize};
+
+    #[test]
+    fn a_terminal_without_a_width_squeezes_no_table() {
+        let terminal = std::fs::File::options().read(true).write(true).open("/dev/ptmx").unwrap();
+        assert!(!has_width(&terminal), "a new one has no size");
+        for (columns, enough) in [(80, true), (1, false), (0, false)] {
+            tcsetwinsize(&terminal, Winsize { ws_row: 24, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
+            assert_eq!(has_width(&terminal), enough, "{columns}");
+        }
+        assert!(!has_width(std::fs::File::open("/dev/null").unwrap()));
     }
 }

@@ -137,7 +137,7 @@ enum Up {
     /// A run.
     Run(Box<Run>),
     /// A planner that is attached to one.
-    Planner(Attached),
+    Planner(Box<Attached>),
 }
 
 fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)> {
@@ -149,7 +149,7 @@ fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)>
     let terminal = terminal()?;
     if let Some(run) = attach::chosen(args, blueprint)? {
         let planner = Attached::start(args, blueprint, run, &terminal).inspect_err(|_| terminal.flush())?;
-        return Ok((Up::Planner(planner), signals, terminal));
+        return Ok((Up::Planner(Box::new(planner)), signals, terminal));
     }
     let run = Run::start(blueprint, args.options()).map_err(|error| {
         terminal.flush();

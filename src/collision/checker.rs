@@ -59,6 +59,9 @@ pub trait CollisionChecker {
     /// Limits of the joints.
     fn limits(&self) -> &[Limits];
 
+    /// Which joints turn without end: what is free at a position is free one turn farther.
+    fn turns(&self) -> &[bool];
+
     /// How finely motions are checked.
     fn resolution(&self) -> Resolution;
 

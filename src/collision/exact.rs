@@ -272,6 +272,10 @@ impl CollisionChecker for ExactChecker {
         self.scene.limits()
     }
 
+    fn turns(&self) -> &[bool] {
+        self.scene.turns()
+    }
+
     fn resolution(&self) -> Resolution {
         self.resolution
     }

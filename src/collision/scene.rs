@@ -96,6 +96,7 @@ pub struct Scene {
     /// `allowed[link][obstacle]`
     pub(super) allowed: Vec<Vec<bool>>,
     pub(super) limits: Vec<Limits>,
+    turns: Vec<bool>,
     joint_names: Vec<String>,
     pub(super) frames: usize,
 }
@@ -123,6 +124,7 @@ impl Scene {
                 first_frame: scene.frames,
             });
             scene.limits.extend_from_slice(robot.kinematics.limits());
+            scene.turns.extend(robot.kinematics.turns());
             let full = |name: &String| full_name(&robot.name, name);
             scene.joint_names.extend(robot.kinematics.names().iter().map(full));
             scene.frames += robot.kinematics.bodies();
@@ -203,6 +205,11 @@ impl Scene {
     /// Limits of the joints.
     pub fn limits(&self) -> &[Limits] {
         &self.limits
+    }
+
+    /// Which joints turn without end.
+    pub fn turns(&self) -> &[bool] {
+        &self.turns
     }
 
     /// Names of the joints, with their robot's before them where that has one.

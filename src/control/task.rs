@@ -218,8 +218,8 @@ impl Task {
         None
     }
 
-    /// A cancel: a trajectory slows down along its path, an end effector in its direction, a stream of joint values just
-    /// ends. `false`: there was nothing to cancel.
+    /// A cancel: a trajectory slows down along its path, an end effector in its direction; of a stream of joint values it
+    /// is the ordinary end. `false`: there was nothing to cancel.
     pub fn cancel(&mut self) -> bool {
         match (&self.body, self.state) {
             (_, TaskState::Cancelling) => true,
@@ -235,7 +235,7 @@ impl Task {
             }
             (_, TaskState::Executing) => {
                 // Streams hold no motion, so there is nothing to free.
-                let _ = self.end(TaskState::Aborted, Reason::Cancelled);
+                let _ = self.end(TaskState::Idle, Reason::StreamEnded);
                 true
             }
             _ => false,

@@ -3,6 +3,8 @@
 pub mod arms;
 pub mod conformance;
 pub mod device;
+pub mod fit;
+pub mod kit;
 pub mod registry;
 pub mod sim;
 pub mod spec;

@@ -5,16 +5,15 @@ use std::net::{IpAddr, SocketAddr};
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
+use crate::hardware::fit::{Fit, Misfit};
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
-use crate::joint::{ControlMode, JointLimits, Joints};
+use crate::joint::{ControlMode, Joints};
 use crate::yaml;
 
 /// How far an adapter has been proven without its hardware.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Level {
-    /// Compiles and connects.
-    Works,
     /// Passes the conformance suite against a double at its SDK or wire boundary.
     Conformant,
     /// Has an emulator of its real wire format, and passes the suite against it.
@@ -25,7 +24,6 @@ impl Level {
     /// The name used in tables.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Works => "works",
             Self::Conformant => "conformant",
             Self::Emulated => "emulated",
         }
@@ -73,15 +71,6 @@ pub struct AdapterConfig {
     pub options: serde_json::Value,
 }
 
-impl AdapterConfig {
-    /// The options as the adapter's own type.
-    pub fn options<T: DeserializeOwned>(&self) -> Result<T, AdapterError> {
-        let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
-        serde_json::from_value(given)
-            .map_err(|e| AdapterError::Rejected(format!("options of {}: {e}", self.hardware_id)))
-    }
-}
-
 /// A running emulator of one arm: the controller's side of the same wire, with a joint plant behind it.
 /// It ends when it is dropped.
 pub trait Emulator: Send {
@@ -125,7 +114,7 @@ impl Place {
     }
 }
 
-/// Starts an emulator for an arm's configuration; `Unsupported` for a place that the arm's transport does not have.
+/// Starts an emulator for an arm's configuration; `Rejected` for a place that the arm's transport does not have.
 pub type Emulate = fn(&AdapterConfig, &Place) -> AdapterResult<Box<dyn Emulator>>;
 
 /// One row of the table.
@@ -155,8 +144,8 @@ pub struct AdapterSpec {
     pub gripper: bool,
     /// The adapter's own options.
     pub options: OptionsSpec,
-    /// Nominal joint limits for a number of joints, known without the device.
-    pub limits: fn(dof: usize) -> JointLimits,
+    /// Whether number of joints and options go together, and what follows from them. Never asks the device.
+    pub fit: fn(&AdapterConfig) -> Result<Fit, Misfit>,
     /// Makes an adapter. Does not connect.
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.

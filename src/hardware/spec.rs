@@ -192,7 +192,8 @@ pub trait ManipulatorAdapter: Send {
     fn write_joint_velocities(&mut self, _velocities: &[f64]) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Stops all motion at once by the device's own means; the motors stay powered. An operational stop.
+    /// Stops all motion at once by the device's own means; the motors stay powered. An operational stop. A gripper that
+    /// still moves afterwards is held by the device thread, which sends it to where it is.
     fn write_stop(&mut self) -> AdapterResult<Stop>;
     /// Enables or disables the servos.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;

@@ -5,15 +5,19 @@
 //! `s` from `−L` to `L` around the corner. So `q` is of fourth degree, meets both lines with equal position, direction
 //! and curvature, and passes the corner at a distance of `3/16·L·|u₂ − u₁|`.
 
-use super::path::{Path, distance, tidy};
+use super::path::distance;
 
-/// A piece of a curve: a polynomial of fourth degree for every joint.
+/// A piece of a curve: a line, or a corner.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
     /// Length of its parameter [rad].
     pub length: f64,
-    /// Coefficients of ascending powers, per joint; lines have two that count.
-    pub coefficients: Vec<[f64; 5]>,
+    /// Where it starts [rad].
+    pub start: Vec<f64>,
+    /// Its direction there, of length 1.
+    pub direction: Vec<f64>,
+    /// What a corner adds to the direction until its end; of a line, nothing.
+    pub turn: Vec<f64>,
     /// Whether it is a corner.
     pub bends: bool,
     /// The corner's index in the path; of a line, that of its end.
@@ -33,16 +37,45 @@ pub struct Jet {
     pub d3: f64,
 }
 
+/// How far a corner has turned: the integral of `σ` by the parameter, `σ`, and its first two derivatives. What is the
+/// same for all joints.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Turned {
+    /// ∫σ ds [rad].
+    pub area: f64,
+    /// σ, from 0 to 1.
+    pub part: f64,
+    /// dσ/ds [1/rad].
+    pub d1: f64,
+    /// d²σ/ds² [1/rad²].
+    pub d2: f64,
+}
+
 impl Piece {
-    /// One joint at parameter `s` from the piece's start [rad].
-    pub fn at(&self, joint: usize, s: f64) -> Jet {
-        let [c0, c1, c2, c3, c4] = self.coefficients[joint];
-        Jet {
-            q: c0 + s * (c1 + s * (c2 + s * (c3 + s * c4))),
-            d1: c1 + s * (2.0 * c2 + s * (3.0 * c3 + s * 4.0 * c4)),
-            d2: 2.0 * c2 + s * (6.0 * c3 + s * 12.0 * c4),
-            d3: 6.0 * c3 + s * 24.0 * c4,
+    /// How far it has turned at parameter `s` from its start [rad].
+    pub fn turned(&self, s: f64) -> Turned {
+        if !self.bends {
+            return Turned::default();
         }
+        let inverse = 1.0 / self.length;
+        let x = s * inverse;
+        Turned {
+            area: s * x * x * (1.0 - 0.5 * x),
+            part: x * x * (3.0 - 2.0 * x),
+            d1: 6.0 * x * (1.0 - x) * inverse,
+            d2: 6.0 * (1.0 - 2.0 * x) * inverse * inverse,
+        }
+    }
+
+    /// All joints at parameter `s` from the piece's start [rad].
+    pub fn jets(&self, s: f64) -> impl Iterator<Item = Jet> + '_ {
+        let t = self.turned(s);
+        self.start.iter().zip(&self.direction).zip(&self.turn).map(move |((start, direction), turn)| Jet {
+            q: start + direction * s + turn * t.area,
+            d1: direction + turn * t.part,
+            d2: turn * t.d1,
+            d3: turn * t.d2,
+        })
     }
 }
 
@@ -64,9 +97,9 @@ pub fn curves(path: &[Vec<f64>], deviation: &[f64]) -> Vec<Curve> {
         let direction = direction(a, b);
         let straight = whole - taken - used;
         if straight > 1e-9 * whole {
-            let start = |(x, u): (&f64, &f64)| [x + u * taken, *u, 0.0, 0.0, 0.0];
-            let coefficients = a.iter().zip(&direction).map(start).collect();
-            curve.push(Piece { length: straight, coefficients, bends: false, corner: i + 1 });
+            let start = a.iter().zip(&direction).map(|(x, u)| x + u * taken).collect();
+            let turn = vec![0.0; a.len()];
+            curve.push(Piece { length: straight, start, direction, turn, bends: false, corner: i + 1 });
         }
         match corner {
             Some(corner) if corner.half > 0.0 => {
@@ -101,14 +134,9 @@ impl Corner {
     }
 
     fn piece(&self, middle: &[f64], corner: usize) -> Piece {
-        let l = self.half;
-        let coefficient = |((m, u1), u2): ((&f64, &f64), &f64)| {
-            let turn = u2 - u1;
-            // ∫σ with x = s / 2L: 2L·(x³ − x⁴/2).
-            [m - u1 * l, *u1, 0.0, turn / (4.0 * l * l), -turn / (16.0 * l * l * l)]
-        };
-        let coefficients = middle.iter().zip(&self.u1).zip(&self.u2).map(coefficient).collect();
-        Piece { length: 2.0 * l, coefficients, bends: true, corner }
+        let start = middle.iter().zip(&self.u1).map(|(m, u)| m - u * self.half).collect();
+        let turn = self.u1.iter().zip(&self.u2).map(|(u1, u2)| u2 - u1).collect();
+        Piece { length: 2.0 * self.half, start, direction: self.u1.clone(), turn, bends: true, corner }
     }
 }
 
@@ -117,14 +145,10 @@ fn direction(a: &[f64], b: &[f64]) -> Vec<f64> {
     a.iter().zip(b).map(|(x, y)| (y - x) / length).collect()
 }
 
-/// A path fit for curves: nothing repeated.
-pub fn prepared(path: &[Vec<f64>]) -> Path {
-    tidy(path)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::planning::path::Path;
     use crate::robot::random::Random;
 
     #[test]
@@ -138,18 +162,17 @@ mod tests {
                 continue;
             }
             for pair in curve.windows(2) {
-                for j in 0..4 {
-                    let (end, start) = (pair[0].at(j, pair[0].length), pair[1].at(j, 0.0));
+                for (end, start) in pair[0].jets(pair[0].length).zip(pair[1].jets(0.0)) {
                     assert!((end.q - start.q).abs() < 1e-9, "{end:?} {start:?}");
                     assert!((end.d1 - start.d1).abs() < 1e-9 && (end.d2 - start.d2).abs() < 1e-6);
                 }
             }
             for piece in curve.iter().filter(|p| p.bends) {
-                let middle: Vec<f64> = (0..4).map(|j| piece.at(j, piece.length / 2.0).q).collect();
+                let middle: Vec<f64> = piece.jets(piece.length / 2.0).map(|jet| jet.q).collect();
                 assert!(distance(&middle, &path[piece.corner]) <= 0.05 + 1e-9);
             }
             let last = curve.last().unwrap();
-            let end: Vec<f64> = (0..4).map(|j| last.at(j, last.length).q).collect();
+            let end: Vec<f64> = last.jets(last.length).map(|jet| jet.q).collect();
             assert!(distance(&end, &path[5]) < 1e-9);
         }
     }

@@ -6,6 +6,8 @@ use std::time::Duration;
 
 use nalgebra::Isometry3;
 
+use crate::robot::Source;
+
 /// A planner.
 #[derive(Debug, Clone, Default)]
 pub struct PlannerConfig {
@@ -28,6 +30,12 @@ pub struct RobotConfig {
     pub packages: BTreeMap<String, PathBuf>,
     /// Arguments of the xacro file.
     pub xacro_args: BTreeMap<String, String>,
+    /// Its SRDF: its named poses and its pairs of links that may touch are added to those here.
+    pub srdf: Option<PathBuf>,
+    /// Its `joint_limits.yaml`.
+    pub joint_limits: Option<PathBuf>,
+    /// Whether collision meshes may be Collada files, which are converted to triangles as they are read.
+    pub convert_meshes: bool,
     /// Where its base link stands in the frame `map`.
     pub base_pose: Isometry3<f64>,
     /// The link that stands there.
@@ -48,6 +56,20 @@ pub struct RobotConfig {
     pub max_acceleration: f64,
     /// Poses with a name: a position for each of `joints` [rad].
     pub named_poses: BTreeMap<String, Vec<f64>>,
+}
+
+impl RobotConfig {
+    /// The files of its description.
+    pub fn source(&self) -> Source {
+        Source {
+            path: self.model_path.clone(),
+            packages: self.packages.clone(),
+            xacro_args: self.xacro_args.clone(),
+            srdf: self.srdf.clone(),
+            joint_limits: self.joint_limits.clone(),
+            ..Source::default()
+        }
+    }
 }
 
 /// How far and how fast those who execute a motion let one joint go.

@@ -7,6 +7,7 @@ use super::setup::PlannedRobot;
 use super::solve::{Failure, Goal, Stage, late};
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
+use crate::robot::model::JointKind;
 use glamx::DAffine3;
 
 /// Different solutions that are looked for when one robot goes to a pose.
@@ -37,7 +38,12 @@ pub(super) fn configurations(
         first += robot.joints.len();
         let goal = wanted.iter().find(|(wanted, _)| wanted == index).map(|(_, goal)| goal);
         let several = match goal {
-            Some(Goal::Joints(values)) => vec![values.clone()],
+            Some(Goal::Joints(values)) => {
+                // Where the model lets a joint turn without end, but the arm does not, whole turns are the same goal.
+                let mut near = values.clone();
+                robot.body.kinematics.unwind(&mut near, &own, |kind| kind == JointKind::Continuous);
+                vec![near]
+            }
             Some(Goal::Pose(pose)) => {
                 let settings = IkSettings { seed, ..reach() };
                 reached(robot, &frame(pose), &own, &settings, &mut free, stop)?

@@ -137,7 +137,7 @@ impl<'a> Ik<'a> {
             failure.attempts += 1;
             let miss = self.descend(target, settings);
             if settings_met(&miss, settings) {
-                self.unwind(near);
+                self.kinematics.unwind(&mut self.q, near, |_| true);
                 let new = !found.iter().any(|q| distance(q, &self.q) < 1e-3);
                 if new && valid(&self.q) {
                     found.push(self.q.clone());
@@ -235,16 +235,6 @@ impl<'a> Ik<'a> {
             best = best.min(miss.squared());
         }
         miss
-    }
-
-    /// Turns joints without limits by whole turns, to be near.
-    fn unwind(&mut self, near: &[f64]) {
-        let turn = std::f64::consts::TAU;
-        for ((q, near), l) in self.q.iter_mut().zip(near).zip(self.kinematics.limits()) {
-            if l.lower.is_infinite() && l.upper.is_infinite() {
-                *q += ((near - *q) / turn).round() * turn;
-            }
-        }
     }
 }
 

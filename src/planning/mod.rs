@@ -24,9 +24,12 @@ pub mod setup;
 pub mod shortcut;
 mod smooth;
 pub mod solve;
+mod steady;
 pub mod timing;
 pub mod topp;
 pub mod verify;
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod turning_tests;

@@ -1,10 +1,13 @@
 //! A tree of configurations in flat arrays; the nearest one by a plain scan. Trees of these searches are small (some
 //! tens of nodes, seldom some thousands), where a scan is faster than any index.
 
+use std::f64::consts::TAU;
+
 /// A tree: nodes, their parents, and how far around each node samples are taken.
 #[derive(Debug, Clone, Default)]
 pub struct Tree {
     dof: usize,
+    turns: Vec<bool>,
     values: Vec<f64>,
     parents: Vec<u32>,
     /// Samples farther than this are not joined to the node [rad] (dynamic domain).
@@ -15,9 +18,9 @@ pub struct Tree {
 const ROOT: u32 = u32::MAX;
 
 impl Tree {
-    /// An empty tree.
-    pub fn new(dof: usize) -> Self {
-        Self { dof, ..Self::default() }
+    /// An empty tree, for joints of which some turn without end.
+    pub fn new(turns: &[bool]) -> Self {
+        Self { dof: turns.len(), turns: turns.to_vec(), ..Self::default() }
     }
 
     /// Number of nodes.
@@ -57,9 +60,28 @@ impl Tree {
 
     /// The node nearest to a configuration, and its distance [rad].
     pub fn nearest(&self, q: &[f64]) -> (usize, f64) {
+        if self.turns.contains(&true) {
+            return self.nearest_around(q);
+        }
         let mut best = (0, f64::INFINITY);
         for (i, node) in self.values.chunks_exact(self.dof.max(1)).enumerate() {
             let squared: f64 = node.iter().zip(q).map(|(a, b)| (a - b) * (a - b)).sum();
+            if squared < best.1 {
+                best = (i, squared);
+            }
+        }
+        (best.0, best.1.sqrt())
+    }
+
+    /// The same with joints that turn without end: the short way round counts.
+    fn nearest_around(&self, q: &[f64]) -> (usize, f64) {
+        let apart = |((a, b), turns): ((&f64, &f64), &bool)| {
+            let d = a - b;
+            if *turns { d - (d / TAU).round() * TAU } else { d }
+        };
+        let mut best = (0, f64::INFINITY);
+        for (i, node) in self.values.chunks_exact(self.dof.max(1)).enumerate() {
+            let squared: f64 = node.iter().zip(q).zip(&self.turns).map(apart).map(|d| d * d).sum();
             if squared < best.1 {
                 best = (i, squared);
             }

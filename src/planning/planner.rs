@@ -6,7 +6,7 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
-use super::path::{Path, between, distance, length};
+use super::path::{Path, between, distance, length, unwind};
 use super::rrt_connect::{Ended, RrtSettings, SearchCount, search};
 use super::sampler::Sampler;
 use super::shortcut::{ShortcutSettings, shorten};
@@ -107,7 +107,8 @@ fn said(contacts: &[Contact]) -> String {
     first.join("; ") + &if more > 0 { format!("; and {more} more") } else { String::new() }
 }
 
-/// Plans from `start` to one of `goals`, the nearest first. The same checker, settings and goals give the same path, as
+/// Plans from `start` to one of `goals`, or to one that is the same but for whole turns of joints that turn without
+/// end, the nearest first. The same checker, settings and goals give the same path, as
 /// long as time does not run out.
 pub fn plan<C: CollisionChecker>(
     checker: &mut C,
@@ -208,13 +209,16 @@ fn way_out<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed:
     None
 }
 
-/// The goals that are inside the limits and free, the nearest first; if there are none, why.
+/// The goals that are inside the limits and free, the nearest first; if there are none, why. Of a joint that turns
+/// without end all positions a whole turn apart are the same goal: the nearest is taken.
 fn usable_goals<C: CollisionChecker>(checker: &mut C, from: &[f64], goals: &[Vec<f64>]) -> Result<Path, PlanError> {
     let mut usable: Path = Vec::new();
     let mut why = PlanError::NoGoal;
     for goal in goals {
         check_shape(checker, "goal", goal)?;
-        let inside = clamped(checker, goal);
+        let mut goal = goal.clone();
+        unwind(&mut goal, from, checker.turns());
+        let inside = clamped(checker, &goal);
         let far = goal.iter().zip(&inside).position(|(a, b)| (a - b).abs() > 1e-6);
         if let Some(joint) = far {
             why = outside(checker, "goal", joint, goal[joint]);

@@ -1,11 +1,14 @@
 //! RRT-Connect (Kuffner and LaValle, 2000): two trees, from the start and from the goals, that grow towards random
 //! configurations and towards each other. Nodes that fail to grow draw fewer samples (dynamic domain: Yershova,
 //! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is checked, the joining one as well.
+//!
+//! Joints that turn without end are taken the short way round: a node follows its parent without a jump, and where the
+//! trees meet, the goal's half of the path is turned to where the start's half has come to.
 
 use crate::collision::checker::{CollisionChecker, Stop};
 
 use super::nearest::Tree;
-use super::path::{Path, between, distance};
+use super::path::{Path, between, distance, unwind, unwind_all};
 use super::sampler::Sampler;
 
 /// How the search goes.
@@ -59,12 +62,13 @@ pub fn search<C: CollisionChecker>(
     stop: &Stop,
 ) -> (Result<Path, Ended>, SearchCount) {
     let dof = start.len();
-    let mut trees = [Tree::new(dof), Tree::new(dof)];
+    let turns = checker.turns().to_vec();
+    let mut trees = [Tree::new(&turns), Tree::new(&turns)];
     trees[0].add(start, None);
     for goal in goals {
         trees[1].add(goal, None);
     }
-    let mut grow = Grow { checker, settings, stop };
+    let mut grow = Grow { checker, settings, turns: &turns, stop };
     let mut count = SearchCount::default();
     let mut sample = vec![0.0; dof];
     let mut at = vec![0.0; dof];
@@ -88,6 +92,7 @@ pub fn search<C: CollisionChecker>(
         if far > trees[side].radius(nearest) || far < 1e-9 {
             continue;
         }
+        unwind(&mut sample, trees[side].node(nearest), &turns);
         between(trees[side].node(nearest), &sample, (settings.range / far).min(1.0), &mut at);
         if !grow.reaches(&mut trees[side], nearest, &at) {
             continue;
@@ -99,7 +104,9 @@ pub fn search<C: CollisionChecker>(
             let (from_start, from_goal) = if side == 0 { (added, joined) } else { (joined, added) };
             let mut path: Path = trees[0].way_up(from_start).map(<[f64]>::to_vec).collect();
             path.reverse();
-            path.extend(trees[1].way_up(from_goal).map(<[f64]>::to_vec));
+            let mut rest: Path = trees[1].way_up(from_goal).map(<[f64]>::to_vec).collect();
+            unwind_all(&mut rest, trees[0].node(from_start), &turns);
+            path.append(&mut rest);
             return (Ok(super::path::tidy(&path)), count);
         }
     }
@@ -108,6 +115,7 @@ pub fn search<C: CollisionChecker>(
 struct Grow<'a, C> {
     checker: &'a mut C,
     settings: &'a RrtSettings,
+    turns: &'a [bool],
     stop: &'a Stop,
 }
 
@@ -137,18 +145,20 @@ impl<C: CollisionChecker> Grow<'_, C> {
         }
         let steps = (far / self.settings.range).ceil().max(1.0) as usize;
         let from = tree.node(node).to_vec();
+        let mut to = to.to_vec();
+        unwind(&mut to, &from, self.turns);
         let mut at = vec![0.0; to.len()];
         for k in 1..=steps {
-            between(&from, to, k as f64 / steps as f64, &mut at);
+            between(&from, &to, k as f64 / steps as f64, &mut at);
             if k == steps {
-                at.copy_from_slice(to);
+                at.copy_from_slice(&to);
             }
             if !self.checker.motion_is_free(tree.node(node), &at, self.stop) {
                 return None;
             }
             node = tree.add(&at, Some(node));
         }
-        debug_assert!(distance(tree.node(node), to) < 1e-9);
+        debug_assert!(distance(tree.node(node), &to) < 1e-9);
         Some(node)
     }
 }

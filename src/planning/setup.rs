@@ -14,9 +14,9 @@ use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
 use crate::robot::kinematics::{Kinematics, frame};
+use crate::robot::load;
 use crate::robot::mesh::Mesh;
 use crate::robot::model::{Limits, RobotModel};
-use crate::robot::{Source, load};
 
 /// Poses that are looked at for pairs of links that always touch.
 const SAMPLES: usize = 200;
@@ -91,31 +91,54 @@ impl Setup {
     /// Pairs of links that touch in every pose can only be what the description means: checking them would forbid
     /// every motion. They are told by name, never left out in silence.
     fn leave_out_what_always_touches(&mut self) {
-        for index in 0..self.robots.len() {
-            let mut alone = World::new();
-            // Added once already, so it can be added again. Without its name before them, links have their own names.
-            let _ = alone.add_robot(Robot { name: String::new(), ..self.robots[index].body.clone() });
-            let home = self.robots[index].neutral();
-            let always = always_touching(&alone.snapshot(), &home, SAMPLES, 0);
-            for suspect in always.into_iter().filter(|suspect| suspect.share > ALWAYS) {
-                let pair = (suspect.contact.link, suspect.contact.other);
-                self.always_touching.push((self.robots[index].config.name.clone(), [pair.0.clone(), pair.1.clone()]));
-                self.robots[index].body.allowed.push(pair);
+        for robot in &mut self.robots {
+            for pair in always_touch(&robot.body) {
+                self.always_touching.push((robot.config.name.clone(), pair.clone()));
+                robot.body.allowed.push(pair.into());
             }
         }
         self.world = self.world.with_robots(self.robots.iter().map(|robot| robot.body.clone()).collect());
     }
 }
 
+/// The pairs of links of one robot that touch in every pose although nothing says that they may, by name.
+pub fn always_touch(robot: &Robot) -> Vec<[String; 2]> {
+    let mut alone = World::new();
+    // Without its name before them, links have their own names.
+    if alone.add_robot(Robot { name: String::new(), ..robot.clone() }).is_err() {
+        return Vec::new();
+    }
+    // A pose in the middle of things: zero, or where zero is outside the limits the nearest that is inside.
+    let home: Vec<f64> = robot.kinematics.limits().iter().map(|l| 0.0_f64.max(l.lower).min(l.upper)).collect();
+    let suspects = always_touching(&alone.snapshot(), &home, SAMPLES, 0).into_iter();
+    let always = suspects.filter(|suspect| suspect.share > ALWAYS);
+    always.map(|suspect| [suspect.contact.link, suspect.contact.other]).collect()
+}
+
+/// A robot of which all independent joints are planned for, alone in the world.
+pub fn whole(model: RobotModel, allowed: Vec<(String, String)>) -> Result<Robot, String> {
+    Ok(Robot {
+        name: String::new(),
+        kinematics: Arc::new(Kinematics::whole(&model).map_err(|e| e.to_string())?),
+        solids: solids(&model, MeshMode::Hull).map_err(|e| e.to_string())?,
+        model: Arc::new(model),
+        base: glamx::DAffine3::IDENTITY,
+        padding: 0.0,
+        allowed,
+    })
+}
+
 impl PlannedRobot {
     fn load(config: &RobotConfig) -> Result<Self, String> {
-        let source = Source {
-            path: config.model_path.clone(),
-            packages: config.packages.clone(),
-            xacro_args: config.xacro_args.clone(),
-            ..Source::default()
-        };
-        let mut model = load(&source).into_model()?;
+        let mut loaded = load(&config.source());
+        let semantics = std::mem::take(&mut loaded.semantics);
+        let mut model = loaded.into_model()?;
+        if let Some((link, mesh)) = model.collada_collision().filter(|_| !config.convert_meshes) {
+            return Err(format!(
+                "link {:?} collides by {:?}, and Collada files are not converted",
+                link.name, mesh.uri
+            ));
+        }
         let joints = config.joints.iter().map(|name| joint(&model, name)).collect::<Result<Vec<_>, _>>()?;
         for &index in &joints {
             if let Some(joint) = model.joints.get_mut(index) {
@@ -143,15 +166,20 @@ impl PlannedRobot {
             solids,
             base: frame(&(config.base_pose * base_in_model.inverse())),
             padding: 0.0,
-            allowed: config.exclusions.clone(),
+            allowed: config.exclusions.iter().cloned().chain(semantics.disabled_pairs()).collect(),
         };
+        let outside = |pose: &[f64]| pose.iter().zip(&limits).position(|(q, l)| !(l.lower..=l.upper).contains(q));
         for (name, pose) in &config.named_poses {
-            let outside = pose.iter().zip(&limits).position(|(q, l)| !(l.lower..=l.upper).contains(q));
-            if let Some(at) = outside {
+            if let Some(at) = outside(pose) {
                 return Err(format!("the named pose {name:?} is outside the limits of {}", config.joints[at]));
             }
         }
-        Ok(Self { config: config.clone(), model, joints, end_effector, limits, body })
+        let mut config = config.clone();
+        // Poses of an SRDF that this robot cannot take are none of its own; what the configuration says goes first.
+        for (name, pose) in semantics.poses_of(&config.joints).into_iter().filter(|(_, pose)| outside(pose).is_none()) {
+            config.named_poses.entry(name.to_owned()).or_insert(pose);
+        }
+        Ok(Self { config, model, joints, end_effector, limits, body })
     }
 
     fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
@@ -176,11 +204,6 @@ impl PlannedRobot {
         self.model = Arc::new(model);
         self.body = Robot { model: self.model.clone(), kinematics: Arc::new(kinematics), ..self.body.clone() };
         Ok(())
-    }
-
-    /// A pose in the middle of things: zero, or where zero is outside the limits the nearest that is inside.
-    fn neutral(&self) -> Vec<f64> {
-        self.limits.iter().map(|l| 0.0_f64.max(l.lower).min(l.upper)).collect()
     }
 
     /// The robot as it stands in the world while it does not move: no joint of it is planned.

@@ -3,7 +3,7 @@
 use crate::collision::checker::{CollisionChecker, Stop};
 use crate::robot::random::Random;
 
-use super::path::{Path, between, distance, length, tidy};
+use super::path::{Path, between, distance, length, tidy, unwind, unwind_all};
 
 /// How much is tried.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,7 +31,8 @@ pub fn shorten<C: CollisionChecker>(
     seed: u64,
     stop: &Stop,
 ) -> Path {
-    let mut path = leave_out(checker, path, stop);
+    let turns = checker.turns().to_vec();
+    let mut path = leave_out(checker, path, &turns, stop);
     let mut random = Random::new(seed);
     let mut idle = 0;
     for _ in 0..settings.tries {
@@ -40,29 +41,40 @@ pub fn shorten<C: CollisionChecker>(
         }
         let whole = length(&path);
         let (s, t) = (random.unit() * whole, random.unit() * whole);
-        let (a, b) = (point_at(&path, s.min(t)), point_at(&path, s.max(t)));
+        let (a, mut b) = (point_at(&path, s.min(t)), point_at(&path, s.max(t)));
+        unwind(&mut b.1, &a.1, &turns);
         idle += 1;
         let saved = (s - t).abs() - distance(&a.1, &b.1);
         if a.0 == b.0 || saved < settings.gain * whole || !checker.motion_is_free(&a.1, &b.1, stop) {
             continue;
         }
         let mut shorter: Path = path[..=a.0].to_vec();
-        shorter.extend([a.1, b.1]);
-        shorter.extend_from_slice(&path[b.0 + 1..]);
+        let mut rest = [&[point_at(&path, s.max(t)).1], &path[b.0 + 1..]].concat();
+        unwind_all(&mut rest, &a.1, &turns);
+        shorter.push(a.1);
+        shorter.append(&mut rest);
         path = tidy(&shorter);
         idle = 0;
     }
-    leave_out(checker, &path, stop)
+    leave_out(checker, &path, &turns, stop)
 }
 
 /// From each configuration on, goes straight to the farthest one that can be reached so.
-fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], stop: &Stop) -> Path {
+fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], turns: &[bool], stop: &Stop) -> Path {
+    let mut path = path.to_vec();
     let mut kept: Path = path.first().cloned().into_iter().collect();
     let mut at = 0;
     while at + 1 < path.len() {
-        let next = (at + 2..path.len()).rev().find(|&to| checker.motion_is_free(&path[at], &path[to], stop));
-        at = next.unwrap_or(at + 1);
-        kept.push(path[at].clone());
+        let free = |to: &usize| {
+            let mut there = path[*to].clone();
+            unwind(&mut there, &path[at], turns);
+            checker.motion_is_free(&path[at], &there, stop)
+        };
+        let next = (at + 2..path.len()).rev().find(free);
+        let (from, next) = (path[at].clone(), next.unwrap_or(at + 1));
+        unwind_all(&mut path[next..], &from, turns);
+        kept.push(path[next].clone());
+        at = next;
     }
     kept
 }

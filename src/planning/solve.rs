@@ -179,7 +179,10 @@ fn told(stage: &Stage<'_>, error: &PlanError) -> Failure {
     match error {
         PlanError::Outside { which, joint, position, lower, upper } => {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
-            Failure::new(format!("{which}: {name} at {position:.4} rad is outside its limits {lower:.4} … {upper:.4}"))
+            let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
+            let unit = { kinds }.nth(*joint).map_or("rad", |kind| kind.unit());
+            let limits = format!("{lower:.4} … {upper:.4} {unit}");
+            Failure::new(format!("{which}: {name} at {position:.4} {unit} is outside its limits {limits}"))
                 .hint("limits are the model's and the arm's, the narrower counts, and commands stay 0.01 rad inside the arm's; `dimos state` shows where the joints are")
         }
         PlanError::Collides { which: "start", .. } => Failure::new(error.to_string())

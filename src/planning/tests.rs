@@ -36,6 +36,9 @@ impl CollisionChecker for Plane {
     fn limits(&self) -> &[Limits] {
         &self.limits
     }
+    fn turns(&self) -> &[bool] {
+        &[false; 2]
+    }
     fn resolution(&self) -> Resolution {
         Resolution::default()
     }

@@ -3,10 +3,10 @@
 //!
 //! Without jerk limits the trajectory's points are those of the grid the speeds were found on: on lines the cubic
 //! between two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a window of
-//! time, which keeps the curve and bounds the jerk, and the points are taken at even times.
+//! time, which keeps the curve and bounds the jerk, and the points are where the jerk changes.
 
 use crate::robot::model::Limits;
-use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryError, TrajectoryPoint};
+use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 
 use super::blend::{Curve, curves};
 use super::path::{Path, tidy};
@@ -108,26 +108,28 @@ pub fn time(
         return Err(TimingError::NoMotion);
     }
     let mut deviation = vec![settings.deviation.max(0.0); path.len()];
-    round_corners(&path, &mut deviation, &mut free);
-    let mut timed = emit(names, &path, bounds, deviation, settings.speed)?;
+    let rounded = round_corners(&path, &mut deviation, &mut free);
+    let mut timed = emit(names, &path, bounds, &rounded, deviation, settings.speed)?;
     if free_throughout(&timed.trajectory, &mut free).is_err() {
         // Between the points the trajectory is not exactly the curve. Without rounding it is.
-        timed = emit(names, &path, bounds, vec![0.0; path.len()], settings.speed)?;
+        let sharp = vec![0.0; path.len()];
+        timed = emit(names, &path, bounds, &curves(&path, &sharp), sharp, settings.speed)?;
         free_throughout(&timed.trajectory, &mut free)?;
     }
     Ok(timed)
 }
 
-/// Makes rounded corners sharper until they are free.
-fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64], &[f64]) -> bool) {
+/// The curves with rounded corners, which get sharper until they are free.
+fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64], &[f64]) -> bool) -> Vec<Curve> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
+    let mut rounded = curves(path, deviation);
     for _ in 0..8 {
         let mut blocked = Vec::new();
-        for piece in curves(path, deviation).iter().flatten().filter(|p| p.bends) {
+        for piece in rounded.iter().flatten().filter(|p| p.bends) {
             let mut passes = |k: usize| {
                 let s = piece.length * k as f64 / 8.0;
                 std::mem::swap(&mut from, &mut to);
-                to.iter_mut().enumerate().for_each(|(j, q)| *q = piece.at(j, s).q);
+                to.iter_mut().zip(piece.jets(s)).for_each(|(q, jet)| *q = jet.q);
                 k == 0 || free(&from, &to)
             };
             if !(0..=8).all(&mut passes) {
@@ -135,29 +137,30 @@ fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64
             }
         }
         if blocked.is_empty() {
-            return;
+            break;
         }
         for corner in blocked {
             deviation[corner] = if deviation[corner] > 2e-3 { deviation[corner] * 0.4 } else { 0.0 };
         }
+        rounded = curves(path, deviation);
     }
+    rounded
 }
 
 fn emit(
     names: &[String],
     path: &Path,
     bounds: &[JointBound],
+    curves: &[Curve],
     deviation: Vec<f64>,
     speed: f64,
 ) -> Result<Timed, TimingError> {
     let jerky = bounds.iter().any(|b| b.jerk.is_finite());
     let mut points: Vec<TrajectoryPoint> = Vec::new();
     let mut excess = Excess::default();
-    for curve in curves(path, &deviation) {
-        let grid = parameterize(&curve, bounds);
-        let (own, used) =
-            if jerky { averaged(names, &curve, &grid, bounds) } else { on_grid(names, &curve, &grid, bounds) }?;
-        excess = excess.max(used);
+    for curve in curves {
+        let mut own = if jerky { averaged(curve, bounds) } else { on_grid(curve, &parameterize(curve, bounds)) };
+        excess = excess.max(slow_down(&mut own, bounds));
         let start = points.last().map_or(0.0, |p| p.time_from_start);
         let skip = usize::from(!points.is_empty());
         points.extend(own.into_iter().skip(skip).map(|mut p| {
@@ -174,18 +177,14 @@ fn emit(
     }
     stretch(&mut points, 1.0 / speed);
     let trajectory = JointTrajectory { joint_names: names.to_vec(), points };
+    trajectory.validate()?;
     let excess = excess.stretched(1.0 / speed);
     let duration = trajectory.points.last().map_or(0.0, |p| p.time_from_start);
     Ok(Timed { trajectory, duration, deviation, excess })
 }
 
-/// The points of the grid itself, slowed down by what their cubics exceed.
-fn on_grid(
-    names: &[String],
-    curve: &Curve,
-    grid: &[GridPoint],
-    bounds: &[JointBound],
-) -> Result<(Vec<TrajectoryPoint>, Excess), TimingError> {
+/// The points of the grid itself.
+fn on_grid(curve: &Curve, grid: &[GridPoint]) -> Vec<TrajectoryPoint> {
     let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(grid.len());
     let last = grid.len().saturating_sub(1);
     for (i, g) in grid.iter().enumerate() {
@@ -198,58 +197,55 @@ fn on_grid(
             points.pop();
         }
         let (piece, speed) = (&curve[g.piece], g.x.sqrt());
-        let jets = (0..names.len()).map(|j| piece.at(j, g.at));
-        let (positions, velocities) = jets.map(|jet| (jet.q, jet.d1 * speed)).unzip();
+        let (positions, velocities) = piece.jets(g.at).map(|jet| (jet.q, jet.d1 * speed)).unzip();
         points.push(TrajectoryPoint { time_from_start: g.time, positions, velocities, accelerations: Vec::new() });
     }
-    let excess = slow_down(names, &mut points, bounds)?;
-    Ok((points, excess))
+    points
 }
 
 /// Stretches points in time so that their spline keeps all bounds; returns what it then uses of them.
-pub(super) fn slow_down(
-    names: &[String],
-    points: &mut Vec<TrajectoryPoint>,
-    bounds: &[JointBound],
-) -> Result<Excess, TimingError> {
-    let trajectory = JointTrajectory { joint_names: names.to_vec(), points: std::mem::take(points) };
-    let found = excess(&trajectory, bounds)?;
-    *points = trajectory.points;
+fn slow_down(points: &mut [TrajectoryPoint], bounds: &[JointBound]) -> Excess {
+    let found = excess(points, bounds);
     let factor = match found.slower() {
         slower if slower > 1.0 => slower * (1.0 + 1e-9),
         _ => 1.0,
     };
     stretch(points, factor);
-    Ok(found.stretched(factor))
+    found.stretched(factor)
 }
 
 /// The same motion, slower by a factor.
 fn stretch(points: &mut [TrajectoryPoint], factor: f64) {
+    if factor == 1.0 {
+        return;
+    }
+    let inverse = 1.0 / factor;
     for p in points {
         p.time_from_start *= factor;
-        p.velocities.iter_mut().for_each(|v| *v /= factor);
-        p.accelerations.iter_mut().for_each(|a| *a /= factor * factor);
+        p.velocities.iter_mut().for_each(|v| *v *= inverse);
+        p.accelerations.iter_mut().for_each(|a| *a *= inverse * inverse);
     }
 }
 
-/// Asks about the motion as it will be sampled: between two samples in each of the trajectory's segments.
+/// Asks about the motion as it will be sampled: from each point to the middle of its segment, and on to the next.
 fn free_throughout(
     trajectory: &JointTrajectory,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
 ) -> Result<(), TimingError> {
-    let spline = Spline::new(trajectory)?;
-    let mut cursor = Cursor::default();
-    let mut samples = vec![Sample::default(); spline.joints()];
-    let mut from: Vec<f64> = trajectory.points.first().map(|p| p.positions.clone()).unwrap_or_default();
-    let mut to = from.clone();
-    for pair in spline.times().windows(2) {
-        for k in [0.5, 1.0] {
-            spline.sample(pair[0] + (pair[1] - pair[0]) * k, &mut cursor, &mut samples);
-            to.iter_mut().zip(&samples).for_each(|(q, s)| *q = s.position);
-            if !free(&from, &to) {
-                return Err(TimingError::NotFree(pair[0], pair[1]));
-            }
-            std::mem::swap(&mut from, &mut to);
+    let mut middle = vec![0.0; trajectory.joint_names.len()];
+    for pair in trajectory.points.windows(2) {
+        let (a, b) = (&pair[0], &pair[1]);
+        let h = b.time_from_start - a.time_from_start;
+        // Of a quintic, or of a cubic.
+        let (first, second) = if a.accelerations.is_empty() { (h / 8.0, 0.0) } else { (h * 5.0 / 32.0, h * h / 64.0) };
+        for (j, q) in middle.iter_mut().enumerate() {
+            let sum = |p: &TrajectoryPoint| p.accelerations.get(j).copied().unwrap_or(0.0);
+            *q = 0.5 * (a.positions[j] + b.positions[j])
+                + first * (a.velocities[j] - b.velocities[j])
+                + second * (sum(a) + sum(b));
+        }
+        if !free(&a.positions, &middle) || !free(&middle, &b.positions) {
+            return Err(TimingError::NotFree(a.time_from_start, b.time_from_start));
         }
     }
     Ok(())

@@ -1,6 +1,6 @@
-//! What a trajectory really does, measured on its spline: the part of each limit that it uses.
+//! What a trajectory really does, measured on the curve between its points: the part of each limit that it uses.
 
-use crate::trajectory::{Cursor, JointTrajectory, Sample, Spline, TrajectoryError};
+use crate::trajectory::TrajectoryPoint;
 
 use super::topp::JointBound;
 
@@ -18,14 +18,12 @@ pub struct Excess {
 impl Excess {
     /// By which factor the motion must be slower to keep all limits; at least 1.
     pub fn slower(&self) -> f64 {
-        self.velocity.max(self.acceleration.sqrt()).max(self.jerk.cbrt()).max(1.0)
+        if self.velocity <= 1.0 && self.acceleration <= 1.0 && self.jerk <= 1.0 {
+            return 1.0;
+        }
+        self.velocity.max(self.acceleration.sqrt()).max(self.jerk.cbrt())
     }
-}
 
-/// Samples of a segment.
-const SAMPLES: usize = 4;
-
-impl Excess {
     /// What it is when the motion takes `factor` times as long.
     pub fn stretched(self, factor: f64) -> Self {
         Self {
@@ -45,53 +43,66 @@ impl Excess {
     }
 }
 
-/// Measures a trajectory. Where points state velocities alone their curve is a cubic, whose extremes are known; else
-/// every segment is sampled, ends included from both sides, and jerk is taken from the change of acceleration.
-pub fn excess(trajectory: &JointTrajectory, bounds: &[JointBound]) -> Result<Excess, TrajectoryError> {
-    let cubic = trajectory.points.iter().all(|p| !p.velocities.is_empty() && p.accelerations.is_empty());
-    if cubic && bounds.iter().all(|b| b.jerk.is_infinite()) {
-        trajectory.validate()?;
-        return Ok(of_cubics(trajectory, bounds));
-    }
-    let spline = Spline::new(trajectory)?;
-    let mut cursor = Cursor::default();
-    let mut samples = vec![Sample::default(); spline.joints()];
-    let mut before = vec![0.0; spline.joints()];
-    let mut most = Excess::default();
-    for pair in spline.times().windows(2) {
-        let (start, length) = (pair[0], pair[1] - pair[0]);
-        for k in 0..=SAMPLES {
-            // Just inside, so that each end is taken from this segment.
-            let part = (k as f64 / SAMPLES as f64).clamp(1e-9, 1.0 - 1e-9);
-            spline.sample(start + length * part, &mut cursor, &mut samples);
-            for ((s, b), last) in samples.iter().zip(bounds).zip(&mut before) {
-                most.velocity = most.velocity.max(s.velocity.abs() / b.velocity);
-                most.acceleration = most.acceleration.max(s.acceleration.abs() / b.acceleration);
-                let change = (s.acceleration - *last).abs() / (length / SAMPLES as f64);
-                most.jerk = most.jerk.max(if k == 0 { 0.0 } else { change / b.jerk });
-                *last = s.acceleration;
-            }
+/// Measures the curve through points that state velocities and, all or none, accelerations: as `Spline` has it, cubic
+/// or quintic. The extremes of cubics are known; quintics are looked at in quarters of each segment.
+pub fn excess(points: &[TrajectoryPoint], bounds: &[JointBound]) -> Excess {
+    let quintic = points.iter().all(|p| !p.accelerations.is_empty());
+    // Per joint, the highest speed, acceleration and jerk.
+    let mut most = vec![[0.0; 3]; bounds.len()];
+    for pair in points.windows(2) {
+        let (a, b) = (&pair[0], &pair[1]);
+        let h = b.time_from_start - a.time_from_start;
+        let inverse = 1.0 / h;
+        for (j, most) in most.iter_mut().enumerate() {
+            let d = (b.positions[j] - a.positions[j]) * inverse;
+            let speeds = (a.velocities[j], b.velocities[j]);
+            let used = if quintic {
+                of_quintic(d, speeds, (a.accelerations[j], b.accelerations[j]), h, inverse)
+            } else {
+                of_cubic(d, speeds, h, inverse)
+            };
+            most.iter_mut().zip(used).for_each(|(m, u)| *m = larger(*m, u));
         }
     }
-    Ok(most)
+    most.iter().zip(bounds).fold(Excess::default(), |all, (&[velocity, acceleration, jerk], bound)| {
+        all.max(Excess {
+            velocity: velocity / bound.velocity,
+            acceleration: acceleration / bound.acceleration,
+            jerk: jerk / bound.jerk,
+        })
+    })
 }
 
-fn of_cubics(trajectory: &JointTrajectory, bounds: &[JointBound]) -> Excess {
-    let mut most = Excess::default();
-    for pair in trajectory.points.windows(2) {
-        let h = pair[1].time_from_start - pair[0].time_from_start;
-        for (j, bound) in bounds.iter().enumerate() {
-            let (v0, v1) = (pair[0].velocities[j], pair[1].velocities[j]);
-            let d = (pair[1].positions[j] - pair[0].positions[j]) / h;
-            // Acceleration goes from a0 to a1 in a straight line; velocity has its extreme where it is zero.
-            let (a0, a1) = ((6.0 * d - 4.0 * v0 - 2.0 * v1) / h, (2.0 * v0 + 4.0 * v1 - 6.0 * d) / h);
-            let mut speed = v0.abs().max(v1.abs());
-            if a0 * a1 < 0.0 {
-                speed = speed.max((v0 - 0.5 * a0 * a0 * h / (a1 - a0)).abs());
-            }
-            most.velocity = most.velocity.max(speed / bound.velocity);
-            most.acceleration = most.acceleration.max(a0.abs().max(a1.abs()) / bound.acceleration);
-        }
+fn larger(a: f64, b: f64) -> f64 {
+    if b > a { b } else { a }
+}
+
+/// The highest speed, acceleration and jerk of a cubic with mean speed `d` over `h`.
+fn of_cubic(d: f64, (v0, v1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
+    // Acceleration goes from a0 to a1 in a straight line; velocity has its extreme where it is zero.
+    let (a0, a1) = ((6.0 * d - 4.0 * v0 - 2.0 * v1) * inverse, (2.0 * v0 + 4.0 * v1 - 6.0 * d) * inverse);
+    let mut speed = larger(v0.abs(), v1.abs());
+    if a0 * a1 < 0.0 {
+        speed = larger(speed, (v0 - 0.5 * a0 * a0 * h / (a1 - a0)).abs());
     }
-    most
+    [speed, larger(a0.abs(), a1.abs()), (a1 - a0).abs() * inverse]
+}
+
+/// The highest speed, acceleration and jerk of a quintic with mean speed `d` over `h`.
+fn of_quintic(d: f64, (v0, v1): (f64, f64), (a0, a1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
+    // Speed is v0 + x·(c1 + x·(c2 + x·(c3 + x·c4))), with x from 0 to 1.
+    let (c1, b1) = (a0 * h, a1 * h);
+    let (rise, change) = (d - v0, v1 - v0);
+    let c2 = 30.0 * rise - 12.0 * change - 4.5 * c1 + 1.5 * b1;
+    let c3 = -60.0 * rise + 28.0 * change + 6.0 * c1 - 4.0 * b1;
+    let c4 = 30.0 * rise - 15.0 * change - 2.5 * c1 + 2.5 * b1;
+    let speed = |x: f64| (v0 + x * (c1 + x * (c2 + x * (c3 + x * c4)))).abs();
+    let acceleration = |x: f64| (c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * 4.0 * c4))).abs();
+    let jerk = |x: f64| (2.0 * c2 + x * (6.0 * c3 + x * 12.0 * c4)).abs();
+    let most = |ends: f64, f: &dyn Fn(f64) -> f64| larger(larger(ends, f(0.25)), larger(f(0.5), f(0.75)));
+    [
+        most(larger(v0.abs(), v1.abs()), &speed),
+        most(larger(c1.abs(), b1.abs()), &acceleration) * inverse,
+        most(larger(jerk(0.0), jerk(1.0)), &jerk) * inverse * inverse,
+    ]
 }

@@ -155,7 +155,7 @@ fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
         if let Some(text) = builtin::text(robot) {
             return Some(text.to_owned());
         }
-        let hint = crate::yaml::did_you_mean(robot, builtin::NAMES.iter().copied(), "there are");
+        let hint = crate::yaml::did_you_mean(robot, builtin::names(), "there are");
         loaded.tree.report(Diag::error(format!("no robot in the box is named `{robot}`")).maybe_hint(hint));
         return None;
     }

@@ -93,6 +93,13 @@ pub struct MeshFile {
     pub scale: Vector3<f64>,
 }
 
+impl MeshFile {
+    /// Whether it is a Collada file: a scene that must be converted to triangles.
+    pub fn is_collada(&self) -> bool {
+        self.uri.to_ascii_lowercase().ends_with(".dae")
+    }
+}
+
 /// Mass and inertia.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Inertial {
@@ -127,6 +134,11 @@ impl JointKind {
             Self::Continuous => "continuous",
             Self::Prismatic => "prismatic",
         }
+    }
+
+    /// The unit of its position.
+    pub fn unit(self) -> &'static str {
+        if self == Self::Prismatic { "m" } else { "rad" }
     }
 
     /// Whether its position is an angle [rad] and not a length [m].
@@ -275,6 +287,15 @@ impl RobotModel {
             poses[joint.child] = poses[joint.parent] * joint.transform(positions.get(i).copied().unwrap_or(0.0));
         }
         poses
+    }
+
+    /// The first link that collides by a Collada file, and the file.
+    pub fn collada_collision(&self) -> Option<(&Link, &MeshFile)> {
+        let mesh = |shape| match shape {
+            &Shape { geometry: Geometry::Mesh(ref mesh), .. } if mesh.is_collada() => Some(mesh),
+            _ => None,
+        };
+        self.links.iter().find_map(|link| Some((link, link.collisions.iter().find_map(mesh)?)))
     }
 
     /// Mesh files of all shapes.

@@ -96,6 +96,24 @@ impl Semantics {
         let own = |i: &usize| robot.joints.get(*i).is_some_and(|j| j.is_independent());
         Some(joints.into_iter().filter(own).collect())
     }
+
+    /// The named poses that give a position to every one of these joints, in their order. Where two have the same
+    /// name, the first one counts.
+    pub fn poses_of(&self, joints: &[String]) -> Vec<(&str, Vec<f64>)> {
+        let mut poses: Vec<(&str, Vec<f64>)> = Vec::new();
+        for pose in &self.poses {
+            let position = |joint: &String| pose.positions.iter().find(|(name, _)| name == joint).map(|(_, q)| *q);
+            let positions: Option<Vec<f64>> = joints.iter().map(position).collect();
+            let known = poses.iter().any(|(name, _)| *name == pose.name);
+            poses.extend(positions.filter(|_| !known && !joints.is_empty()).map(|q| (pose.name.as_str(), q)));
+        }
+        poses
+    }
+
+    /// The pairs of links whose contact does not count, by name.
+    pub fn disabled_pairs(&self) -> impl Iterator<Item = (String, String)> + '_ {
+        self.disabled.iter().map(|pair| (pair.a.clone(), pair.b.clone()))
+    }
 }
 
 /// Reads an SRDF for a robot.
@@ -118,7 +136,8 @@ pub fn read(root: &Element, robot: &RobotModel, tree: &mut Tree, calls: &Calls) 
     }
     reader.check_groups(root, &out);
     if reader.missing > 0 {
-        let what = format!("{} pairs of `disable_collisions` name links that this robot lacks", reader.missing);
+        let pairs = if reader.missing == 1 { "pair" } else { "pairs" };
+        let what = format!("{} {pairs} of `disable_collisions` with links that this robot lacks", reader.missing);
         reader.tree.report(Diag::warning(what).at(root.at.label()));
     }
     Some(out)
@@ -279,8 +298,11 @@ mod tests {
         assert_eq!(out.group_joints(&robot(), "all"), Some(vec![0, 1, 2, 3]));
         assert_eq!(out.group_joints(&robot(), "none"), None);
         assert_eq!(out.poses[0].positions, [("j1".to_owned(), 0.5), ("j2".to_owned(), -0.25)]);
+        let of = |joints: &[&str]| joints.iter().map(|j| (*j).to_owned()).collect::<Vec<_>>();
+        assert_eq!(out.poses_of(&of(&["j2", "j1"])), [("home", vec![-0.25, 0.5])]);
+        assert_eq!((out.poses_of(&of(&["j1", "j3"])), out.poses_of(&[])), (vec![], vec![]));
         assert_eq!((out.end_effectors.len(), out.disabled.len()), (1, 1));
-        assert!(text.contains("1 pairs") && !text.contains("error"), "{text}");
+        assert!(text.contains("1 pair of") && !text.contains("error"), "{text}");
     }
 
     #[test]

@@ -12,6 +12,7 @@
 mod call;
 mod evaluate;
 mod expand;
+mod fill;
 mod format;
 mod functions;
 mod include;
@@ -20,6 +21,7 @@ mod property;
 mod scope;
 mod syntax;
 mod text;
+mod tokens;
 mod value;
 mod yaml11;
 

@@ -239,8 +239,8 @@ pub struct RobotReport {
     pub end_effector_link: String,
     /// The coordinator's joints, in the order of joint goals.
     pub joints: Vec<String>,
-    /// Lowest and highest positions [rad].
-    pub limits: Vec<[f64; 2]>,
+    /// Lowest and highest positions [rad]; `null` where a joint turns without end.
+    pub limits: Vec<[Option<f64>; 2]>,
     /// The task that executes its motions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,

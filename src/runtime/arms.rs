@@ -72,7 +72,7 @@ pub fn bring_up(
             dof: arm.joints.len(),
             tick_period: period,
             native_rate: arm.adapter.native_rate,
-            velocity_max: (arm.adapter.limits)(arm.joints.len()).velocity_max.iter().copied().fold(0.1, f64::max),
+            velocity_max: arm.own_limits.velocity_max.iter().copied().fold(0.1, f64::max),
             realtime,
             beat: beat.clone(),
             clock: Arc::new(MonotonicClock),

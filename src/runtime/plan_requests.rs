@@ -91,7 +91,11 @@ impl PlannerPort {
             name: robot.config.name.clone(),
             end_effector_link: robot.config.end_effector_link.clone(),
             joints: robot.config.coordinator_joints.clone(),
-            limits: robot.limits.iter().map(|l| [l.lower, l.upper]).collect(),
+            limits: robot
+                .limits
+                .iter()
+                .map(|l| [l.lower, l.upper].map(|q| Some(q).filter(|q| q.is_finite())))
+                .collect(),
             task: robot.config.task.clone(),
             named_poses: robot.config.named_poses.clone(),
         };

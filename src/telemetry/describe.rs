@@ -192,7 +192,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
 
 fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> Described {
     let severity = match (state, reason) {
-        (_, Reason::None | Reason::Cancelled) => Severity::Info,
+        (_, Reason::None | Reason::Cancelled | Reason::StreamEnded) => Severity::Info,
         (_, Reason::ArmHeld(_, Cause::Operator | Cause::Shutdown)) => Severity::Warn,
         (TaskState::Aborted | TaskState::Fault, _) => Severity::Error,
         _ => Severity::Warn,
@@ -203,7 +203,7 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
     let text = format!("task {name} is {}{colon}{why}", state.name());
     let mut d = Described { task: Some(name), ..plain("task", severity, state.name(), text) };
     match reason {
-        Reason::None | Reason::Cancelled | Reason::Timeout => {}
+        Reason::None | Reason::Cancelled | Reason::Timeout | Reason::StreamEnded => {}
         Reason::PathTolerance(joint, value)
         | Reason::GoalTolerance(joint, value)
         | Reason::TrackingError(joint, value)
@@ -226,6 +226,7 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::None => String::new(),
         Reason::Cancelled => "cancelled".into(),
         Reason::Timeout => "its targets stopped coming".into(),
+        Reason::StreamEnded => "its stream was ended".into(),
         Reason::PathTolerance(joint, by) => format!("{} was {} from the path", names.joint(joint), angle(by)),
         Reason::GoalTolerance(joint, by) => format!("{} ended {} from the goal", names.joint(joint), angle(by)),
         Reason::Preempted(task, joint) => format!("task {} took {}", names.task(task), names.joint(joint)),

@@ -176,6 +176,8 @@ pub enum Reason {
     Cancelled,
     /// Its stream of targets stopped.
     Timeout,
+    /// Its stream of targets was ended by whom it came from, or by an operator's cancel.
+    StreamEnded,
     /// A joint was further from the path than the path tolerance: joint, error [rad].
     PathTolerance(u16, f64),
     /// A joint did not arrive within the goal time: joint, error [rad].

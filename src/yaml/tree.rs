@@ -203,6 +203,23 @@ impl Tree {
         self.entry(map, key).map(|(_, value)| value)
     }
 
+    /// What stands at a path of keys and numbers with dots (`sim.faults.0`) below `root`, or as near to it as there is
+    /// anything.
+    pub fn nearest(&self, root: NodeId, path: &str) -> NodeId {
+        let mut at = root;
+        for step in path.split('.') {
+            let next = match step.parse().ok().and_then(|index: usize| self.items(at).get(index)) {
+                Some(item) => Some(*item),
+                None => self.get(at, step),
+            };
+            match next {
+                Some(next) => at = next,
+                None => break,
+            }
+        }
+        at
+    }
+
     /// Takes a key out of a group.
     pub fn remove(&mut self, map: NodeId, key: &str) {
         let kept = self.entries(map).iter().copied().filter(|(k, _)| self.text(*k) != Some(key)).collect();

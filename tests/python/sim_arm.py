@@ -130,13 +130,17 @@ class SimArmAdapter:
             raise RuntimeError("Not connected")
         self._sdk.step()
         if TROUBLE == "nan":
-            return [math.nan] * self._dof
+            return [0.1, 0.2, math.nan] + [0.0] * (self._dof - 3)
+        if TROUBLE == "short":
+            return [0.0] * (self._dof - 1)
         return [math.radians(p) for p in self._sdk.q]
 
     def read_joint_velocities(self) -> list[float]:
         if not self._sdk:
             return [0.0] * self._dof
         self._sdk.step()
+        if TROUBLE == "infinite":
+            return [0.0, -math.inf] + [0.0] * (self._dof - 2)
         return [math.radians(v) for v in self._sdk.v]
 
     def read_joint_efforts(self) -> list[float]:

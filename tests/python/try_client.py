@@ -3,6 +3,7 @@
 import itertools
 import math
 import os
+import time
 
 import dimos_client as dimos
 from dimos_client import Client
@@ -85,6 +86,37 @@ def follows_a_policy(robot, watcher):
     robot.cancel()
 
 
+def moves_the_end_effector(robot):
+    """A twist about the base's z turns joint 1; a pose goes there and stays."""
+    before = robot.state("arm").position
+    for _ in range(25):
+        robot.twist("twist_arm", [0, 0, 0.05], [0, 0, 0])
+        time.sleep(0.02)
+    robot.settle()
+    after = robot.state("arm").position
+    assert abs(after[0] - before[0]) < 1e-3 and not near(after[1:4], before[1:4], 0.01), (before, after)
+    robot.twist("twist_arm", [0, 0, 0, 0], [0, 0, 0])
+    refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
+    robot.twist("twist_arm", [0, 0, 0.05], [0, 0, 0], frame="world")
+    refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
+    robot.pose("pose_arm", [0.35, 0, 0.3])
+    refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
+    deadline = time.monotonic() + 60
+    while True:  # until it stands there
+        robot.pose("pose_arm", [0.35, 0.05, 0.4], rpy=[3.1, 0, 0.2])
+        robot.settle()
+        time.sleep(0.05)
+        state = robot.state("arm")
+        if max(abs(v) for v in state.velocity) < 1e-9 and abs(state.position[0] - before[0]) > 0.01:
+            break
+        assert time.monotonic() < deadline, state
+    task = next(t for t in robot.status()["tasks"] if t["name"] == "pose_arm")
+    assert task["state"] == "EXECUTING" and task["type"] == "cartesian_ik", task
+    robot.pose("twist_arm", [0.35, 0.05, 0.4], quat=[0, 0, 0, 1])
+    refused(dimos.Refused, "WRONG_TASK", robot.settle)
+    robot.cancel()
+
+
 def grips_and_stops(robot):
     robot.gripper("arm", "open")
     while abs(robot.state("arm").gripper - 0.08) > 1e-3:
@@ -107,6 +139,7 @@ with Client.connect() as robot, Client.connect("scripts") as watcher:
     a_slow_reader_is_told(watcher)
     moves(robot)
     follows_a_policy(robot, watcher)
+    moves_the_end_effector(robot)
     grips_and_stops(robot)
     assert robot.call("release")["arms"] == ["arm"]
     watcher.move("arm", READY)

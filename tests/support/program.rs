@@ -57,6 +57,23 @@ impl Home {
         Started::of(self.command(arguments).stdin(Stdio::null())).wait()
     }
 
+    /// Runs a verb again that was refused only because a busy machine held an arm up.
+    #[track_caller]
+    pub fn patiently(&self, arguments: &str) -> Ended {
+        for _ in 0..5 {
+            let ended = self.dimos(arguments);
+            if !ended.err.contains("is held (its states") && !ended.err.contains("reset it first") {
+                return ended;
+            }
+            for arm in self.status()["arms"].as_array().unwrap() {
+                let id = arm["hardware_id"].as_str().unwrap();
+                self.dimos(&format!("arm reset {id}"));
+                self.dimos(&format!("arm enable {id}"));
+            }
+        }
+        self.dimos(arguments)
+    }
+
     /// Starts something that goes on, without waiting for anything.
     pub fn start(&self, arguments: &str) -> Started {
         Started::of(self.command(arguments).stdin(Stdio::null()))

@@ -9,6 +9,7 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
+use dimos::hardware::kit::{fault, fill, finite};
 use dimos::hardware::registry::AdapterConfig;
 use dimos::hardware::spec::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
@@ -17,7 +18,7 @@ use dimos::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanP
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Control, FILTERS, Feedback, Identity, Mode, PAIRS, Status, WireJoints};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 
 /// Longest wait for the arm's introduction, and for its first state: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1200);
@@ -56,13 +57,10 @@ struct State {
 impl AcmeAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("acme has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
-            address: CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?,
+            address: config.parse_address(CanAddress::parse)?,
             port: None,
             identity: None,
             round: State::default(),
@@ -171,7 +169,7 @@ impl AcmeAdapter {
         match self.recent()?.status {
             Status { error: 0, enabled: true, .. } => Ok(()),
             Status { error: 0, .. } => Err(AdapterError::Rejected("acme: the motors are off".into())),
-            Status { error, .. } => Err(fault(error)),
+            Status { error, .. } => Err(fault(error, protocol::error_text(error))),
         }
     }
 
@@ -200,10 +198,6 @@ impl AcmeAdapter {
     }
 }
 
-fn fault(code: u16) -> AdapterError {
-    AdapterError::Fault { code: code.into(), text: protocol::error_text(code).into() }
-}
-
 // --- Units. YOUR ARM: other units, other signs, another order of the joints are changed here and nowhere else ---
 
 /// Joint values of the wire [0.001 deg or 0.001 deg/s] as ours [rad or rad/s].
@@ -213,17 +207,7 @@ fn from_wire(values: &WireJoints) -> Joints {
 
 /// Our joint values [rad] as those of the wire [0.001 deg].
 fn to_wire(values: &[f64]) -> AdapterResult<WireJoints> {
-    match <[f64; DOF]>::try_from(values) {
-        Ok(values) if values.iter().all(|value| value.is_finite()) => {
-            Ok(values.map(|value| (value.to_degrees() * 1000.0).round() as i32))
-        }
-        _ => Err(AdapterError::Rejected(format!("{DOF} finite values are needed, one per joint"))),
-    }
-}
-
-/// Copies the first values; `out` has length dof.
-fn fill(out: &mut [f64], values: &[f64]) {
-    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+    Ok(finite(values)?.map(|value: f64| (value.to_degrees() * 1000.0).round() as i32))
 }
 
 impl ManipulatorAdapter for AcmeAdapter {
@@ -277,7 +261,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // YOUR ARM: ask it, if it knows them
+        Ok(limits()) // YOUR ARM: ask it, if it knows them
     }
 
     // --- Mode ---
@@ -364,7 +348,7 @@ impl ManipulatorAdapter for AcmeAdapter {
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         match self.recent()?.status.error {
-            error if enable && error != 0 => Err(fault(error)),
+            error if enable && error != 0 => Err(fault(error, protocol::error_text(error))),
             _ => self.command(Control::Enable(enable), |status| status.enabled == enable),
         }
     }
@@ -372,7 +356,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         let cleared = self.command(Control::Clear, |status| status.error == 0);
         match (cleared, self.state.status.error) {
-            (Err(AdapterError::Timeout(_)), error) if error != 0 => Err(fault(error)),
+            (Err(AdapterError::Timeout(_)), error) if error != 0 => Err(fault(error, protocol::error_text(error))),
             (cleared, _) => cleared,
         }
     }

@@ -8,62 +8,20 @@ use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
-use dimos::hardware::sim::arm::{Delivery, SimArm};
-use dimos::hardware::sim::can_server::{CanController, CanServer};
-use dimos::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use dimos::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm};
+use dimos::hardware::sim::can_server::{CanController, CanServer, PLAYABLE};
 use dimos::hardware::spec::AdapterResult;
 use dimos::hardware::transport::can::CanFrame;
-use dimos::joint::{ControlMode, Joints};
+use dimos::joint::ControlMode;
 
 use super::{DOF, NATIVE_RATE, Options, limits};
 
-/// The faults that the emulator can play: on a bus no byte is damaged, and integers are never NaN.
-const PLAYABLE: &[FaultKind] = &[
-    FaultKind::Stall,
-    FaultKind::Silent,
-    FaultKind::Disconnect,
-    FaultKind::ErrorCode,
-    FaultKind::Estop,
-    FaultKind::PowerLoss,
-    FaultKind::ZeroState,
-    FaultKind::Garbage,
-    FaultKind::Truncated,
-    FaultKind::WrongDof,
-    FaultKind::Sag,
-    FaultKind::Blocked,
-];
-
-/// A running emulator. Ends when it is dropped.
-pub struct AcmeEmulator(CanServer<AcmeController>);
-
-impl AcmeEmulator {
-    /// Starts an emulator at `place`, with the `sim` part of the arm's options.
-    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
-        let (options, limits) = (config.options::<Options>()?.sim, limits(DOF));
-        options.check("acme", &limits, PLAYABLE)?;
-        let arm = SimArm::new(&limits, &options, f64::INFINITY, MonotonicClock.now());
-        let controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
-        CanServer::start("acme", controller, place, Duration::from_secs_f64(1.0 / NATIVE_RATE)).map(Self)
-    }
-}
-
-impl Emulator for AcmeEmulator {
-    fn address(&self) -> String {
-        self.0.address().to_string()
-    }
-
-    fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the acme emulator", &[fault], PLAYABLE)?;
-        self.0.with(|controller, now| controller.arm.inject(fault, now));
-        Ok(())
-    }
-
-    fn true_positions(&self) -> Option<Joints> {
-        self.0.with(|controller, now| {
-            controller.arm.advance(now);
-            Some(controller.arm.joints().0)
-        })
-    }
+/// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
+pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
+    let options: Options = config.options()?;
+    let arm = SimArm::new("acme", &limits(), &options.sim, PLAYABLE, MonotonicClock.now())?;
+    let controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
+    Ok(Box::new(CanServer::start("acme", controller, place, Duration::from_secs_f64(1.0 / NATIVE_RATE))?))
 }
 
 /// The arm's computer: commands in, what the arm makes of them, its state out.
@@ -73,6 +31,12 @@ struct AcmeController {
     speed: u8,
     /// [0.001 deg]
     targets: [i32; DOF],
+}
+
+impl HasArm for AcmeController {
+    fn arm(&mut self) -> &mut SimArm {
+        &mut self.arm
+    }
 }
 
 impl CanController for AcmeController {
@@ -118,7 +82,7 @@ impl CanController for AcmeController {
 
 impl AcmeController {
     /// All targets have come.
-    fn go(&mut self) -> Result<(), dimos::hardware::sim::arm::Refusal> {
+    fn go(&mut self) -> Result<(), Refusal> {
         let target = self.targets.map(|value| (f64::from(value) * 0.001).to_radians());
         if self.arm.mode() == ControlMode::Position {
             self.arm.move_to(&target, f64::from(self.speed) / 100.0)
@@ -174,7 +138,7 @@ mod tests {
     #[test]
     fn the_golden_commands_are_obeyed() {
         let now = Mono(1_000_000_000);
-        let arm = SimArm::new(&limits(DOF), &SimOptions::default(), f64::INFINITY, now);
+        let arm = SimArm::new("acme", &limits(), &SimOptions::default(), PLAYABLE, now).unwrap();
         let mut controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
         let mut answers = Vec::new();
         let mut hear = |frame: &CanFrame, after: u64| {

@@ -8,8 +8,10 @@ pub mod emulator;
 mod golden;
 pub mod protocol;
 
-use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use dimos::hardware::fit::{Fit, Misfit};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use dimos::hardware::sim::arm::SimOptions;
+use dimos::hardware::sim::can_server::PLAYABLE;
 use dimos::hardware::transport::can::CanAddress;
 use dimos::hardware::transport::can::address::FORMS;
 use dimos::joint::{ControlMode, JointLimits};
@@ -44,21 +46,27 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: false,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
-    emulate: Some(|config, place| Ok(Box::new(emulator::AcmeEmulator::start(config, place)?))),
+    emulate: Some(emulator::start),
 };
 
+/// Whether number of joints and options go together, and the joint limits that follow: `dimos check` asks this.
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("acme", SPEC.dof)?;
+    let (options, limits) = (config.options::<Options>()?, limits());
+    options.sim.check("acme", &limits, PLAYABLE)?;
+    Ok(Fit { limits }) // YOUR ARM: where an option changes the limits, like a model, this is the place
+}
+
 /// The joint limits of the data sheet, in SI units.
-fn limits(_dof: usize) -> JointLimits {
+fn limits() -> JointLimits {
     // YOUR ARM: lowest and highest position [deg] and top speed [deg/s] of each joint, base first.
     const DATA_SHEET: [(f64, f64, f64); DOF] = [(-170.0, 170.0, 180.0); DOF];
     JointLimits {
-        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
-        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
-        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
-        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it empty where the sheet says nothing
+        acceleration_max: vec![10.0; DOF], // YOUR ARM [rad/s²]; leave it out where the sheet says nothing
         jerk_max: vec![100.0; DOF],        // YOUR ARM [rad/s³]; the same
+        ..JointLimits::of_degrees(&DATA_SHEET)
     }
 }
 

@@ -8,5 +8,7 @@ fn main() -> ExitCode {
     Program::new()
         .adapter(acme::SPEC)
         .blueprint("coordinator-acme", include_str!("../blueprints/coordinator-acme.yaml"))
+        .blueprint("acme-planner", include_str!("../blueprints/acme-planner.yaml"))
+        .robot("acme", include_str!("../robots/acme.urdf"))
         .main()
 }

@@ -3,7 +3,7 @@
 use serde_json::{Map, Value};
 
 use super::super::exit::{Exit, Failure, Result};
-use crate::hardware::arms::ABSENT;
+use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
 use crate::hardware::spec::AdapterError;
 use crate::joint::MAX_DOF;
@@ -30,7 +30,7 @@ impl Choice {
         if let Some(row) = registry.get(&self.name) {
             return Ok(*row);
         }
-        if let Some(absent) = ABSENT.iter().find(|absent| absent.name == self.name) {
+        if let Some(absent) = registry.absent().find(|absent| absent.name == self.name) {
             return Err(Failure::usage(format!("{} is not in this build", absent.name)).hint(absent.remedy));
         }
         let close = |name: &&&str| strsim::damerau_levenshtein(name, &self.name) <= 2;
@@ -39,19 +39,28 @@ impl Choice {
         Err(names.iter().find(close).map_or(failure.clone(), |name| failure.hint(format!("did you mean {name}?"))))
     }
 
-    /// The numbers of joints to try, the likeliest first.
-    pub fn dofs(&self, row: &AdapterSpec) -> Result<Vec<usize>> {
+    /// What the adapter is made from: with the joints that were asked for, else with the most that fit the options.
+    pub fn config(&self, row: &AdapterSpec, address: &str) -> Result<AdapterConfig> {
         let (least, most) = row.dof;
-        match self.dof.map(usize::from) {
-            Some(dof) if (least..=most).contains(&dof) => Ok(vec![dof]),
-            Some(dof) => Err(Failure::usage(format!("{} has {}, not {dof}", row.name, joints(row)))),
-            // Which of them a model has, only the adapter knows.
-            None => Ok((least..=most).rev().collect()),
+        let dofs = match self.dof.map(usize::from) {
+            Some(dof) if (least..=most).contains(&dof) => dof..=dof,
+            Some(dof) => return Err(Failure::usage(format!("{} has {}, not {dof}", row.name, joints(row)))),
+            None => least..=most,
+        };
+        let mut refusal = None;
+        for dof in dofs.rev() {
+            let config = self.with_dof(address, dof)?;
+            match (row.fit)(&config) {
+                Ok(_) => return Ok(config),
+                // With another number of joints it may be the model that was asked for.
+                Err(misfit) => refusal = refusal.or(Some(misfit)),
+            }
         }
+        let refusal = refusal.unwrap_or_else(|| Misfit::new("", format!("{} has no joints", row.name)));
+        Err(Failure { hint: refusal.hint, ..Failure::usage(refusal.what) })
     }
 
-    /// What the adapter is made from.
-    pub fn config(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
+    fn with_dof(&self, address: &str, dof: usize) -> Result<AdapterConfig> {
         let mut options = Map::new();
         let model = self.model.iter().map(|model| ("model", model.as_str()));
         for (path, text) in self.options.iter().map(|(path, text)| (path.as_str(), text.as_str())).chain(model) {
@@ -94,10 +103,26 @@ pub fn failure(exit: Exit, error: &AdapterError) -> Failure {
     }
 }
 
+/// Why an emulator does not start: what was asked for cannot be, or the computer does not give what it needs.
+pub fn not_started(error: AdapterError) -> Failure {
+    let exit = if matches!(error, AdapterError::Rejected(_)) { Exit::Usage } else { Exit::Hardware };
+    failure(exit, &error)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hardware::registry::Absent;
     use serde_json::json;
+
+    #[test]
+    fn what_this_build_lacks_is_told_also_where_a_program_of_its_own_lacks_it() {
+        let servobot = Absent { name: "servobot", about: "an arm", remedy: "build with --features servobot" };
+        let registry = Registry::builtin().lacking(&[servobot]);
+        let choice = Choice { name: "servobot".into(), dof: None, model: None, options: Vec::new() };
+        let failure = choice.row(&registry).unwrap_err();
+        assert_eq!(failure.hint.as_deref(), Some("build with --features servobot"));
+    }
 
     #[test]
     fn options_nest_by_their_dots() {

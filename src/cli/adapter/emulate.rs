@@ -11,12 +11,13 @@ use serde_json::{Value, json};
 use super::super::arguments::duration;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
-use super::super::output;
-use super::choice::{self, Choice};
+use super::super::output::{self, Table};
+use super::choice::{Choice, not_started};
 use crate::blueprint;
+use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::registry::{AdapterSpec, Emulator, Place, Registry};
-use crate::hardware::sim::faults::Fault;
-use crate::hardware::spec::AdapterError;
+use crate::hardware::sim::diary::{self, Happening};
+use crate::hardware::sim::faults::{Fault, FaultKind};
 
 /// How often the joints are shown.
 const LOOK: Duration = Duration::from_millis(100);
@@ -25,8 +26,8 @@ const LOOK: Duration = Duration::from_millis(100);
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 A fault script: at=2,kind=stall,duration=0.5 (repeatable), or a YAML or JSON file with a list of such.
-`at` counts seconds from the first client's connection. The kinds are those of `dimos schema`; an emulator names the
-ones that it can play when it is asked for another.")]
+`at` counts seconds from the first client's connection. `--fault list` shows the kinds that this arm's emulator can play.
+Clients that come and go, and faults that strike, are told on stderr, in seconds since the start.")]
 pub struct Args {
     #[command(flatten)]
     pub choice: Choice,
@@ -39,7 +40,7 @@ pub struct Args {
     /// Stand on a new pseudo-terminal [default for arms on a serial line]
     #[arg(long, group = "place")]
     pub pty: bool,
-    /// What goes wrong, and when (repeatable)
+    /// What goes wrong, and when (repeatable); `list` shows what can
     #[arg(long, value_name = "SCRIPT")]
     pub fault: Vec<String>,
     /// End after this time: 10s, 500ms
@@ -53,8 +54,12 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     let row = args.choice.row(registry)?;
+    if args.fault.iter().any(|text| text == "list") {
+        return list_faults(args, &row);
+    }
     let faults = args.fault.iter().map(|text| script(text)).collect::<Result<Vec<_>>>()?.concat();
     let place = args.place(&row)?;
+    diary::open();
     let (emulator, dof) = start(args, &row, &place)?;
     for fault in &faults {
         emulator.inject(*fault).map_err(Failure::usage)?;
@@ -65,8 +70,9 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     if let Ok(style) = ProgressStyle::with_template("SIMULATED {wide_msg}") {
         bar.set_style(style);
     }
-    let began = Instant::now();
+    let (began, zero) = (Instant::now(), MonotonicClock.now());
     let ended = loop {
+        tell(&bar, zero);
         if let Some(signal) = signals.last() {
             break Exit::by_signal(signal);
         }
@@ -80,8 +86,38 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         }
         std::thread::sleep(left.unwrap_or(LOOK).min(LOOK));
     };
+    tell(&bar, zero);
     bar.finish_and_clear();
     Ok(ended)
+}
+
+/// Tells what has happened to the emulator since the last time: nobody who serves a client waits for a terminal.
+fn tell(bar: &ProgressBar, zero: Mono) {
+    while let Some((at, what)) = diary::take() {
+        let what = match what {
+            Happening::Came => "a client connected".to_owned(),
+            Happening::Gone => "the client is gone".to_owned(),
+            Happening::TurnedAway => "another client was turned away".to_owned(),
+            Happening::Struck(kind) => format!("the fault {} strikes", kind.name()),
+        };
+        bar.suspend(|| output::note(format_args!("{:8.3} s  {what}", at.seconds_since(zero))));
+    }
+}
+
+/// The kinds of faults that this arm's emulator can play, each with what it means.
+fn list_faults(args: &Args, row: &AdapterSpec) -> Result {
+    // Where nobody else is disturbed; on a bus, where it can play what it can play on any.
+    let place = if row.transport == "can" { Place::Pty } else { Place::InProcess };
+    let (emulator, _) = start(args, row, &place)?;
+    let mut table = Table::new(&["KIND", "WHAT GOES WRONG"]);
+    for (kind, about) in FaultKind::all() {
+        // One in the far future only asks whether it can be played.
+        if emulator.inject(Fault::new(kind).at(1e6)).is_ok() {
+            table.row([kind.name(), about]);
+        }
+    }
+    table.print();
+    Ok(Exit::Ok)
 }
 
 impl Args {
@@ -110,22 +146,11 @@ fn start(args: &Args, row: &AdapterSpec, place: &Place) -> Result<(Box<dyn Emula
             "it needs none: it is an arm in memory"
         }));
     };
-    let mut refusal = None;
-    for dof in args.choice.dofs(row)? {
-        match emulate(&args.choice.config("", dof)?, place) {
-            Ok(emulator) => return Ok((emulator, dof)),
-            Err(AdapterError::Unsupported) => {
-                return Err(Failure::usage(format!(
-                    "the emulator of {} cannot be there: it speaks {}",
-                    row.name, row.transport
-                )));
-            }
-            // With another number of joints it may be the model that was asked for.
-            Err(error @ AdapterError::Rejected(_)) => refusal = refusal.or(Some(choice::failure(Exit::Usage, &error))),
-            Err(error) => return Err(choice::failure(Exit::Hardware, &error)),
-        }
+    let config = args.choice.config(row, "")?;
+    match emulate(&config, place) {
+        Ok(emulator) => Ok((emulator, config.dof)),
+        Err(error) => Err(not_started(error)),
     }
-    Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
 }
 
 /// A fault script: one fault as `key=value,…`, or a file with a list.

@@ -1,5 +1,6 @@
 //! `dimos adapter new NAME`: the start of an adapter for a new arm.
 
+mod description;
 mod name;
 mod table;
 mod templates;
@@ -16,10 +17,11 @@ use crate::hardware::registry::Registry;
 use crate::joint::MAX_DOF;
 use name::Name;
 use templates::Arm;
-use write::Plan;
+use write::{Change, Plan};
 
-/// Where the table of adapters stands in a checkout.
+/// Where the table of adapters stands in a checkout, and that of robot descriptions.
 const TABLE: &str = "src/hardware/arms/mod.rs";
+const ROBOTS: &str = "src/robot/builtin.rs";
 /// The checkout that this program was built from, wherever it is now.
 const BUILT_FROM: &str = env!("CARGO_MANIFEST_DIR");
 /// Where dimos is published, if it is.
@@ -28,15 +30,16 @@ const REPOSITORY: &str = env!("CARGO_PKG_REPOSITORY");
 /// Arguments of `adapter new`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Writes a crate of its own, DIR/NAME: an adapter, an emulator, tests, a blueprint, and a program
-that is `dimos` with one arm more. It compiles, passes the conformance suite and runs at once,
-with a made-up wire format: search it for `YOUR ARM`. Nothing is ever written over.
+Writes a crate of its own, DIR/NAME: an adapter, an emulator, tests, a robot description, two
+blueprints, and a program that is `dimos` with one arm more. It compiles, passes the conformance
+suite, runs and plans at once, with a made-up wire format and a made-up shape: search it for
+`YOUR ARM`. Nothing is ever written over.
 
   dimos adapter new acme --dof 6 --transport tcp
   cd acme && cargo test && cargo run -- run coordinator-acme
 
-With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, its lines in the
-table of arms, and blueprints/coordinator-NAME.yaml.
+With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, assets/robots,
+blueprints, and a line in the table of each.
 
 docs/adding-an-arm.md goes through it step by step.")]
 pub struct Args {
@@ -92,7 +95,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 }
 
 /// Commands to go on with, and what each is for.
-type Next = [(String, &'static str); 3];
+type Next = [(String, &'static str); 4];
 
 fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
     if !args.path.is_dir() {
@@ -104,9 +107,13 @@ fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
     let next = [
         (format!("cd {} && cargo test", shown(&folder)), "its bytes, and the conformance suite"),
         (format!("cargo run -- run {}", arm.blueprint()), "with its emulator"),
-        ("grep -rn 'YOUR ARM' src".to_owned(), "what to change"),
+        (
+            format!("cargo run -- run {}", arm.planner()),
+            "the same with a planner: `cargo run -- plan arm --named home`",
+        ),
+        ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change"),
     ];
-    Ok((Plan { new, folders: vec![folder], change: None }, next))
+    Ok((Plan { new, folders: vec![folder], changes: Vec::new() }, next))
 }
 
 fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
@@ -115,19 +122,23 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
         let what = format!("--in-tree: {} is no checkout of dimos", root.display());
         return Err(Failure::usage(what).hint("give the one to write into: --path DIR"));
     }
-    let table = root.join(TABLE);
-    let before = fs::read_to_string(&table)
-        .map_err(|e| Failure::new(Exit::Failed, format!("cannot read {}: {e}", table.display())))?;
-    let after = table::with_row(&before, &arm.name.snake)
-        .map_err(|e| Failure::usage(format!("{}: {e}: nothing was written", table.display())))?;
+    let name = &arm.name.snake;
+    let changes = vec![
+        Change::of(root.join(TABLE), |text| table::with_row(text, name)).map_err(Failure::usage)?,
+        Change::of(root.join(ROBOTS), |text| table::with_robot(text, name)).map_err(Failure::usage)?,
+    ];
     let new = arm.in_tree().into_iter().map(|(path, text)| (root.join(path), text)).collect();
     let folder = root.join("src/hardware/arms").join(&arm.name.snake);
     let next = [
         ("DIMOS_REGENERATE=1 cargo test --lib blueprint".to_owned(), "brings the generated pages up to date"),
         ("cargo test --test conformance".to_owned(), "every arm of the table, this one too"),
         (format!("cargo run -- run {}", arm.blueprint()), "with its emulator"),
+        (
+            format!("cargo run -- run {}", arm.planner()),
+            "the same with a planner: `cargo run -- plan arm --named home`",
+        ),
     ];
-    Ok((Plan { new, folders: vec![folder], change: Some((table, before, after)) }, next))
+    Ok((Plan { new, folders: vec![folder], changes }, next))
 }
 
 /// Where a crate finds dimos, as its manifest writes it.
@@ -165,11 +176,12 @@ fn shown(path: &Path) -> String {
 fn report(args: &Args, arm: &Arm, plan: &Plan, next: &Next) {
     let name = |path: &Path| path.strip_prefix(".").unwrap_or(path).display().to_string();
     let written: Vec<String> = plan.new.iter().map(|(path, _)| name(path)).collect();
-    let changed = plan.change.iter().map(|(path, ..)| name(path));
+    let changed = plan.changes.iter().map(|change| name(&change.path));
     if args.json {
         output::json(&json!({
             "adapter": arm.name.snake,
             "blueprint": arm.blueprint(),
+            "planner": arm.planner(),
             "written": written,
             "changed": changed.collect::<Vec<_>>(),
             "next": next.iter().map(|(command, _)| command).collect::<Vec<_>>(),

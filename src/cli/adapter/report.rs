@@ -101,6 +101,28 @@ struct Part {
     notes: Vec<String>,
 }
 
+impl Part {
+    fn print(self) {
+        output::line("");
+        output::line(self.title);
+        let mut table = Table::new(&self.headings);
+        for row in self.rows {
+            let mut cells: Vec<comfy_table::Cell> = row.iter().map(comfy_table::Cell::new).collect();
+            let tone = match row.first().map(String::as_str) {
+                Some("passed") => Some(Tone::Good),
+                Some("failed") => Some(Tone::Bad),
+                _ => None,
+            };
+            if let (Some(tone), Some(first)) = (tone, cells.first_mut()) {
+                *first = toned(row.first().cloned().unwrap_or_default(), tone);
+            }
+            table.row(cells);
+        }
+        table.print();
+        self.notes.iter().for_each(output::line);
+    }
+}
+
 impl Report {
     /// How many checks ended in this way.
     pub fn count(&self, outcome: &str) -> usize {
@@ -145,8 +167,7 @@ impl Report {
 
     fn parts(&self) -> Vec<Part> {
         let figures = self.figures.as_ref().map(state_part);
-        let motion = self.motion.as_ref().map(motion_part);
-        [Some(self.checks_part()), figures, Some(self.limits_part()), motion].into_iter().flatten().collect()
+        [Some(self.checks_part()), figures, Some(self.limits_part())].into_iter().flatten().collect()
     }
 
     fn checks_part(&self) -> Part {
@@ -182,31 +203,18 @@ impl Report {
         Part { title: "limits", headings, rows: (0..self.arm.dof).map(row).collect(), notes: Vec::new() }
     }
 
-    /// Prints it to stdout.
+    /// Prints to stdout what was found without motion.
     pub fn print(&self) {
         output::line(self.title());
         for (what, text) in self.facts() {
             output::line(format_args!("  {what:<12} {text}"));
         }
-        for part in self.parts() {
-            output::line("");
-            output::line(part.title);
-            let mut table = Table::new(&part.headings);
-            for row in part.rows {
-                let mut cells: Vec<comfy_table::Cell> = row.iter().map(comfy_table::Cell::new).collect();
-                let tone = match row.first().map(String::as_str) {
-                    Some("passed") => Some(Tone::Good),
-                    Some("failed") => Some(Tone::Bad),
-                    _ => None,
-                };
-                if let (Some(tone), Some(first)) = (tone, cells.first_mut()) {
-                    *first = toned(row.first().cloned().unwrap_or_default(), tone);
-                }
-                table.row(cells);
-            }
-            table.print();
-            part.notes.iter().for_each(output::line);
-        }
+        self.parts().into_iter().for_each(Part::print);
+    }
+
+    /// Prints the rest: the motion, if there was one, and the verdict.
+    pub fn conclude(&self) {
+        self.motion.iter().map(motion_part).for_each(Part::print);
         output::line("");
         output::line(self.verdict());
     }
@@ -217,7 +225,7 @@ impl Report {
         for (what, fact) in self.facts() {
             text += &format!("- {what}: {}\n", escaped(&fact));
         }
-        for part in self.parts() {
+        for part in self.parts().into_iter().chain(self.motion.iter().map(motion_part)) {
             text += &format!("\n## {}\n\n", part.title);
             let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
             text += &line(part.headings.iter().map(|h| h.trim_start_matches('>').to_owned()).collect());

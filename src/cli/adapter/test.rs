@@ -12,7 +12,7 @@ use rustix::io::Errno;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
-use super::choice::{Choice, failure};
+use super::choice::{Choice, failure, not_started};
 use super::report::{Arm, Limits, Report, Row};
 use crate::hardware::conformance::{Check, Made, Subject, checks, figures, gently, run_all};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry, SIM};
@@ -25,8 +25,8 @@ const WATCH: Duration = Duration::from_secs(2);
 /// Arguments of `adapter test`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Without --allow-motion nothing is enabled and nothing moves. With it, after a question, each joint goes 2° to either
-side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
+Without --allow-motion nothing is enabled and nothing moves. With it, and only when no check failed, after a question,
+each joint goes 2° to either side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
 Stay within reach of the arm's own E-stop button.
 
 Exit codes: 0 all passed, 1 something failed, 2 usage, 3 the arm cannot be reached.")]
@@ -86,25 +86,32 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     let info = adapter.get_info();
     adapter.disconnect();
     let checks = args.check(&bench.subject, chosen, &signals).into_iter().map(Row::of).collect();
-    let motion = match (args.allow_motion, signals.last()) {
-        (true, None) => Some(args.motion(&mut *adapter, &info, &bench, &signals)?),
-        _ => None,
-    };
     let mut report = Report {
         adapter: row.name.to_owned(),
         address: bench.address.clone(),
         simulated: bench._emulator.is_some(),
         when: jiff::Timestamp::from_second(jiff::Timestamp::now().as_second()).unwrap_or_default().to_string(),
         dimos: crate::VERSION,
-        arm: arm(&row, info),
+        arm: arm(&row, info.clone()),
         figures: Some(figures),
         limits: Limits::from(&limits),
         checks,
         passed: false,
-        motion,
+        motion: None,
     };
+    if !args.json {
+        report.print(); // before the motion: whoever is asked about that knows what was found
+    }
+    let moved = match report.count("failed") {
+        _ if !args.allow_motion || signals.last().is_some() => Ok(None),
+        0 => args.motion(&mut *adapter, &info, &bench, &signals).map(Some),
+        1 => Err(Failure::new(Exit::Failed, "not moved: 1 check failed")),
+        failed => Err(Failure::new(Exit::Failed, format!("not moved: {failed} checks failed"))),
+    };
+    report.motion = moved.as_ref().ok().cloned().flatten();
     report.passed = report.count("failed") == 0 && report.motion.as_ref().is_none_or(|motion| motion.odd.is_none());
     args.publish(&report)?;
+    moved?;
     match signals.last() {
         Some(signal) => Ok(Exit::by_signal(signal)),
         None if report.passed => Ok(Exit::Ok),
@@ -149,38 +156,22 @@ impl Args {
 
     /// A configuration from which an adapter can be made.
     fn made(&self, row: &AdapterSpec, address: &str) -> Result<AdapterConfig> {
-        let dofs = self.choice.dofs(row)?;
-        let mut refusal = None;
-        for dof in &dofs {
-            let config = self.choice.config(address, *dof)?;
-            match (row.create)(&config) {
-                Ok(_) if dofs.len() > 1 && row.address.required && address != SIM && self.choice.model.is_none() => {
-                    let what = format!("how many joints has it? {} allows {}", row.name, super::choice::joints(row));
-                    return Err(Failure::usage(what).hint(format!("--dof {dof}, say")));
-                }
-                Ok(_) => return Ok(config),
-                Err(error) => refusal = refusal.or(Some(failure(Exit::Usage, &error))),
-            }
+        let config = self.choice.config(row, address)?;
+        let several = self.choice.dof.is_none() && row.dof.0 != row.dof.1;
+        if several && row.address.required && self.choice.model.is_none() {
+            let what = format!("how many joints has it? {} allows {}", row.name, super::choice::joints(row));
+            return Err(Failure::usage(what).hint(format!("--dof {}, say", config.dof)));
         }
-        Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+        Ok(config)
     }
 
     /// Starts the emulator, and says what an adapter for it is made from.
     fn emulate(&self, row: &AdapterSpec) -> Result<(Box<dyn Emulator>, AdapterConfig)> {
-        let mut refusal = None;
-        for dof in self.choice.dofs(row)? {
-            let mut config = self.choice.config(SIM, dof)?;
-            let emulator =
-                row.emulate.ok_or(AdapterError::Unsupported).and_then(|start| start(&config, &Place::InProcess));
-            match emulator {
-                Ok(emulator) => {
-                    config.address = emulator.address();
-                    return Ok((emulator, config));
-                }
-                Err(error) => refusal = refusal.or(Some(failure(Exit::Usage, &error))),
-            }
-        }
-        Err(refusal.unwrap_or_else(|| Failure::usage(format!("{} has no joints", row.name))))
+        let mut config = self.choice.config(row, SIM)?;
+        let start = row.emulate.ok_or(AdapterError::Unsupported);
+        let emulator = start.and_then(|start| start(&config, &Place::InProcess)).map_err(not_started)?;
+        config.address = emulator.address();
+        Ok((emulator, config))
     }
 
     /// Makes the checks, showing how far it is.
@@ -216,14 +207,8 @@ impl Args {
         bench: &Bench,
         signals: &Signals,
     ) -> Result<gently::Motion> {
-        adapter.connect().map_err(|e| failure(Exit::Hardware, &e))?;
-        let refused = gently::refusal(adapter);
+        connect_to_move(adapter)?;
         adapter.disconnect();
-        if let Err(why) = refused {
-            let (what, hint) = why.split_once("\nhint: ").unwrap_or((&why, ""));
-            let failure = Failure::new(Exit::Failed, format!("not moved: {what}"));
-            return Err(if hint.is_empty() { failure } else { failure.hint(hint) });
-        }
         let (model, dof) = (&info.model, info.dof);
         if bench.subject.real && !self.yes {
             output::note(format_args!(
@@ -236,7 +221,8 @@ impl Args {
             ));
             confirm(signals)?;
         }
-        adapter.connect().map_err(|e| failure(Exit::Hardware, &e))?;
+        // Once more: much can happen while a question waits for its answer.
+        connect_to_move(adapter)?;
         let quiet = self.json;
         let motion = gently::move_gently(adapter, &|| signals.last().is_some(), &mut |what| {
             if !quiet {
@@ -252,12 +238,22 @@ impl Args {
         if self.json {
             output::json(report);
         } else {
-            report.print();
+            report.conclude();
         }
         let Some(path) = &self.report else { return Ok(()) };
         std::fs::write(path, report.markdown())
             .map_err(|e| Failure::new(Exit::Failed, format!("--report {}: {e}", path.display())))
     }
+}
+
+/// Connects to an arm that is to be moved, unless something speaks against moving it from where it stands.
+fn connect_to_move(adapter: &mut dyn ManipulatorAdapter) -> Result<()> {
+    adapter.connect().map_err(|e| failure(Exit::Hardware, &e))?;
+    let Err(why) = gently::refusal(adapter) else { return Ok(()) };
+    adapter.disconnect();
+    let (what, hint) = why.split_once("\nhint: ").unwrap_or((&why, ""));
+    let failure = Failure::new(Exit::Failed, format!("not moved: {what}"));
+    Err(if hint.is_empty() { failure } else { failure.hint(hint) })
 }
 
 /// Asks, where somebody can answer.

@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use super::File;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
+use crate::planning::setup::{always_touch, whole};
 use crate::robot::mesh::Mesh;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Geometry, Loaded, RobotModel, Shape};
@@ -15,12 +16,13 @@ pub(super) fn run(file: &File) -> Result {
     let mut loaded = file.load(Meshes::Find);
     let summary = loaded.model.take().map(|robot| {
         let triangles = read_meshes(&robot, &mut loaded);
-        let independent = robot.independent_joints().len();
-        format!(
-            "{}: {} links, {independent} joints that move on their own, {triangles} triangles",
-            robot.name,
-            robot.links.len()
-        )
+        let (links, independent) = (robot.links.len(), robot.independent_joints().len());
+        let summary = format!(
+            "{}: {links} links, {independent} joints that move on their own, {triangles} triangles",
+            robot.name
+        );
+        touching_links(robot, &mut loaded);
+        summary
     });
     let fine = summary.is_some() && !loaded.has_errors();
     if file.json {
@@ -35,14 +37,31 @@ pub(super) fn run(file: &File) -> Result {
         Some(summary) => {
             output::line(summary);
             let warnings = loaded.warnings();
-            output::line(if warnings == 0 {
-                "no mistakes".to_owned()
-            } else {
-                format!("no mistakes, {warnings} warnings")
+            output::line(match warnings {
+                0 => "no mistakes".to_owned(),
+                1 => "no mistakes, 1 warning".to_owned(),
+                more => format!("no mistakes, {more} warnings"),
             });
             Ok(Exit::Ok)
         }
         None => Err(Failure::usage(format!("{} has mistakes", file.file.display()))),
+    }
+}
+
+/// Warns of links that touch in every pose: a planner could not check them against each other.
+fn touching_links(robot: RobotModel, loaded: &mut Loaded) {
+    let allowed = loaded.semantics.disabled_pairs().collect();
+    // What keeps shapes from being made was reported with the meshes; the rest is a mistake that only shows here.
+    let touching = match whole(robot, allowed) {
+        Ok(robot) => always_touch(&robot),
+        Err(_) if loaded.has_errors() => return,
+        Err(why) => return loaded.report(Diag::error(why)),
+    };
+    for (number, [a, b]) in touching.iter().enumerate() {
+        let what = format!("the links `{a}` and `{b}` touch in every pose: a planner does not check them");
+        let hint = "if they may touch, exclude the pair: disable_collisions in an SRDF, or collision_exclusion_pairs";
+        let last = (number + 1 == touching.len()).then(|| hint.to_owned());
+        loaded.report(Diag::warning(what).maybe_hint(last));
     }
 }
 

@@ -47,10 +47,11 @@ pub fn run(args: &Args) -> Result {
         return Err(Failure::usage(what).hint(format!("the joints are: {}", moving.join(" "))));
     }
     for (joint, q) in moving.iter().zip(&args.positions) {
-        let limits = robot.joint_index(joint).and_then(|i| robot.joints.get(i)).map(|j| j.limits);
-        if let Some(limits) = limits.filter(|l| *q < l.lower || *q > l.upper) {
+        let joint = robot.joint_index(joint).and_then(|i| robot.joints.get(i));
+        if let Some(joint) = joint.filter(|j| *q < j.limits.lower || *q > j.limits.upper) {
+            let (name, unit, limits) = (&joint.name, joint.kind.unit(), joint.limits);
             output::note(format_args!(
-                "warning: {joint} {q} is outside its limits {} to {}",
+                "warning: {name} at {q} {unit} is outside its limits {:.4} to {:.4} {unit}",
                 limits.lower, limits.upper
             ));
         }
@@ -76,7 +77,7 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-fn index(robot: &RobotModel, name: &str) -> Result<usize> {
+pub(super) fn index(robot: &RobotModel, name: &str) -> Result<usize> {
     robot.link_index(name).ok_or_else(|| {
         let hint = did_you_mean(name, robot.links.iter().map(|l| l.name.as_str()), "the links are");
         Failure { hint, ..Failure::usage(format!("{} has no link `{name}`", robot.name)) }
@@ -84,7 +85,7 @@ fn index(robot: &RobotModel, name: &str) -> Result<usize> {
 }
 
 /// The first link that most joints lead to.
-fn deepest(robot: &RobotModel) -> usize {
+pub(super) fn deepest(robot: &RobotModel) -> usize {
     let mut depths = vec![0; robot.links.len()];
     for joint in &robot.joints {
         depths[joint.child] = depths[joint.parent] + 1;

@@ -3,24 +3,13 @@
 use crate::hardware::registry::{Absent, AdapterSpec};
 
 pub mod mock;
-#[cfg(feature = "can")]
 pub mod piper;
 pub mod remote;
 pub mod xarm;
 pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[
-    mock::SPEC,
-    yourarm::SPEC,
-    xarm::SPEC,
-    #[cfg(feature = "can")]
-    piper::SPEC,
-    remote::SPEC,
-];
+pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC, xarm::SPEC, piper::SPEC, remote::SPEC];
 
-/// The adapters that this build does not have.
-pub const ABSENT: &[Absent] = &[
-    #[cfg(not(feature = "can"))]
-    Absent { name: "piper", about: "AgileX Piper, 6 joints and gripper", remedy: "build with --features can" },
-];
+/// The adapters that this build does not have: those behind a cargo feature that is off. None of the box is.
+pub const ABSENT: &[Absent] = &[];

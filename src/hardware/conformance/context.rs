@@ -216,6 +216,12 @@ impl Context {
         self.adapter.read_error().map_err(|e| format!("read_error: {e}"))
     }
 
+    /// The gripper's opening [m], as the device says after this call; `None` without gripper.
+    pub fn gripper(&mut self) -> Result<Option<f64>, String> {
+        self.joints()?;
+        self.adapter.read_gripper_position().map_err(|e| format!("read_gripper_position: {e}"))
+    }
+
     /// Joint positions at nine tenths of the way from the lower to the upper limits [rad]: a long way from anywhere
     /// that an arm stands at power-up.
     pub fn far(&mut self) -> Result<Vec<f64>, String> {

@@ -41,7 +41,9 @@ fn describes_itself(context: &mut Context) -> Result<(), String> {
 fn limits_are_usable(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let dof = context.config.dof;
-    for (source, limits) in [("table", (context.row.limits)(dof)), ("get_limits", context.limits()?)] {
+    let fit =
+        (context.row.fit)(&context.config).map_err(|misfit| format!("its own configuration does not fit: {misfit}"))?;
+    for (source, limits) in [("fit", fit.limits), ("get_limits", context.limits()?)] {
         let required = [&limits.position_lower, &limits.position_upper, &limits.velocity_max];
         require(required.iter().all(|values| values.len() == dof), || format!("{source}: not {dof} values"))?;
         for optional in [&limits.acceleration_max, &limits.jerk_max] {
@@ -75,19 +77,22 @@ fn addresses_are_checked(context: &mut Context) -> Result<(), String> {
 
 fn options_are_strict(context: &mut Context) -> Result<(), String> {
     let options = serde_json::json!({ "no_such_option": 1 });
-    match (context.row.create)(&AdapterConfig { options, ..context.config.clone() }) {
-        Ok(_) => Err("an unknown option is accepted".into()),
-        Err(error) => require(error.to_string().contains("no_such_option"), || {
-            format!("the error does not name the option: {error}")
-        }),
+    let config = AdapterConfig { options, ..context.config.clone() };
+    let fit = (context.row.fit)(&config).map(drop).map_err(|misfit| misfit.to_string());
+    let made = (context.row.create)(&config).map(drop).map_err(|error| error.to_string());
+    for (by, result) in [("fit", fit), ("create", made)] {
+        let error = result.err().ok_or_else(|| format!("{by} accepts an unknown option"))?;
+        require(error.contains("no_such_option"), || format!("{by}: the error does not name the option: {error}"))?;
     }
+    Ok(())
 }
 
 fn dof_is_checked(context: &mut Context) -> Result<(), String> {
     let (fewest, most) = context.row.dof;
     for dof in [fewest.wrapping_sub(1), most + 1] {
-        let made = (context.row.create)(&AdapterConfig { dof, ..context.config.clone() });
-        require(made.is_err(), || format!("{dof} joints are accepted"))?;
+        let config = AdapterConfig { dof, ..context.config.clone() };
+        require((context.row.fit)(&config).is_err(), || format!("fit accepts {dof} joints"))?;
+        require((context.row.create)(&config).is_err(), || format!("create accepts {dof} joints"))?;
     }
     Ok(())
 }

@@ -127,16 +127,16 @@ fn disabled_arms(context: &mut Context) -> Result<(), String> {
     context.ready(mode)?;
     context.adapter.write_enable(false).map_err(|e| format!("write_enable: {e}"))?;
     context.until("the motors to go off", |context| Ok(!context.enabled()?))?;
-    if !context.row.holds_when_disabled {
-        return Ok(());
-    }
+    let holds = context.row.holds_when_disabled; // one that falls does not stay anywhere
     let start = context.positions()?;
     let target = context.nearby(&start)?;
     let result = context.adapter.write_joint_positions(&target, 0.1);
     require(result.is_err(), || "a command without power is accepted".into())?;
-    context.stays(&start, 1e-3)?;
+    if holds {
+        context.stays(&start, 1e-3)?;
+    }
     context.adapter.write_enable(true).map_err(|e| format!("write_enable: {e}"))?;
-    context.stays(&start, 0.005)
+    if holds { context.stays(&start, 0.005) } else { Ok(()) }
 }
 
 fn nonsense(context: &mut Context) -> Result<(), String> {

@@ -35,7 +35,7 @@ fn readable(context: &Context, limit: Duration) -> Result<bool, String> {
 }
 
 /// Waits for the next state as the device thread does, which also reads when a period has passed without news.
-fn await_news(context: &mut Context) -> Result<(), String> {
+pub(super) fn await_news(context: &mut Context) -> Result<(), String> {
     let period = Duration::from_secs_f64(1.0 / context.adapter.get_info().native_rate);
     let end = MonotonicClock.now().after(PATIENCE);
     while !readable(context, period)? {

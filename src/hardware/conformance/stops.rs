@@ -5,6 +5,8 @@ use std::time::Duration;
 use super::Check;
 use super::Needs::{Faults, Motion};
 use super::context::{Context, farthest, require};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::device::gripper::GripperStop;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::AdapterError;
 use crate::joint::ControlMode;
@@ -16,6 +18,7 @@ pub const CHECKS: &[Check] = &[
     Check::new(Motion, "stop_ends_streaming", "write_stop between set points holds the arm", stop_ends_streaming),
     Check::new(Motion, "stop_ends_velocity", "write_stop ends a velocity at once", stop_ends_velocity),
     Check::new(Motion, "stop_is_no_fault", "after a stop, activate and a mode are enough to move", stop_is_no_fault),
+    Check::new(Motion, "stop_holds_the_gripper", "after a stop a moving gripper can be held", stop_holds_gripper),
     Check::new(Faults, "stop_in_error_is_harmless", "write_stop in error clears nothing", stop_in_error),
 ];
 
@@ -23,6 +26,8 @@ pub const CHECKS: &[Check] = &[
 const SLOW: f64 = 0.1;
 /// Speed of a stream that is to be interrupted [rad/s].
 const SPEED: f64 = 0.1;
+/// With less than this left of its way [m] a gripper may have arrived before a stop reaches it.
+const GRIPPER_ROOM: f64 = 0.02;
 /// How far an arm may still go that is stopped at `SPEED` [rad].
 const COASTING: f64 = 0.008;
 
@@ -123,6 +128,60 @@ fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
     context.set_mode(ControlMode::Position).map_err(|e| format!("set_control_mode: {e}"))?;
     context.command(&start, 0.5)?;
     context.until("arrival", |context| Ok(farthest(&context.positions()?, &start) < 1e-3))
+}
+
+/// What the device thread does after a stop, where the arm's own does not reach the gripper.
+fn stop_holds_gripper(context: &mut Context) -> Result<(), String> {
+    context.ready(context.first_mode())?;
+    if context.gripper()?.is_none() {
+        return context.skip("it has no gripper");
+    }
+    let Some((closed, open)) = context.adapter.get_gripper_range() else {
+        return context.skip("nobody knows how far its gripper goes");
+    };
+    // A busy machine may look away until it has arrived: then it is sent back, and stopped again.
+    for target in [open, closed, open, closed, open] {
+        if let Some(stopped) = stop_gripper_on_its_way(context, target)? {
+            return gripper_stays(context, stopped);
+        }
+    }
+    context.skip("its gripper is too fast to be stopped on its way")
+}
+
+/// Sends the gripper somewhere and stops it. Where it came to rest; `None` when it was there already.
+fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<f64>, String> {
+    let left = |opening: Option<f64>| opening.map_or(0.0, |opening| (target - opening).abs());
+    context.adapter.write_gripper_position(target).map_err(|e| format!("write_gripper_position: {e}"))?;
+    let way = left(context.gripper()?);
+    context.until("the gripper's motion", |context| Ok(left(context.gripper()?) < 0.95 * way.max(0.01)))?;
+    if left(context.gripper()?) < GRIPPER_ROOM {
+        context.until("the gripper's arrival", |context| Ok(left(context.gripper()?) < 0.001))?;
+        context.activate()?;
+        return Ok(None);
+    }
+    context.stop()?;
+    let mut stop = GripperStop::default();
+    stop.begin(MonotonicClock.now());
+    let mut rest = (context.gripper()?, MonotonicClock.now());
+    context.until("the gripper's rest", |context| {
+        let (opening, now) = (context.gripper()?, MonotonicClock.now());
+        if let Some(here) = opening.and_then(|opening| stop.look(opening, now)) {
+            context.adapter.write_gripper_position(here).map_err(|e| format!("holding the gripper: {e}"))?;
+        }
+        if left(opening) != left(rest.0) {
+            rest = (opening, now);
+        }
+        Ok(now.since(rest.1) > Duration::from_millis(400))
+    })?;
+    let went = left(rest.0);
+    require(went > 0.002, || format!("it went on to {target} m in spite of a stop"))?;
+    Ok(rest.0)
+}
+
+fn gripper_stays(context: &mut Context, stopped: f64) -> Result<(), String> {
+    std::thread::sleep(Duration::from_millis(300));
+    let now = context.gripper()?.unwrap_or(f64::NAN);
+    require((now - stopped).abs() < 0.001, || format!("it went on from {stopped:.4} to {now:.4} m"))
 }
 
 fn stop_in_error(context: &mut Context) -> Result<(), String> {

@@ -6,6 +6,7 @@
 //! rpc  ──orders─────────▶└───────────────┘   watches the tick's heartbeat; holds the arm by itself when it stops
 //! ```
 
+pub mod gripper;
 mod health;
 mod thread;
 

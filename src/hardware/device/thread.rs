@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering::{Relaxed, Release};
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Duration;
 
+use super::gripper::GripperStop;
 use super::{Connected, DeviceConfig, Health, Note, Order};
 use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
 use crate::clock::Mono;
@@ -41,6 +42,7 @@ pub(super) struct Worker {
     last: ArmCommand,
     /// A stop that the arm has not taken yet. Kept until it does, also over a new connection.
     stop_owed: bool,
+    gripper_stop: GripperStop,
     /// What is told of writes that fail.
     write_trouble: String,
     /// Since when the arm refuses a change of mode.
@@ -78,6 +80,7 @@ impl Worker {
             reading: JointReading::default(),
             last: ArmCommand::default(),
             stop_owed: false,
+            gripper_stop: GripperStop::default(),
             write_trouble: String::new(),
             mode_wanted: None,
             wanted: false,
@@ -252,6 +255,7 @@ impl Worker {
         }
         self.state.self_held = false;
         self.stop_owed = false;
+        self.gripper_stop.end();
         self.write_errors = 0;
         self.turn = 0;
         for _ in 0..6 {
@@ -344,7 +348,10 @@ impl Worker {
         // A refused gripper costs the joints nothing.
         let gripper = match command.gripper_seq == before.gripper_seq {
             true => Ok(()),
-            false => adapter.write_gripper_position(command.gripper),
+            false => {
+                self.gripper_stop.end();
+                adapter.write_gripper_position(command.gripper)
+            }
         };
         let Some(mode) = command.mode else { return gripper };
         if adapter.get_control_mode() != mode {
@@ -380,6 +387,7 @@ impl Worker {
         match adapter.write_stop() {
             Ok(stop) => {
                 self.stop_owed = false;
+                self.gripper_stop.begin(self.config.clock.now());
                 if stop == Stop::Confirmed {
                     self.health.stop_confirmed.store(self.last.stop_seq, Relaxed);
                 }
@@ -387,6 +395,16 @@ impl Worker {
                 self.health.stop_sent.store(self.last.stop_seq, Release);
             }
             Err(error) => self.not_taken(adapter, "the arm did not take the stop", &error),
+        }
+    }
+
+    /// Holds a gripper that goes on after a stop. Joints and gripper are held one after the other: the joints first.
+    fn hold_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let now = self.config.clock.now();
+        let Some(here) = self.state.gripper.and_then(|opening| self.gripper_stop.look(opening, now)) else { return };
+        let (closed, open) = adapter.get_gripper_range().unwrap_or((0.0, f64::MAX));
+        if let Err(error) = adapter.write_gripper_position(here.max(closed).min(open)) {
+            self.trouble(&format!("the gripper did not take the stop: {error}"));
         }
     }
 
@@ -469,6 +487,7 @@ impl Worker {
         }
         if all || turn == 2 {
             self.state.gripper = adapter.read_gripper_position()?;
+            self.hold_gripper(adapter);
         }
         if all || turn == 3 {
             self.state.wrench = adapter.read_force_torque()?;

@@ -7,9 +7,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::clock::Mono;
-use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript, check_kinds};
+use crate::hardware::fit::Misfit;
+use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript, check_kind, check_script};
 use crate::hardware::sim::plant::{Drive, Plant, Tracking};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::spec::AdapterResult;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
 /// How far joints are behind their set points [s].
@@ -41,7 +42,7 @@ pub const PLAYABLE: &[FaultKind] = &[
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint; a pose near the middle of the joints' ranges when empty.
+    /// Joint positions at power-up [rad], one per joint; a pose of the arm's own when empty.
     pub initial_positions: Vec<f64>,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
@@ -49,15 +50,27 @@ pub struct SimOptions {
 
 impl SimOptions {
     /// Refuses a pose outside `limits`, and faults that are not among `playable`. `name` is the arm's.
-    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> AdapterResult<()> {
-        check_kinds(&format!("the {name} emulator"), &self.faults, playable).map_err(AdapterError::Rejected)?;
-        let dof = limits.position_lower.len();
-        let fits = self.initial_positions.len() == dof && inside(&self.initial_positions, limits, 0.0);
-        if self.initial_positions.is_empty() || fits {
-            return Ok(());
+    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), Misfit> {
+        check_script(&format!("the {name} emulator"), &self.faults, playable)
+            .and_then(|()| check_pose(&self.initial_positions, limits))
+            .map_err(|misfit| misfit.within("sim"))
+    }
+}
+
+/// Refuses `initial_positions` [rad] that are neither empty nor a pose within `limits`.
+pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), Misfit> {
+    let (dof, given) = (limits.position_lower.len(), positions.len());
+    let needed = format!("initial_positions must be {dof} angles [rad] within the joint limits");
+    if given != 0 && given != dof {
+        return Err(Misfit::new("initial_positions", format!("{needed}, not {given}")));
+    }
+    let mut range = limits.position_lower.iter().zip(&limits.position_upper).zip(positions).enumerate();
+    match range.find(|(_, ((lower, upper), value))| !(**lower..=**upper).contains(value)) {
+        None => Ok(()),
+        Some((joint, ((lower, upper), value))) => {
+            let what = format!("{needed}: joint {} goes from {lower:.4} to {upper:.4}, not to {value}", joint + 1);
+            Err(Misfit::new(format!("initial_positions.{joint}"), what))
         }
-        let what = format!("initial_positions must be {dof} angles [rad] within the joint limits");
-        Err(AdapterError::Rejected(format!("{name} emulator: {what}")))
     }
 }
 
@@ -108,8 +121,16 @@ pub struct Measured {
     pub efforts: Joints,
 }
 
+/// An emulated controller with an arm behind it: what its server needs to be the arm's emulator.
+pub trait HasArm {
+    /// The arm.
+    fn arm(&mut self) -> &mut SimArm;
+}
+
 /// An arm that was just switched on: disabled, in position mode.
 pub struct SimArm {
+    name: &'static str,
+    playable: &'static [FaultKind],
     plant: Plant,
     limits: JointLimits,
     mode: ControlMode,
@@ -128,8 +149,16 @@ pub struct SimArm {
 }
 
 impl SimArm {
-    /// An arm within `limits` that stops when no velocity arrives for `velocity_timeout` [s].
-    pub fn new(limits: &JointLimits, options: &SimOptions, velocity_timeout: f64, now: Mono) -> Self {
+    /// An arm within `limits`. Refuses options that it cannot follow; `playable` are the faults that its controller can
+    /// play, `name` is the adapter's.
+    pub fn new(
+        name: &'static str,
+        limits: &JointLimits,
+        options: &SimOptions,
+        playable: &'static [FaultKind],
+        now: Mono,
+    ) -> AdapterResult<Self> {
+        options.check(name, limits, playable)?;
         let somewhere: Vec<f64>;
         let initial = if options.initial_positions.is_empty() {
             somewhere = pose_of_no_symmetry(limits);
@@ -137,20 +166,28 @@ impl SimArm {
         } else {
             &options.initial_positions
         };
-        Self {
+        Ok(Self {
+            name,
+            playable,
             plant: Plant::new(limits, initial, Tracking::Lag(LAG), 0.0),
             limits: limits.clone(),
             mode: ControlMode::Position,
             error: 0,
             estop_open: false,
             estop_until: None,
-            velocity_timeout,
+            velocity_timeout: f64::INFINITY,
             last_velocity: now,
             script: FaultScript::new(&options.faults),
             first_client: None,
             powered_up: now,
             advanced_to: now,
-        }
+        })
+    }
+
+    /// The same arm, that in velocity mode stops when no velocity arrives for so long [s].
+    pub fn with_velocity_timeout(mut self, timeout: f64) -> Self {
+        self.velocity_timeout = timeout;
+        self
     }
 
     // --- Time and faults ---
@@ -168,15 +205,12 @@ impl SimArm {
         self.plant.advance(now.seconds_since(self.advanced_to).max(0.0));
         self.advanced_to = now.max(self.advanced_to);
         if self.estop_until.is_some_and(|until| now >= until) {
-            self.estop_open = false;
-            self.estop_until = None;
+            self.release_estop();
         }
         let t = self.script_time();
         if let Some(fault) = self.script.take(FaultKind::Estop, t) {
-            self.estop_open = true;
+            self.press_estop();
             self.estop_until = fault.left(t).map(|left| now.after(left));
-            self.error = ESTOP;
-            self.plant.enable(false);
         }
         if let Some(fault) = self.script.take(FaultKind::ErrorCode, t) {
             self.error = fault.code;
@@ -197,10 +231,26 @@ impl SimArm {
         self.plant.stop();
     }
 
-    /// Lets a fault happen `fault.at` seconds from `now`.
-    pub fn inject(&mut self, fault: Fault, now: Mono) {
+    /// Lets a fault happen `fault.at` seconds from `now`; an error names the kinds that can be played.
+    pub fn inject(&mut self, fault: Fault, now: Mono) -> Result<(), String> {
+        check_kind(&format!("the {} emulator", self.name), &fault, self.playable)?;
         let t = self.first_client.map_or(0.0, |first| now.seconds_since(first));
         self.script.inject(fault, t);
+        Ok(())
+    }
+
+    /// Opens the E-stop line: error, motors off.
+    pub fn press_estop(&mut self) {
+        self.estop_open = true;
+        self.estop_until = None;
+        self.error = ESTOP;
+        self.plant.enable(false);
+    }
+
+    /// Closes the E-stop line. Error and motors stay as they are.
+    pub fn release_estop(&mut self) {
+        self.estop_open = false;
+        self.estop_until = None;
     }
 
     /// Whether a fault of a kind strikes now.
@@ -265,6 +315,12 @@ impl SimArm {
         }
     }
 
+    /// Joint positions as they truly are at `now` [rad].
+    pub fn positions_at(&mut self, now: Mono) -> Joints {
+        self.advance(now);
+        self.plant.positions()
+    }
+
     /// Joint positions [rad] and velocities [rad/s] as they truly are.
     pub fn joints(&self) -> (Joints, Joints) {
         (self.plant.positions(), self.plant.velocities())
@@ -288,6 +344,11 @@ impl SimArm {
     /// The error; 0 = none.
     pub fn error(&self) -> u16 {
         self.error
+    }
+
+    /// Whether the E-stop line is open.
+    pub fn estop_open(&self) -> bool {
+        self.estop_open
     }
 
     /// The mode.
@@ -363,13 +424,19 @@ impl SimArm {
         Ok(())
     }
 
-    fn may_move(&self, mode: ControlMode) -> Result<(), Refusal> {
+    /// Refuses what moves anything while the motors are off or the arm is in error.
+    pub fn ready(&self) -> Result<(), Refusal> {
         match (self.error, self.plant.enabled()) {
-            (0, true) if self.mode == mode => Ok(()),
-            (0, true) => Err(Refusal::WrongMode),
+            (0, true) => Ok(()),
             (0, false) => Err(Refusal::Disabled),
             _ => Err(Refusal::InError),
         }
+    }
+
+    /// The same, and what needs a mode that the arm is not in.
+    pub fn may_move(&self, mode: ControlMode) -> Result<(), Refusal> {
+        self.ready()?;
+        if self.mode == mode { Ok(()) } else { Err(Refusal::WrongMode) }
     }
 
     fn within(&self, target: &[f64]) -> Result<(), Refusal> {

@@ -5,18 +5,37 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::diary::{self, Happening};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::Place;
-use crate::hardware::sim::arm::Delivery;
+use crate::hardware::registry::{Emulator, Place};
+use crate::hardware::sim::arm::{Delivery, HasArm};
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::bus::Bus;
 use crate::hardware::transport::can::slcan_pty::SlcanPty;
 use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanPort};
+use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
 
 /// How long a fault that cuts the wire keeps it cut: longer than any adapter should believe in a silent arm.
 const CUT: Duration = Duration::from_millis(800);
+
+/// The faults that a `SimArm` can play on a bus whose frames hold integers: no byte is damaged there, nothing is NaN.
+pub const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Truncated,
+    FaultKind::WrongDof,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+];
 
 /// The arm's side of a bus.
 pub trait CanController: Send + 'static {
@@ -99,6 +118,20 @@ impl<C: CanController> CanServer<C> {
     }
 }
 
+impl<C: CanController + HasArm> Emulator for CanServer<C> {
+    fn address(&self) -> String {
+        self.address.to_string()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.with(|controller, now| controller.arm().inject(fault, now))
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.with(|controller, now| controller.arm().positions_at(now)))
+    }
+}
+
 impl<C: CanController> Drop for CanServer<C> {
     fn drop(&mut self) {
         self.shared.closing.store(true, Ordering::Relaxed);
@@ -113,6 +146,7 @@ impl<C: CanController> Drop for CanServer<C> {
 fn live<C: CanController>(shared: &Shared<C>, mut port: Box<dyn CanPort>, period: Duration) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
     let mut frames = Vec::with_capacity(64);
+    let mut heard = false;
     let mut next = Instant::now();
     // Until then the arm neither hears nor sends.
     let mut deaf_until = next;
@@ -120,6 +154,9 @@ fn live<C: CanController>(shared: &Shared<C>, mut port: Box<dyn CanPort>, period
         loop {
             match port.receive() {
                 Ok(Some(CanEvent::Frame(frame))) if Instant::now() >= deaf_until => {
+                    if !std::mem::replace(&mut heard, true) {
+                        diary::note(Happening::Came);
+                    }
                     shared.controller().hear(&frame, MonotonicClock.now(), &mut frames);
                 }
                 Ok(Some(_)) => {}

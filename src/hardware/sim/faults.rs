@@ -1,9 +1,13 @@
 //! Scripted faults of simulated arms: what goes wrong, when, and for how long.
 
+use std::cell::Cell;
 use std::time::Duration;
 
-use schemars::JsonSchema;
+use schemars::{JsonSchema, SchemaGenerator};
 use serde::{Deserialize, Deserializer, Serialize};
+
+use super::diary::{self, Happening};
+use crate::hardware::fit::Misfit;
 
 /// What goes wrong. Not every simulated arm can play every kind; each names those it can.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -53,6 +57,24 @@ pub enum FaultKind {
     NoBuffers,
     /// The arm leads others: it sends commands instead of its state.
     Leader,
+}
+
+impl FaultKind {
+    /// All kinds, each with what goes wrong, in the order of the reference.
+    pub fn all() -> Vec<(Self, String)> {
+        let schema = Self::json_schema(&mut SchemaGenerator::default());
+        let kinds = schema.get("oneOf").and_then(|kinds| kinds.as_array());
+        let kind = |entry: &serde_json::Value| {
+            let about = entry.get("description")?.as_str()?.to_owned();
+            Some((serde_json::from_value(entry.get("const")?.clone()).ok()?, about))
+        };
+        kinds.map(|kinds| kinds.iter().filter_map(kind).collect()).unwrap_or_default()
+    }
+
+    /// The name in a script.
+    pub fn name(self) -> String {
+        serde_json::to_value(self).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
+    }
 }
 
 /// One fault of a script.
@@ -167,54 +189,82 @@ impl Fault {
 /// A script and how much of it has been played.
 #[derive(Debug, Clone, Default)]
 pub struct FaultScript {
-    entries: Vec<(Fault, u32)>,
+    entries: Vec<Entry>,
+}
+
+#[derive(Debug, Clone)]
+struct Entry {
+    fault: Fault,
+    struck: u32,
+    /// Whether the diary has it.
+    noted: Cell<bool>,
+}
+
+impl Entry {
+    fn new(fault: Fault) -> Self {
+        Self { fault, struck: 0, noted: Cell::new(false) }
+    }
+
+    fn over(&self, now: f64) -> bool {
+        let fault = &self.fault;
+        let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
+        (limit > 0 && self.struck >= limit) || fault.over(now)
+    }
+
+    fn is(&self, kind: FaultKind, now: f64) -> bool {
+        self.fault.kind == kind && now >= self.fault.at && !self.over(now)
+    }
+
+    fn note(&self) {
+        if !self.noted.replace(true) {
+            diary::note(Happening::Struck(self.fault.kind));
+        }
+    }
 }
 
 impl FaultScript {
     /// A script that has not begun.
     pub fn new(faults: &[Fault]) -> Self {
-        Self { entries: faults.iter().map(|fault| (*fault, 0)).collect() }
+        Self { entries: faults.iter().copied().map(Entry::new).collect() }
     }
 
     /// Adds a fault that begins `fault.at` seconds after `now` [s since the first connection].
     pub fn inject(&mut self, mut fault: Fault, now: f64) {
         fault.at += now;
-        self.entries.retain(|entry| !Self::over(entry, now));
-        self.entries.push((fault, 0));
+        self.entries.retain(|entry| !entry.over(now));
+        self.entries.push(Entry::new(fault));
     }
 
     /// The fault of this kind that strikes at `now` [s since the first connection], counted as one strike.
     pub fn take(&mut self, kind: FaultKind, now: f64) -> Option<Fault> {
-        let entry = self
-            .entries
-            .iter_mut()
-            .find(|entry| entry.0.kind == kind && now >= entry.0.at && !Self::over(entry, now))?;
-        entry.1 += 1;
-        Some(entry.0)
+        let entry = self.entries.iter_mut().find(|entry| entry.is(kind, now))?;
+        entry.struck += 1;
+        entry.note();
+        Some(entry.fault)
     }
 
     /// Whether a fault of this kind with a duration is active at `now`. No strike is counted.
     pub fn lasts(&self, kind: FaultKind, now: f64) -> bool {
-        let active = |entry: &(Fault, u32)| entry.0.kind == kind && now >= entry.0.at && !Self::over(entry, now);
-        self.entries.iter().any(|entry| entry.0.duration > 0.0 && active(entry))
-    }
-
-    fn over((fault, struck): &(Fault, u32), now: f64) -> bool {
-        let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
-        (limit > 0 && *struck >= limit) || fault.over(now)
+        let active = self.entries.iter().find(|entry| entry.fault.duration > 0.0 && entry.is(kind, now));
+        active.is_some_and(|entry| {
+            entry.note();
+            true
+        })
     }
 }
 
-/// Refuses a script with kinds that the simulated arm `name` cannot play.
-pub fn check_kinds(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), String> {
-    match faults.iter().find(|fault| !playable.contains(&fault.kind)) {
-        None => Ok(()),
-        Some(fault) => {
-            let word = |kind: &FaultKind| serde_json::to_value(kind).map_or(String::new(), |v| v.to_string());
-            let known: Vec<String> = playable.iter().map(word).collect();
-            Err(format!("{name} cannot play the fault {}; it can play {}", word(&fault.kind), known.join(", ")))
-        }
-    }
+/// Refuses a script with kinds that the simulated arm `name` cannot play. The option is that of `faults`.
+pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), Misfit> {
+    let unknown = faults.iter().enumerate().find(|(_, fault)| !playable.contains(&fault.kind));
+    let Some((index, fault)) = unknown else { return Ok(()) };
+    let known: Vec<String> = playable.iter().map(|kind| format!("{:?}", kind.name())).collect();
+    let what = format!("{name} cannot play the fault {:?}; it can play {}", fault.kind.name(), known.join(", "));
+    Err(Misfit::new(format!("faults.{index}.kind"), what))
+}
+
+/// Refuses a fault that the simulated arm `name` cannot play.
+pub fn check_kind(name: &str, fault: &Fault, playable: &[FaultKind]) -> Result<(), String> {
+    check_script(name, std::slice::from_ref(fault), playable).map_err(|misfit| misfit.what)
 }
 
 #[cfg(test)]
@@ -251,6 +301,13 @@ mod tests {
     }
 
     #[test]
+    fn every_kind_says_what_it_is() {
+        let all = FaultKind::all();
+        assert_eq!((all.len(), all[2].0), (FaultKind::Leader as usize + 1, FaultKind::Stall));
+        assert!(all.iter().all(|(_, about)| about.ends_with('.')), "{all:?}");
+    }
+
+    #[test]
     fn the_written_form_is_strict() {
         let read = serde_json::from_str::<Fault>;
         let fault = read(r#"{"at": 2.0, "kind": "error_code", "code": 3}"#).unwrap();
@@ -262,7 +319,7 @@ mod tests {
 
     #[test]
     fn kinds_that_cannot_be_played_are_named() {
-        let wrong = check_kinds("mock", &[Fault::new(FaultKind::Garbage)], &[FaultKind::Stall]).unwrap_err();
+        let wrong = check_kind("mock", &Fault::new(FaultKind::Garbage), &[FaultKind::Stall]).unwrap_err();
         assert_eq!(wrong, r#"mock cannot play the fault "garbage"; it can play "stall""#);
     }
 }

@@ -3,6 +3,7 @@
 
 pub mod arm;
 pub mod can_server;
+pub mod diary;
 pub mod faults;
 pub mod gripper;
 pub mod plant;

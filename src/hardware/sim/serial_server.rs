@@ -5,11 +5,15 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::arm::HasArm;
+use super::diary::{self, Happening};
+use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared, lock};
 use crate::clock::Mono;
-use crate::hardware::registry::Place;
+use crate::hardware::registry::{Emulator, Place};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::serial::Pty;
+use crate::joint::Joints;
 use crate::rt::host;
 
 /// How long a fault that cuts the line keeps it cut: longer than any adapter should believe in a silent arm.
@@ -53,6 +57,20 @@ impl<C: Controller> SerialServer<C> {
     }
 }
 
+impl<C: Controller + HasArm> Emulator for SerialServer<C> {
+    fn address(&self) -> String {
+        self.path.clone()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.with(|controller, now| controller.arm().inject(fault, now))
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.with(|controller, now| controller.arm().positions_at(now)))
+    }
+}
+
 impl<C: Controller> Drop for SerialServer<C> {
     fn drop(&mut self) {
         lock(&self.shared.line).closing = true;
@@ -66,7 +84,7 @@ impl<C: Controller> Drop for SerialServer<C> {
 /// The controller's thread.
 fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
-    let mut line = Line { pty, shared };
+    let mut line = Line { pty, shared, heard: false };
     while !shared.closing() {
         let silence = match shared.serve(&mut line) {
             Ending::Closed => LOOK,
@@ -86,6 +104,8 @@ fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
 struct Line<'a, C> {
     pty: Pty,
     shared: &'a Shared<C, ()>,
+    /// Somebody has written to it.
+    heard: bool,
 }
 
 impl<C: Controller> Read for Line<'_, C> {
@@ -93,7 +113,12 @@ impl<C: Controller> Read for Line<'_, C> {
         while !self.shared.closing() && !room.is_empty() {
             match self.pty.read(room, LOOK) {
                 Ok(0) => {}
-                Ok(n) => return Ok(n),
+                Ok(n) => {
+                    if !std::mem::replace(&mut self.heard, true) {
+                        diary::note(Happening::Came);
+                    }
+                    return Ok(n);
+                }
                 Err(error) => return Err(std::io::Error::other(error.to_string())),
             }
         }

@@ -2,16 +2,21 @@
 //!
 //! A thread waits for clients, another serves the one that is connected; both sleep in the kernel while nothing comes.
 
-use std::io::{Read, Write};
+use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::arm::HasArm;
+use super::diary::{self, Happening};
+use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared, lock};
 use crate::clock::Mono;
+use crate::hardware::registry::Emulator;
 use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::joint::Joints;
 use crate::rt::host;
 
 /// How long a new client waits for the end of one that has just gone.
@@ -32,8 +37,7 @@ struct Inner<C> {
 impl<C: Controller> TcpServer<C> {
     /// Listens at `address`, which should be a loopback address. `name` is the arm's, for messages.
     pub fn start(name: &str, controller: C, address: SocketAddr) -> AdapterResult<Self> {
-        let failed =
-            |e: std::io::Error| AdapterError::Rejected(format!("{name} emulator: cannot listen at {address}: {e}"));
+        let failed = |e| cannot_listen(&format!("{name} emulator"), address, &e);
         let listener = TcpListener::bind(address).map_err(failed)?;
         let address = listener.local_addr().map_err(failed)?;
         let inner = Arc::new(Inner { address, shared: Shared::new(controller), refused: AtomicU64::new(0) });
@@ -56,6 +60,20 @@ impl<C: Controller> TcpServer<C> {
     /// How many clients were turned away because another one was connected.
     pub fn refused(&self) -> u64 {
         self.inner.refused.load(Ordering::Relaxed)
+    }
+}
+
+impl<C: Controller + HasArm> Emulator for TcpServer<C> {
+    fn address(&self) -> String {
+        self.inner.address.to_string()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.with(|controller, now| controller.arm().inject(fault, now))
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        Some(self.with(|controller, now| controller.arm().positions_at(now)))
     }
 }
 
@@ -115,7 +133,9 @@ impl<C: Controller> Inner<C> {
     /// Serves one client until it is gone.
     fn serve(&self, mut stream: TcpStream) {
         let _ = stream.set_nodelay(true);
+        diary::note(Happening::Came);
         let ending = self.shared.serve(&mut stream);
+        diary::note(Happening::Gone);
         if let Ending::Dark(time) = ending {
             lock(&self.shared.line).dark_until = Instant::now() + time;
         }
@@ -127,6 +147,20 @@ impl<C: Controller> Inner<C> {
         lock(&self.shared.line).client = None;
         self.shared.changed.notify_all();
     }
+}
+
+/// Why `who` cannot have a port of this computer, and what to do.
+pub fn cannot_listen(who: &str, at: SocketAddr, error: &io::Error) -> AdapterError {
+    let hint = match error.kind() {
+        ErrorKind::PermissionDenied => format!(
+            "\nhint: allow it with `sysctl net.ipv4.ip_unprivileged_port_start={}` as root, or give the program \
+             CAP_NET_BIND_SERVICE",
+            at.port()
+        ),
+        ErrorKind::AddrInUse => "\nhint: take another address of this computer, like 127.0.0.5".to_owned(),
+        _ => String::new(),
+    };
+    AdapterError::Io(format!("{who}: cannot listen at {at}: {error}{hint}"))
 }
 
 /// The thread that waits for clients.
@@ -154,6 +188,7 @@ fn listen<C: Controller>(inner: &Arc<Inner<C>>, mut listener: TcpListener) {
         }
         if !inner.wait_for_free() {
             inner.refused.fetch_add(1, Ordering::Relaxed);
+            diary::note(Happening::TurnedAway);
             inner.turn_away(stream);
             continue;
         }

@@ -19,6 +19,17 @@ pub enum Scan<T> {
     Take(usize, T),
 }
 
+impl<T> Scan<T> {
+    /// The same with what `f` makes of the frame.
+    pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Scan<U> {
+        match self {
+            Self::More => Scan::More,
+            Self::Skip(n) => Scan::Skip(n),
+            Self::Take(n, frame) => Scan::Take(n, f(frame)),
+        }
+    }
+}
+
 /// Bytes that have arrived and are not used up yet.
 #[derive(Debug)]
 pub(super) struct Incoming {

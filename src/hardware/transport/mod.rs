@@ -2,6 +2,7 @@
 
 pub mod can;
 pub mod device_time;
+pub mod dialogue;
 mod incoming;
 pub mod pty;
 pub mod serial;

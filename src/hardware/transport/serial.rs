@@ -24,6 +24,38 @@ const RATE_TOLERANCE: u32 = 2;
 /// How serial devices are named that an arm may be at.
 const NAMES: [&str; 5] = ["ttyUSB", "ttyACM", "ttyAMA", "ttyTHS", "ttymxc"];
 
+/// Where a controller on a serial line is: `/dev/ttyUSB0`, `/dev/ttyUSB0@115200`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SerialAddress {
+    /// The device.
+    pub path: String,
+    /// Rate of the line [bit/s].
+    pub baud: u32,
+}
+
+impl SerialAddress {
+    /// Reads `PATH[@BAUD]`; what is wrong with it, in a sentence without full stop. Opens nothing.
+    pub fn parse(address: &str, default_baud: u32) -> Result<Self, String> {
+        let (path, baud) = match address.rsplit_once('@') {
+            None => (address, default_baud),
+            Some((path, rate)) => match rate.parse() {
+                Ok(baud @ 1200..=4_000_000) => (path, baud),
+                _ => return Err(format!("{rate:?} is not a rate (1200 to 4000000 bit/s)")),
+            },
+        };
+        if !path.starts_with('/') || path.ends_with('/') {
+            return Err(format!("{path:?} is not the path of a serial device, such as /dev/ttyUSB0"));
+        }
+        Ok(Self { path: path.to_owned(), baud })
+    }
+}
+
+impl std::fmt::Display for SerialAddress {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}@{}", self.path, self.baud)
+    }
+}
+
 /// A serial line over which frames go both ways.
 #[derive(Debug)]
 pub struct SerialLink {
@@ -183,6 +215,16 @@ fn others() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn addresses() {
+        let full = |address| SerialAddress::parse(address, 1_000_000).map(|line| line.to_string());
+        assert_eq!(full("/dev/ttyUSB0"), Ok("/dev/ttyUSB0@1000000".into()));
+        assert_eq!(full("/dev/ttyUSB0@115200"), Ok("/dev/ttyUSB0@115200".into()));
+        for bad in ["", "ttyUSB0", "/dev/", "/dev/ttyUSB0@", "/dev/ttyUSB0@fast", "/dev/ttyUSB0@0"] {
+            assert!(full(bad).is_err(), "{bad:?}");
+        }
+    }
 
     const WAIT: Duration = Duration::from_secs(10);
 

@@ -10,6 +10,8 @@ pub mod jacobian;
 pub mod step;
 mod stored;
 
+use std::f64::consts::TAU;
+
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
@@ -138,6 +140,34 @@ impl Kinematics {
     /// What each joint lets its child do.
     pub fn kinds(&self) -> &[JointKind] {
         &self.kinds
+    }
+
+    /// Whether a joint, and all that follows it, comes to the same after a whole turn.
+    fn comes_round(&self, variable: usize) -> bool {
+        let round = |b: &Body| b.motion == Motion::Turn && b.multiplier.fract() == 0.0;
+        self.bodies.iter().skip(1).filter(|b| b.variable == variable).all(round)
+    }
+
+    /// Which joints turn without end: they come to the same after a whole turn, and have no limits.
+    pub fn turns(&self) -> Vec<bool> {
+        let endless = |l: &Limits| l.lower == f64::NEG_INFINITY && l.upper == f64::INFINITY;
+        self.limits.iter().enumerate().map(|(v, l)| endless(l) && self.comes_round(v)).collect()
+    }
+
+    /// Turns joints of some kinds by whole turns, as far as their limits let them, to be near: the same pose of every
+    /// link. A joint that is nearest already is left as it is to the last bit.
+    pub fn unwind(&self, q: &mut [f64], near: &[f64], of: impl Fn(JointKind) -> bool) {
+        let joints =
+            self.kinds.iter().zip(&self.limits).enumerate().filter(|(v, (k, _))| of(**k) && self.comes_round(*v));
+        for (v, (_, limits)) in joints {
+            let (Some(q), Some(near)) = (q.get_mut(v), near.get(v)) else { continue };
+            // Where the limits end, the last turn that is within them is the nearest.
+            let (most, least) = (((limits.upper - *q) / TAU).floor(), ((limits.lower - *q) / TAU).ceil());
+            let whole = ((near - *q) / TAU).round().min(most).max(least);
+            if whole != 0.0 && (limits.lower..=limits.upper).contains(&(*q + whole * TAU)) {
+                *q += whole * TAU;
+            }
+        }
     }
 
     /// Number of bodies, the root included: the length of a buffer of frames.

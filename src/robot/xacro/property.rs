@@ -5,7 +5,7 @@ use std::rc::Rc;
 use super::expand::{Env, Expander, boolean};
 use super::functions;
 use super::scope::{Block, Entry};
-use super::syntax::is_identifier;
+use super::tokens::is_identifier;
 use super::value::{Value, literal};
 use super::{Result, Trouble};
 use crate::robot::xml::{Attribute, Element};

@@ -1,4 +1,5 @@
-//! The lines of `src/hardware/arms/mod.rs` that put an arm into the table.
+//! The lines that put an arm into the tables of a checkout: `src/hardware/arms/mod.rs`, the adapters, and
+//! `src/robot/builtin.rs`, the robot descriptions.
 
 /// The text of the table's file with a module and a row more; what is wrong with it where they have no place.
 pub fn with_row(text: &str, module: &str) -> Result<String, String> {
@@ -40,9 +41,43 @@ fn with_entry(text: &str, module: &str) -> Result<String, String> {
     Ok(entry + after)
 }
 
+/// The text of the file of robot descriptions with a name more; what is wrong with it where that has no place.
+pub fn with_robot(text: &str, name: &str) -> Result<String, String> {
+    let missing = "it has no `robots!( … );` with a name on each line";
+    let start = text.find("\nrobots!(\n").ok_or(missing)? + "\nrobots!(\n".len();
+    let (before, rest) = text.split_at(start);
+    let (list, after) = rest.split_once("\n);").ok_or(missing)?;
+    let mut names: Vec<&str> = list.lines().map(|line| line.trim().trim_end_matches(',')).collect();
+    let own = format!("{name:?}");
+    if names.contains(&own.as_str()) {
+        return Err(format!("it has {own} already"));
+    }
+    // Names stand in alphabetical order.
+    let at = names.iter().position(|other| *other > own.as_str()).unwrap_or(names.len());
+    names.insert(at, &own);
+    let list: Vec<String> = names.iter().map(|name| format!("    {name}")).collect();
+    Ok(format!("{before}{}\n);{after}", list.join(",\n")))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_robots_of_this_checkout_take_a_name() {
+        let text = include_str!("../../../robot/builtin.rs");
+        for (name, place) in [
+            ("acme", "robots!(\n    \"acme\",\n    \"lite6\","),
+            ("penny", "    \"lite6_gripper\",\n    \"penny\",\n    \"piper\","),
+            ("zorro", "    \"yourarm_gripper\",\n    \"zorro\"\n);"),
+        ] {
+            let with = with_robot(text, name).unwrap();
+            assert!(with.contains(place), "{with}");
+            assert_eq!(with.len(), text.len() + name.len() + "    \"\",\n".len());
+            assert!(with_robot(&with, name).unwrap_err().contains("already"));
+        }
+        assert!(with_robot("robots!(\"a\");", "b").is_err());
+    }
 
     #[test]
     fn the_table_of_this_checkout_takes_a_row() {

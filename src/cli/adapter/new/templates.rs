@@ -4,25 +4,28 @@
 //! an arm of another name is made by writing that name, its number of joints and its address in their place.
 
 use super::Transport;
+use super::description;
 use super::name::Name;
 
 macro_rules! arm {
-    ($folder:literal) => {
+    ($folder:literal $($more:literal)?) => {
         [
             ("mod.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/mod.rs"))),
             ("adapter.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/adapter.rs"))),
             ("protocol.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/protocol.rs"))),
             ("golden.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/golden.rs"))),
             ("emulator.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/emulator.rs"))),
+            $(($more, include_str!(concat!("../../../../assets/templates/", $folder, "/", $more))),)?
         ]
     };
 }
 
-const TCP: [(&str, &str); 5] = arm!("tcp");
-const CAN: [(&str, &str); 5] = arm!("can");
-const SERIAL: [(&str, &str); 5] = arm!("serial");
+const TCP: &[(&str, &str)] = &arm!("tcp" "wire.rs");
+const CAN: &[(&str, &str)] = &arm!("can");
+const SERIAL: &[(&str, &str)] = &arm!("serial" "wire.rs");
 
 const BLUEPRINT: &str = include_str!("../../../../assets/templates/blueprint.yaml");
+const PLANNER: &str = include_str!("../../../../assets/templates/planner.yaml");
 /// What a crate has besides: its path in the crate, and its text.
 const CRATE: [(&str, &str); 5] = [
     ("Cargo.toml", include_str!("../../../../assets/templates/crate/manifest.toml")),
@@ -55,7 +58,8 @@ impl Arm {
             true => ((*file).to_owned(), self.code(text)),
             false => ((*file).to_owned(), self.words(text).replace("DIMOS", dimos)),
         });
-        rest.chain(sources).chain([(format!("blueprints/{}.yaml", self.blueprint()), self.words(BLUEPRINT))]).collect()
+        let robot = (format!("robots/{}.urdf", self.name.snake), self.urdf("src/lib.rs"));
+        rest.chain(sources).chain(self.blueprints()).chain([robot]).collect()
     }
 
     /// The new files in a checkout of dimos, with their paths below it.
@@ -65,7 +69,8 @@ impl Arm {
             let text = self.code(text).replace("dimos::", "crate::");
             (format!("{folder}/{file}"), text)
         });
-        sources.chain([(format!("blueprints/{}.yaml", self.blueprint()), self.words(BLUEPRINT))]).collect()
+        let robot = (format!("assets/robots/{}.urdf", self.name.snake), self.urdf(&format!("{folder}/mod.rs")));
+        sources.chain(self.blueprints()).chain([robot]).collect()
     }
 
     /// The name of its blueprint.
@@ -73,17 +78,33 @@ impl Arm {
         format!("coordinator-{}", self.name.kebab)
     }
 
+    /// The name of its blueprint with a planner.
+    pub fn planner(&self) -> String {
+        format!("{}-planner", self.name.kebab)
+    }
+
+    fn blueprints(&self) -> [(String, String); 2] {
+        [(self.blueprint(), BLUEPRINT), (self.planner(), PLANNER)]
+            .map(|(name, text)| (format!("blueprints/{name}.yaml"), self.words(text)))
+    }
+
+    fn urdf(&self, limits_in: &str) -> String {
+        let about = self.written("Acme, a 6-joint arm", &[]);
+        description::urdf(&self.name.snake, &about, self.dof, limits_in)
+    }
+
     fn sources(&self) -> &'static [(&'static str, &'static str)] {
         match self.transport {
-            Transport::Tcp => &TCP,
-            Transport::Can => &CAN,
-            Transport::Serial => &SERIAL,
+            Transport::Tcp => TCP,
+            Transport::Can => CAN,
+            Transport::Serial => SERIAL,
         }
     }
 
     /// Rust code of this arm.
     fn code(&self, text: &str) -> String {
-        self.written(text, &[("acme", &self.name.snake)])
+        let planner = self.planner();
+        self.written(text, &[("acme-planner", &planner), ("acme", &self.name.snake)])
     }
 
     /// Any other text of this arm.
@@ -94,7 +115,20 @@ impl Arm {
             Transport::Serial => "/dev/ttyUSB0",
         };
         let adapter_type = format!("adapter_type: {}", self.name.snake);
-        let more = [("adapter_type: acme", &*adapter_type), ("acme", &self.name.kebab), ("ADDRESS", address)];
+        let robot = format!("robots/{}.urdf", self.name.snake);
+        let builtin = format!("builtin:{}", self.name.snake);
+        let (joints, home) = (description::joint_names(self.dof), description::home(self.dof));
+        let zero = vec!["0"; self.dof.into()].join(", ");
+        let more = [
+            ("adapter_type: acme", &*adapter_type),
+            ("robots/acme.urdf", &robot),
+            ("builtin:acme", &builtin),
+            ("acme", &self.name.kebab),
+            ("ADDRESS", address),
+            ("JOINTS", &joints),
+            ("HOME", &home),
+            ("ZERO", &zero),
+        ];
         self.written(text, &more)
     }
 
@@ -144,8 +178,8 @@ mod tests {
         for (transport, sources) in [(Transport::Tcp, TCP), (Transport::Can, CAN), (Transport::Serial, SERIAL)] {
             let files = arm("acme", 6, transport).own_crate("path = \"x\"");
             for (file, text) in sources {
-                let path = if file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
-                assert!(files.contains(&(path, text.to_owned())), "{file}");
+                let path = if *file == "mod.rs" { "src/lib.rs".to_owned() } else { format!("src/{file}") };
+                assert!(files.contains(&(path, (*text).to_owned())), "{file}");
             }
         }
     }
@@ -162,6 +196,15 @@ mod tests {
             text("Cargo.toml").contains("name = \"acme-2\"") && text("Cargo.toml").contains("dimos = { git = \"x\" }")
         );
         assert!(text("blueprints/coordinator-acme-2.yaml").contains("adapter_type: acme_2\n"));
+        assert!(text("src/main.rs").contains("(\"acme_2\", include_str!(\"../robots/acme_2.urdf\"))"));
+        assert!(
+            text("src/main.rs").contains("(\"acme-2-planner\", include_str!(\"../blueprints/acme-2-planner.yaml\"))")
+        );
+        let planner = text("blueprints/acme-2-planner.yaml");
+        assert!(planner.contains("model_path: builtin:acme_2 ") && planner.contains("include: [coordinator-acme-2]"));
+        assert!(planner.contains("joint_names: [joint1, joint2, joint3, joint4, joint5, joint6, joint7, joint8]"));
+        assert!(planner.contains("home: [0, 0.4, 0, 0.4, 0, 0.4, 0, 0.4]"), "{planner}");
+        assert!(text("robots/acme_2.urdf").contains("<robot name=\"acme_2\">"));
         assert!(text("README.md").contains("hardware.arm.address=can0"));
         assert!(files.iter().all(|(_, text)| !text.contains("acme_2_2") && !text.contains("DIMOS")));
     }
@@ -170,7 +213,7 @@ mod tests {
     fn in_the_tree_nothing_is_of_another_crate() {
         for transport in [Transport::Tcp, Transport::Can, Transport::Serial] {
             let files = arm("otto", 7, transport).in_tree();
-            assert_eq!(files.len(), 6);
+            assert_eq!(files.len(), if transport == Transport::Can { 8 } else { 9 });
             let left = |text: &str| text.contains("dimos::") || text.to_lowercase().contains("acme");
             assert!(files.iter().all(|(_, text)| !left(text)), "{transport:?}");
         }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::device::{Device, GRIPPER_MAX};
 use super::options::Options;
-use super::{MODES, NATIVE_RATE, limits};
+use super::{MODES, NATIVE_RATE, fit, limits};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -32,13 +32,8 @@ impl MockArm {
 
     /// A mock arm on another clock, for tests. Latency and stalls block in real time all the same.
     pub fn with_clock(config: &AdapterConfig, clock: Arc<dyn Clock>) -> AdapterResult<Self> {
-        let options: Options = config.options()?;
-        let dof = config.dof;
-        let rejected = |text| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if !(1..=MAX_DOF).contains(&dof) {
-            return Err(rejected(format!("a mock arm has 1 to {MAX_DOF} joints, not {dof}")));
-        }
-        options.check(dof).map_err(rejected)?;
+        config.fit(fit)?;
+        let (options, dof) = (config.options::<Options>()?, config.dof);
         Ok(Self {
             device: Device::new(dof, &options, clock),
             options,

@@ -9,7 +9,8 @@ mod tests;
 pub use adapter::MockArm;
 pub use options::Options;
 
-use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use std::f64::consts::PI;
 
@@ -33,10 +34,16 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: true,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(MockArm::new(config)?)),
     emulate: None,
 };
+
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("a mock arm", SPEC.dof)?;
+    config.options::<Options>()?.check(config.dof)?;
+    Ok(Fit { limits: limits(config.dof) })
+}
 
 /// ±2π rad, π rad/s, 10 rad/s², 100 rad/s³ for every joint.
 fn limits(dof: usize) -> JointLimits {

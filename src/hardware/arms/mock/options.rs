@@ -4,7 +4,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::limits;
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::fit::Misfit;
+use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::faults::{Fault, FaultKind, check_script};
 
 /// The faults that a mock arm can play.
 const PLAYABLE: &[FaultKind] = &[
@@ -68,23 +70,18 @@ impl Default for Options {
 
 impl Options {
     /// Says what is wrong with the values for an arm of `dof` joints.
-    pub(super) fn check(&self, dof: usize) -> Result<(), String> {
+    pub(super) fn check(&self, dof: usize) -> Result<(), Misfit> {
         let given = self.initial_positions.len();
         if given != 0 && given != dof {
-            return Err(format!("initial_positions has {given} values for {dof} joints"));
+            let what = format!("initial_positions has {given} values for {dof} joints");
+            return Err(Misfit::new("initial_positions", what));
         }
-        let limits = limits(dof);
-        let range = limits.position_lower.iter().zip(&limits.position_upper);
-        if let Some((value, _)) =
-            self.initial_positions.iter().zip(range).find(|(v, (lo, hi))| !(**lo..=**hi).contains(v))
-        {
-            return Err(format!("initial_positions: {value} is outside the joint's limits of ±2π rad"));
-        }
+        check_pose(&self.initial_positions, &limits(dof))?;
         for (name, value, max) in [("latency_ms", self.latency_ms, 10_000.0), ("lag", self.lag, 10.0)] {
             if !(0.0..=max).contains(&value) {
-                return Err(format!("{name}: {value} is not between 0 and {max}"));
+                return Err(Misfit::new(name, format!("{name}: {value} is not between 0 and {max}")));
             }
         }
-        check_kinds("mock", &self.faults, PLAYABLE)
+        check_script("mock", &self.faults, PLAYABLE)
     }
 }

@@ -16,7 +16,7 @@ use super::picture::{Counts, Picture};
 use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
-use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
@@ -54,15 +54,11 @@ impl PiperAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("piper has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
-        Ok(Self {
-            arm: Session::new(config.hardware_id.clone(), address),
-            options: config.options()?,
-            mode: ControlMode::Position,
-        })
+        let options: Options = config.options()?;
+        let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
+        Ok(Self { arm, options, mode: ControlMode::Position })
     }
 
     /// What was counted since the connection was made: frames of the arm, and of the bus.
@@ -87,12 +83,23 @@ impl PiperAdapter {
         self.arm.send(&protocol::joint_targets(100, self.follow(), self.arm.picture.joints))
     }
 
-    fn velocities(&self) -> Joints {
-        joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI))
+    /// With how much torque the gripper closes at most [mNm].
+    fn gripper_torque(&self) -> u16 {
+        (self.options.gripper_torque / MILLI).round() as u16
     }
 
-    /// Torques [Nm]; `None` when the firmware, which says how to read the currents, is not known.
+    /// Velocities [rad/s]; `None` when a motor has not told its own lately.
+    fn velocities(&self) -> Option<Joints> {
+        let known = self.arm.measures();
+        known.then(|| joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI)))
+    }
+
+    /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which says
+    /// how to read the currents.
     fn efforts(&self) -> Option<Joints> {
+        if !self.arm.measures() {
+            return None;
+        }
         let quarter = self.arm.picture.firmware()? <= QUARTER_CURRENT;
         let mut efforts = [0.0; DOF];
         let motors = self.arm.picture.motors.iter().zip(TORQUE).enumerate();
@@ -147,7 +154,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     /// The data sheet's limits, narrowed by those that the controller has been given.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        let mut limits = limits(DOF);
+        let mut limits = limits();
         let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
         let all = positions.zip(&mut limits.velocity_max).zip(&self.arm.picture.limits);
         for (((lower, upper), speed), own) in all {
@@ -187,15 +194,16 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
-        self.arm.refresh()?;
+        self.arm.whole()?;
         fill(positions, &self.arm.picture.joints.map(radians));
         Ok(())
     }
 
     fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
         self.arm.known()?;
-        fill(velocities, &self.velocities());
-        Ok(true)
+        let known = self.velocities();
+        known.iter().for_each(|known| fill(velocities, known));
+        Ok(known.is_some())
     }
 
     fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
@@ -206,11 +214,11 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
-        self.arm.refresh()?;
+        self.arm.whole()?;
         *reading = JointReading {
             stamp: Some(self.arm.picture.joints_at),
             position: joints_of(&self.arm.picture.joints.map(radians)),
-            velocity: Some(self.velocities()),
+            velocity: self.velocities(),
             effort: self.efforts(),
         };
         Ok(())
@@ -245,9 +253,11 @@ impl ManipulatorAdapter for PiperAdapter {
             }
         }
         self.arm.may_move()?;
-        let speed = if self.mode == ControlMode::Position { self.percent(velocity) } else { 100 };
         let joints: WireJoints = positions.map(millidegrees);
-        self.arm.send(&protocol::joint_targets(speed, self.follow(), joints))
+        match self.mode {
+            ControlMode::ServoPosition => self.arm.stream(&protocol::joint_targets(100, self.follow(), joints)),
+            _ => self.arm.send(&protocol::joint_targets(self.percent(velocity), self.follow(), joints)),
+        }
     }
 
     /// Holds the arm where it is. Confirmed when its feedback shows that every joint gets slower or stands.
@@ -257,10 +267,11 @@ impl ManipulatorAdapter for PiperAdapter {
         if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
             self.hold()?;
         }
-        let sent = self.arm.picture.joints_at;
+        let sent = MonotonicClock.now();
         let slower = |picture: &Picture| {
             let speeds = picture.motors.iter().map(|motor| i32::from(motor.speed).abs());
-            picture.joints_at > sent && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
+            picture.motors_heard(sent)
+                && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
         };
         Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
     }
@@ -286,9 +297,12 @@ impl ManipulatorAdapter for PiperAdapter {
             return self.arm.in_order();
         }
         self.arm.send(&[protocol::clear_errors()])?;
-        self.arm.picture.expect_drivers();
+        if let Some(gripper) = self.arm.picture.gripper.filter(|_| self.arm.picture.gripper_errors().next().is_some()) {
+            let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
+            self.arm.send(&[frame])?;
+        }
         let asked = MonotonicClock.now();
-        let cleared = |p: &Picture| p.drivers_heard() && p.status_at > asked && p.error_code() == 0;
+        let cleared = |p: &Picture| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
         if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
             return Ok(());
         }
@@ -333,7 +347,6 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(self.arm.refuse(format!("gripper opening {position} m is not within 0 to {stroke} m")));
         }
         self.arm.may_move()?;
-        let torque = (self.options.gripper_torque / MILLI).round() as u16;
-        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, torque)])
+        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque())])
     }
 }

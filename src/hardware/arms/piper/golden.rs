@@ -26,6 +26,8 @@ pub const MOVE_POSE: [&str; 4] =
     ["151#0100320000000000", "152#0000DB40FFFCF2C0", "153#00034112FFFD40E0", "154#00014C08000001F4"];
 /// Gripper to 42.5 mm with 1 Nm, enabled.
 pub const GRIPPER: &str = "159#0000A60403E80100";
+/// The same, which clears its errors; and to 0, off.
+pub const CLEAR_GRIPPER: [&str; 2] = ["159#0000A60403E80300", "159#0000000003E80200"];
 /// All motors on, and off.
 pub const ENABLE: &str = "471#0702000000000000";
 pub const DISABLE: &str = "471#0701000000000000";
@@ -42,7 +44,7 @@ pub const POSE_FEEDBACK: [&str; 3] = ["2A2#0000DB40FFFCF2C0", "2A3#00034112FFFD4
 pub const JOINT_FEEDBACK: [&str; 3] = ["2A5#000005DCFFFEA070", "2A6#00000001FFFFFFFF", "2A7#00010000FFFF0000"];
 /// 42.5 mm, −0.5 Nm, enabled and homed.
 pub const GRIPPER_FEEDBACK: &str = "2A8#0000A604FE0CC000";
-/// Joint 1: −1.5 rad/s, 2 A, 0.0005 rad short of one radian (999); joint 6: 0.001 rad/s, −0.001 A, −1000.
+/// Joint 1: −1.5 rad/s, 2 A, 0.001 rad short of one radian (999); joint 6: 0.001 rad/s, −0.001 A, −1000.
 pub const MOTOR_1: &str = "251#FA2407D0000003E7";
 pub const MOTOR_6: &str = "256#0001FFFFFFFFFC18";
 /// Joint 3: 24 V, driver 45 °C, motor −5 °C, enabled and stalled, 1.5 A.

@@ -16,9 +16,9 @@ mod wire;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::transport::can::CanAddress;
-use crate::hardware::transport::can::address::FORMS;
+use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::transport::can::{self, address::FORMS};
 use crate::joint::{ControlMode, JointLimits};
 
 /// The modes of the arm. It has no velocity mode.
@@ -40,15 +40,11 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "0.001 deg, 0.001 mm",
     native_rate: NATIVE_RATE,
-    address: AddressForm {
-        form: FORMS,
-        required: true,
-        check: |address| CanAddress::parse(address).map(|address| address.to_string()),
-    },
+    address: AddressForm { form: FORMS, required: true, check: can::check },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(adapter::PiperAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::PiperEmulator::start(config, place)?))),
 };
@@ -61,8 +57,15 @@ const RANGES: [(f64, f64); protocol::DOF] =
 const SPEED: f64 = 3.0;
 const ACCELERATION: f64 = 5.0;
 
-/// The joint limits of the data sheet. They do not depend on `dof`: the arm has 6 joints.
-fn limits(_dof: usize) -> JointLimits {
+/// All arms have the same limits; a connected one may have been given narrower ones.
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("piper", SPEC.dof)?;
+    config.options::<Options>()?.sim.check(emulator::PLAYABLE)?;
+    Ok(Fit { limits: limits() })
+}
+
+/// The joint limits of the data sheet.
+fn limits() -> JointLimits {
     JointLimits {
         position_lower: RANGES.iter().map(|range| range.0).collect(),
         position_upper: RANGES.iter().map(|range| range.1).collect(),

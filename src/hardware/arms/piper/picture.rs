@@ -5,7 +5,9 @@
 
 use std::time::Duration;
 
-use super::protocol::{DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text};
+use super::protocol::{
+    DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
+};
 use crate::clock::Mono;
 
 /// Frames of one burst arrive within less than a period of the arm.
@@ -14,8 +16,6 @@ const BURST: Duration = Duration::from_millis(4);
 const FAR: u32 = 360_000;
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
-/// All joints, as bits.
-const ALL: u8 = 0x3F;
 /// Room for the text of the firmware.
 const TEXT: usize = 128;
 
@@ -73,19 +73,22 @@ pub struct Picture {
     pub status_at: Mono,
     /// Speeds and currents.
     pub motors: [Motor; DOF],
+    /// When each of `motors` arrived.
+    motors_at: [Mono; DOF],
     /// Voltages, temperatures, errors.
     pub drivers: [Driver; DOF],
+    /// When each of `drivers` arrived.
+    drivers_at: [Mono; DOF],
     /// The gripper, once it was heard of.
     pub gripper: Option<Gripper>,
+    /// Whether the gripper is used: only then its errors are errors.
+    pub gripper_used: bool,
     /// The limits that the controller was asked for.
     pub limits: [Option<MotorLimits>; DOF],
     /// When somebody else last sent a command to an arm on this bus.
     pub commanded_at: Mono,
     /// What was counted.
     pub counts: Counts,
-    /// Of which motors and drivers there was news, as bits: ever, and since [`Picture::expect_drivers`].
-    motors_seen: u8,
-    drivers_seen: u8,
     joint_parts: Triple,
     pose_parts: Triple,
     text: [u8; TEXT],
@@ -101,13 +104,14 @@ impl Default for Picture {
             status: Status::default(),
             status_at: Mono::ZERO,
             motors: Default::default(),
+            motors_at: [Mono::ZERO; DOF],
             drivers: Default::default(),
+            drivers_at: [Mono::ZERO; DOF],
             gripper: None,
+            gripper_used: false,
             limits: [None; DOF],
             commanded_at: Mono::ZERO,
             counts: Counts::default(),
-            motors_seen: 0,
-            drivers_seen: 0,
             joint_parts: Triple::default(),
             pose_parts: Triple::default(),
             text: [0; TEXT],
@@ -117,6 +121,11 @@ impl Default for Picture {
 }
 
 impl Picture {
+    /// Nothing known yet, of an arm whose gripper is used or not.
+    pub fn of_arm(gripper_used: bool) -> Self {
+        Self { gripper_used, ..Self::default() }
+    }
+
     /// Adds what a frame says that arrived at `now`.
     pub fn take(&mut self, feedback: Feedback, now: Mono) {
         match feedback {
@@ -138,12 +147,14 @@ impl Picture {
             Feedback::Status(status) => (self.status, self.status_at) = (status, now),
             Feedback::Gripper(gripper) => self.gripper = Some(gripper),
             Feedback::Motor(joint, motor) => {
-                self.motors.get_mut(joint).into_iter().for_each(|to| *to = motor);
-                self.motors_seen |= 1 << joint;
+                if let (Some(to), Some(at)) = (self.motors.get_mut(joint), self.motors_at.get_mut(joint)) {
+                    (*to, *at) = (motor, now);
+                }
             }
             Feedback::Driver(joint, driver) => {
-                self.drivers.get_mut(joint).into_iter().for_each(|to| *to = driver);
-                self.drivers_seen |= 1 << joint;
+                if let (Some(to), Some(at)) = (self.drivers.get_mut(joint), self.drivers_at.get_mut(joint)) {
+                    (*to, *at) = (driver, now);
+                }
             }
             Feedback::Limits(joint, limits) => {
                 self.limits.get_mut(joint).into_iter().for_each(|to| *to = Some(limits));
@@ -171,8 +182,24 @@ impl Picture {
 
     /// Whether everything was heard of that the reads need.
     pub fn complete(&self) -> bool {
-        let heard = [self.joints_at, self.status_at].iter().all(|at| *at != Mono::ZERO);
-        heard && self.motors_seen == ALL && self.drivers_seen == ALL
+        let others = self.motors_at.iter().chain(&self.drivers_at);
+        [self.joints_at, self.status_at].iter().chain(others).all(|at| *at != Mono::ZERO)
+    }
+
+    /// Whether every motor was heard of after this time.
+    pub fn motors_heard(&self, after: Mono) -> bool {
+        self.motors_at.iter().all(|at| *at > after)
+    }
+
+    /// Whether every driver was heard of after this time.
+    pub fn drivers_heard(&self, after: Mono) -> bool {
+        self.drivers_at.iter().all(|at| *at > after)
+    }
+
+    /// The joints, counted from 1, whose drivers were not heard of after this time: `2, 5`.
+    pub fn silent_drivers(&self, after: Mono) -> String {
+        let silent = (1..).zip(&self.drivers_at).filter(|(_, at)| **at <= after);
+        silent.map(|(joint, _): (u32, _)| joint.to_string()).collect::<Vec<_>>().join(", ")
     }
 
     /// Whether every motor is on.
@@ -183,16 +210,6 @@ impl Picture {
     /// Whether every motor is off.
     pub fn disabled(&self) -> bool {
         !self.drivers.iter().any(Driver::enabled)
-    }
-
-    /// Forgets which drivers were heard of, to hear of each of them anew.
-    pub fn expect_drivers(&mut self) {
-        self.drivers_seen = 0;
-    }
-
-    /// Whether all drivers were heard of since [`Picture::expect_drivers`].
-    pub fn drivers_heard(&self) -> bool {
-        self.drivers_seen == ALL
     }
 
     /// The firmware as (1, 6, 3) for `S-V1.6-3`, once the controller has said it.
@@ -207,7 +224,7 @@ impl Picture {
     // --- Errors ---
 
     /// The first error, by weight: 1–15 and above a state of the arm, 201–206 a joint that does not answer, 101–106 a
-    /// joint beyond its limits, 3jb bit b of the driver of joint j; 0 = none.
+    /// joint beyond its limits, 3jb bit b of the driver of joint j, 40b bit b of the gripper; 0 = none.
     pub fn error_code(&self) -> i32 {
         let bit = |bits: u8| bits.trailing_zeros() as i32 + 1;
         let Status { arm, limits, silent, .. } = self.status;
@@ -220,7 +237,8 @@ impl Picture {
         if limits != 0 {
             return 100 + bit(limits);
         }
-        self.driver_errors().next().map_or(0, |(joint, bit, _)| 300 + 10 * joint as i32 + i32::from(bit))
+        let driver = self.driver_errors().map(|(joint, bit, _)| 300 + 10 * joint as i32 + i32::from(bit)).next();
+        driver.or_else(|| self.gripper_errors().next().map(|(bit, _)| 400 + i32::from(bit))).unwrap_or(0)
     }
 
     /// All that is wrong, in words; empty when nothing is.
@@ -250,6 +268,7 @@ impl Picture {
                 _ => format!("joint {joint}: {what}"),
             }
         }));
+        parts.extend(self.gripper_errors().map(|(_, what)| format!("gripper: {what}")));
         parts.join("; ")
     }
 
@@ -259,6 +278,12 @@ impl Picture {
             let errors = (0..8).filter(|bit| driver.status & (1 << bit) != 0 && driver_text(*bit).is_some());
             errors.map(move |bit| (i + 1, bit, driver))
         })
+    }
+
+    /// Bit and words of every error that the gripper reports, where it is used.
+    pub fn gripper_errors(&self) -> impl Iterator<Item = (u8, &'static str)> {
+        let status = self.gripper.filter(|_| self.gripper_used).map_or(0, |gripper| gripper.status);
+        (0..8).filter(move |bit| status & (1 << bit) != 0).filter_map(|bit| Some((bit, gripper_text(bit)?)))
     }
 }
 
@@ -323,6 +348,16 @@ mod tests {
         assert_eq!((picture.error_code(), picture.error_text()), (9, text.into()));
         picture.take(Feedback::Status(Status { arm: 12, ..Status::default() }), ms(0));
         assert_eq!(picture.error_code(), 331, "being taught is no error");
+        let closed_too_hard = Gripper { status: 0xC0 | 0b100100, ..Gripper::default() };
+        let mut picture = Picture::default();
+        picture.take(Feedback::Gripper(closed_too_hard), ms(0));
+        assert_eq!((picture.error_code(), picture.error_text()), (0, String::new()), "of no interest");
+        picture.gripper_used = true;
+        let text = "gripper: overcurrent; gripper: driver error";
+        assert_eq!((picture.error_code(), picture.error_text()), (402, text.into()));
+        picture.take(Feedback::Driver(2, hot), ms(0));
+        let text = "joint 3: motor too hot (84 °C); gripper: overcurrent; gripper: driver error";
+        assert_eq!((picture.error_code(), picture.error_text()), (331, text.into()));
     }
 
     #[test]

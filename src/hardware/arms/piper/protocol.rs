@@ -68,6 +68,13 @@ pub fn gripper_target(stroke: i32, torque: u16) -> CanFrame {
     frame(0x159, [a, b, c, d, e, f, 1, 0])
 }
 
+/// Clears the gripper's errors and leaves it on or off, as it was; its target is this stroke [0.001 mm], with a torque of
+/// at most so much [mNm].
+pub fn clear_gripper(stroke: i32, torque: u16, on: bool) -> CanFrame {
+    let [a, b, c, d, e, f, ..] = gripper_target(stroke, torque).data;
+    frame(0x159, [a, b, c, d, e, f, if on { 3 } else { 2 }, 0])
+}
+
 /// Enables or disables all motors, the gripper's too.
 pub fn enable(on: bool) -> CanFrame {
     frame(0x471, [7, if on { 2 } else { 1 }, 0, 0, 0, 0, 0, 0])
@@ -97,10 +104,6 @@ pub struct Status {
     pub control: u8,
     /// The arm's state; 0 = in order.
     pub arm: u8,
-    /// The move mode in use.
-    pub move_mode: u8,
-    /// Whether the arm is on its way to a target.
-    pub moving: bool,
     /// Joints beyond their limits: bit 0 = joint 1.
     pub limits: u8,
     /// Joints that do not answer: bit 0 = joint 1.
@@ -127,8 +130,6 @@ pub struct Driver {
     pub motor_temperature: i8,
     /// Bits: 0 low voltage, 1 motor hot, 2 overcurrent, 3 driver hot, 4 collision, 5 driver error, 6 enabled, 7 stall.
     pub status: u8,
-    /// From the supply [mA].
-    pub bus_current: u16,
 }
 
 impl Driver {
@@ -143,10 +144,15 @@ impl Driver {
 pub struct Gripper {
     /// Opening [0.001 mm].
     pub stroke: i32,
-    /// [mNm]
-    pub torque: i16,
     /// Bits: 0 low voltage, 1 motor hot, 2 overcurrent, 3 driver hot, 4 sensor, 5 driver error, 6 enabled, 7 homed.
     pub status: u8,
+}
+
+impl Gripper {
+    /// Whether its motor is on.
+    pub fn enabled(&self) -> bool {
+        self.status & 0x40 != 0
+    }
 }
 
 /// A joint's limits as the controller has them (0x473).
@@ -200,17 +206,10 @@ pub fn decode(frame: &CanFrame) -> Feedback {
     let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
     let from = |first: u16| usize::from(id.wrapping_sub(first));
     let feedback = match id {
-        0x2A1 => Feedback::Status(Status {
-            control: a,
-            arm: b,
-            move_mode: c,
-            moving: e != 0,
-            limits: g & 0x3F,
-            silent: h & 0x3F,
-        }),
+        0x2A1 => Feedback::Status(Status { control: a, arm: b, limits: g & 0x3F, silent: h & 0x3F }),
         0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
         0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
-        0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], torque: i16::from_be_bytes([e, f]), status: g }),
+        0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], status: g }),
         0x251..=0x256 => {
             let motor = Motor { speed: i16::from_be_bytes([a, b]), current: i16::from_be_bytes([c, d]) };
             Feedback::Motor(from(0x251), motor)
@@ -221,7 +220,6 @@ pub fn decode(frame: &CanFrame) -> Feedback {
                 driver_temperature: i16::from_be_bytes([c, d]),
                 motor_temperature: i8::from_be_bytes([e]),
                 status: f,
-                bus_current: u16::from_be_bytes([g, h]),
             };
             Feedback::Driver(from(0x261), driver)
         }
@@ -301,6 +299,15 @@ pub fn driver_text(bit: u8) -> Option<&'static str> {
         4 => Some("collision"),
         5 => Some("driver error"),
         7 => Some("stalled"),
+        _ => None,
+    }
+}
+
+/// What an error bit of the gripper means (0x2A8, byte 6); `None` for bits that are no error.
+pub fn gripper_text(bit: u8) -> Option<&'static str> {
+    match bit {
+        4 => Some("sensor error"),
+        0..=3 | 5 => driver_text(bit),
         _ => None,
     }
 }

@@ -7,6 +7,8 @@ fn commands_are_the_golden_bytes() {
     assert_eq!(joint_targets(200, Follow::Direct, JOINTS)[0], frame(golden::MOVE_DIRECT));
     assert_eq!(pose_target(50, POSE), golden::MOVE_POSE.map(frame));
     assert_eq!(gripper_target(42_500, 1000), frame(golden::GRIPPER));
+    let clear = [clear_gripper(42_500, 1000, true), clear_gripper(0, 1000, false)];
+    assert_eq!(clear, golden::CLEAR_GRIPPER.map(frame));
     assert_eq!(gripper_target(0, 9999).data[4..6], [0x13, 0x88], "5 Nm at most");
     assert_eq!(enable(true), frame(golden::ENABLE));
     assert_eq!(enable(false), frame(golden::DISABLE));
@@ -18,19 +20,18 @@ fn commands_are_the_golden_bytes() {
 #[test]
 fn feedback_is_read_from_the_golden_bytes() {
     let read = |text| decode(&frame(text));
-    let status = Status { control: 1, arm: 4, move_mode: 1, moving: true, limits: 0b10, silent: 0b100000 };
+    let status = Status { control: 1, arm: 4, limits: 0b10, silent: 0b100000 };
     assert_eq!(read(golden::STATUS), Feedback::Status(status));
     for part in 0..3 {
         let two = |all: [i32; 6]| [all[2 * part], all[2 * part + 1]];
         assert_eq!(read(golden::POSE_FEEDBACK[part]), Feedback::Pose(part, two(POSE)));
         assert_eq!(read(golden::JOINT_FEEDBACK[part]), Feedback::Joints(part, two(JOINTS)));
     }
-    let gripper = Gripper { stroke: 42_500, torque: -500, status: 0xC0 };
+    let gripper = Gripper { stroke: 42_500, status: 0xC0 };
     assert_eq!(read(golden::GRIPPER_FEEDBACK), Feedback::Gripper(gripper));
     assert_eq!(read(golden::MOTOR_1), Feedback::Motor(0, Motor { speed: -1500, current: 2000 }));
     assert_eq!(read(golden::MOTOR_6), Feedback::Motor(5, Motor { speed: 1, current: -1 }));
-    let driver =
-        Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0, bus_current: 1500 };
+    let driver = Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0 };
     assert_eq!(read(golden::DRIVER_3), Feedback::Driver(2, driver));
     assert!(driver.enabled());
     assert_eq!(read(golden::LIMITS_3), Feedback::Limits(2, MotorLimits { upper: 0, lower: -1700, speed: 3000 }));
@@ -60,6 +61,7 @@ fn every_error_has_words() {
     assert!((0..=15).all(|code| arm_text(code) != unknown) && arm_text(16) == unknown);
     assert!((0..=7).all(|control| control_text(control) != control_text(8)));
     assert!((0..8).all(|bit| driver_text(bit).is_some() == (bit != 6)));
+    assert!((0..8).all(|bit| gripper_text(bit).is_some() == (bit < 6)));
 }
 
 /// Prints how fast frames are read; the figure of a debug build is a lower bound.

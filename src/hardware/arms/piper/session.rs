@@ -18,6 +18,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_millis(300);
 const RECENT: Duration = Duration::from_millis(5);
 /// A state older than this is no state: a living arm sends one every 5 ms; the rest is for a busy host.
 const SILENCE: Duration = Duration::from_millis(150);
+/// The same of what the drivers say, which comes every 25 ms.
+const DRIVERS_SILENCE: Duration = Duration::from_millis(300);
 /// After this long without a state the connection is given up: the arm has lost its power.
 const LOST: Duration = Duration::from_millis(400);
 /// Enabling and disabling are asked for again and again, as the vendor does, and for so long.
@@ -43,13 +45,13 @@ pub struct Session {
 
 impl Session {
     /// A session with the arm on the bus at `address`. Does not connect.
-    pub fn new(hardware_id: String, address: CanAddress) -> Self {
-        Self { hardware_id, address, wire: None, picture: Picture::default(), drained_at: Mono::ZERO }
+    pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
+        Self { hardware_id, address, wire: None, picture: Picture::of_arm(gripper_used), drained_at: Mono::ZERO }
     }
 
     /// Opens the port and waits for a whole state. Only asks.
     pub fn connect(&mut self) -> AdapterResult<()> {
-        self.picture = Picture::default();
+        self.picture = Picture::of_arm(self.picture.gripper_used);
         self.wire = Some(Wire::open(&self.address)?);
         let introduced = self.introduce();
         if introduced.is_err() {
@@ -71,9 +73,14 @@ impl Session {
         result
     }
 
-    /// Sends a command.
+    /// Sends a command: an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
         self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
+    }
+
+    /// Sends a set point of a stream, which may get lost: the next one replaces it.
+    pub fn stream(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
+        self.wire.as_mut().ok_or(AdapterError::NotConnected)?.stream(frames)
     }
 
     /// Takes up feedback until `done` says so; `false` when the time is over.
@@ -106,6 +113,26 @@ impl Session {
             return Err(AdapterError::Io(text));
         }
         Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, SILENCE.as_millis())))
+    }
+
+    /// Takes up what has arrived; an error when the state is too old to be told, or the drivers do not say any more
+    /// whether the motors are on.
+    pub fn whole(&mut self) -> AdapterResult<()> {
+        self.refresh()?;
+        let earliest = MonotonicClock.now().before(DRIVERS_SILENCE);
+        if self.picture.drivers_heard(earliest) {
+            return Ok(());
+        }
+        let (address, silent) = (&self.address, self.picture.silent_drivers(earliest));
+        Err(AdapterError::Timeout(format!(
+            "piper at {address}: the drivers of joints {silent} have said nothing for {} ms",
+            DRIVERS_SILENCE.as_millis()
+        )))
+    }
+
+    /// Whether what is known of the motors' speeds and currents is new enough to be told.
+    pub fn measures(&self) -> bool {
+        self.picture.motors_heard(MonotonicClock.now().before(SILENCE))
     }
 
     /// The picture, for reads that mostly follow one of the joints and then answer from memory.
@@ -197,7 +224,7 @@ impl Session {
 
     /// An error unless the arm may be told to move.
     pub fn may_move(&mut self) -> AdapterResult<()> {
-        self.refresh()?;
+        self.whole()?;
         self.in_order()?;
         if self.picture.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
     }
@@ -211,7 +238,7 @@ impl Session {
                     .into(),
             ));
         }
-        let limits = limits(DOF);
+        let limits = limits();
         let range = limits.position_lower.iter().zip(&limits.position_upper);
         for (i, (wire, (lower, upper))) in self.picture.joints.iter().zip(range).enumerate() {
             let value = radians(*wire);
@@ -228,24 +255,27 @@ impl Session {
 
     /// Asks for the motors to be on or off until they say that they are.
     pub fn switch_motors(&mut self, on: bool) -> AdapterResult<()> {
-        let switched = |p: &Picture| p.drivers_heard() && if on { p.enabled() } else { p.disabled() };
-        let end = MonotonicClock.now().after(ENABLE_TIMEOUT);
-        self.picture.expect_drivers();
+        let began = MonotonicClock.now();
+        let end = began.after(ENABLE_TIMEOUT);
+        let switched = |p: &Picture| p.drivers_heard(began) && if on { p.enabled() } else { p.disabled() };
+        let mut sent = Ok(());
         while MonotonicClock.now() < end {
-            self.send(&[protocol::enable(on)])?;
+            sent = self.send(&[protocol::enable(on)]);
             if self.watch(REPEAT, switched)? {
                 return Ok(());
             }
         }
+        sent?;
+        let (name, within) = (&self.hardware_id, ENABLE_TIMEOUT.as_millis());
+        let silent = self.picture.silent_drivers(began);
+        if !silent.is_empty() {
+            let what = format!("{name}: the drivers of joints {silent} have said nothing for {within} ms");
+            return Err(AdapterError::Timeout(what));
+        }
         let wrong = |(_, driver): &(usize, &protocol::Driver)| driver.enabled() != on;
         let joints: Vec<String> =
             (1..).zip(&self.picture.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
-        Err(AdapterError::Timeout(format!(
-            "{}: the motors of joints {} do not go {} within {} ms",
-            self.hardware_id,
-            joints.join(", "),
-            if on { "on" } else { "off" },
-            ENABLE_TIMEOUT.as_millis()
-        )))
+        let (joints, word) = (joints.join(", "), if on { "on" } else { "off" });
+        Err(AdapterError::Timeout(format!("{name}: the motors of joints {joints} do not go {word} within {within} ms")))
     }
 }

@@ -261,7 +261,7 @@ fn stamps_are_of_the_arrival_and_the_same_when_nothing_came() {
 #[test]
 fn limits_are_the_narrower_of_sheet_and_arm() {
     let (emulator, mut arm) = connected();
-    let sheet = (SPEC.limits)(DOF);
+    let sheet = (SPEC.fit)(&config("can0", serde_json::json!({}))).unwrap().limits;
     let own = arm.get_limits().unwrap();
     assert!(farthest(&own.position_lower, &sheet.position_lower) < 1e-3);
     assert!(farthest(&own.position_upper, &sheet.position_upper) < 1e-3);

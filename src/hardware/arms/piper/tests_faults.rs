@@ -5,8 +5,10 @@ use std::time::{Duration, Instant};
 use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::golden;
+use super::picture::Picture;
 use super::protocol::{DOF, decode};
 use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
+use crate::clock::Mono;
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{AdapterError, ManipulatorAdapter, Stop};
@@ -60,6 +62,41 @@ fn f05_silence_is_noticed_by_the_age_of_the_state() {
     let error = arm.connect().unwrap_err().to_string();
     assert!(error.contains("nothing was heard") && error.contains("\nhint: is the arm powered"), "{error}");
     assert!(start.elapsed() < Duration::from_secs(3));
+}
+
+#[test]
+fn f05_speeds_that_are_old_are_not_told() {
+    let (emulator, mut arm) = connected();
+    assert!(read(&mut arm).unwrap().velocity.is_some());
+    emulator.mute(Some(0x252..=0x252));
+    until("the silence of motor 2", || read(&mut arm).unwrap().velocity.is_none());
+    assert!(read(&mut arm).unwrap().effort.is_none());
+    let mut values = [7.0; DOF];
+    assert_eq!((arm.read_joint_velocities(&mut values), values), (Ok(false), [7.0; DOF]));
+    assert_eq!((arm.read_joint_efforts(&mut values), values), (Ok(false), [7.0; DOF]));
+    assert_eq!(arm.write_stop(), Ok(Stop::Sent), "nothing shows that motor 2 stands");
+    emulator.mute(None);
+    until("news of it", || read(&mut arm).unwrap().velocity.is_some());
+    assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
+}
+
+#[test]
+fn f05_drivers_that_fall_silent_are_named_and_the_arm_can_still_be_stopped() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.mute(Some(0x263..=0x264));
+    let error = failure(&mut arm);
+    let AdapterError::Timeout(text) = &error else { panic!("{error:?}") };
+    assert!(text.ends_with("the drivers of joints 3, 4 have said nothing for 300 ms"), "{text}");
+    assert_eq!(arm.write_joint_positions(&START, 0.1), Err(error), "whether its motors are on is not known");
+    emulator.record();
+    assert!(arm.write_stop().is_ok() && arm.is_connected());
+    until("the hold", || ids(&emulator) == [0x151, 0x155, 0x156, 0x157]);
+    let off = arm.write_enable(false).unwrap_err().to_string();
+    assert_eq!(off, "arm: the drivers of joints 3, 4 have said nothing for 1000 ms");
+    emulator.mute(None);
+    until("all of them", || read(&mut arm).is_ok());
+    assert_eq!(arm.read_enabled(), Ok(false));
 }
 
 #[test]
@@ -188,9 +225,10 @@ fn f16_what_waits_when_the_power_goes_moves_nothing_when_it_returns() {
 }
 
 #[test]
-fn f17_full_queues_cost_commands_and_then_an_error() {
+fn f17_full_queues_cost_set_points_and_then_an_error() {
     let (emulator, mut arm) = connected();
     activate(&emulator, &mut arm);
+    arm.set_control_mode(ControlMode::ServoPosition).unwrap();
     emulator.inject(Fault::new(FaultKind::NoBuffers)).unwrap();
     until("one command less", || {
         arm.write_joint_positions(&START, 0.1).unwrap();
@@ -211,6 +249,67 @@ fn f17_full_queues_cost_commands_and_then_an_error() {
         read(&mut arm).unwrap();
         arm.write_joint_positions(&START, 0.1).is_ok()
     });
+}
+
+/// The bus has no room for the next so many commands, from now on.
+fn no_room(emulator: &PiperEmulator, commands: usize) {
+    emulator.inject(Fault::new(FaultKind::NoBuffers)).unwrap();
+    let mut other = other(emulator);
+    let mut left = 4; // of one strike
+    until("no room", || {
+        left -= usize::from(other.send(&[golden::frame(golden::ASK_FIRMWARE)]).unwrap() == 0);
+        left == commands
+    });
+}
+
+#[test]
+fn f17_a_stop_that_the_bus_does_not_take_is_no_stop() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+    no_room(&emulator, 1);
+    emulator.record();
+    let error = arm.write_stop().unwrap_err().to_string();
+    assert!(error.contains("its bus takes no frames"), "{error}");
+    assert_eq!((ids(&emulator), arm.is_connected()), (vec![], true));
+    arm.write_stop().unwrap();
+    until("the hold", || ids(&emulator) == [0x151, 0x155, 0x156, 0x157]);
+}
+
+#[test]
+fn f17_motors_do_not_come_on_when_the_hold_before_them_is_lost() {
+    let (emulator, mut arm) = connected();
+    no_room(&emulator, 1);
+    emulator.record();
+    let error = arm.write_enable(true).unwrap_err().to_string();
+    assert!(error.contains("its bus takes no frames"), "{error}");
+    assert_eq!((ids(&emulator), emulator.enabled()), (vec![], false));
+    activate(&emulator, &mut arm);
+    assert!(farthest(&emulator.joints().0, &START) < 1e-3);
+}
+
+#[test]
+fn f17_what_nothing_replaces_is_told_when_it_is_lost() {
+    let (emulator, mut arm) = connected();
+    activate(&emulator, &mut arm);
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(7)).unwrap();
+    until("the collision", || {
+        read(&mut arm).unwrap();
+        arm.read_error().unwrap().0 == 7
+    });
+    no_room(&emulator, 1);
+    assert!(matches!(arm.write_clear_errors(), Err(AdapterError::Io(_))));
+    arm.write_clear_errors().unwrap();
+    let pose = arm.read_cartesian_position().unwrap().unwrap();
+    no_room(&emulator, 3);
+    assert!(arm.write_joint_positions(&START, 0.1).is_err(), "a planned move");
+    assert!(arm.write_cartesian_position(&pose, 0.1).is_err());
+    assert!(arm.write_gripper_position(0.01).is_err());
+    arm.write_gripper_position(0.01).unwrap();
+    // The command for the motors is repeated until they obey.
+    no_room(&emulator, 2);
+    arm.write_enable(false).unwrap();
+    assert!(!emulator.enabled());
 }
 
 #[test]
@@ -234,14 +333,23 @@ fn f18_noise_and_short_frames_cost_nothing_but_readings() {
             arm.counts().0.damaged > before
         });
     }
-    // Random frames: nothing panics, and no pose is made of them.
+    // Random frames at the arm's rate: nothing panics, and neither joints nor a pose are made of them.
+    let mut picture = Picture::default();
     let mut seed = 0x2545_F491_4F6C_DD1D_u64;
-    for _ in 0..200_000 {
+    let mut take = |n: u64, id: Option<u16>| {
         seed ^= seed << 13;
         seed ^= seed >> 7;
         seed ^= seed << 17;
-        let _ = decode(&CanFrame { id: (seed >> 48) as u16 & 0x7FF, len: seed as u8 % 10, data: seed.to_le_bytes() });
-    }
+        let (id, len) = id.map_or(((seed >> 48) as u16 & 0x7FF, seed as u8 % 10), |id| (id, 8));
+        picture.take(decode(&CanFrame { id, len, data: seed.to_le_bytes() }), Mono(330_000 * (n + 1)));
+        (picture.joints_at, picture.counts.sets, picture.pose, picture.counts.damaged)
+    };
+    let random = (0..200_000).fold(Default::default(), |_, n| take(n, None));
+    assert_eq!((random.0, random.1, random.2), (Mono::ZERO, 0, None));
+    assert!(random.3 > 1_000, "some were as good as the arm's");
+    // Not even where they come in the order of joint positions.
+    let ordered = (200_001..260_001).fold(random, |_, n| take(n, Some(0x2A5 + (n % 3) as u16)));
+    assert_eq!((ordered.0, ordered.1, ordered.3 - random.3), (Mono::ZERO, 0, 20_000), "60 000 frames, 20 000 sets");
 }
 
 #[test]
@@ -261,6 +369,47 @@ fn f19_faults_have_code_and_text_and_are_cleared_without_a_fall() {
     assert_eq!((arm.read_error(), arm.read_enabled()), (Ok((0, String::new())), Ok(true)));
     assert!(farthest(&emulator.joints().0, &START) < 1e-3, "it held all the time");
     arm.write_joint_positions(&START, 0.1).unwrap();
+}
+
+#[test]
+fn f19_faults_of_the_gripper_are_told_and_cleared_where_it_is_used() {
+    let (emulator, mut arm) = connected();
+    for on in [false, true] {
+        if on {
+            activate(&emulator, &mut arm);
+            arm.write_gripper_position(0.03).unwrap();
+            until("the gripper", || {
+                read(&mut arm).unwrap();
+                arm.read_gripper_position().unwrap().unwrap() == 0.03
+            });
+        }
+        let opening = arm.read_gripper_position().unwrap().unwrap();
+        emulator.inject(Fault::new(FaultKind::ErrorCode).code(402)).unwrap();
+        until("overcurrent", || {
+            read(&mut arm).unwrap();
+            arm.read_error() == Ok((402, "gripper: overcurrent".into()))
+        });
+        assert!(matches!(arm.write_gripper_position(0.05), Err(AdapterError::Fault { code: 402, .. })));
+        emulator.record();
+        arm.write_clear_errors().unwrap();
+        assert_eq!(arm.read_error(), Ok((0, String::new())));
+        let frames: Vec<CanFrame> = emulator.trace().iter().map(|(_, f)| *f).collect();
+        assert_eq!(frames[0], golden::frame(golden::CLEAR));
+        let stroke = (opening * 1e6).round() as i32;
+        assert_eq!((two(&frames[1])[0], frames[1].data[6], frames.len()), (stroke, if on { 3 } else { 2 }, 2));
+    }
+    arm.write_gripper_position(0.05).unwrap();
+    let (emulator, mut arm) = pair(serde_json::json!({}));
+    drop(arm);
+    let without = config(&emulator.address(), serde_json::json!({ "gripper": "none" }));
+    arm = PiperAdapter::new(&without).unwrap();
+    arm.connect().unwrap();
+    emulator.inject(Fault::new(FaultKind::ErrorCode).code(402)).unwrap();
+    let end = Instant::now() + Duration::from_millis(200);
+    while Instant::now() < end {
+        read(&mut arm).unwrap();
+        assert_eq!(arm.read_error(), Ok((0, String::new())), "nobody uses it");
+    }
 }
 
 #[test]

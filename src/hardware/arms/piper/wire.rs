@@ -25,7 +25,7 @@ const FILTERS: &[CanFilter] = &[
 /// Frames that may wait for the bus: the next command is not sent behind them. A healthy bus takes a burst in 1 ms, and
 /// what waits when the arm loses its power reaches it when the power returns.
 const MAY_WAIT: usize = 8;
-/// So many commands in a row that the bus does not take are more than a hiccup.
+/// So many set points in a row that the bus does not take are more than a hiccup.
 const TOO_MANY: u32 = 3;
 /// Most events fetched in one go: a second's.
 const BATCH: usize = 4096;
@@ -59,24 +59,32 @@ impl Wire {
         Ok(Self { port, peer: format!("piper at {address}"), refused: 0, counts: WireCounts::default() })
     }
 
-    /// Sends a command. One that the bus has no room for is dropped and counted: the next one replaces it. Three in a
-    /// row are an error.
+    /// Sends a command: an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
+        if self.offer(frames)? { Ok(()) } else { Err(self.no_room()) }
+    }
+
+    /// Sends a set point of a stream. One that the bus has no room for is dropped and counted: the next one replaces it.
+    /// Three in a row are an error.
+    pub fn stream(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
+        if self.offer(frames)? || self.refused < TOO_MANY { Ok(()) } else { Err(self.no_room()) }
+    }
+
+    /// Whether the bus has taken all of a command.
+    fn offer(&mut self, frames: &[CanFrame]) -> AdapterResult<bool> {
         let taken = if self.port.waiting() > MAY_WAIT { 0 } else { self.port.send(frames)? };
-        if taken == frames.len() {
-            self.refused = 0;
-            return Ok(());
-        }
+        let whole = taken == frames.len();
+        self.refused = if whole { 0 } else { self.refused.saturating_add(1) };
         self.counts.not_taken += (frames.len() - taken) as u64;
-        self.refused += 1;
-        if self.refused < TOO_MANY {
-            return Ok(());
-        }
-        Err(AdapterError::Io(format!(
+        Ok(whole)
+    }
+
+    fn no_room(&self) -> AdapterError {
+        AdapterError::Io(format!(
             "{}: its bus takes no frames: the queue is full\nhint: nobody acknowledges: is the arm powered, plugged \
              in, and the bus at 1 Mbit/s?",
             self.peer
-        )))
+        ))
     }
 
     /// Adds all that has arrived to the picture, without waiting.

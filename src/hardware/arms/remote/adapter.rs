@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
-use super::{MODES, NATIVE_RATE, Options, limits, same_modes};
+use super::{MODES, NATIVE_RATE, fit, limits, same_modes};
 use crate::arm::Pose;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
@@ -37,10 +37,7 @@ impl RemoteAdapter {
     /// An adapter for the peer at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if !(1..=MAX_DOF).contains(&config.dof) {
-            return Err(rejected(format!("a remote arm has 1 to {MAX_DOF} joints, not {}", config.dof)));
-        }
-        config.options::<Options>()?;
+        config.fit(fit)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let (mode, assumed_enabled) = (ControlMode::Position, false);
         Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })

@@ -17,8 +17,10 @@ use std::f64::consts::PI;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::sim::faults::Fault;
+use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::faults::{Fault, check_script};
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use address::Address;
 
@@ -47,10 +49,19 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: false,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(adapter::RemoteAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(peer::start_emulator(config, place)?))),
 };
+
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("a remote arm", SPEC.dof)?;
+    let (sim, limits) = (config.options::<Options>()?.sim, limits(config.dof));
+    check_script("the peer", &sim.faults, peer::PLAYABLE)
+        .and_then(|()| check_pose(&sim.initial_positions, &limits))
+        .map_err(|misfit| misfit.within("sim"))?;
+    Ok(Fit { limits })
+}
 
 /// Nominal limits: ±2π rad, π rad/s. The peer states the real ones.
 fn limits(dof: usize) -> JointLimits {

@@ -1,6 +1,7 @@
 //! The xArm adapter: the adapter protocol on one side, a [`Session`] with the controller on the other.
 //!
-//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. Every conversion between the two is in this file.
+//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. The conversions between the two are in this file, those of the
+//! gripper's pulses in `protocol/gripper.rs`.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -11,7 +12,7 @@ pub use super::control::Counts;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
 use super::session::Session;
-use super::{HOLDS_WHEN_DISABLED, MODES, Options, model_of};
+use super::{HOLDS_WHEN_DISABLED, MODES, Options, fit, model_of};
 use crate::arm::Pose;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
@@ -52,8 +53,9 @@ impl XArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
+        config.fit(fit)?;
         let options: Options = config.options()?;
-        let model = model_of(&options, config.dof).map_err(rejected)?;
+        let model = model_of(&options, config.dof)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         Ok(Self { address, model, options, session: None, target: None })
     }
@@ -307,7 +309,6 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        let used = self.options.force_torque;
-        Ok(self.recent()?.motion().0.wrench.filter(|_| used))
+        Ok(self.recent()?.wrench())
     }
 }

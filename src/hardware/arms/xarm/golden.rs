@@ -78,9 +78,18 @@ pub const ERROR_REPLY: &str = "ffff000300040f501f00";
 
 /// A report of port 30000 at 123.456789 s: moving, mode 1, 3 commands in the queue.
 pub fn full() -> Vec<u8> {
-    let head = [(0, "00000324"), (4, "00000000075bcd15"), (12, "11"), (13, "0003")];
+    full_of(804, "00000324")
+}
+
+/// The same from an older firmware, which sends 784 bytes.
+pub fn full_784() -> Vec<u8> {
+    full_of(784, "00000310")
+}
+
+fn full_of(length: usize, head: &str) -> Vec<u8> {
+    let head = [(0, head), (4, "00000000075bcd15"), (12, "11"), (13, "0003")];
     let target = [(32, Q), (60, QD), (116, Q), (144, QD), (228, TAU)];
-    packet(804, &[&head[..], &target, &[(424, POSE_HEX), (472, POSE_HEX), (712, WRENCH_HEX)]].concat())
+    packet(length, &[&head[..], &target, &[(424, POSE_HEX), (472, POSE_HEX), (712, WRENCH_HEX)]].concat())
 }
 
 /// The same at port 30003, in mode 4.

@@ -12,6 +12,8 @@ use crate::hardware::spec::{AdapterError, AdapterResult};
 /// How often the position is asked for, and how often when the gripper does not answer.
 const POLL: Duration = Duration::from_millis(100);
 const POLL_SILENT: Duration = Duration::from_millis(1000);
+/// For how long it is asked again and again after a stop, to see whether it still moves.
+const WATCH: Duration = Duration::from_millis(500);
 /// A telegram whose answer takes longer is lost.
 const TIMEOUT: Duration = Duration::from_millis(300);
 /// So many lost telegrams in a row mean that there is no gripper.
@@ -44,6 +46,7 @@ pub struct Gripper {
     error: u16,
     failures: u32,
     next_poll: Mono,
+    watched_until: Mono,
     polls: u32,
 }
 
@@ -60,6 +63,7 @@ impl Gripper {
             error: 0,
             failures: 0,
             next_poll: Mono::ZERO,
+            watched_until: Mono::ZERO,
             polls: 0,
         }
     }
@@ -84,6 +88,12 @@ impl Gripper {
         }
         self.wanted = Some(self.kind.pulses(opening));
         Ok(())
+    }
+
+    /// The arm was told to stop. A target that is not sent yet is dropped; whether it still goes to one shows soon.
+    pub fn stopped(&mut self, now: Mono) {
+        self.wanted = None;
+        self.watched_until = now.after(WATCH);
     }
 
     /// Clears its error, when its turn comes.
@@ -124,7 +134,7 @@ impl Gripper {
         if let Some(pulses) = self.wanted.filter(|_| !silent) {
             return Some(self.wake.unwrap_or(Step::Go(pulses)));
         }
-        if now < self.next_poll {
+        if now < self.next_poll && (silent || now >= self.watched_until) {
             return None;
         }
         self.next_poll = now.after(if silent { POLL_SILENT } else { POLL });

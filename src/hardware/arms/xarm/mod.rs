@@ -27,8 +27,9 @@ mod tests;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::joint::{ControlMode, JointLimits};
+use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::joint::ControlMode;
 use address::Address;
 use model::Model;
 use protocol::gripper::GripperKind;
@@ -60,7 +61,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    limits: |dof| Model::of_dof(dof).map_or_else(JointLimits::default, Model::limits),
+    fit,
     create: |config| Ok(Box::new(adapter::XArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::XArmEmulator::start(config, place)?))),
 };
@@ -96,12 +97,22 @@ impl Default for Options {
     }
 }
 
+/// The model says how many joints there are, and what their limits are.
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    let options: Options = config.options()?;
+    let limits = model_of(&options, config.dof)?.limits();
+    options.sim.check(&limits)?;
+    Ok(Fit { limits })
+}
+
 /// The model that options and number of joints say; or why they do not go together.
-fn model_of(options: &Options, dof: usize) -> Result<Model, String> {
-    let model = options.model.or(Model::of_dof(dof)).ok_or_else(|| format!("no xArm has {dof} joints"))?;
+fn model_of(options: &Options, dof: usize) -> Result<Model, Misfit> {
+    let model = options.model.or(Model::of_dof(dof));
+    let model = model.ok_or_else(|| Misfit::new("", format!("no xArm has {dof} joints")))?;
     match model.axes() {
         axes if axes == dof => Ok(model),
-        axes => Err(format!("{} has {axes} joints, not {dof}", model.name())),
+        axes => Err(Misfit::new("model", format!("{} has {axes} joints, not {dof}", model.name()))
+            .hint(format!("give the arm {axes} joints, or leave `model` out for the xArm with {dof}"))),
     }
 }
 

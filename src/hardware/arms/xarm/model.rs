@@ -124,7 +124,8 @@ impl Model {
         if self == Self::Lite6 { 500.0 } else { 1000.0 }
     }
 
-    /// Joint limits that hold for every arm of this model: the narrower ones where series differ.
+    /// Joint limits of the usual arm of this model: the narrower ones where series differ. Arms of another kind, such as
+    /// a mirrored one, have others: [`Identity::limits`].
     pub fn limits(self) -> JointLimits {
         limits_of(match self {
             Self::Xarm5 => &XARM5_1305,

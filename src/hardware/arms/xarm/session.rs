@@ -26,6 +26,10 @@ use crate::joint::JointLimits;
 /// A controller that lives reports 100 or 250 times a second: after so much silence, also on a connection that
 /// looks well, it is gone.
 pub const SILENCE: Duration = Duration::from_millis(500);
+/// Reports from before an answer may still be on the way for so long after it: two periods of the slower kind.
+const ON_THE_WAY: Duration = Duration::from_millis(20);
+/// Which motors are on is told five times a second, and by nothing else: after so much silence that is not known.
+const CONDITION_SILENCE: Duration = Duration::from_millis(1000);
 /// How long one call may work on a change of mode. It goes on with the next call.
 const MODE_SLICE: Duration = Duration::from_millis(15);
 /// How long an activation may take for the motors, and for the mode.
@@ -86,6 +90,8 @@ pub struct Session {
     change: Option<ModeChange>,
     /// The mode that the last change did not reach, and why, until somebody hears of it.
     failed: Option<(u8, &'static str)>,
+    /// When the force/torque sensor was switched on: before that its place in the reports holds zeros.
+    wrench_since: Option<Mono>,
     updated: Mono,
 }
 
@@ -117,6 +123,7 @@ impl Session {
             halted: true,
             change: None,
             failed: None,
+            wrench_since: None,
             updated: arrived,
         }
     }
@@ -151,6 +158,12 @@ impl Session {
         self.control.counts()
     }
 
+    /// Force and torque at the sensor [N, Nm], once that is switched on.
+    pub fn wrench(&self) -> Option<[f64; 6]> {
+        let measured = |since| self.fresh_at.since(since) > ON_THE_WAY;
+        self.motion.wrench.filter(|_| self.wrench_since.is_some_and(measured))
+    }
+
     /// Whether all motors are on.
     pub fn enabled(&self) -> bool {
         self.known.condition.all_enabled(self.device.model.axes())
@@ -174,6 +187,9 @@ impl Session {
         }
         if MonotonicClock.now().since(self.fresh_at) > SILENCE {
             return Err(AdapterError::Io(format!("{} sent nothing new for {SILENCE:?}", self.reports.peer())));
+        }
+        if MonotonicClock.now().since(self.normal.arrived) > CONDITION_SILENCE {
+            return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_SILENCE:?}", self.normal.peer())));
         }
         self.advance_change()?;
         if let Some(question) = self.known.condition.due(now, self.control.last_sent()) {
@@ -283,7 +299,8 @@ impl Session {
             self.enable(true)?;
         }
         if force_torque {
-            self.ask(&Command::EnableForceTorque(true))?;
+            let status = self.ask(&Command::EnableForceTorque(true))?.status;
+            self.wrench_since = (!status.error() && !status.invalid()).then(|| MonotonicClock.now());
         }
         self.control.take_refusal();
         self.begin_change(mode);
@@ -300,6 +317,8 @@ impl Session {
         self.update(Duration::ZERO)?;
         self.fault()?;
         if self.change.is_none() {
+            // A change that came to nothing between two calls has stopped the arm: first why, then that.
+            self.reached()?;
             let _ = self.heed_refusal(); // of a set point; but it may tell that the arm was stopped
             self.may_be_commanded()?;
         }
@@ -333,10 +352,13 @@ impl Session {
             self.update(Duration::ZERO)?;
         }
         self.fault()?;
-        match self.failed.take() {
-            None => Ok(true),
-            Some((mode, why)) => Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}"))),
-        }
+        self.reached().map(|()| true)
+    }
+
+    /// An error, told once, when the last change did not reach its mode.
+    fn reached(&mut self) -> AdapterResult<()> {
+        let Some((mode, why)) = self.failed.take() else { return Ok(()) };
+        Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}")))
     }
 
     /// Goes on with the change of mode, as far as the newest report allows.
@@ -365,9 +387,11 @@ impl Session {
         self.motion.state == 1 && !self.motion.velocity.is_some_and(still)
     }
 
-    /// Stops all motion of the joints. The arm stays stopped until it is activated.
+    /// Stops all motion of the joints. The arm stays stopped until it is activated. The gripper knows no stop: it can be
+    /// held where it is.
     pub fn stop(&mut self) -> AdapterResult<Stop> {
         (self.change, self.halted) = (None, true);
+        self.known.gripper.stopped(MonotonicClock.now());
         self.ask(&Command::SetState(STOP))?;
         let state = self.ask(&Command::GetState)?.data().first().copied();
         Ok(if matches!(state, Some(4..=6)) { Stop::Confirmed } else { Stop::Sent })

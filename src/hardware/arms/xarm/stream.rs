@@ -18,8 +18,6 @@ pub struct Stream<T> {
     length: Option<usize>,
     /// When the newest report was taken up.
     pub arrived: Mono,
-    /// Reports taken up.
-    pub count: u64,
 }
 
 impl<T> Stream<T> {
@@ -31,7 +29,7 @@ impl<T> Stream<T> {
         timeout: Duration,
     ) -> AdapterResult<Self> {
         let link = TcpLink::connect("the reports of xarm", &address.report(kind.offset()), timeout)?;
-        Ok(Self { link, kind, decode, length: None, arrived: MonotonicClock.now(), count: 0 })
+        Ok(Self { link, kind, decode, length: None, arrived: MonotonicClock.now() })
     }
 
     /// The newest of the reports that have arrived since the last call, without waiting.
@@ -45,7 +43,6 @@ impl<T> Stream<T> {
             };
             self.length = Some(length);
             self.arrived = MonotonicClock.now();
-            self.count += 1;
             newest = Some(report);
         }
     }
@@ -56,7 +53,6 @@ impl<T> Stream<T> {
         let (length, report) = self.link.receive(timeout, |bytes| scan(bytes, kind, length, decode))?;
         self.length = Some(length);
         self.arrived = MonotonicClock.now();
-        self.count += 1;
         Ok(report)
     }
 

@@ -10,7 +10,6 @@ use super::SPEC;
 use super::adapter::XArmAdapter;
 use super::emulator::XArmEmulator;
 use crate::arm::Pose;
-use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::conformance::{Outcome, Subject, checks, run_on};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -136,6 +135,20 @@ fn si_units_and_the_vendors_units() {
 }
 
 #[test]
+fn the_zeros_of_a_sensor_that_is_off_are_no_measurement() {
+    let (_emulator, mut arm) = pair(6, json!({"force_torque": true}));
+    arm.connect().unwrap();
+    assert_eq!(arm.read_force_torque(), Ok(None), "not switched on yet");
+    arm.activate().unwrap();
+    until("the sensor", || arm.read_force_torque().unwrap().is_some_and(|wrench| wrench[2] < -4.0));
+    arm.disconnect();
+    arm.connect().unwrap();
+    assert_eq!(arm.read_force_torque(), Ok(None), "another controller may have lost its power meanwhile");
+    let (_emulator, mut arm) = ready(json!({}), ControlMode::Position);
+    assert_eq!(arm.read_force_torque(), Ok(None), "not asked for");
+}
+
+#[test]
 fn starting_and_stopping_asks_for_no_motion() {
     let (emulator, mut arm) = pair(6, json!({"gripper": "xarm"}));
     emulator.record();
@@ -177,6 +190,27 @@ fn modes_change_through_a_stop_and_velocities_end() {
     assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
     let refused = arm.write_joint_positions(&far, 0.05).unwrap_err().to_string();
     assert!(refused.ends_with("enable it again"), "{refused}");
+}
+
+#[test]
+fn why_a_mode_was_not_reached_is_told_by_whichever_call_comes_next() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    emulator.keep_mode(true);
+    let under_way = set(&mut arm, ControlMode::Velocity).unwrap_err();
+    assert_eq!(under_way, AdapterError::Rejected("the change of mode is under way".into()));
+    // The change goes on with every reading, and comes to nothing in one of them.
+    let end = Instant::now() + Duration::from_secs(1);
+    while Instant::now() < end {
+        read(&mut arm).unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    let error = set(&mut arm, ControlMode::Velocity).unwrap_err();
+    assert_eq!(error, AdapterError::Protocol("xarm did not change to mode 4: it does not take the mode".into()));
+    let refused = set(&mut arm, ControlMode::Velocity).unwrap_err().to_string();
+    assert_eq!(refused, "the arm was stopped: enable it again", "told once");
+    emulator.keep_mode(false);
+    arm.activate().unwrap();
+    until("velocity mode", || set(&mut arm, ControlMode::Velocity).is_ok());
 }
 
 #[test]
@@ -247,15 +281,30 @@ fn errors_are_told_with_what_to_do_and_stay_until_they_are_cleared() {
 fn an_error_shows_at_once_and_refuses_set_points() {
     let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
     let hold = six(&mut arm);
+    // A stop shows in the next report, and register 15 is asked then: nobody waits for the 5 Hz report.
+    emulator.mute_condition(true);
     emulator.inject(Fault::new(FaultKind::ErrorCode).code(24)).unwrap();
-    let began = MonotonicClock.now();
     until("the error", || {
         read(&mut arm).unwrap();
         matches!(arm.write_joint_positions(&hold, 1.0), Err(AdapterError::Fault { code: 24, .. }))
     });
-    // A stop shows in the next report, and register 15 is asked then: nobody waits for the 5 Hz report.
-    let took = MonotonicClock.now().since(began);
-    assert!(took < Duration::from_secs(2), "{took:?}");
+}
+
+#[test]
+fn what_is_known_of_the_motors_does_not_outlive_its_reports() {
+    let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
+    emulator.mute_condition(true);
+    let mut error = None;
+    until("an error", || {
+        error = read(&mut arm).err();
+        error.is_some()
+    });
+    let Some(AdapterError::Io(text)) = error else { panic!("{error:?}") };
+    assert!(text.ends_with("sent nothing for 1s") && !arm.is_connected(), "{text}");
+    assert!(arm.connect().is_err(), "still silent");
+    emulator.mute_condition(false);
+    arm.connect().unwrap();
+    assert_eq!(arm.read_enabled(), Ok(true));
 }
 
 #[test]
@@ -335,5 +384,14 @@ fn wrong_configurations_are_refused() {
     ] {
         let error = (SPEC.create)(&config).err().unwrap().to_string();
         assert!(error.contains(part), "{error}");
+    }
+}
+
+#[test]
+fn a_stop_holds_a_moving_gripper() {
+    let check = checks().find(|check| check.name == "stop_holds_the_gripper").unwrap();
+    for gripper in ["xarm", "xarm_g2"] {
+        let subject = Subject { config: config("", 6, json!({ "gripper": gripper })), ..Subject::emulated(&SPEC) };
+        assert_eq!(run_on(&subject, check).0, Outcome::Passed, "{gripper}");
     }
 }

@@ -10,24 +10,24 @@ use std::time::Duration;
 
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
-use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, limits};
+use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::kit::{fault, fill, finite};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
 use crate::hardware::transport::device_time::DeviceTime;
-use crate::hardware::transport::tcp::{Endpoint, Scan, TcpLink};
+use crate::hardware::transport::dialogue::{Dialogue, Patience};
+use crate::hardware::transport::tcp::{Endpoint, TcpLink};
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 /// Longest wait for the connection and for the controller's introduction: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1500);
-const HELLO_TIMEOUT: Duration = Duration::from_millis(1000);
+const HELLO: Patience = Patience::once(Duration::from_millis(1000));
 /// Longest wait for any other reply. The controller answers within 1 ms; the rest is for a busy host.
-const REPLY_TIMEOUT: Duration = Duration::from_millis(100);
-/// So many replies in a row that do not come end the connection. One lost reply is not a lost arm.
-const LOST_AFTER: u32 = 3;
+const REPLY: Patience = Patience::once(Duration::from_millis(100));
 /// A packet answers further questions for one period of the controller.
 const PACKET_AGE: Duration = Duration::from_millis(2);
 
@@ -38,12 +38,10 @@ pub struct YourArmAdapter {
     endpoint: Endpoint,
     options: Options,
     /// The connection, and who is at its other end.
-    link: Option<TcpLink>,
+    line: Dialogue<TcpLink>,
     hello: Option<Hello>,
     /// Number of the last command; its reply carries the same.
     sequence: u16,
-    /// Replies in a row that did not come.
-    lost: u32,
     /// The last packet, and when it arrived; `Mono::ZERO` when it must not answer anything any more.
     state: protocol::State,
     state_at: Mono,
@@ -53,18 +51,13 @@ pub struct YourArmAdapter {
 impl YourArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        if config.dof != DOF {
-            return Err(rejected(format!("yourarm has {DOF} joints, not {}", config.dof)));
-        }
+        config.fit(fit)?;
         Ok(Self {
-            endpoint: Endpoint::parse(&config.address, protocol::PORT)
-                .map_err(|e| rejected(format!("address: {e}")))?,
+            endpoint: config.parse_address(|address| Endpoint::parse(address, protocol::PORT))?,
             options: config.options()?,
-            link: None,
+            line: Dialogue::default(),
             hello: None,
             sequence: 0,
-            lost: 0,
             state: protocol::State::default(),
             state_at: Mono::ZERO,
             device_time: DeviceTime::default(),
@@ -75,52 +68,35 @@ impl YourArmAdapter {
     fn request<T>(
         &mut self,
         command: &Command,
-        timeout: Duration,
+        patience: Patience,
         decode: impl Fn(&[u8]) -> Option<T>,
     ) -> AdapterResult<T> {
-        let link = self.link.as_mut().ok_or(AdapterError::NotConnected)?;
         self.sequence = self.sequence.wrapping_add(1);
         let (sequence, opcode) = (self.sequence, command.opcode());
         let mut frame = [0; MAX_FRAME];
-        let result = link.send(protocol::encode(command, sequence, &mut frame)).and_then(|()| {
-            link.receive(timeout, |bytes| match frame::scan(bytes, opcode, sequence) {
-                Scan::More => Scan::More,
-                Scan::Skip(n) => Scan::Skip(n),
-                Scan::Take(n, reply) => Scan::Take(n, read_reply(command, &reply, &decode)),
-            })
-        });
-        match result {
-            Ok(reply) => {
-                self.lost = 0;
-                reply
-            }
-            Err(error) => {
-                self.lost += 1;
-                if !matches!(error, AdapterError::Timeout(_)) || self.lost >= LOST_AFTER {
-                    self.disconnect();
-                }
-                Err(error)
-            }
-        }
+        let frame = protocol::encode(command, sequence, &mut frame);
+        self.line.request(frame, patience, |bytes| {
+            frame::scan(bytes, opcode, sequence).map(|reply| read_reply(command, &reply, &decode))
+        })?
     }
 
     /// A command whose reply has no data. What was measured before it answers nothing after it.
     fn command(&mut self, command: &Command) -> AdapterResult<()> {
         self.state_at = Mono::ZERO;
-        self.request(command, REPLY_TIMEOUT, |_| Some(()))
+        self.request(command, REPLY, |_| Some(()))
     }
 
     /// Asks for a packet of measurements.
     fn fetch(&mut self) -> AdapterResult<()> {
         self.state_at = Mono::ZERO;
-        self.state = self.request(&Command::GetState, REPLY_TIMEOUT, protocol::State::decode)?;
+        self.state = self.request(&Command::GetState, REPLY, protocol::State::decode)?;
         self.state_at = MonotonicClock.now();
         Ok(())
     }
 
     /// The last packet, or a new one when that is too old.
     fn recent(&mut self) -> AdapterResult<&protocol::State> {
-        if self.link.is_none() {
+        if !self.line.is_open() {
             return Err(AdapterError::NotConnected);
         }
         if MonotonicClock.now().since(self.state_at) > PACKET_AGE {
@@ -155,7 +131,7 @@ fn read_reply<T>(command: &Command, reply: &Reply<'_>, decode: impl Fn(&[u8]) ->
             .ok_or_else(|| AdapterError::Protocol(format!("yourarm: the reply to {name} is malformed"))),
         Status::Refused(protocol::IN_ERROR) => {
             let code = protocol::decode_refusal(reply.data).unwrap_or_default();
-            Err(AdapterError::Fault { code: code.into(), text: protocol::error_text(code).into() })
+            Err(fault(code, protocol::error_text(code)))
         }
         Status::Refused(status) => {
             Err(AdapterError::Rejected(format!("yourarm refuses {name}: {}", protocol::status_text(status))))
@@ -172,15 +148,7 @@ fn from_degrees(values: &WireJoints) -> Joints {
 
 /// Our joint values [rad or rad/s] as those of the wire [deg or deg/s].
 fn to_degrees(values: &[f64]) -> AdapterResult<WireJoints> {
-    match <[f64; DOF]>::try_from(values) {
-        Ok(values) if values.iter().all(|value| value.is_finite()) => Ok(values.map(f64::to_degrees)),
-        _ => Err(AdapterError::Rejected(format!("{DOF} finite values are needed, one per joint"))),
-    }
-}
-
-/// Copies the first values; `out` has length dof.
-fn fill(out: &mut [f64], values: &[f64]) {
-    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
+    Ok(finite(values)?.map(f64::to_degrees))
 }
 
 impl ManipulatorAdapter for YourArmAdapter {
@@ -188,8 +156,8 @@ impl ManipulatorAdapter for YourArmAdapter {
 
     fn connect(&mut self) -> AdapterResult<()> {
         self.disconnect();
-        self.link = Some(TcpLink::connect("yourarm", &self.endpoint, CONNECT_TIMEOUT)?);
-        let introduced = self.request(&Command::Hello, HELLO_TIMEOUT, Hello::decode).and_then(|hello| {
+        self.line.open(TcpLink::connect("yourarm", &self.endpoint, CONNECT_TIMEOUT)?);
+        let introduced = self.request(&Command::Hello, HELLO, Hello::decode).and_then(|hello| {
             self.verify(&hello)?;
             self.hello = Some(hello);
             self.fetch() // so that the mode is known, and that measurements do come
@@ -201,14 +169,13 @@ impl ManipulatorAdapter for YourArmAdapter {
     }
 
     fn disconnect(&mut self) {
-        self.link = None;
-        self.lost = 0;
+        self.line.close();
         self.state_at = Mono::ZERO;
         self.device_time = DeviceTime::default();
     }
 
     fn is_connected(&self) -> bool {
-        self.link.is_some()
+        self.line.is_open()
     }
 
     // `activate` and `deactivate`: the default bodies do what is right here. ENABLE holds the arm where it is; STOP
@@ -236,7 +203,7 @@ impl ManipulatorAdapter for YourArmAdapter {
     }
 
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(limits(DOF)) // the controller cannot be asked for them
+        Ok(limits()) // the controller cannot be asked for them
     }
 
     // --- Mode ---

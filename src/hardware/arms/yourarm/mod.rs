@@ -14,7 +14,9 @@ mod tests;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
 
@@ -48,7 +50,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    limits,
+    fit,
     create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
 };
@@ -66,14 +68,21 @@ const DATA_SHEET: [(f64, f64, f64); protocol::DOF] = [
 const ACCELERATION: f64 = 10.0;
 const JERK: f64 = 100.0;
 
-/// The joint limits in SI units. They do not depend on `dof`: the arm has 6 joints.
-fn limits(_dof: usize) -> JointLimits {
+/// Whether number of joints and options go together: what the type of the options cannot say. All arms have the same
+/// limits; where they depend on an option, like a model, this is the place.
+fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+    config.check_dof("yourarm", SPEC.dof)?;
+    let (options, limits) = (config.options::<Options>()?, limits());
+    options.sim.check("yourarm", &limits, emulator::PLAYABLE)?;
+    Ok(Fit { limits })
+}
+
+/// The joint limits in SI units.
+fn limits() -> JointLimits {
     JointLimits {
-        position_lower: DATA_SHEET.iter().map(|joint| joint.0.to_radians()).collect(),
-        position_upper: DATA_SHEET.iter().map(|joint| joint.1.to_radians()).collect(),
-        velocity_max: DATA_SHEET.iter().map(|joint| joint.2.to_radians()).collect(),
         acceleration_max: vec![ACCELERATION; protocol::DOF],
         jerk_max: vec![JERK; protocol::DOF],
+        ..JointLimits::of_degrees(&DATA_SHEET)
     }
 }
 
@@ -88,12 +97,12 @@ pub struct Options {
     /// Whether to use the gripper.
     pub gripper: bool,
     /// What the emulator does, when one stands in for the arm.
-    pub sim: emulator::SimOptions,
+    pub sim: SimOptions,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { speed_scale: 1.0, gripper: true, sim: emulator::SimOptions::default() }
+        Self { speed_scale: 1.0, gripper: true, sim: SimOptions::default() }
     }
 }
 

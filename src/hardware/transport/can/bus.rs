@@ -149,11 +149,6 @@ impl Bus {
         waited
     }
 
-    /// Throws away what waits for an acknowledgement; answers how many frames that were.
-    pub fn purge(&self) -> usize {
-        lock(&self.hub).queue.drain(..).count()
-    }
-
     /// Takes the interface down, or up again. Going down breaks the ports of the programs and throws away what waits.
     pub fn set_up(&self, up: bool) {
         let mut state = lock(&self.hub);

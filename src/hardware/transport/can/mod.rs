@@ -118,6 +118,20 @@ pub fn open(device: &str, address: &CanAddress, filters: &[CanFilter]) -> Adapte
     }
 }
 
+/// Whether this build reaches CAN interfaces of the system.
+const INTERFACES: bool = cfg!(all(feature = "can", target_os = "linux"));
+
+/// The address in full, for the adapter table; refuses what this build cannot reach. Asks nobody.
+pub fn check(address: &str) -> Result<String, String> {
+    match CanAddress::parse(address)? {
+        CanAddress::Interface(name) if !INTERFACES => Err(format!(
+            "this build reaches no CAN interface such as {name}: build with --features can, on Linux, or take a serial \
+             adapter, slcan:/dev/ttyX"
+        )),
+        address => Ok(address.to_string()),
+    }
+}
+
 #[cfg(all(feature = "can", target_os = "linux"))]
 fn open_interface(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
     Ok(Box::new(socket::open(device, name, filters)?))
@@ -133,6 +147,15 @@ fn open_interface(device: &str, name: &str, _filters: &[CanFilter]) -> AdapterRe
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_interface_is_refused_by_a_build_that_cannot_reach_it() {
+        assert_eq!(check("slcan:/dev/ttyACM0").as_deref(), Ok("slcan:/dev/ttyACM0@1000000"));
+        match check("can0") {
+            Ok(address) => assert!(INTERFACES && address == "can0"),
+            Err(why) => assert!(!INTERFACES && why.contains("such as can0: build with --features can"), "{why}"),
+        }
+    }
 
     #[cfg(not(feature = "can"))]
     #[test]

@@ -5,6 +5,7 @@
 //! motors were off is where it goes when they come on; every reset takes the power away.
 
 use std::f64::consts::TAU;
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::super::{GripperKind, RANGES, SPEED, limits, protocol::DOF};
@@ -12,6 +13,7 @@ use super::SimOptions;
 use super::kinematics;
 use super::wire::{self, Request, Status};
 use crate::clock::Mono;
+use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::sim::faults::{Fault, FaultKind, FaultScript};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Plant, Tracking};
@@ -53,6 +55,9 @@ pub struct Controller {
     plant: Plant,
     gripper: Gripper,
     has_gripper: bool,
+    /// Its motor is on; its error bits.
+    gripper_on: bool,
+    gripper_errors: u8,
     firmware: [u8; 8],
     /// Highest and lowest angle [0.1°] and speed [0.001 rad/s] of each joint.
     limits: [(i16, i16, u16); DOF],
@@ -82,6 +87,8 @@ pub struct Controller {
     trace: Option<Vec<(Mono, CanFrame)>>,
     /// How often the motors lost their power under a reset.
     pub power_drops: u64,
+    /// Frames that it does not send.
+    pub muted: Option<RangeInclusive<u16>>,
 }
 
 impl Controller {
@@ -92,9 +99,11 @@ impl Controller {
         let mut firmware = [0; 8];
         firmware.iter_mut().zip(options.firmware.bytes()).for_each(|(to, byte)| *to = byte);
         Self {
-            plant: Plant::new(&limits(DOF), initial, Tracking::Lag(LAG), 0.0),
+            plant: Plant::new(&limits(), initial, Tracking::Lag(LAG), 0.0),
             gripper: Gripper::new(gripper.stroke().unwrap_or_default(), GRIPPER_SPEED),
             has_gripper: gripper != GripperKind::None,
+            gripper_on: false,
+            gripper_errors: 0,
             firmware,
             limits: RANGES.map(|(lower, upper)| (decidegrees(upper), decidegrees(lower), (SPEED * 1e3) as u16)),
             control: 0,
@@ -118,6 +127,7 @@ impl Controller {
             advanced_to: now,
             trace: None,
             power_drops: 0,
+            muted: None,
         }
     }
 
@@ -181,9 +191,17 @@ impl Controller {
             self.estop();
             self.estop_until = fault.left(t).map(|left| now.after(left));
         }
-        if let Some(fault) = self.script.take(FaultKind::ErrorCode, t) {
-            self.arm = fault.code.min(255) as u8;
-            self.plant.stop();
+        match self.script.take(FaultKind::ErrorCode, t).map(|fault| fault.code) {
+            None => {}
+            // Of the gripper; what else the arm does not call by a number of its own.
+            Some(code @ 400..=405) => {
+                self.gripper_errors |= 1 << (code - 400);
+                self.gripper.stop();
+            }
+            Some(code) => {
+                self.arm = code.min(255) as u8;
+                self.plant.stop();
+            }
         }
         if self.script.take(FaultKind::Leader, t).is_some() {
             self.leading = true;
@@ -203,12 +221,13 @@ impl Controller {
         self.arm = state::ESTOP;
         self.estop_until = None;
         self.motors_off();
-        self.gripper.stop();
     }
 
     fn motors_off(&mut self) {
         self.motors = [false; DOF];
         self.starting = None;
+        self.gripper_on = false;
+        self.gripper.stop();
         self.plant.enable(false);
     }
 
@@ -237,7 +256,10 @@ impl Controller {
     /// Does what a frame says; answers go into `out`.
     pub fn handle(&mut self, frame: &CanFrame, now: Mono, out: &mut Vec<CanFrame>) {
         self.advance(now);
-        self.first_frame.get_or_insert(now);
+        if self.first_frame.is_none() {
+            self.first_frame = Some(now);
+            diary::note(Happening::Came);
+        }
         if let Some(trace) = &mut self.trace
             && trace.len() < TRACE
         {
@@ -273,8 +295,7 @@ impl Controller {
                     self.move_joints(six(self.joints), now);
                 }
             }
-            Request::Gripper(stroke, _, action) if action & 1 == 1 => self.gripper.move_to(f64::from(stroke) * 1e-6),
-            Request::Gripper(..) => self.gripper.stop(),
+            Request::Gripper(stroke, _, action) => self.grip(stroke, action),
             Request::Role(0xFA) => self.leading = true,
             Request::Role(0xFC) => self.leading = false,
             Request::Role(_) => {}
@@ -284,6 +305,18 @@ impl Controller {
             Request::Configure(_, _, clear) if clear && self.arm != state::ESTOP => (self.arm, self.beyond) = (0, 0),
             Request::Configure(..) => {}
             Request::Firmware => out.push(wire::firmware(&self.firmware)),
+        }
+    }
+
+    /// Bit 0 of `action`: on, and to this stroke [0.001 mm]; bit 1: errors are cleared before that.
+    fn grip(&mut self, stroke: i32, action: u8) {
+        if action & 2 != 0 {
+            self.gripper_errors = 0;
+        }
+        self.gripper_on = action & 1 != 0;
+        match self.gripper_on && self.gripper_errors == 0 {
+            true => self.gripper.move_to(f64::from(stroke) * 1e-6),
+            false => self.gripper.stop(),
         }
     }
 
@@ -311,6 +344,7 @@ impl Controller {
             (7 | 255, 2) if self.arm == state::ESTOP => {}
             (7 | 255, 2) if self.motors != [true; DOF] => {
                 self.starting.get_or_insert(now);
+                self.gripper_on = true;
             }
             (7 | 255, 1) => self.motors_off(),
             (1..=6, 1 | 2) if self.arm != state::ESTOP => {
@@ -422,7 +456,8 @@ impl Controller {
         out.extend(wire::triple(0x2A2, [x, y, z, roll, pitch, yaw]));
         out.extend(wire::triple(0x2A5, positions.map(millidegrees)));
         if self.has_gripper {
-            out.push(wire::gripper(stroke, 0, 0xC0));
+            let on = if self.gripper_on { 0x40 } else { 0 };
+            out.push(wire::gripper(stroke, 0, 0x80 | on | self.gripper_errors)); // it knows its zero
         }
         let efforts = first(&self.plant.efforts());
         let milli = |value: f64| (value * 1e3).round() as i32;
@@ -434,6 +469,9 @@ impl Controller {
             for (joint, on) in (1..).zip(self.motors) {
                 out.push(wire::driver(joint, 240, [35, 30], if on { 0x40 } else { 0 }, if on { 400 } else { 20 }));
             }
+        }
+        if let Some(muted) = &self.muted {
+            out.retain(|frame| !muted.contains(&frame.id));
         }
     }
 

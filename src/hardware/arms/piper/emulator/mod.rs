@@ -10,22 +10,25 @@ mod kinematics;
 mod server;
 mod wire;
 
+use std::ops::RangeInclusive;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use super::protocol::DOF;
 use super::{GripperKind, NATIVE_RATE, Options, limits};
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
+use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::Joints;
 use controller::Controller;
 use server::Server;
 
 /// The faults that the emulator can play on any bus.
-const PLAYABLE: &[FaultKind] = &[
+pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
     FaultKind::ErrorCode,
@@ -72,6 +75,19 @@ impl Default for SimOptions {
     }
 }
 
+impl SimOptions {
+    /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
+    pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), Misfit> {
+        check_script("the piper emulator", &self.faults, playable)
+            .and_then(|()| check_pose(&self.initial_positions, &limits()))
+            .map_err(|misfit| misfit.within("sim"))?;
+        match self.firmware.len() {
+            8 => Ok(()),
+            _ => Err(Misfit::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
+        }
+    }
+}
+
 fn rate<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     let value = f64::deserialize(deserializer)?;
     if (20.0..=NATIVE_RATE).contains(&value) {
@@ -97,17 +113,7 @@ impl PiperEmulator {
     /// Starts an emulator at `place`.
     pub fn with(options: &SimOptions, gripper: GripperKind, place: &Place) -> AdapterResult<Self> {
         let playable = if *place == Place::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
-        check_kinds("the piper emulator", &options.faults, playable).map_err(AdapterError::Rejected)?;
-        let rejected = |text: String| AdapterError::Rejected(format!("piper emulator: {text}"));
-        let (initial, limits) = (&options.initial_positions, limits(DOF));
-        let mut range = limits.position_lower.iter().zip(&limits.position_upper);
-        let inside = initial.iter().zip(&mut range).all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
-        if !initial.is_empty() && (initial.len() != DOF || !inside) {
-            return Err(rejected(format!("initial_positions must be {DOF} angles [rad] within the joint limits")));
-        }
-        if options.firmware.len() != 8 {
-            return Err(rejected("firmware must have 8 characters, as S-V1.8-5 has".to_owned()));
-        }
+        options.check(playable)?;
         let controller = Controller::new(options, gripper, MonotonicClock.now());
         Ok(Self { server: Server::start(controller, place, options.feedback_hz)?, playable })
     }
@@ -128,6 +134,11 @@ impl PiperEmulator {
     /// How often a client has let the motors lose their power by a reset (0x150).
     pub fn power_drops(&self) -> u64 {
         self.server.with(|controller, _| controller.power_drops)
+    }
+
+    /// Lets it leave out the frames with these identifiers, or none again; all others go on.
+    pub fn mute(&self, identifiers: Option<RangeInclusive<u16>>) {
+        self.server.with(|controller, _| controller.muted = identifiers);
     }
 
     /// Starts to record what comes over the bus, up to 200 000 frames; forgets what was recorded before.
@@ -157,7 +168,7 @@ impl Emulator for PiperEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the piper emulator", &[fault], self.playable)?;
+        check_kind("the piper emulator", &fault, self.playable)?;
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
     }

@@ -28,7 +28,7 @@ pub enum Request {
     Pose(usize, [i32; 2]),
     /// 0x155–7: part 0–2 of joint targets [0.001°].
     Joints(usize, [i32; 2]),
-    /// 0x159: stroke [0.001 mm], torque [mNm], and what to do (bit 0: enable).
+    /// 0x159: stroke [0.001 mm], torque [mNm], and what to do (bit 0: enable, bit 1: clear errors).
     Gripper(i32, u16, u8),
     /// 0x15A–F: one joint by impedance.
     Mit(u8),
@@ -174,6 +174,8 @@ mod tests {
             assert_eq!(read(golden::MOVE_POSE[part + 1]), Some(Request::Pose(part, two(POSE))));
         }
         assert_eq!(read(golden::GRIPPER), Some(Request::Gripper(42_500, 1000, 1)));
+        assert_eq!(read(golden::CLEAR_GRIPPER[0]), Some(Request::Gripper(42_500, 1000, 3)));
+        assert_eq!(read(golden::CLEAR_GRIPPER[1]), Some(Request::Gripper(0, 1000, 2)));
         assert_eq!(read(golden::ENABLE), Some(Request::Motors(7, 2)));
         assert_eq!(read(golden::DISABLE), Some(Request::Motors(7, 1)));
         assert_eq!(read(golden::CLEAR), Some(Request::Configure(7, false, true)));

@@ -22,7 +22,9 @@ use self::service::Service;
 use super::Options;
 use super::address::Address;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, Registry};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::sim::diary::{self, Happening};
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kind};
+use crate::hardware::sim::tcp_server::cannot_listen;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -35,7 +37,7 @@ pub const PORT: u16 = 7450;
 const SEND_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The faults that a peer can play, whatever it serves.
-const PLAYABLE: &[FaultKind] = &[
+pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
     FaultKind::Disconnect,
@@ -74,7 +76,10 @@ impl Peer {
     }
 
     fn serve(service: Service, address: &Address) -> AdapterResult<Self> {
-        let failed = |e: std::io::Error| AdapterError::Io(format!("cannot listen at {address}: {e}"));
+        let failed = |e| match address {
+            Address::Tcp(at) => cannot_listen("peer", *at, &e),
+            Address::Unix(_) => AdapterError::Io(format!("cannot listen at {address}: {e}")),
+        };
         let listener = Listener::bind(address).map_err(failed)?;
         let address = listener.address(address).map_err(failed)?;
         let (service, wake) = (Arc::new(Mutex::new(service)), Wake::new().map_err(failed)?);
@@ -94,7 +99,7 @@ impl Peer {
 
     /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that can be played.
     pub fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the peer", &[fault], PLAYABLE)?;
+        check_kind("the peer", &fault, PLAYABLE)?;
         lock(&self.service).inject(fault);
         Ok(())
     }
@@ -102,9 +107,8 @@ impl Peer {
 
 /// The emulator of the table's row: the mock arm behind the protocol.
 pub fn start_emulator(config: &AdapterConfig, place: &Place) -> AdapterResult<PeerEmulator> {
+    config.fit(super::fit)?;
     let sim = config.options::<Options>()?.sim;
-    let rejected = |text| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-    check_kinds("the peer", &sim.faults, PLAYABLE).map_err(rejected)?;
     let registry = Registry::builtin();
     let mock = registry.get("mock").ok_or(AdapterError::Unsupported)?;
     let options = serde_json::json!({ "initial_positions": sim.initial_positions, "effort_feedback": true });
@@ -277,9 +281,11 @@ impl Serving {
             if knocked && let Ok(mut client) = listener.accept() {
                 if self.client.is_none() {
                     self.client = Some(client);
+                    diary::note(Happening::Came);
                 } else {
                     let busy = AdapterError::Rejected("it serves another client already".to_owned());
                     client.send(&wire::refused(1, &busy));
+                    diary::note(Happening::TurnedAway);
                 }
             }
             self.watch_for_silence();
@@ -341,7 +347,9 @@ impl Serving {
     }
 
     fn hang_up(&mut self) {
-        self.client = None;
+        if self.client.take().is_some() {
+            diary::note(Happening::Gone);
+        }
         let mut service = lock(&self.service);
         if service.commanded() {
             service.stop_by_itself("its client has gone");

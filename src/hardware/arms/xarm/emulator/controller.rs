@@ -20,7 +20,7 @@ use crate::joint::{JointLimits, Joints};
 
 /// How far joints are behind their set points [s].
 const LAG: f64 = 0.01;
-/// Acceleration and jerk of the emulated joints [rad/s²]: a real arm does less than its limit.
+/// Acceleration of the emulated joints [rad/s²]: a real arm does less than its limit.
 const ACCELERATION: f64 = 12.0;
 /// Longest stretch that is advanced at once [s], so that queued moves follow one another.
 const SLICE: f64 = 0.02;
@@ -113,6 +113,10 @@ pub struct Controller {
     pub(super) current: Option<Move>,
     pub(super) velocity_until: Option<Mono>,
     pub(super) settings: Settings,
+    /// It answers to a change of mode, and stays in the mode that it is in.
+    pub keeps_mode: bool,
+    /// It sends no reports of how it is; all others go on.
+    pub condition_muted: bool,
     estop_open: bool,
     estop_until: Option<Mono>,
     pub(super) script: FaultScript,
@@ -159,6 +163,8 @@ impl Controller {
             current: None,
             velocity_until: None,
             settings: Settings { sensitivity: [3, 3], ..Settings::default() },
+            keeps_mode: false,
+            condition_muted: false,
             estop_open: false,
             estop_until: None,
             script: FaultScript::new(&options.faults),

@@ -18,7 +18,7 @@ mod tool;
 mod wire;
 
 use std::io;
-use std::net::{IpAddr, TcpListener};
+use std::net::{IpAddr, SocketAddr, TcpListener};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -29,10 +29,13 @@ use super::protocol::gripper::GripperKind;
 use super::protocol::identity::Firmware;
 use super::{Options, model_of};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
+use crate::hardware::sim::tcp_server::cannot_listen;
 use crate::hardware::spec::{AdapterError, AdapterResult};
-use crate::joint::Joints;
+use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 pub use controller::Received;
 use server::Server;
@@ -57,6 +60,8 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Blocked,
 ];
 
+/// Who speaks in messages.
+const WHO: &str = "xarm emulator";
 /// The report ports follow one another.
 const REPORT_PORTS: u16 = 4;
 /// Attempts to find so many free ports in a row.
@@ -80,6 +85,22 @@ impl Default for SimOptions {
     }
 }
 
+impl SimOptions {
+    /// Refuses a pose outside `limits`, firmware that has no version, and faults that the emulator cannot play.
+    pub(super) fn check(&self, limits: &JointLimits) -> Result<(), Misfit> {
+        check_script("the xarm emulator", &self.faults, PLAYABLE)
+            .and_then(|()| check_pose(&self.initial_positions, limits))
+            .map_err(|misfit| misfit.within("sim"))?;
+        self.firmware().map(drop)
+    }
+
+    fn firmware(&self) -> Result<[u16; 3], Misfit> {
+        let what = || format!("firmware {:?} is not a version like 2.5.1", self.firmware);
+        let Firmware(version) = Firmware::parse(&self.firmware).ok_or_else(|| Misfit::new("sim.firmware", what()))?;
+        Ok(version)
+    }
+}
+
 /// A running emulator. Ends when it is dropped.
 pub struct XArmEmulator {
     server: Server,
@@ -89,7 +110,7 @@ impl XArmEmulator {
     /// Starts an emulator at `place` of the arm that a configuration describes.
     pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
         let options: Options = config.options()?;
-        let model = model_of(&options, config.dof).map_err(rejected)?;
+        let model = model_of(&options, config.dof)?;
         let control = place.tcp(CONTROL_PORT)?;
         let in_process = *place == Place::InProcess;
         Self::listen(model, options.gripper, &options.sim, control.ip(), in_process)
@@ -102,22 +123,12 @@ impl XArmEmulator {
         ip: IpAddr,
         in_process: bool,
     ) -> AdapterResult<Self> {
-        check_kinds("the xarm emulator", &options.faults, PLAYABLE).map_err(AdapterError::Rejected)?;
-        let initial = &options.initial_positions;
-        let limits = model.limits();
-        let range = limits.position_lower.iter().zip(&limits.position_upper);
-        let inside = initial.iter().zip(range).all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
-        if !initial.is_empty() && (initial.len() != model.axes() || !inside) {
-            let axes = model.axes();
-            return Err(rejected(format!("initial_positions must be {axes} angles [rad] within the joint limits")));
-        }
-        let Some(Firmware(firmware)) = Firmware::parse(&options.firmware) else {
-            return Err(rejected(format!("firmware {:?} is not a version like 2.5.1", options.firmware)));
-        };
-        let ports = Ports::bind(ip, in_process).map_err(|e| AdapterError::Io(format!("xarm emulator: {e}")))?;
+        options.check(&model.limits())?;
+        let firmware = options.firmware()?;
+        let ports = Ports::bind(ip, in_process)?;
         let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now());
         let server = Server::start(controller, ports, firmware >= [2, 1, 0])
-            .map_err(|e| rejected(format!("cannot serve: {e}")))?;
+            .map_err(|e| AdapterError::Io(format!("{WHO}: cannot serve: {e}")))?;
         Ok(Self { server })
     }
 
@@ -132,6 +143,16 @@ impl XArmEmulator {
     /// Releases the E-stop button. Nothing else changes.
     pub fn release_estop(&self) {
         self.server.with(|controller, _| controller.release_estop());
+    }
+
+    /// Lets it stay in its mode whatever it is told, or obey again.
+    pub fn keep_mode(&self, keep: bool) {
+        self.server.with(|controller, _| controller.keeps_mode = keep);
+    }
+
+    /// Lets port 30001 fall silent while its connections stay open and all other ports go on, or report again.
+    pub fn mute_condition(&self, mute: bool) {
+        self.server.with(|controller, _| controller.condition_muted = mute);
     }
 
     /// True joint positions [rad] and velocities [rad/s] now.
@@ -172,7 +193,7 @@ impl Emulator for XArmEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the xarm emulator", &[fault], PLAYABLE)?;
+        check_kind("the xarm emulator", &fault, PLAYABLE)?;
         self.server.with(|controller, now| controller.inject(fault, now));
         Ok(())
     }
@@ -180,10 +201,6 @@ impl Emulator for XArmEmulator {
     fn true_positions(&self) -> Option<Joints> {
         Some(self.joints().0)
     }
-}
-
-fn rejected(text: String) -> AdapterError {
-    AdapterError::Rejected(format!("xarm emulator: {text}"))
 }
 
 /// The sockets that wait for clients.
@@ -196,7 +213,7 @@ struct Ports {
 
 impl Ports {
     /// Listens at the arm's own ports, or at free ones.
-    fn bind(ip: IpAddr, in_process: bool) -> Result<Self, String> {
+    fn bind(ip: IpAddr, in_process: bool) -> AdapterResult<Self> {
         if !in_process {
             return Self::at(ip, CONTROL_PORT, REPORT_PORT);
         }
@@ -205,12 +222,12 @@ impl Ports {
             let reports = Self::block(ip, 0).ok()?;
             Some(Self { ip, control, reports })
         };
-        (0..ATTEMPTS).find_map(free).ok_or_else(|| format!("no free ports at {ip}"))
+        (0..ATTEMPTS).find_map(free).ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))
     }
 
     /// Listens at these ports.
-    fn at(ip: IpAddr, control: u16, reports: u16) -> Result<Self, String> {
-        let failed = |port: u16| move |e: io::Error| cannot_listen(ip, port, &e);
+    fn at(ip: IpAddr, control: u16, reports: u16) -> AdapterResult<Self> {
+        let failed = |port: u16| move |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, port), &e);
         let control = TcpListener::bind((ip, control)).map_err(failed(control))?;
         Ok(Self { ip, control, reports: Self::block(ip, reports).map_err(failed(reports))? })
     }
@@ -224,18 +241,5 @@ impl Ports {
             all.push(TcpListener::bind((ip, port))?);
         }
         Ok(all)
-    }
-}
-
-/// Why a port cannot be had, and what to do.
-fn cannot_listen(ip: IpAddr, port: u16, error: &io::Error) -> String {
-    let what = format!("cannot listen at {ip}:{port}: {error}");
-    match error.kind() {
-        io::ErrorKind::PermissionDenied => format!(
-            "{what}\nhint: allow it with `sysctl net.ipv4.ip_unprivileged_port_start={port}` as root, or give the \
-             program CAP_NET_BIND_SERVICE"
-        ),
-        io::ErrorKind::AddrInUse => format!("{what}\nhint: take another address of this computer, like 127.0.0.5"),
-        _ => what,
     }
 }

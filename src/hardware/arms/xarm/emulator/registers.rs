@@ -195,7 +195,11 @@ impl Controller {
     fn set_mode(&mut self, mode: u8) {
         // From one streaming mode to another while it is ready, it silently lands in mode 0.
         let silently_0 = self.state == state::STANDING && self.mode != 0 && mode != 0 && mode != self.mode;
-        self.mode = if silently_0 { 0 } else { mode };
+        self.mode = match mode {
+            _ if self.keeps_mode => self.mode,
+            _ if silently_0 => 0,
+            mode => mode,
+        };
         self.halt(if self.all_enabled() { state::CHANGED } else { state::STOPPED });
     }
 

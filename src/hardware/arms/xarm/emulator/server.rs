@@ -15,6 +15,7 @@ use super::controller::{Controller, Delivery};
 use super::report::Kind;
 use super::wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::transport::tcp::Scan;
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -79,8 +80,7 @@ impl Shared {
         self.wake.raise();
     }
 
-    /// What a fault leaves of a packet; `None`: nothing is sent, `Some(false)` in the second place: after it the
-    /// connection is in order again.
+    /// Does to a packet, and to the connections, what a fault does. Whether what is left of the packet is to be sent.
     fn deliver(&self, delivery: Delivery, packet: &mut Vec<u8>) -> bool {
         match delivery {
             Delivery::Send | Delivery::Frozen => return true,
@@ -251,6 +251,7 @@ impl Floor {
         let Ok(copy) = stream.try_clone() else { return };
         let mut line = lock(&self.shared.line);
         if line.closing || self.sessions.len() >= CLIENTS {
+            diary::note(Happening::TurnedAway);
             return;
         }
         line.clients.push(copy);
@@ -259,7 +260,9 @@ impl Floor {
         let session = std::thread::Builder::new().name("xarm-sim-client".into()).spawn(move || {
             host::enter_realtime(host::EMULATOR_PRIORITY);
             let peer = stream.peer_addr().ok();
+            diary::note(Happening::Came);
             serve(&shared, stream);
+            diary::note(Happening::Gone);
             lock(&shared.line).clients.retain(|client| client.peer_addr().ok() != peer);
         });
         self.sessions.extend(session);
@@ -276,6 +279,9 @@ impl Floor {
             let period = Duration::from_micros(reader.kind.period_us());
             reader.due = if now > reader.due + period { now + period } else { reader.due + period };
             let mut controller = lock(&shared.controller);
+            if reader.kind == Kind::Normal && controller.condition_muted {
+                return true;
+            }
             let mono = MonotonicClock.now();
             let snapshot = controller.snapshot(mono);
             // Damage strikes where it matters: at the reports with the joints.

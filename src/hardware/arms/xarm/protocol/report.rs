@@ -37,10 +37,11 @@ impl Kind {
         }
     }
 
-    /// Which lengths it can have: a newer firmware may add to it, an old one sends less.
+    /// Which lengths it can have, from the end of what is read of it: a newer firmware may add to it, an old one sends
+    /// less. Of the full report both 784 and 804 bytes are documented.
     fn fits(self, length: usize) -> bool {
         match self {
-            Self::Full => (804..=2048).contains(&length),
+            Self::Full => (736..=2048).contains(&length),
             Self::Real => (87..=512).contains(&length),
             Self::Normal => (133..=512).contains(&length),
         }
@@ -56,8 +57,6 @@ pub struct Motion {
     pub state: u8,
     /// The mode.
     pub mode: u8,
-    /// Moves that wait in the queue.
-    pub queued: u16,
     /// Joint positions [rad].
     pub position: [f64; 7],
     /// Joint velocities [rad/s], where it tells.
@@ -73,12 +72,11 @@ pub struct Motion {
 impl Motion {
     /// Decodes a report of port 30000.
     pub fn decode_full(packet: &[u8]) -> Option<Self> {
-        let [state_mode, queue_high, queue_low] = take::bytes(packet, 12)?;
+        let [state_mode] = take::bytes(packet, 12)?;
         let motion = Self {
             time_us: Some(u64::from_be_bytes(take::bytes(packet, 4)?)),
             state: state_mode & 0x0F,
             mode: state_mode >> 4,
-            queued: u16::from_be_bytes([queue_high, queue_low]),
             position: take::floats(packet, 116)?,
             velocity: Some(take::floats(packet, 144)?),
             torque: take::floats(packet, 228)?,
@@ -90,12 +88,11 @@ impl Motion {
 
     /// Decodes a report of port 30003.
     pub fn decode_real(packet: &[u8]) -> Option<Self> {
-        let [state_mode, queue_high, queue_low] = take::bytes(packet, 4)?;
+        let [state_mode] = take::bytes(packet, 4)?;
         let motion = Self {
             time_us: None,
             state: state_mode & 0x0F,
             mode: state_mode >> 4,
-            queued: u16::from_be_bytes([queue_high, queue_low]),
             position: take::floats(packet, 7)?,
             velocity: None,
             torque: take::floats(packet, 59)?,

@@ -82,7 +82,7 @@ fn what_answers_nothing_is_skipped() {
 fn reports_are_read_from_the_golden_bytes() {
     let q = DEGREES.map(f64::to_radians);
     let motion = Motion::decode_full(&golden::full()).unwrap();
-    assert_eq!((motion.time_us, motion.state, motion.mode, motion.queued), (Some(123_456_789), 1, 1, 3));
+    assert_eq!((motion.time_us, motion.state, motion.mode), (Some(123_456_789), 1, 1));
     assert!(near(&motion.position, &q) && near(&motion.velocity.unwrap(), &VELOCITIES));
     assert!(near(&motion.torque, &TORQUES) && near(&motion.pose, &POSE) && near(&motion.wrench.unwrap(), &WRENCH));
     let motion = Motion::decode_real(&golden::real()).unwrap();
@@ -91,6 +91,17 @@ fn reports_are_read_from_the_golden_bytes() {
     assert_eq!(Motion::decode_real(&golden::real()[..87]).unwrap().wrench, None, "an old firmware");
     let health = Health::decode(&golden::normal()).unwrap();
     assert_eq!(health, Health { enabled: 0x3F, error: 31, warning: 11 });
+}
+
+#[test]
+fn a_full_report_may_be_as_short_as_the_vendors_page_has_it() {
+    let short = golden::full_784();
+    let Scan::Take(784, (784, motion)) = report::scan(&short, Kind::Full, None, Motion::decode_full) else {
+        panic!("784 bytes are a report")
+    };
+    assert_eq!(Some(motion), Motion::decode_full(&golden::full()), "the last 20 bytes are not read");
+    let cut = [&735_u32.to_be_bytes()[..], &short[4..735]].concat();
+    assert_eq!(report::scan(&cut, Kind::Full, None, Motion::decode_full), Scan::Skip(1), "the wrench is missing");
 }
 
 #[test]

@@ -9,22 +9,19 @@ pub mod wire;
 
 use std::net::SocketAddr;
 
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-
-use super::limits;
-use super::protocol::{DOF, PORT};
+use super::protocol::PORT;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kinds};
+pub use crate::hardware::sim::arm::SimOptions;
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::TcpServer;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::spec::AdapterResult;
 use crate::joint::Joints;
 use controller::Controller;
 pub use controller::Received;
 
 /// The faults that the emulator can play.
-const PLAYABLE: &[FaultKind] = &[
+pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
     FaultKind::Disconnect,
@@ -43,16 +40,6 @@ const PLAYABLE: &[FaultKind] = &[
     FaultKind::Blocked,
 ];
 
-/// What the emulator does.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint; `[0, -0.3, 0.6, 0, 0.8, 0]` when empty.
-    pub initial_positions: Vec<f64>,
-    /// What goes wrong, and when (seconds after the first connection).
-    pub faults: Vec<Fault>,
-}
-
 /// A running emulator. Ends when it is dropped.
 pub struct YourArmEmulator {
     server: TcpServer<Controller>,
@@ -70,20 +57,7 @@ impl YourArmEmulator {
     }
 
     fn listen(options: &SimOptions, address: SocketAddr) -> AdapterResult<Self> {
-        let rejected = |text| AdapterError::Rejected(format!("yourarm emulator: {text}"));
-        check_kinds("the yourarm emulator", &options.faults, PLAYABLE).map_err(AdapterError::Rejected)?;
-        let initial = &options.initial_positions;
-        if !initial.is_empty() {
-            let limits = limits(DOF);
-            let inside = initial
-                .iter()
-                .zip(limits.position_lower.iter().zip(&limits.position_upper))
-                .all(|(value, (lower, upper))| (*lower..=*upper).contains(value));
-            if initial.len() != DOF || !inside {
-                return Err(rejected(format!("initial_positions must be {DOF} angles [rad] within the joint limits")));
-            }
-        }
-        let controller = Controller::new(initial, &options.faults, MonotonicClock.now());
+        let controller = Controller::new(options, PLAYABLE, MonotonicClock.now())?;
         Ok(Self { server: TcpServer::start("yourarm", controller, address)? })
     }
 
@@ -91,26 +65,26 @@ impl YourArmEmulator {
     pub fn press_estop(&self) {
         self.server.with(|controller, now| {
             controller.advance(now);
-            controller.press_estop();
+            controller.arm.press_estop();
         });
     }
 
     /// Releases the E-stop button. Nothing else changes.
     pub fn release_estop(&self) {
-        self.server.with(|controller, _| controller.release_estop());
+        self.server.with(|controller, _| controller.arm.release_estop());
     }
 
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
         self.server.with(|controller, now| {
             controller.advance(now);
-            controller.joints()
+            controller.arm.joints()
         })
     }
 
     /// Whether the motors are on.
     pub fn enabled(&self) -> bool {
-        self.server.with(|controller, _| controller.enabled())
+        self.server.with(|controller, _| controller.arm.enabled())
     }
 
     /// Starts to record what comes over the wire, up to 200 000 requests; forgets what was recorded before.
@@ -135,9 +109,7 @@ impl Emulator for YourArmEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kinds("the yourarm emulator", &[fault], PLAYABLE)?;
-        self.server.with(|controller, now| controller.inject(fault, now));
-        Ok(())
+        self.server.with(|controller, now| controller.arm.inject(fault, now))
     }
 
     fn true_positions(&self) -> Option<Joints> {

@@ -1,0 +1,98 @@
+//! What `dimos check` says of the planner's robots. Their descriptions and shapes are read as a run reads them.
+
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use crate::blueprint::Blueprint;
+use crate::cli::output::{self, Table};
+use crate::planning::setup::{PlannedRobot, Setup};
+
+/// A robot that is planned for.
+#[derive(Debug, Serialize)]
+pub(super) struct Robot {
+    name: String,
+    model: String,
+    end_effector_link: String,
+    joints: Vec<Joint>,
+    named_poses: Vec<String>,
+    /// Pairs of links that touch in every pose.
+    always_touching: Vec<[String; 2]>,
+}
+
+/// A joint with the limits that its motions are timed with; `None` where there is none.
+#[derive(Debug, Serialize)]
+struct Joint {
+    model: String,
+    coordinator: String,
+    lower: Option<f64>,
+    upper: Option<f64>,
+    velocity: Option<f64>,
+    acceleration: Option<f64>,
+    jerk: Option<f64>,
+}
+
+/// The robots of a blueprint; the error says what a run would fail at.
+pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
+    // What lies in an asset that is not here can only be told once it is.
+    let Some(planner) = blueprint.planner.as_ref().filter(|_| blueprint.awaited_assets().is_empty()) else {
+        return Ok(Vec::new());
+    };
+    let setup = Setup::load(planner)?;
+    Ok(setup.robots.iter().map(|planned| robot(planned, &setup)).collect())
+}
+
+fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {
+    let (config, finite) = (&planned.config, |value: f64| Some(value).filter(|v| v.is_finite()));
+    let names = config.joints.iter().zip(&config.coordinator_joints);
+    let joints = names.zip(&planned.limits).map(|((model, coordinator), limits)| Joint {
+        model: model.clone(),
+        coordinator: coordinator.clone(),
+        lower: finite(limits.lower),
+        upper: finite(limits.upper),
+        velocity: finite(limits.velocity),
+        acceleration: limits.acceleration,
+        jerk: limits.jerk,
+    });
+    let touching = setup.always_touching.iter().filter(|(name, _)| *name == config.name);
+    Robot {
+        name: config.name.clone(),
+        model: config.model_path.display().to_string(),
+        end_effector_link: config.end_effector_link.clone(),
+        joints: joints.collect(),
+        named_poses: config.named_poses.keys().cloned().collect(),
+        always_touching: touching.map(|(_, pair)| pair.clone()).collect(),
+    }
+}
+
+/// Adds what a run would fail at to the problems; whether the blueprint is still valid.
+pub(super) fn refuse(problems: &mut Value, what: &str) -> Value {
+    if let Some(problems) = problems.as_array_mut() {
+        problems.push(json!({"severity": "error", "message": what}));
+    }
+    json!(false)
+}
+
+pub(super) fn print(robot: &Robot) {
+    output::line("");
+    output::line(format_args!("robot {}: {}, planned to {}", robot.name, robot.model, robot.end_effector_link));
+    let mut table = Table::new(&["  JOINT", "OF THE MODEL", ">LOWER", ">UPPER", ">/s", ">/s²", ">/s³"]);
+    for joint in &robot.joints {
+        let limits = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk];
+        let mut cells = vec![format!("  {}", joint.coordinator), joint.model.clone()];
+        cells.extend(limits.iter().map(|limit| output::number(*limit, 3)));
+        table.row(cells);
+    }
+    table.print();
+    if !robot.named_poses.is_empty() {
+        output::line(format_args!("  named poses: {}", robot.named_poses.join(", ")));
+    }
+    for [a, b] in &robot.always_touching {
+        output::line(format_args!(
+            "  warning: {a} and {b} touch in every pose: they are not checked against each other"
+        ));
+    }
+    if !robot.always_touching.is_empty() {
+        let hint = "say so in collision_exclusion_pairs or the SRDF if they may, else correct their shapes";
+        output::line(format_args!("  hint: {hint}"));
+    }
+}

@@ -1,0 +1,83 @@
+//! Whether an arm's number of joints and its options go together, and what follows from them: all that can be known
+//! without the device. A row answers it with [`AdapterSpec::fit`](super::registry::AdapterSpec); `dimos check` shows a
+//! misfit at its place in the blueprint, and nothing is made of a configuration that does not fit.
+
+use std::fmt;
+
+use serde::de::DeserializeOwned;
+
+use super::registry::AdapterConfig;
+use super::spec::{AdapterError, AdapterResult};
+use crate::joint::JointLimits;
+
+/// What follows from a configuration that fits.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Fit {
+    /// Nominal joint limits. An arm that is connected may narrow them.
+    pub limits: JointLimits,
+}
+
+/// What does not fit, and where. As text it is a sentence without full stop; the hint is not part of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Misfit {
+    /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty: the number of joints, or all options.
+    pub option: String,
+    /// What is wrong with it.
+    pub what: String,
+    /// What to do.
+    pub hint: Option<String>,
+}
+
+impl Misfit {
+    /// Something that does not fit, at an option.
+    pub fn new(option: impl Into<String>, what: impl Into<String>) -> Self {
+        Self { option: option.into(), what: what.into(), hint: None }
+    }
+
+    /// The same, with what to do.
+    pub fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+
+    /// The same, as an option of the group `group`: `faults.0` of `sim` is `sim.faults.0`.
+    pub fn within(mut self, group: &str) -> Self {
+        self.option = format!("{group}.{}", self.option);
+        self
+    }
+}
+
+impl fmt::Display for Misfit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)
+    }
+}
+
+impl From<Misfit> for AdapterError {
+    fn from(misfit: Misfit) -> Self {
+        let hint = misfit.hint.map(|hint| format!("\nhint: {hint}")).unwrap_or_default();
+        Self::Rejected(misfit.what + &hint)
+    }
+}
+
+impl AdapterConfig {
+    /// The options as the adapter's own type.
+    pub fn options<T: DeserializeOwned>(&self) -> Result<T, Misfit> {
+        let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
+        serde_json::from_value(given).map_err(|e| Misfit::new("", format!("options: {e}")))
+    }
+
+    /// Refuses a number of joints that the adapter `name` cannot have.
+    pub fn check_dof(&self, name: &str, (fewest, most): (usize, usize)) -> Result<(), Misfit> {
+        match self.dof {
+            dof if (fewest..=most).contains(&dof) => Ok(()),
+            dof if fewest == most => Err(Misfit::new("", format!("{name} has {most} joints, not {dof}"))),
+            dof => Err(Misfit::new("", format!("{name} has {fewest} to {most} joints, not {dof}"))),
+        }
+    }
+
+    /// Asks whether it fits; a misfit becomes a refusal that names the arm.
+    pub fn fit(&self, fit: fn(&Self) -> Result<Fit, Misfit>) -> AdapterResult<Fit> {
+        fit(self).map_err(|misfit| Misfit { what: format!("{}: {}", self.hardware_id, misfit.what), ..misfit }.into())
+    }
+}

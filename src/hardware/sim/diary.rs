@@ -1,0 +1,50 @@
+//! What happens to an emulator: clients that come and go, faults that strike. Nobody reads it unless it was opened, as
+//! `dimos adapter emulate` does; whoever writes neither waits for a terminal nor makes the diary grow without bound.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use super::faults::FaultKind;
+use crate::clock::{Clock, Mono, MonotonicClock};
+
+/// So many entries wait for a reader; newer ones are then lost.
+const LONGEST: usize = 256;
+
+/// Something that happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Happening {
+    /// A client connected; on a bus: the first frame came.
+    Came,
+    /// A client has gone, or was cut off.
+    Gone,
+    /// Another client was turned away.
+    TurnedAway,
+    /// A fault of the script struck, for the first time.
+    Struck(FaultKind),
+}
+
+static OPEN: AtomicBool = AtomicBool::new(false);
+static ENTRIES: Mutex<VecDeque<(Mono, Happening)>> = Mutex::new(VecDeque::new());
+
+/// From now on everything is noted that happens to emulators of this program.
+pub fn open() {
+    ENTRIES.lock().unwrap_or_else(PoisonError::into_inner).reserve(LONGEST);
+    OPEN.store(true, Ordering::Relaxed);
+}
+
+/// Notes something, where the diary is open.
+pub fn note(what: Happening) {
+    if !OPEN.load(Ordering::Relaxed) {
+        return;
+    }
+    let mut entries = ENTRIES.lock().unwrap_or_else(PoisonError::into_inner);
+    if entries.len() < LONGEST {
+        entries.push_back((MonotonicClock.now(), what));
+    }
+}
+
+/// Takes out the oldest entry.
+pub fn take() -> Option<(Mono, Happening)> {
+    ENTRIES.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
+}
