@@ -39,8 +39,8 @@ impl Assets {
 
     /// Whether anything of a description does.
     pub fn source_awaited(&self, source: &Source) -> bool {
-        let beside = source.srdf.iter().chain(&source.joint_limits);
-        std::iter::once(&source.path).chain(beside).chain(source.packages.values()).any(|path| self.awaited(path))
+        let files = [Some(&source.path), source.srdf.as_ref(), source.joint_limits.as_ref()];
+        files.into_iter().flatten().chain(source.packages.values()).any(|path| self.awaited(path))
     }
 }
 

@@ -82,12 +82,12 @@ pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: b
     let robots = robots.map_err(Failure::usage)?;
     print(&summary);
     robots.iter().for_each(robots::print);
-    output::line("");
-    output::line("no mistakes");
     let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
     for asset in awaited {
         output::note(format_args!("{} is not fetched yet: what lies in it was not checked", asset.name));
     }
+    output::line("");
+    output::line("no mistakes");
     Ok(Exit::Ok)
 }
 

@@ -33,6 +33,7 @@ struct Joint {
 
 /// The robots of a blueprint, none while it waits for assets; the error says what a run would fail at.
 pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
+    // What lies in an asset that is not here can only be told once it is.
     let Some(planner) = blueprint.planner.as_ref().filter(|_| blueprint.awaited_assets().is_empty()) else {
         return Ok(Vec::new());
     };
