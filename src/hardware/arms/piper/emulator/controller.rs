@@ -2,7 +2,7 @@
 //! buses.
 //!
 //! Where the sheet leaves open what an arm does, this one does the worst: a joint target that it was given while its
-//! motors were off is where it goes when they come on; every reset takes the power away.
+//! motors were off is where it goes when they come on; every reset takes the power away. One machine, hence its length.
 
 use std::f64::consts::TAU;
 use std::ops::RangeInclusive;
