@@ -155,7 +155,7 @@ fn solve(arm: &Arm, problem: &Problem, arguments: &Arguments) -> Result<Row, Box
     let (total, cpu) = (began.elapsed(), cpu_time().saturating_sub(cpu));
     let timeout = matches!(found, Err(PlanError::Timeout(_)));
     let mut row = row(problem, found, total, cpu);
-    row.late_us = timeout.then(|| (total.as_secs_f64() - arguments.timeout) * 1e6);
+    row.late_us = timeout.then_some((total.as_secs_f64() - arguments.timeout) * 1e6);
     if let Some(path) = &row.path {
         let bounds = bounds(kinematics.names(), kinematics.limits())?;
         let free = |a: &[f64], b: &[f64]| checker.motion_is_free(a, b, &Stop::never());
