@@ -217,8 +217,8 @@ fn an_xarm_that_is_disabled_is_not_at_fault() {
 fn options_that_do_not_fit_the_joints_have_a_hint_of_their_own() {
     let home = Home::new();
     home.write("seven.yaml", &with_faults("").replace("{sim", "{model: xarm7, sim"));
-    let said = home.dimos("run seven.yaml --no-record").with(3);
-    said.says(&["xArm 7 has 7 joints, not 6", "hint: see `hardware.arm.joints`"]);
+    let said = home.dimos("run seven.yaml --no-record").with(2);
+    said.says(&["xArm 7 has 7 joints, not 6", "seven.yaml:6:22", "hint: give the arm 7 joints, or leave `model` out"]);
 }
 
 /// A blueprint of an xArm 6 whose emulator has these faults.

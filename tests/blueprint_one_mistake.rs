@@ -4,19 +4,25 @@
 #[path = "support/fake_arms.rs"]
 mod fake_arms;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use dimos::blueprint::{Found, Loaded, Overrides, SearchPath, Source, load_from};
 use dimos::yaml::{Kind, NodeId, Tree};
 
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/blueprints")
+}
+
+/// Loads a text in the place of the fixture, so that its paths lead to what is there.
 fn load(text: &str) -> Loaded {
-    let found = Found { name: "one".to_owned(), source: Source::Embedded, bytes: text.as_bytes().to_vec() };
+    let source = Source::Path(folder().join("full.yaml"));
+    let found = Found { name: "one".to_owned(), source, bytes: text.as_bytes().to_vec() };
     load_from(&SearchPath::default(), &found, &Overrides::default(), &fake_arms::registry())
 }
 
 /// `full.yaml` with its include written out.
 fn good() -> String {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/blueprints");
+    let folder = folder();
     let search = SearchPath { folders: vec![folder.clone()] };
     let found = search.find(folder.join("full.yaml").to_str().unwrap()).unwrap();
     let loaded = load_from(&search, &found, &Overrides::default(), &fake_arms::registry());
@@ -25,7 +31,7 @@ fn good() -> String {
 }
 
 /// Paths below which keys are free.
-const FREE: [&str; 5] = ["planner.world", "xacro_args", "package_paths", "named_poses", "assets"];
+const FREE: [&str; 6] = ["planner.world", "xacro_args", "package_paths", "named_poses", "collision_shapes", "assets"];
 
 struct Place {
     path: String,

@@ -211,7 +211,7 @@ fn the_written_blueprint_reads_back_the_same() {
     let first = first.blueprint.unwrap();
     let found = blueprint::Found {
         name: "again".to_owned(),
-        source: Source::Embedded,
+        source: Source::Path(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/blueprints/full.yaml")),
         bytes: first.source_yaml.clone().into_bytes(),
     };
     let again = load(&found, &Overrides::default(), &fake_arms::registry());

@@ -9,6 +9,7 @@ use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::blueprint::range::{non_negative, positive};
+use crate::collision::body::MeshMode;
 use crate::yaml::{Keyed, Located, Text};
 
 /// Motion planning.
@@ -76,6 +77,10 @@ pub struct RobotConfig {
     /// Pairs of links that may touch: `[[finger_left, finger_right]]`.
     #[serde(default)]
     pub collision_exclusion_pairs: Vec<(String, String)>,
+    /// How the collision meshes of links are checked, by the link's name: `{left_finger: decomposition}`. `hull` (default)
+    /// fills what is hollow, `decomposition` takes several convex parts, `triangles` the mesh as it is, slowly.
+    #[serde(default)]
+    pub collision_shapes: Keyed<Located<MeshMode>>,
     /// Whether collision meshes may be Collada files, which are converted to triangles. STL and OBJ are read as they are.
     #[serde(default = "yes")]
     pub auto_convert_meshes: bool,

@@ -53,6 +53,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Describ
         xacro_args: source.xacro_args,
         srdf: source.srdf,
         joint_limits: source.joint_limits,
+        shapes: typed.collision_shapes.0.iter().map(|(link, mode)| (link.value.clone(), mode.value)).collect(),
         convert_meshes: typed.auto_convert_meshes,
         base_pose: pose(&typed.base_pose),
         base_link: typed.base_link.clone(),

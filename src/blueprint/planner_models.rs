@@ -40,6 +40,7 @@ pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, described: &[Descr
         if let Some(model) = &described.model {
             names(checker, robot, described, model);
             exclusions(checker, robot, model);
+            shapes(checker, robot, model);
             meshes(checker, robot, model);
             named_poses(checker, robot, described, model);
         }
@@ -201,6 +202,12 @@ fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &Ro
     for (a, b) in &robot.collision_exclusion_pairs {
         link(checker, at, a, model);
         link(checker, at, b, model);
+    }
+}
+
+fn shapes(checker: &mut Checker<'_>, robot: &TypedRobot, model: &RobotModel) {
+    for (name, _) in &robot.collision_shapes.0 {
+        link(checker, name.at, &name.value, model);
     }
 }
 

@@ -3,6 +3,9 @@
 use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
+use parry3d_f64::transformation::vhacd::{VHACD, VHACDParameters};
+use schemars::JsonSchema;
+use serde::Deserialize;
 
 use crate::robot::kinematics::frame;
 use crate::robot::mesh;
@@ -11,11 +14,15 @@ use crate::robot::model::{Geometry, RobotModel};
 use super::shape::{Mesh, ShapeError, Solid};
 
 /// How links that are given as meshes are checked.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
 pub enum MeshMode {
     /// As the convex hull of each mesh: holds all of the mesh, and is faster.
     #[default]
     Hull,
+    /// As the convex hulls of parts of each mesh, which hold all of it together, and leave out what a hull fills: the
+    /// space between fingers. Takes a moment to find, and is slower the more parts there are.
+    Decomposition,
     /// Triangle by triangle.
     Triangles,
 }
@@ -45,34 +52,62 @@ pub enum BodyError {
     },
 }
 
-/// The collision solids of every link of a model, in the links' frames. Reads the mesh files.
+/// The collision solids of every link of a model, in the links' frames, all in one mode. Reads the mesh files.
 pub fn solids(model: &RobotModel, mode: MeshMode) -> Result<Vec<Vec<Solid>>, BodyError> {
+    solids_of(model, |_| mode)
+}
+
+/// The collision solids of every link of a model, in the links' frames: `mode` says how a link, by its name, is checked.
+/// Reads the mesh files.
+pub fn solids_of(model: &RobotModel, mode: impl Fn(&str) -> MeshMode) -> Result<Vec<Vec<Solid>>, BodyError> {
     let link = |link: &crate::robot::model::Link| {
         let solid = |(i, shape): (usize, &crate::robot::model::Shape)| {
             let bad = |error| BodyError::Shape { link: link.name.clone(), number: i + 1, error };
             let at = frame(&shape.origin);
-            match &shape.geometry {
-                Geometry::Box { size } => Solid::cuboid(DVec3::new(size.x, size.y, size.z), at).map_err(bad),
-                Geometry::Sphere { radius } => Solid::sphere(*radius, at).map_err(bad),
-                Geometry::Cylinder { radius, length } => Solid::cylinder(*radius, *length, at).map_err(bad),
-                Geometry::Capsule { radius, length } => Solid::capsule(*radius, *length, at).map_err(bad),
+            let one = match &shape.geometry {
+                Geometry::Box { size } => Solid::cuboid(DVec3::new(size.x, size.y, size.z), at),
+                Geometry::Sphere { radius } => Solid::sphere(*radius, at),
+                Geometry::Cylinder { radius, length } => Solid::cylinder(*radius, *length, at),
+                Geometry::Capsule { radius, length } => Solid::capsule(*radius, *length, at),
                 Geometry::Mesh(file) => {
-                    let (link, uri) = (link.name.clone(), file.uri.clone());
-                    let mesh = mesh::Mesh::load(file).map_err(|error| BodyError::File { link, uri, error })?;
-                    of_mesh(&mesh, mode, at).map_err(bad)
+                    let (name, uri) = (link.name.clone(), file.uri.clone());
+                    let mesh = mesh::Mesh::load(file).map_err(|error| BodyError::File { link: name, uri, error })?;
+                    return of_mesh(&mesh, mode(&link.name), at).map_err(bad);
                 }
-            }
+            };
+            one.map(|solid| vec![solid]).map_err(bad)
         };
-        link.collisions.iter().enumerate().map(solid).collect::<Result<Vec<_>, _>>()
+        let all = link.collisions.iter().enumerate().map(solid).collect::<Result<Vec<_>, _>>()?;
+        Ok(all.into_iter().flatten().collect())
     };
     model.links.iter().map(link).collect()
 }
 
-/// A solid of a mesh.
-pub fn of_mesh(mesh: &mesh::Mesh, mode: MeshMode, frame: DAffine3) -> Result<Solid, ShapeError> {
-    let vertices: Vec<DVec3> = mesh.vertices.iter().map(|v| DVec3::new(v.x, v.y, v.z)).collect();
+/// The solids of a mesh: one, but for a decomposition.
+pub fn of_mesh(mesh: &mesh::Mesh, mode: MeshMode, frame: DAffine3) -> Result<Vec<Solid>, ShapeError> {
     match mode {
-        MeshMode::Hull => Solid::hull(&vertices, frame),
-        MeshMode::Triangles => Solid::mesh(Arc::new(Mesh::new(vertices, mesh.triangles.clone())?), frame),
+        MeshMode::Hull => Ok(vec![Solid::hull(&vertices(mesh), frame)?]),
+        MeshMode::Decomposition => decomposed(&vertices(mesh), &mesh.triangles, frame),
+        MeshMode::Triangles => Ok(vec![surface(mesh, frame)?]),
     }
+}
+
+/// A mesh as it is, triangle by triangle.
+pub fn surface(mesh: &mesh::Mesh, frame: DAffine3) -> Result<Solid, ShapeError> {
+    Solid::mesh(Arc::new(Mesh::new(vertices(mesh), mesh.triangles.clone())?), frame)
+}
+
+fn vertices(mesh: &mesh::Mesh) -> Vec<DVec3> {
+    mesh.vertices.iter().map(|v| DVec3::new(v.x, v.y, v.z)).collect()
+}
+
+/// Convex parts that hold all of a mesh together (V-HACD: K. Mamou, "Volumetric Hierarchical Approximate Convex
+/// Decomposition", 2016), each the hull of the surface it covers. A mesh that has no such parts is taken as its hull.
+fn decomposed(vertices: &[DVec3], triangles: &[[u32; 3]], frame: DAffine3) -> Result<Vec<Solid>, ShapeError> {
+    // Refuses what cannot be used at all.
+    let whole = Solid::hull(vertices, frame)?;
+    let parts = VHACD::decompose(&VHACDParameters::default(), vertices, triangles, true);
+    let hulls = parts.compute_exact_convex_hulls(vertices, triangles);
+    let hulls = hulls.iter().map(|(points, _)| Solid::hull(points, frame)).collect::<Result<Vec<_>, _>>();
+    Ok(hulls.ok().filter(|hulls| hulls.len() > 1).unwrap_or_else(|| vec![whole]))
 }

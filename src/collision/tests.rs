@@ -5,13 +5,16 @@ use std::sync::Arc;
 use glamx::{DAffine3, DVec3};
 
 use super::always::always_touching;
-use super::body::{MeshMode, solids};
+use super::body::{MeshMode, of_mesh, solids};
 use super::checker::{CollisionChecker, Resolution, Stop};
 use super::exact::ExactChecker;
 use super::report::Pair;
 use super::shape::Solid;
 use super::world::{Attached, Obstacle, Robot, World, WorldError};
+use nalgebra::Point3;
+
 use crate::robot::kinematics::Kinematics;
+use crate::robot::mesh::Mesh;
 use crate::robot::random::Random;
 use crate::robot::urdf::from_text;
 
@@ -196,4 +199,50 @@ fn a_stop_ends_a_proof() {
     let stop = Stop::new(None, Some(flag));
     assert!(!checker.motion_is_free(&[0.0; 3], &[-1.0, 0.0, 0.0], &stop) && stop.is_cancelled());
     assert!(checker.motion_is_free(&[0.0; 3], &[-1.0, 0.0, 0.0], &Stop::never()));
+}
+
+/// A fork: a palm of 40 cm × 10 cm × 10 cm along x, and two fingers of 30 cm along y at its ends.
+fn fork() -> Mesh {
+    let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+    // The outline in the plane, and the quadrilaterals that fill it.
+    let outline = [[0.0, 0.0], [0.4, 0.0], [0.4, 0.4], [0.3, 0.4], [0.3, 0.1], [0.1, 0.1], [0.1, 0.4], [0.0, 0.4]];
+    for z in [-0.05, 0.05] {
+        vertices.extend(outline.iter().map(|[x, y]| Point3::new(*x, *y, z)));
+    }
+    for [a, b, c] in [[0, 5, 1], [1, 5, 4], [1, 4, 3], [1, 3, 2], [0, 7, 6], [0, 6, 5]] {
+        triangles.extend([[a, b, c], [a + 8, c + 8, b + 8]]);
+    }
+    for i in 0..8u32 {
+        let next = (i + 1) % 8;
+        triangles.extend([[i, next, next + 8], [i, next + 8, i + 8]]);
+    }
+    Mesh { vertices, triangles }
+}
+
+#[test]
+fn a_decomposition_holds_the_mesh_and_leaves_its_hollow_free() {
+    let touched = |mode: MeshMode, at: DVec3| {
+        let mut robot = arm("", DVec3::ZERO);
+        robot.solids = vec![of_mesh(&fork(), mode, DAffine3::IDENTITY).unwrap(), vec![], vec![], vec![]];
+        let mut world = World::new();
+        world.add_robot(robot).unwrap();
+        world.add(ball("ball", at, 0.002)).unwrap();
+        !checker(&world).contacts(&[0.0; 3]).is_empty()
+    };
+    let between = DVec3::new(0.2, 0.25, 0.0);
+    assert!(touched(MeshMode::Hull, between), "a hull fills it");
+    for mode in [MeshMode::Decomposition, MeshMode::Triangles] {
+        assert!(!touched(mode, between), "{mode:?}");
+        // All over the surface, and within a finger.
+        let mut random = Random::new(7);
+        let mesh = fork();
+        for [a, b, c] in &mesh.triangles {
+            let [a, b, c] = [a, b, c].map(|i| mesh.vertices[*i as usize]);
+            let (s, t) = (random.unit(), random.unit());
+            let (s, t) = if s + t > 1.0 { (1.0 - s, 1.0 - t) } else { (s, t) };
+            let p = a + (b - a) * s + (c - a) * t;
+            assert!(touched(mode, DVec3::new(p.x, p.y, p.z)), "{mode:?} {p}");
+        }
+        assert!(touched(mode, DVec3::new(0.05, 0.3, 0.0)), "{mode:?}");
+    }
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use nalgebra::Isometry3;
 
+use crate::collision::body::MeshMode;
 use crate::robot::Source;
 
 /// A planner.
@@ -34,6 +35,8 @@ pub struct RobotConfig {
     pub srdf: Option<PathBuf>,
     /// Its `joint_limits.yaml`.
     pub joint_limits: Option<PathBuf>,
+    /// How the collision meshes of a link, by its name, are checked; as their hulls, where nothing is said.
+    pub shapes: BTreeMap<String, MeshMode>,
     /// Whether collision meshes may be Collada files, which are converted to triangles as they are read.
     pub convert_meshes: bool,
     /// Where its base link stands in the frame `map`.

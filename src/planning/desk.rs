@@ -295,6 +295,7 @@ mod tests {
             xacro_args: BTreeMap::new(),
             srdf: None,
             joint_limits: None,
+            shapes: BTreeMap::new(),
             convert_meshes: true,
             base_pose: Isometry3::identity(),
             base_link: "base_link".into(),

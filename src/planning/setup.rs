@@ -9,7 +9,7 @@ use glamx::DVec3;
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::timing::DEFAULT_ACCELERATION;
 use crate::collision::always::always_touching;
-use crate::collision::body::{MeshMode, of_mesh, solids};
+use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
@@ -153,7 +153,8 @@ impl PlannedRobot {
             model.link_index(name).ok_or_else(|| format!("there is no link {name:?}; {}", hint()))
         };
         let (base, end_effector) = (link(&config.base_link)?, link(&config.end_effector_link)?);
-        let solids = solids(&model, MeshMode::Hull).map_err(|e| e.to_string())?;
+        let shape = |link: &str| config.shapes.get(link).copied().unwrap_or_default();
+        let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
         let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
         let limits = kinematics.limits().to_vec();
         let rest = model.positions(&HashMap::new());
@@ -228,7 +229,7 @@ pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
         ObjectShape::Box(size) => Solid::cuboid(DVec3::from_array(*size), at),
         ObjectShape::Sphere(radius) => Solid::sphere(*radius, at),
         ObjectShape::Cylinder([radius, length]) => Solid::cylinder(*radius, *length, at),
-        ObjectShape::Mesh(path) => of_mesh(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, MeshMode::Triangles, at),
+        ObjectShape::Mesh(path) => surface(&Mesh::read(path, nalgebra::Vector3::repeat(1.0))?, at),
         ObjectShape::Cloud(path) => {
             let about = std::fs::metadata(path).map_err(|e| format!("{}: {e}", path.display()))?;
             if !about.is_file() || about.len() > MAX_CLOUD {
