@@ -1,5 +1,6 @@
 //! The faults of the fault table that need a process, a wire or a real clock. The number in a test's name is the
-//! fault's. Each prints what it measured. Those of pure logic are in `faults_virtual.rs`.
+//! fault's. Each prints what it measured. Those of pure logic are in `faults_virtual.rs`. One table of faults, hence the
+//! length.
 
 #[allow(dead_code, reason = "shared with other tests")]
 #[path = "support/program.rs"]

@@ -1,4 +1,5 @@
 //! Planning in a run, with the real binary: from a plan to its motion, the world around it, and all that is refused.
+//! Long because all of it happens in the one cell at its top.
 
 #[allow(dead_code, reason = "shared with other tests")]
 #[path = "support/program.rs"]

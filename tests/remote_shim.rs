@@ -1,5 +1,6 @@
 //! `adapter_type: remote` with the Python shim: the conformance suite against an adapter in the form of the guide's
-//! skeleton, whole runs with it, and what a run says when the shim dies, hangs or is something else.
+//! skeleton, whole runs with it, and what a run says when the shim dies, hangs or is something else. Long because all
+//! of them start the same shim in the same way.
 
 #[allow(dead_code, reason = "shared with other tests")]
 #[path = "support/program.rs"]

@@ -1,6 +1,6 @@
 //! The coordinator: `tick` turns the arms' states and the requests of the moment into one command per arm. It
 //! sleeps never, does no I/O, takes no lock, allocates and frees nothing; the same states, requests and times give
-//! the same commands, bit for bit.
+//! the same commands, bit for bit. A tick and what it keeps belong together, hence the length.
 
 use super::arbitrate::Arbiter;
 use super::arm_control::{ArmControl, Ask, Routed};
