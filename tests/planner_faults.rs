@@ -22,24 +22,7 @@ use dimos::rpc::report::TickReport;
 use dimos::runtime::{Record, Run};
 use program::{Home, eventually};
 
-const BLUEPRINT: &str = "
-name: lab
-hardware:
-  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: mock}
-tasks:
-  - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
-planner:
-  robots:
-    - name: arm
-      model_path: builtin:yourarm
-      end_effector_link: flange
-      joint_names: [joint1, joint2, joint3, joint4, joint5, joint6]
-      joint_prefix: arm_
-      coordinator_task_name: traj_arm
-      named_poses: {home: [0, -0.3, 0.6, 0, 0.8, 0]}
-  world:
-    table: {shape: {box: [1.2, 1.2, 0.02]}, pose: {xyz: [0, 0, -0.02]}}
-";
+const BLUEPRINT: &str = include_str!("support/lab.yaml");
 /// Seeds of requests that break the solver of these tests.
 const PANICS: u64 = 13;
 const HANGS: u64 = 14;

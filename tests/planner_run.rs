@@ -11,26 +11,8 @@ use dimos::rpc::api::{ArmEnable, ArmReset, Lease, Plan, PlanGoal, Planning, Stat
 use program::{Home, Started, eventually};
 use rustix::process::Signal;
 
-/// An ideal arm in memory, so that nothing here depends on how busy the machine is, with YourArm's description.
-const BLUEPRINT: &str = "
-name: lab
-hardware:
-  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: mock}
-tasks:
-  - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
-planner:
-  robots:
-    - name: arm
-      model_path: builtin:yourarm
-      end_effector_link: flange
-      joint_names: [joint1, joint2, joint3, joint4, joint5, joint6]
-      joint_prefix: arm_
-      coordinator_task_name: traj_arm
-      named_poses:
-        home: [0, -0.3, 0.6, 0, 0.8, 0]
-  world:
-    table: {shape: {box: [1.2, 1.2, 0.02]}, pose: {xyz: [0, 0, -0.02]}}
-";
+/// An ideal arm in memory, with YourArm's description.
+const BLUEPRINT: &str = include_str!("support/lab.yaml");
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// Two walls that leave no way from one side of the arm to the other, as far as a search can tell in a minute.
 const WALLS: [&str; 2] = ["world add front --box 2 0.02 4 --at 1.1 0 0", "world add back --box 2 0.02 4 --at -1.1 0 0"];
