@@ -1,11 +1,11 @@
-# run install check test · test-tools test-rerun · bench jitter
+# run install check test · test-tools test-rerun · bench bench-quick jitter
 
 PYTHON ?= python3
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
-.PHONY: run install check test test-tools test-rerun bench jitter
+.PHONY: run install check test test-tools test-rerun bench bench-quick jitter
 
 # Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
@@ -56,6 +56,12 @@ test-rerun: .venv/readers-installed
 # are verified.
 bench:
 	cargo bench --locked --bench control --bench wire --bench rpc --bench verify
+
+# Starts every benchmark in a form of a few seconds, without optimization: to see that each still runs. Fails where a part
+# of one does not; its figures mean nothing.
+bench-quick:
+	cargo bench --locked --profile dev --bench control --bench jitter --bench planning --bench rpc --bench verify \
+	--bench wire -- --quick
 
 # Lateness of the tick beside cyclictest.
 jitter:
