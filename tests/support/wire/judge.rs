@@ -106,12 +106,12 @@ impl Bounds {
         let mut worst = Worst::default();
         for chain in chains(told, velocity) {
             for pair in chain.windows(2) {
-                // An arm that has stopped by itself meanwhile begins at rest.
+                // An arm that has stopped by itself meanwhile may begin at rest.
                 let silence = pair[1].0.seconds_since(pair[0].0);
                 let stands = self.time_limit.is_some_and(|limit| silence > limit);
                 for (j, (a, b)) in pair[0].1.iter().zip(pair[1].1).enumerate() {
                     let most = self.acceleration[j] * self.period * 2.0 + self.rounding;
-                    worst.look(j, pair[1].0, if stands { b.abs() } else { (b - a).abs() }, most);
+                    worst.look(j, pair[1].0, if stands { b.abs().min((b - a).abs()) } else { (b - a).abs() }, most);
                 }
             }
         }
