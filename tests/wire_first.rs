@@ -10,7 +10,7 @@ mod wire;
 use std::time::{Duration, Instant};
 
 use dimos::hardware::sim::faults::{Fault, FaultKind};
-use wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, World, XARM, YOURARM};
+use wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, World, XARM, YOURARM, furthest};
 use wire::judge::position;
 
 /// How far a first set point may be from where the arm is [rad]: what a moved joint is told by, too.
@@ -49,10 +49,6 @@ fn each(arms: Vec<Arm>, trial: fn(Arm) -> Vec<String>) {
         threads.into_iter().flat_map(of).collect()
     });
     assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
-}
-
-fn furthest(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
 /// How far the arm goes from `from` within `time` [rad].
