@@ -354,7 +354,13 @@ impl Rig {
     /// A tick that reads these states; no arm obeys its commands.
     pub fn tick_with(&mut self, states: &[ArmState], skipped: u32) {
         let late_ns = skipped as u64 * self.config.period().as_nanos() as u64;
-        let time = TickTime { now: self.now, next: self.now.after(self.config.period()), skipped, late_ns, woke_late_ns: late_ns };
+        let time = TickTime {
+            now: self.now,
+            next: self.now.after(self.config.period()),
+            skipped,
+            late_ns,
+            woke_late_ns: late_ns,
+        };
         let inbox = &mut self.inbox;
         (self.around)(true);
         let output = self.coordinator.tick(time, states, || inbox.pop_front());
