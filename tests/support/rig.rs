@@ -458,7 +458,8 @@ impl Rig {
             for j in 0..arm.dof {
                 // A held joint that does not follow has its set point drawn to it.
                 let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
-                let drawn = sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
+                let drawn =
+                    sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
                 let velocity = match (mode == ControlMode::Velocity, switched) {
                     (true, _) => values[j],
                     (false, false) => (values[j] - wire.values[j]) / dt,

@@ -275,12 +275,14 @@ impl Bed {
             let began = Instant::now();
             while !done(self) {
                 let report = self.run.motion(motion);
-                assert!(
-                    began.elapsed() < PATIENCE,
-                    "{}: it does not arrive: {report:?} {:?}",
-                    self.arm.name,
-                    self.run.status()
-                );
+                if began.elapsed() > PATIENCE {
+                    let last = self.gate.sent().last().map(|t| (super::now().since(t.at), t.what.clone()));
+                    panic!(
+                        "{}: it does not arrive: {report:?}, {last:?}, {:?}",
+                        self.arm.name,
+                        self.run.status().arms[0]
+                    );
+                }
                 std::thread::sleep(Duration::from_millis(5));
             }
             let there = self.run.motion(motion).unwrap();
