@@ -148,14 +148,24 @@ impl Bounds {
     /// Where set points go after a stall that the arm is held for.
     pub fn travel(&self, delivered: &[Told], began: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
-        let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| position(&t.what));
-        let Some(last) = last else { return Ok(()) };
+        let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| Some((t.at, position(&t.what)?)));
+        let Some((at, last)) = last else { return Ok(()) };
+        // Counted from where the set points were when the stall began, after the last of them.
+        let delay = self.stale_after + began.seconds_since(at).min(self.period);
         for one in delivered.iter().filter(|t| t.at >= began) {
             for (j, (a, b)) in last.iter().zip(position(&one.what).unwrap_or(last)).enumerate() {
-                worst.look(j, one.at, (b - a).abs(), self.stopping(j, self.stale_after) + self.rounding);
+                worst.look(j, one.at, (b - a).abs(), self.stopping(j, delay) + self.rounding);
             }
         }
         worst.verdict("the way after a stall", "rad", began)
+    }
+
+    /// How long after a moment set points still moved [s].
+    pub fn moved_for(&self, sent: &[Told], began: Mono) -> f64 {
+        let points: Vec<(Mono, &Vec<f64>)> = sent.iter().filter_map(|t| Some((t.at, position(&t.what)?))).collect();
+        let moves = |pair: &[(Mono, &Vec<f64>)]| pair[0].1.iter().zip(pair[1].1).any(|(a, b)| (a - b).abs() > 1e-4);
+        let last = points.windows(2).rev().find(|pair| moves(pair));
+        last.map_or(0.0, |pair| pair[1].0.seconds_since(began))
     }
 
     /// How far the arm itself went.
