@@ -21,7 +21,7 @@ use rustix::thread::CapabilitySet;
 /// An arm behind another process.
 const REMOTE: &str = "
 hardware:
-  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: remote, address: 'unix:arm.sock'}
+  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: remote, address: 'unix:arm.sock', accept_zero_pose: true}
 tasks:
   - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
 ";
