@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 use serde_json::Value;
-use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncWriteExt, BufReader};
+use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
 use tokio::sync::mpsc;
@@ -25,8 +25,9 @@ use super::api::{
     Registered, Release, Reply, Request, read_params,
 };
 use super::error::{Code, RpcError};
-use super::lease::{Lessee, Subject};
+use super::lease::{Leases, Lessee, Subject};
 use super::planner_line::PlannerLine;
+use super::seats::Seat;
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
 use super::subscription::{Pace, Subscription};
@@ -39,15 +40,17 @@ const IN_FLIGHT: usize = 32;
 /// Time for the client to take the last replies, and for the rest of an oversize line to pass.
 const FAREWELL: Duration = Duration::from_secs(1);
 
-/// Serves one client until it closes its end, or sends a line that is too long.
-pub(super) async fn serve(stream: UnixStream, backend: Arc<dyn Backend>, lessee: Lessee) {
+/// Serves one client until it closes its end, sends a line that is too long, or must make room. `read` was read of it
+/// before.
+pub(super) async fn serve(stream: UnixStream, read: Vec<u8>, backend: Arc<dyn Backend>, lessee: Lessee, seat: Seat) {
     let (from_client, to_client) = stream.into_split();
     let (queue, waiting) = mpsc::channel(QUEUE);
     let mut writer = tokio::spawn(write(to_client, waiting));
-    let mut from_client = BufReader::new(from_client);
+    let mut from_client = BufReader::new(std::io::Cursor::new(read).chain(from_client));
     let connection = Connection {
         backend,
         lessee,
+        seat,
         queue,
         in_flight: VecDeque::new(),
         running: JoinSet::new(),
@@ -73,6 +76,8 @@ struct Connection {
     backend: Arc<dyn Backend>,
     /// What it holds of the leases; they end with the conversation.
     lessee: Lessee,
+    /// Its place among the connections.
+    seat: Seat,
     queue: mpsc::Sender<String>,
     /// Targets that the tick has not answered yet, the oldest first.
     in_flight: VecDeque<(Value, Answer)>,
@@ -103,8 +108,16 @@ impl Connection {
         let mut line = Vec::new();
         loop {
             let longest = self.longest();
+            if self.in_flight.is_empty() {
+                self.seat.pin(!self.subscriptions.is_empty() || self.planner.is_some());
+                self.seat.rest();
+            }
             let read = tokio::select! {
                 biased;
+                reason = self.seat.must_leave() => {
+                    let _ = timeout(FAREWELL, self.reply::<Done>(&Value::Null, Err(reason))).await;
+                    return;
+                }
                 done = oldest(&mut self.in_flight), if !self.in_flight.is_empty() => {
                     if self.send_oldest(done).await.is_err() {
                         return;
@@ -115,7 +128,7 @@ impl Connection {
                 read = read_line(from, &mut line, longest), if self.in_flight.len() < IN_FLIGHT => read,
             };
             match read {
-                Line::Whole => {}
+                Line::Whole => self.seat.begin(),
                 Line::End => {
                     let _ = self.settle().await;
                     return;
@@ -201,14 +214,7 @@ impl Connection {
 
     fn call(&self, method: String, request: Request) -> Answer {
         let (backend, leases) = (self.backend.clone(), self.lessee.leases().clone());
-        Box::pin(async move {
-            let Ok(result) = timeout(CALL_LIMIT, backend.call(request)).await else {
-                let waited = CALL_LIMIT.as_secs();
-                let error = RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"));
-                return Err(error.hint("it may still take effect; ask for `status`"));
-            };
-            result.map(|reply| leases.complete(reply))
-        })
+        Box::pin(async move { answer(&method, backend.call(request), &leases).await })
     }
 
     /// Waits for the answers to all targets that are on their way.
@@ -305,6 +311,20 @@ impl Connection {
     async fn send(&mut self, line: String) -> Result<(), Gone> {
         self.queue.send(line).await.map_err(|_| Gone)
     }
+}
+
+/// Waits for what the run answers, not for ever.
+pub(super) async fn answer(
+    method: &str,
+    call: impl Future<Output = Result<Reply, RpcError>>,
+    leases: &Leases,
+) -> Result<Reply, RpcError> {
+    let Ok(result) = timeout(CALL_LIMIT, call).await else {
+        let waited = CALL_LIMIT.as_secs();
+        let error = RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"));
+        return Err(error.hint("it may still take effect; ask for `status`"));
+    };
+    result.map(|reply| leases.complete(reply))
 }
 
 /// The answer to the oldest target that is on its way. Once it has come, the target must be taken out.

@@ -87,6 +87,11 @@ impl Leases {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Whether a connection holds the lease of any arm.
+    pub fn holds(&self, connection: u64) -> bool {
+        self.lock().values().any(|holder| holder.connection == connection)
+    }
+
     /// Adds to a reply what only the connections know: `status` tells who commands the arms.
     pub fn complete(&self, mut reply: Reply) -> Reply {
         if let Reply::Status(status) = &mut reply {

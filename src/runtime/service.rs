@@ -30,7 +30,7 @@ use crate::rpc::planner_line::PlannerLine;
 use crate::rpc::report::StatusReport;
 use crate::rpc::streams::Streams;
 use crate::rpc::{Code, RpcError, Subject};
-use crate::rt::host::Grant;
+use crate::rt::host::{self, Grant};
 use crate::rt::slot::SlotReader;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
@@ -321,6 +321,11 @@ impl Backend for Service {
 
     fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
         self.register(planner, line)
+    }
+
+    fn prepare_urgent_thread(&self) {
+        // Where it is not granted, the thread competes like any other; it is idle otherwise, so its turn comes soon.
+        let _ = host::set_fifo(host::STOP_PRIORITY);
     }
 
     fn streams(&self) -> &Streams {
