@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::mpsc::channel;
 
 use dimos::arm::{ArmCommand, ArmState, Link, Pose, VelocitySource};
 use dimos::clock::{Mono, WallOffset};
 use dimos::joint::{ControlMode, joints_of, make_joints};
 use dimos::recording::log_writer::LogAttachment;
+use dimos::recording::notes::channel;
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
 use dimos::recording::replay::LogReader;
 use dimos::telemetry::describe::{ArmNames, Names, Severity};

@@ -10,9 +10,11 @@
 mod arm_messages;
 pub mod cdr;
 mod entries;
+mod executes;
 pub mod files;
 pub mod log_writer;
 pub mod messages;
+pub mod notes;
 pub mod recorder;
 pub mod records;
 pub mod replay;

@@ -7,16 +7,17 @@ use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::Receiver;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use thiserror::Error;
 
 use super::log_writer::LogAttachment;
+pub use super::notes::Note;
+use super::notes::Noted;
 use super::worker::Worker;
-use crate::clock::{Clock, Mono, MonotonicClock, WallOffset};
-use crate::telemetry::describe::{Described, Names, Severity};
+use crate::clock::{Clock, MonotonicClock, WallOffset};
+use crate::telemetry::describe::{Described, Names};
 use crate::telemetry::{Event, Sample};
 
 /// How often the ring is emptied: half as often as the log is flushed, because each time costs a wake-up.
@@ -43,36 +44,6 @@ pub struct RecorderConfig {
     pub metadata: BTreeMap<String, String>,
     /// Offset between monotonic and Unix time.
     pub wall: WallOffset,
-}
-
-/// What other threads want in the log.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Note {
-    /// A request, sent before it is told to the tick.
-    Request {
-        /// The id that the tick answers with.
-        id: u64,
-        /// When it came.
-        stamp: Mono,
-        /// The request as it was told to the tick.
-        json: String,
-    },
-    /// A line of text.
-    Log {
-        /// How much it matters.
-        severity: Severity,
-        /// When.
-        stamp: Mono,
-        /// The line.
-        text: String,
-    },
-    /// What an arm says about its present error.
-    ArmText {
-        /// Index of the arm.
-        arm: u16,
-        /// The text.
-        text: String,
-    },
 }
 
 /// What the recorder tells while it runs, on its own thread: be quick.
@@ -152,7 +123,7 @@ impl Recorder {
     pub fn start(
         config: RecorderConfig,
         ring: rtrb::Consumer<Sample>,
-        notes: Receiver<Note>,
+        notes: Noted,
         on_notice: impl FnMut(Notice<'_>) + Send + 'static,
     ) -> Result<Self, RecordError> {
         let stats = Arc::new(RecorderStats::default());

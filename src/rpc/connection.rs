@@ -80,7 +80,7 @@ struct Connection {
     seat: Seat,
     queue: mpsc::Sender<String>,
     /// Targets that the tick has not answered yet, the oldest first.
-    in_flight: VecDeque<(Value, Answer)>,
+    in_flight: VecDeque<InFlight>,
     /// The subscriptions' tasks; dropping the set ends them.
     running: JoinSet<()>,
     subscriptions: BTreeMap<u64, AbortHandle>,
@@ -99,6 +99,14 @@ impl Drop for Connection {
 
 /// The answer to a request, when it comes.
 type Answer = Pin<Box<dyn Future<Output = Result<Reply, RpcError>> + Send>>;
+
+/// A target that the tick has not answered yet.
+struct InFlight {
+    id: Value,
+    /// The arms whose leases it needs.
+    arms: Vec<String>,
+    answer: Answer,
+}
 
 /// The client is gone.
 struct Gone;
@@ -192,8 +200,8 @@ impl Connection {
     }
 
     async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Gone> {
-        let request = match self.lessee.admit(request, &*self.backend).await {
-            Ok(request) => request,
+        let (request, arms) = match self.lessee.admit(request, &*self.backend).await {
+            Ok(admitted) => admitted,
             Err(refusal) => return self.reply::<Done>(&id, Err(refusal)).await,
         };
         let is_target =
@@ -202,13 +210,14 @@ impl Connection {
         if !is_target {
             self.settle().await?;
             let result = answer.await;
+            self.lessee.settle(&arms, is_taken_on(&result));
             return self.reply(&id, result).await;
         }
         // Polled once, it is on its way to the tick, whatever is read next.
         if let Poll::Ready(result) = poll_fn(|cx| Poll::Ready(answer.as_mut().poll(cx))).await {
             answer = Box::pin(ready(result));
         }
-        self.in_flight.push_back((id, answer));
+        self.in_flight.push_back(InFlight { id, arms, answer });
         Ok(())
     }
 
@@ -228,7 +237,14 @@ impl Connection {
 
     async fn send_oldest(&mut self, result: Result<Reply, RpcError>) -> Result<(), Gone> {
         match self.in_flight.pop_front() {
-            Some((id, _)) => self.send(wire::reply(&id, result)).await,
+            Some(InFlight { id, arms, .. }) => {
+                let taken_on = is_taken_on(&result);
+                // While more targets are on their way, the last of them decides.
+                if taken_on || self.in_flight.is_empty() {
+                    self.lessee.settle(&arms, taken_on);
+                }
+                self.send(wire::reply(&id, result)).await
+            }
             None => Ok(()),
         }
     }
@@ -313,6 +329,11 @@ impl Connection {
     }
 }
 
+/// Whether a request takes effect, or may: what is not answered in time was not refused.
+fn is_taken_on(result: &Result<Reply, RpcError>) -> bool {
+    result.as_ref().map_or_else(|error| error.code == Code::NoAnswer, |_| true)
+}
+
 /// Waits for what the run answers, not for ever.
 pub(super) async fn answer(
     method: &str,
@@ -328,9 +349,9 @@ pub(super) async fn answer(
 }
 
 /// The answer to the oldest target that is on its way. Once it has come, the target must be taken out.
-async fn oldest(in_flight: &mut VecDeque<(Value, Answer)>) -> Result<Reply, RpcError> {
+async fn oldest(in_flight: &mut VecDeque<InFlight>) -> Result<Reply, RpcError> {
     match in_flight.front_mut() {
-        Some((_, answer)) => answer.await,
+        Some(InFlight { answer, .. }) => answer.await,
         None => std::future::pending().await,
     }
 }

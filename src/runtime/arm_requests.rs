@@ -97,10 +97,20 @@ impl Service {
             }
         }
         let limit = Instant::now() + READY_LIMIT;
-        while self.phase(arm as usize) != Phase::Ready && Instant::now() < limit {
-            tokio::time::sleep(Duration::from_millis(5)).await;
+        loop {
+            let view = self.arm_view(arm as usize).ok_or_else(internal)?;
+            let outcome = match view.phase {
+                Phase::Ready => return self.phase_reply(id, arm).await,
+                // A stop or a fault overtook it.
+                Phase::Held => Outcome::ArmLatched(arm, view.cause),
+                phase if Instant::now() >= limit => Outcome::ArmNotReady(arm, phase, view.cause),
+                _ => {
+                    tokio::time::sleep(Duration::from_millis(5)).await;
+                    continue;
+                }
+            };
+            return self.refusal(&outcome).map_or_else(|| Err(internal()), Err);
         }
-        self.phase_reply(id, arm).await
     }
 
     pub(super) async fn disable(&self, id: String) -> Result<Reply, RpcError> {

@@ -29,6 +29,7 @@ use crate::planning::config::PlannerConfig;
 use crate::planning::setup::Setup;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
+use crate::recording::notes::{self, Notes};
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
 use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
@@ -62,7 +63,7 @@ impl Run {
             hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
         })?;
         let pulse = Arc::new(Pulse::default());
-        let (notes, noted) = channel();
+        let (notes, noted) = notes::channel();
 
         let device_notes = {
             let (notes, names) = (notes.clone(), names.clone());
@@ -410,7 +411,7 @@ fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
     ])
 }
 
-fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: device::Note) {
+fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: device::Note) {
     let id = names.arm(arm as u16);
     let (severity, text) = match note {
         device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),

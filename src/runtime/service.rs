@@ -8,8 +8,6 @@ use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
-use serde_json::Value;
-
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
 use super::motions::Motions;
@@ -189,11 +187,12 @@ impl Service {
 
     pub(super) async fn ask(&self, request: Request) -> Result<Outcome, RpcError> {
         let log = log_of(&request);
-        self.ask_logged(request, log).await
+        self.outcome(self.parts.dispatcher.ask(request, log).await)
     }
 
-    pub(super) async fn ask_logged(&self, request: Request, log: Value) -> Result<Outcome, RpcError> {
-        let outcome = self.parts.dispatcher.ask(request, log).await.map_err(|e| match e {
+    /// What the tick answered, or its refusal.
+    pub(super) fn outcome(&self, answer: Result<Outcome, NotTold>) -> Result<Outcome, RpcError> {
+        let outcome = answer.map_err(|e| match e {
             NotTold::Full => RpcError::new(Code::NoAnswer, e.to_string()).hint("send fewer requests at once"),
             NotTold::NoAnswer => {
                 RpcError::new(Code::NoAnswer, e.to_string()).hint("`dimos status` shows whether the run is alive")
