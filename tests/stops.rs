@@ -7,7 +7,7 @@ mod program;
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::IpAddr;
-use std::os::unix::net::UnixStream;
+use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -236,6 +236,22 @@ fn stop_stops_every_arm_of_every_run() {
 }
 
 #[test]
+fn runs_of_other_users_are_named_as_not_stopped() {
+    let (home, _run) = up("--no-record");
+    let folder = home.path().join("theirs/dimos");
+    std::fs::create_dir_all(&folder).unwrap();
+    let socket = folder.join("their-cell.sock");
+    let _theirs = UnixListener::bind(&socket).unwrap();
+    if std::os::unix::fs::chown(&socket, Some(65534), None).is_err() {
+        println!("not checked: this user cannot give a file away");
+        return;
+    }
+    let stopped = home.dimos("stop").with(0).says(&["not stopped: run their-cell of user "]);
+    assert!(stopped.out.contains("confirmed") && !stopped.out.contains("their-cell"), "{}", stopped.out);
+    assert!(!home.dimos("stop --run streams").with(0).err.contains("their-cell"));
+}
+
+#[test]
 fn a_stop_that_arrives_after_the_reconnect_is_reported() {
     let home = Home::new();
     // A loopback address of its own, where the arm can come back.
@@ -250,8 +266,10 @@ fn a_stop_that_arrives_after_the_reconnect_is_reported() {
     eventually("the link is lost", || home.status()["arms"][0]["link"] != "up");
     let refused = home.dimos("stop").with(1);
     assert!(refused.out.contains("not sent"), "{}", refused.out);
+    assert_eq!(home.status()["arms"][0]["stop_pending"], true);
     let _arm = power_on();
     run.until("the stop of arm was delivered after the reconnect");
+    assert_eq!(home.status()["arms"][0].get("stop_pending"), None);
 }
 
 #[test]

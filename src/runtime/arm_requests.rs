@@ -38,6 +38,9 @@ impl Service {
                     None => tokio::time::sleep(Duration::from_millis(5)).await,
                 }
             };
+            if confirmation == api::Confirmation::NotSent {
+                self.stop_not_sent(i);
+            }
             arms.insert(config.name.clone(), confirmation);
         }
         Ok(Reply::Stop(api::StopReply { arms }))

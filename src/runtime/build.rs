@@ -158,7 +158,10 @@ impl Run {
         };
         let publish = {
             let service = service.clone();
-            move |ticked| service.publish(ticked)
+            move |ticked| {
+                service.publish(ticked);
+                service.report_late_stops(wall);
+            }
         };
         let io = |what: &str, e: std::io::Error| StartError::other(format!("no {what} thread: {e}"), "see ulimit -u");
         let courier = Courier::start(dispatcher.clone(), reply_wake, reply_consumer, retired_consumer, publish)

@@ -16,6 +16,7 @@ use crate::control::tasks::cartesian::Goal;
 use crate::recording::notes::{Note, Notes};
 use crate::rt::wake::Wake;
 use crate::telemetry::Outcome;
+use crate::telemetry::describe::Severity;
 use crate::trajectory::JointTrajectory;
 
 /// Room for requests on their way to the tick.
@@ -101,6 +102,11 @@ impl Dispatcher {
     /// Sends a request and waits for its outcome.
     pub async fn ask(&self, request: Request, log: Value) -> Result<Outcome, NotTold> {
         answer(self.send(request, log)?).await
+    }
+
+    /// Puts a line of text into the log.
+    pub fn log(&self, severity: Severity, text: String) {
+        let _ = self.notes.send(Note::Log { severity, stamp: MonotonicClock.now(), text });
     }
 
     fn answered(&self, id: u64, outcome: Outcome) {

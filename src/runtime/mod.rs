@@ -15,6 +15,7 @@ pub(crate) mod device_lock;
 mod dispatch;
 mod handle;
 mod in_process;
+mod late_stops;
 mod motion_requests;
 mod motions;
 mod plan_requests;

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
+use super::late_stops::LateStops;
 use super::motions::Motions;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
@@ -65,6 +66,7 @@ pub struct Service {
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
     pub(super) repeats: Repeats,
+    pub(super) late_stops: LateStops,
     /// Ticks done when the joint state was published last.
     pub(super) published: AtomicU64,
     /// The planner that is attached, or was.
@@ -83,6 +85,7 @@ impl Service {
             motions: Mutex::default(),
             recorder: OnceLock::new(),
             repeats: Repeats::default(),
+            late_stops: LateStops::default(),
             published: AtomicU64::new(0),
             attached: Mutex::default(),
             executed: Mutex::default(),
