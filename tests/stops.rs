@@ -8,16 +8,23 @@ mod program;
 use std::io::{BufRead, BufReader, Write};
 use std::net::IpAddr;
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, LazyLock};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use dimos::hardware::arms::yourarm;
-use dimos::hardware::registry::{AdapterConfig, Place};
+use dimos::hardware::arms::yourarm::emulator::wire::Request;
+use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::hardware::registry::{AdapterConfig, Emulator, Place, Registry};
 use dimos::rpc::Code;
-use dimos::rpc::api::{ArmEnable, ArmReset, Confirmation, Execute, Point, Servo, State, Status, Stop, Trajectory};
+use dimos::rpc::api::{
+    ArmEnable, ArmReset, Confirmation, Execute, Point, Servo, State, Status, Stop, Trajectory, Velocity,
+};
 use dimos::rpc::client::{Client, ClientError};
+use dimos::rpc::place::RunFolder;
+use dimos::runtime::{Record, Run};
+use dimos::testing::{Call, MockAdapter};
 use program::{Home, Started, eventually};
 use serde_json::{Value, json};
 
@@ -354,4 +361,73 @@ fn refused_executes_are_not_logged_whole() {
     assert!(refusals.len() >= 40, "every refusal is in the log");
     assert!(told.len() < 40 * 1000, "{} bytes for 40 refusals", told.len());
     home.dimos(&format!("replay {} --verify", log.display())).with(0);
+}
+
+/// A velocity task that moves joint 6 at this speed [rad/s] until the arm does, then the end of its stream.
+fn let_go_at(home: &Home, speed: f64, measured: f64) {
+    let mut client = home.client();
+    eventually("it moves", || {
+        let velocities = vec![0.0, 0.0, 0.0, 0.0, 0.0, speed];
+        client.call(Velocity { task: "velocity_arm".into(), velocities }).unwrap();
+        let state = client.call(State {}).unwrap();
+        state.arms[0].joints[5].velocity.is_some_and(|v| v >= measured)
+    });
+}
+
+#[test]
+fn disable_switches_off_an_arm_at_rest_however_long_it_brakes() {
+    let home = Home::new();
+    let arm = YourArmEmulator::with(&SimOptions::default()).unwrap();
+    home.write(
+        "streams.yaml",
+        "
+include: [coordinator-yourarm]
+tasks:
+  - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}
+",
+    );
+    // From 0.8 rad/s to rest in 4 s.
+    let limits = "--set hardware.arm.limits.acceleration=0.2";
+    let _run = home.run(&format!("streams.yaml --no-record --set hardware.arm.address={} {limits}", arm.address()));
+    let_go_at(&home, 0.8, 0.75);
+    arm.record();
+    home.dimos("arm disable arm").with(0);
+    let trace = arm.trace();
+    let off = trace.iter().position(|r| r.request == Request::Enable(false)).expect("the motors were switched off");
+    let last = trace[..off].iter().rev().find_map(|r| match r.request {
+        Request::VelocityJoints(velocities) => Some(velocities[5].to_radians()),
+        _ => None,
+    });
+    let last = last.expect("it was braked by velocities");
+    assert!(last.abs() < 0.01, "the motors went off at {last} rad/s");
+}
+
+/// An arm that says that it moves, whatever it is told.
+static RUNAWAY: LazyLock<MockAdapter> = LazyLock::new(|| MockAdapter::new(7));
+
+#[test]
+fn an_arm_that_does_not_come_to_rest_keeps_its_motors_unless_now_is_said() {
+    let mut row = *Registry::builtin().get("mock").unwrap();
+    row.create = |_| Ok(Box::new(RUNAWAY.clone()));
+    let folder = tempfile::tempdir().unwrap();
+    let run = Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunFolder::at(folder.path()));
+    let run = run.adapters(&[row]).start().unwrap();
+    let _moving = RUNAWAY.clone().velocities(Some(&[0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    eventually("it moves", || run.state().arms[0].joints[1].velocity.is_some_and(|v| v > 0.2));
+    let switched_off = || RUNAWAY.calls().contains(&Call::WriteEnable(false));
+    let refused = run.disable("arm").unwrap_err();
+    assert_eq!(refused.code, Code::ArmNotReady);
+    assert!(refused.message.contains("arm still moves at 0.30 rad/s"), "{refused}");
+    assert!(refused.hint.is_some_and(|hint| hint.contains("--now")));
+    assert!(!switched_off(), "its motors stay on");
+    let note = run.disable_now("arm").unwrap().note;
+    assert_eq!(note.as_deref(), Some("the motors were switched off at once, while it moved at 0.30 rad/s"));
+    assert!(switched_off());
+}
+
+#[test]
+fn disable_now_says_so() {
+    let (home, _run) = up("--no-record");
+    let cut = home.dimos("arm disable --now arm").with(0);
+    assert!(cut.out == "arm: disabled\n" && cut.err.contains("switched off at once"), "{}{}", cut.out, cut.err);
 }

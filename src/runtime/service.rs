@@ -37,7 +37,7 @@ use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 /// How long a device takes to refuse an opening of its gripper.
 const GRIPPER_REPLY: Duration = Duration::from_millis(20);
 /// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
-const STANDSTILL: f64 = 0.02;
+pub(super) const STANDSTILL: f64 = 0.02;
 
 /// What a service is made from.
 pub struct ServiceParts {
@@ -279,7 +279,7 @@ impl Service {
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
             Call::ArmEnable(a) => self.enable(a.arm).await,
-            Call::ArmDisable(a) => self.disable(a.arm).await,
+            Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
             Call::Gripper(g) => self.gripper(g).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
