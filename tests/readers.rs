@@ -31,6 +31,7 @@ fn record(path: &Path) {
         }],
         metadata: BTreeMap::new(),
         wall: WallOffset::of(Mono(5_000_000_000), WALL),
+        min_free: 0,
     };
     let (mut ring, consumer) = rtrb::RingBuffer::new(4096);
     let (notes, receiver) = channel();

@@ -18,6 +18,7 @@ pub mod notes;
 pub mod recorder;
 pub mod records;
 pub mod replay;
+pub mod space;
 mod tick_log;
 pub mod wire;
 mod worker;

@@ -15,6 +15,7 @@ use thiserror::Error;
 use super::log_writer::LogAttachment;
 pub use super::notes::Note;
 use super::notes::Noted;
+use super::space::Megabytes;
 use super::worker::Worker;
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::telemetry::describe::{Described, Names};
@@ -44,6 +45,8 @@ pub struct RecorderConfig {
     pub metadata: BTreeMap<String, String>,
     /// Offset between monotonic and Unix time.
     pub wall: WallOffset,
+    /// The log ends when less room than this is left on its disk [bytes].
+    pub min_free: u64,
 }
 
 /// What the recorder tells while it runs, on its own thread: be quick.
@@ -60,7 +63,7 @@ pub enum Notice<'a> {
     },
     /// The recorder fell behind: so many samples are missing in the log.
     Lost(u32),
-    /// The log could not be written and ends here. Said once; the run goes on.
+    /// The log ends here, before the run. Said once; events are still told.
     Stopped(&'a RecordError),
 }
 
@@ -76,12 +79,33 @@ pub enum RecordError {
         source: std::io::Error,
     },
     /// A write failed.
-    #[error("the log {path} ends here: {reason}\nhint: see whether the disk is full; the run goes on without a log")]
+    #[error("the log {path} ends here: {reason}\nhint: see whether the disk is full; --no-record runs without a log")]
     Write {
         /// The log file.
         path: PathBuf,
         /// Why.
         reason: String,
+    },
+    /// The disk is nearly full.
+    #[error(
+        "the log {path}: only {free} are free on its disk, and {min_free} must be\n\
+         hint: make room, name another file with --record FILE, or set recording.min_free; --no-record runs without a log"
+    )]
+    Room {
+        /// The log file.
+        path: PathBuf,
+        /// What is free.
+        free: Megabytes,
+        /// What must be.
+        min_free: Megabytes,
+    },
+    /// The file is not where it was.
+    #[error(
+        "the log {path} ends here: it was removed or replaced while it was written\nhint: keep logs out of folders that are cleaned up"
+    )]
+    Removed {
+        /// The log file.
+        path: PathBuf,
     },
     /// The thread cannot be started.
     #[error("the recorder thread cannot be started: {0}\nhint: see whether a limit on threads or memory is reached")]

@@ -14,6 +14,7 @@ use super::executes::{Execute, Executes};
 use super::log_writer::LogWriter;
 use super::notes::Noted;
 use super::recorder::{Note, Notice, RecordError, RecorderConfig, RecorderStats};
+use super::space;
 use super::tick_log::TickLog;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::telemetry::describe::{Described, Names, describe};
@@ -21,6 +22,8 @@ use crate::telemetry::{Event, Outcome, Sample, TickSample};
 
 /// How often the disk is asked to keep what it was given, against a loss of power.
 const SYNC_EVERY: Duration = Duration::from_secs(1);
+/// How often it is looked whether the disk has room and the log is still there.
+const WATCH_EVERY: Duration = Duration::from_millis(500);
 
 /// Samples and notes in, log and notices out. A test steps it on a clock of its own.
 pub(super) struct Worker<W: Write + Seek, F> {
@@ -29,6 +32,8 @@ pub(super) struct Worker<W: Write + Seek, F> {
     /// The file once more, to be told to keep what it has.
     disk: Option<File>,
     synced: Mono,
+    min_free: u64,
+    watched: Mono,
     ticks: TickLog,
     names: Names,
     ring: rtrb::Consumer<Sample>,
@@ -67,6 +72,8 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             log,
             disk,
             synced: Mono::ZERO,
+            min_free: config.min_free,
+            watched: Mono::ZERO,
             ticks,
             names,
             ring,
@@ -93,8 +100,20 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         // Events are told before anything waits for the disk.
         let mut described = self.tell_events(&samples);
         if let Err(e) = self.write(notes, &samples, &mut described, now) {
-            self.stop_log(&e);
+            self.stop_log(write_error(&self.path, &e));
+        } else if now.since(self.watched) >= WATCH_EVERY {
+            self.watched = now;
+            self.watch();
         }
+    }
+
+    /// Ends the log while there is still room to close it, or when it is not there any more.
+    fn watch(&mut self) {
+        let Some((file, _)) = self.disk.as_ref().zip(self.log.as_ref()) else { return };
+        let Err(reason) = space::watch(&self.path, file, self.min_free) else { return };
+        let closed = self.log.take().map(|log| log.finish().map(drop)).transpose();
+        // What the room is too small for is the worse news.
+        self.stop_log(closed.map_or_else(|e| write_error(&self.path, &e), |_| reason));
     }
 
     fn tell_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
@@ -182,10 +201,9 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         result
     }
 
-    fn stop_log(&mut self, e: &McapError) {
+    fn stop_log(&mut self, error: RecordError) {
         self.log = None;
         self.stats.failed.store(true, Ordering::Relaxed);
-        let error = write_error(&self.path, e);
         (self.on_notice)(Notice::Stopped(&error));
         self.ended = Some(error);
     }
@@ -197,13 +215,14 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             if let Some(log) = &mut self.log
                 && let Err(e) = self.ticks.request(log, id, execute.stamp, &execute.whole())
             {
-                self.stop_log(&e);
+                self.stop_log(write_error(&self.path, &e));
             }
         }
+        self.watch();
         let Some(log) = self.log.take() else { return self.ended.map_or(Ok(()), Err) };
         let closed = log.finish().map(drop).and_then(|()| Ok(self.disk.as_ref().map_or(Ok(()), File::sync_data)?));
         closed.map_err(|e| {
-            self.stop_log(&e);
+            self.stop_log(write_error(&self.path, &e));
             write_error(&self.path, &e)
         })
     }
@@ -259,6 +278,7 @@ mod tests {
             attachments: Vec::new(),
             metadata: BTreeMap::new(),
             wall: WallOffset::of(Mono::ZERO, 0),
+            min_free: 0,
         };
         let told = Arc::new(Mutex::new(Vec::new()));
         let sink = told.clone();
@@ -280,7 +300,7 @@ mod tests {
         assert_eq!(producer.slots(), 64);
         assert!(stats.failed.load(Ordering::Relaxed));
         let message = "the log run.mcap ends here: No space left on device\n\
-                       hint: see whether the disk is full; the run goes on without a log";
+                       hint: see whether the disk is full; --no-record runs without a log";
         assert_eq!(*told.lock().unwrap(), [message, "degraded"]);
         assert_eq!(worker.finish(Mono(1)).unwrap_err().to_string(), message);
     }

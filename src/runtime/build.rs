@@ -31,6 +31,7 @@ use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::{self, Notes};
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
+use crate::recording::space;
 use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
 use crate::rpc::streams::Streams;
@@ -55,6 +56,9 @@ impl Run {
         let (grants, latency) = host::prepare_process(options.hold_latency);
         let wall = WallOffset::take(&MonotonicClock);
         let log = log_path(blueprint, &options, &name, wall)?;
+        if let Some(log) = &log {
+            space::check(log, blueprint.recording.min_free.0).map_err(|e| split_hint(&e.to_string()))?;
+        }
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
         let robots = blueprint.planner.as_ref().map(robots).transpose()?;
@@ -115,6 +119,7 @@ impl Run {
             attachments: attachments(blueprint, &config),
             metadata: metadata(blueprint),
             wall,
+            min_free: blueprint.recording.min_free.0,
         };
         let service = Arc::new(Service::new(ServiceParts {
             run: name.clone(),

@@ -151,7 +151,11 @@ impl Service {
                 self.tell(tick, described, wall);
             }
             Notice::Lost(count) => tracing::warn!("the recorder fell behind: {count} samples are missing in the log"),
-            Notice::Stopped(error) => tracing::error!("{error}"),
+            Notice::Stopped(error) => {
+                tracing::error!("{error}");
+                let first = error.to_string().lines().next().unwrap_or_default().to_owned();
+                let _ = self.parts.endings.send(Ending::Log(first));
+            }
         }
     }
 

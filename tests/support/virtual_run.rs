@@ -87,6 +87,7 @@ impl VirtualRun {
             attachments: vec![attachment],
             metadata: BTreeMap::new(),
             wall: WallOffset::of(START.0, START.1),
+            min_free: 0,
         };
         let (ring, samples) = rtrb::RingBuffer::new(64 * 1024);
         let (notes, noted) = channel();

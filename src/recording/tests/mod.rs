@@ -40,6 +40,7 @@ fn config(path: PathBuf) -> RecorderConfig {
         }],
         metadata: BTreeMap::from([("tick_rate".to_owned(), "100".to_owned())]),
         wall: WallOffset::of(Mono(1_000_000_000), WALL),
+        min_free: 0,
     }
 }
 
