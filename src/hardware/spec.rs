@@ -40,6 +40,9 @@ pub enum AdapterError {
     /// The device has no such feature.
     #[error("not supported by this arm")]
     Unsupported,
+    /// Not written, and no error: two set points are on their way already.
+    #[error("two set points are on their way")]
+    Busy,
     /// Called before `connect` or after the connection was lost.
     #[error("not connected")]
     NotConnected,
@@ -124,6 +127,12 @@ pub trait ManipulatorAdapter: Send {
         self.write_stop().map(|_| ())
     }
 
+    /// Discards commands that have not left this computer: called when states have gone stale, before anything new is
+    /// sent.
+    fn discard_pending(&mut self) {
+        self.disconnect();
+    }
+
     // --- What it is ---
 
     /// Vendor, model, dof, versions, rate, modes.
@@ -139,6 +148,13 @@ pub trait ManipulatorAdapter: Send {
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()>;
     /// The mode the device is in, verified where it can tell.
     fn get_control_mode(&self) -> ControlMode;
+
+    /// What another client of the device, or a person at its panel, changed since the last `activate` or
+    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: nothing, or the device itself is the cause
+    /// (`read_error`). An adapter never undoes such a change by itself. Must not allocate.
+    fn foreign_change(&self) -> Option<&'static str> {
+        None
+    }
 
     // --- State ---
 

@@ -31,6 +31,8 @@ pub struct Condition {
     servos: [u8; 7],
     /// Something has changed; register 15 must say what.
     pub changed: bool,
+    /// When something was seen that only an answer to a later question explains.
+    doubted: Mono,
     servos_changed: bool,
     /// When it was asked, while the answer is outstanding.
     asked: Option<Mono>,
@@ -41,6 +43,11 @@ impl Condition {
     pub fn all_enabled(&self, axes: usize) -> bool {
         let all = ((1_u16 << axes) - 1) as u8;
         self.enabled & all == all
+    }
+
+    /// Whether the motors of the first `axes` joints are off.
+    pub fn none_enabled(&self, axes: usize) -> bool {
+        u16::from(self.enabled) & ((1 << axes) - 1) == 0
     }
 
     /// Looks at the state byte of a response.
@@ -54,13 +61,19 @@ impl Condition {
         self.changed |= health.error != self.error || health.warning != self.warning;
     }
 
+    /// Something happened just now: what was asked before does not explain it.
+    pub fn doubt(&mut self, now: Mono) {
+        (self.changed, self.doubted) = (true, now);
+    }
+
     /// Takes the answer to a question of [`Condition::due`].
     pub fn take(&mut self, response: &Response) {
         match (response.register, response.data()) {
             (15, [error, warning, ..]) => {
                 self.servos_changed = SERVO_ERRORS.contains(error) && *error != self.error;
                 (self.error, self.warning) = (*error, *warning);
-                (self.changed, self.asked) = (false, None);
+                self.changed &= self.asked.is_some_and(|asked| asked <= self.doubted);
+                self.asked = None;
                 if POWER_CUT.contains(error) {
                     self.enabled = 0;
                 }
