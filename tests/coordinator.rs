@@ -335,7 +335,7 @@ fn an_arm_is_not_taken_up_without_a_fresh_state() {
 
 fn time(rig: &Rig) -> dimos::control::coordinator::TickTime {
     let next = rig.now.after(rig.config.period());
-    dimos::control::coordinator::TickTime { now: rig.now, next, skipped: 0, late_ns: 0 }
+    dimos::control::coordinator::TickTime { now: rig.now, next, skipped: 0, late_ns: 0, woke_late_ns: 0 }
 }
 
 #[test]

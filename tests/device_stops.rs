@@ -38,12 +38,11 @@ fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate
     let (state_writer, states) = slot(ArmState::default());
     let (commands, command_reader) = slot(ArmCommand::default());
     let config = DeviceConfig {
-        realtime: true,
         hardware_id: "arm".into(),
         dof: 6,
         tick_period: Duration::from_millis(10),
         native_rate,
-        velocity_max: 2.0,
+        supervision: dimos::arm::Supervision::default(),
         beat: beat.clone(),
         clock: Arc::new(MonotonicClock),
         notes: Box::new(|_| {}),

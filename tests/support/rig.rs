@@ -9,7 +9,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::control::config::*;
 use dimos::control::coordinator::{Coordinator, TickTime};
@@ -46,6 +46,8 @@ pub struct SimArm {
     pub blocked: bool,
     /// No new states come.
     pub silent: bool,
+    /// Commands do not reach it.
+    pub deaf: bool,
     /// How old a state is when the tick reads it.
     pub age: Duration,
     pub enabled: bool,
@@ -75,6 +77,7 @@ impl SimArm {
             stop_takes_hold: false,
             blocked: false,
             silent: false,
+            deaf: false,
             age: Duration::from_millis(1),
             enabled: true,
             error: 0,
@@ -123,7 +126,7 @@ impl SimArm {
             self.gripper = command.gripper;
         }
         self.last = *command;
-        if let Some(mode) = command.mode.filter(|_| self.enabled && self.link == Link::Up) {
+        if let Some(mode) = command.mode.filter(|_| self.enabled && self.link == Link::Up && !self.deaf) {
             if mode != self.mode {
                 self.switching += 1;
                 if self.switching > self.mode_delay {
@@ -131,6 +134,7 @@ impl SimArm {
                 }
             }
             if mode == self.mode {
+                self.state.written = command.seq;
                 self.setpoint = Some(command.values[..self.dof].to_vec());
             }
         }
@@ -193,7 +197,10 @@ pub fn arm(name: &str, dof: usize) -> ArmConfig {
         limits,
         modes: vec![ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: true,
-        state_timeout: Duration::from_millis(30),
+        own_velocity: Vec::new(),
+        read_period: Duration::from_millis(10),
+        write_period: Duration::from_millis(10),
+        supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
     }
 }
 
@@ -235,7 +242,7 @@ pub fn sweep(id: u64, joints: std::ops::Range<u16>, from: f64, to: f64, seconds:
 
 impl Rig {
     pub fn new(rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
-        let config = CoordinatorConfig { rate, arms, tasks };
+        let config = CoordinatorConfig { version: CONTROL_VERSION, rate, arms, tasks };
         let wire = |a: &ArmConfig| Wire {
             mode: None,
             values: vec![0.0; a.dof],
@@ -347,7 +354,7 @@ impl Rig {
     /// A tick that reads these states; no arm obeys its commands.
     pub fn tick_with(&mut self, states: &[ArmState], skipped: u32) {
         let late_ns = skipped as u64 * self.config.period().as_nanos() as u64;
-        let time = TickTime { now: self.now, next: self.now.after(self.config.period()), skipped, late_ns };
+        let time = TickTime { now: self.now, next: self.now.after(self.config.period()), skipped, late_ns, woke_late_ns: late_ns };
         let inbox = &mut self.inbox;
         (self.around)(true);
         let output = self.coordinator.tick(time, states, || inbox.pop_front());

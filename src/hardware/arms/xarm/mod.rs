@@ -31,6 +31,8 @@ mod tests_foreign;
 #[cfg(test)]
 mod tests_slow;
 
+use std::time::Duration;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -63,6 +65,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "rad, mm",
     native_rate: NATIVE_RATE,
+    accuracy: 0.002,
+    lag: 0.05,
+    stale_after: Duration::from_millis(50),
     address: AddressForm {
         form: "HOST[:CONTROL_PORT[:REPORT_PORT]]",
         required: true,
