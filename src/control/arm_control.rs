@@ -166,6 +166,9 @@ impl ArmControl {
 
     /// The state as it was read, refused positions included, with estimated velocities: for the log.
     pub fn measured(&self) -> ArmState {
+        if self.raw.position.iter().take(self.config.dof).any(|q| !q.is_finite()) {
+            return self.state; // what is not a number is no measurement
+        }
         ArmState { velocity: self.state.velocity, velocity_source: self.state.velocity_source, ..self.raw }
     }
 
@@ -347,7 +350,7 @@ impl ArmControl {
         let phase = self.failsafe.phase();
         let held = phase == Phase::Held;
         // What somebody else does with the arm is theirs to end: it gets no set point and no stop.
-        let foreign = held && matches!(self.failsafe.cause(), Cause::ModeChanged | Cause::PowerChanged);
+        let foreign = held && self.failsafe.cause().is_foreign();
         self.stop_owed |= held && !self.was_held && !foreign;
         self.was_held = held;
         self.note_gap(now);
@@ -426,8 +429,10 @@ impl ArmControl {
     /// Slows down by commands; when at rest, asks the arm to stop by its own means and leaves it alone.
     fn come_to_rest(&mut self, dt: f64) {
         if let Some(mode) = self.command.mode {
+            // A velocity that cannot be reduced, because nothing gets through, goes on: the stop replaces it.
+            let stuck = self.gap_since.is_some() && mode == ControlMode::Velocity;
             let drawn = mode.is_position() && self.draw(dt);
-            if drawn || !self.settled(dt) {
+            if drawn || !(stuck || self.settled(dt)) {
                 return self.hold(mode, dt);
             }
             self.command.mode = None;

@@ -43,9 +43,6 @@ pub enum AdapterError {
     /// The device has no such feature.
     #[error("not supported by this arm")]
     Unsupported,
-    /// Not written, and no error: two set points are on their way already.
-    #[error("two set points are on their way")]
-    Busy,
     /// Called before `connect` or after the connection was lost.
     #[error("not connected")]
     NotConnected,
@@ -132,12 +129,6 @@ pub trait ManipulatorAdapter: Send {
     /// Ends commanded motion gracefully, before `disconnect`. Motor power stays as it is.
     fn deactivate(&mut self) -> AdapterResult<()> {
         self.write_stop().map(|_| ())
-    }
-
-    /// Discards commands that have not left this computer: called when states have gone stale, before anything new is
-    /// sent.
-    fn discard_pending(&mut self) {
-        self.disconnect();
     }
 
     // --- What it is ---

@@ -60,6 +60,10 @@ pub struct SimArm {
     pub state: ArmState,
     pub stops: u32,
     pub gripper: f64,
+    /// The last set points that reached it, and the tick's time of them.
+    pub written: Option<Vec<f64>>,
+    pub written_at: Mono,
+    pub written_start: u32,
     switching: u32,
     last: ArmCommand,
 }
@@ -88,6 +92,9 @@ impl SimArm {
             state: ArmState::default(),
             stops: 0,
             gripper: 0.0,
+            written: None,
+            written_at: Mono::ZERO,
+            written_start: 0,
             switching: 0,
             last: ArmCommand::default(),
         }
@@ -135,6 +142,8 @@ impl SimArm {
             }
             if mode == self.mode {
                 self.state.written = command.seq;
+                self.written = Some(command.values[..self.dof].to_vec());
+                (self.written_at, self.written_start) = (command.at, command.start_seq);
                 self.setpoint = Some(command.values[..self.dof].to_vec());
             }
         }
@@ -415,7 +424,11 @@ impl Rig {
             let at = |what: &str| format!("tick {}: arm {i}: {what}: {command:?} after {was:?}", self.ticks);
             assert!(command.values.iter().all(|v| v.is_finite()) && command.gripper.is_finite(), "{}", at("F07"));
             let values = command.values[..arm.dof].to_vec();
-            let resting = wire.velocity.iter().all(|v| v.abs() < 1e-9);
+            // Nothing was written for more than two periods: the command is what was written last, from rest.
+            let starts = command.start_seq != arm.written_start;
+            let unwritten = self.now.since(arm.written_at) > 2 * self.config.period();
+            let gap = unwritten && !starts;
+            let resting = unwritten || wire.velocity.iter().all(|v| v.abs() < 1e-9);
             let Some(mode) = command.mode else {
                 let reachable = arm.link == Link::Up && arm.enabled;
                 assert!(wire.mode.is_none() || resting || !reachable, "{}", at("let go while it moves"));
@@ -425,7 +438,7 @@ impl Rig {
             };
             let may_move = matches!(sample.phase, Phase::Activating | Phase::Ready | Phase::Held | Phase::Standby);
             assert!(may_move && arm.enabled, "{}", at("commanded without power"));
-            let switched = wire.mode != Some(mode);
+            let switched = wire.mode != Some(mode) || starts;
             if switched {
                 let still = arm.state.velocity[..arm.dof].iter().all(|v| v.abs() <= 0.05);
                 assert!(resting, "{}", at("F11: mode switched while commands move"));
@@ -437,6 +450,9 @@ impl Rig {
                 }
             }
             for j in 0..arm.dof {
+                // A held joint that does not follow has its set point drawn to it.
+                let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
+                let drawn = sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
                 let velocity = match (mode == ControlMode::Velocity, switched) {
                     (true, _) => values[j],
                     (false, false) => (values[j] - wire.values[j]) / dt,
@@ -450,6 +466,14 @@ impl Rig {
                 let change = velocity - wire.velocity[j];
                 assert!(velocity.abs() <= limits.velocity_max[j] * (1.0 + 1e-9) + 1e-12, "{}", at("F08 velocity"));
                 let most = limits.acceleration_max[j] * dt * (1.0 + 1e-6) + 1e-8;
+                if (drawn || gap) && mode != ControlMode::Velocity {
+                    wire.velocity[j] = if drawn { 0.0 } else { velocity };
+                    if gap {
+                        assert_eq!(Some(to), arm.written.as_ref().map(|w| w[j]), "{}", at("in a gap"));
+                        wire.velocity[j] = 0.0;
+                    }
+                    continue;
+                }
                 assert!(change.abs() <= most, "{} joint {j} by {}", at("F08 acceleration"), change / dt);
                 wire.velocity[j] = velocity;
                 if mode != ControlMode::Velocity {

@@ -9,6 +9,7 @@ use std::time::Duration;
 use super::address::Address;
 use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
+use super::measured::measured;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
 use super::session::Session;
@@ -250,7 +251,7 @@ impl ManipulatorAdapter for XArmAdapter {
             position: self.only(&motion.position),
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
-            valid: None,
+            valid: measured(motion, self.model, session.condition().tool),
         };
         Ok(())
     }

@@ -27,6 +27,8 @@ pub struct Condition {
     pub warning: u8,
     /// Motors that are on, one bit per joint.
     pub enabled: u8,
+    /// Where the tool is from the flange: x, y, z [mm].
+    pub tool: [f64; 3],
     /// Error codes of the joints' servos.
     servos: [u8; 7],
     /// Something has changed; register 15 must say what.
@@ -57,7 +59,7 @@ impl Condition {
 
     /// Looks at a report.
     pub fn report(&mut self, health: Health) {
-        self.enabled = health.enabled;
+        (self.enabled, self.tool) = (health.enabled, health.tool);
         self.changed |= health.error != self.error || health.warning != self.warning;
     }
 

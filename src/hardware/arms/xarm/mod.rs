@@ -18,6 +18,7 @@ mod foreign;
 #[cfg(test)]
 mod golden;
 mod gripper;
+mod measured;
 mod mode;
 pub mod model;
 mod orders;

@@ -42,6 +42,8 @@ pub enum Next {
     Wait,
     /// The arm is ready in its mode.
     Done,
+    /// Another client brings the arm into a mode.
+    TakenOver,
     /// The arm does not get there; what it did not do.
     GiveUp(&'static str),
 }
@@ -74,7 +76,7 @@ impl ModeChange {
         let there = motion.mode == self.target;
         // The way leads from the mode it was in to the target, or silently to 0. Any other is not ours to undo.
         if !there && motion.mode != 0 && motion.mode != *self.from.get_or_insert(motion.mode) {
-            return Next::GiveUp("another client changed the mode");
+            return Next::TakenOver;
         }
         match self.step {
             Step::Begin if there && is_ready(motion.state) => return Next::Done,
@@ -136,7 +138,7 @@ mod tests {
         let now = Mono(1);
         let mut change = ModeChange::new(4, true, now);
         assert_eq!(change.advance(&reported(2, 1), now), Next::Send(Command::SetState(STOP)));
-        assert_eq!(change.advance(&reported(2, 2), now), Next::GiveUp("another client changed the mode"));
+        assert_eq!(change.advance(&reported(2, 2), now), Next::TakenOver);
     }
 
     #[test]

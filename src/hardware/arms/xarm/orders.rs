@@ -143,6 +143,11 @@ impl Session {
             }
             Next::Wait => self.change = Some(change),
             Next::Done => self.ready = Some(Ready { mode: change.target, since: now }),
+            Next::TakenOver => {
+                self.failed = Some((change.target, "another client changed it"));
+                self.ready = Some(Ready { mode: change.target, since: now });
+                self.changed_by_another_client();
+            }
             Next::GiveUp(why) => self.failed = Some((change.target, why)),
         }
         Ok(())

@@ -285,7 +285,7 @@ impl Session {
 
     /// The arm is not as this run ordered: nothing is commanded any more, and nothing is undone. Register 15 tells
     /// whether the device itself is the cause.
-    fn changed_by_another_client(&mut self) {
+    pub(super) fn changed_by_another_client(&mut self) {
         self.foreign = self.ready.take().map(|ready| ready.mode);
         self.known.condition.doubt(MonotonicClock.now());
     }

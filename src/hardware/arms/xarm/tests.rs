@@ -348,6 +348,27 @@ fn without_port_30000_the_reports_of_30003_are_used() {
 }
 
 #[test]
+fn an_arm_at_zero_is_told_from_one_that_has_not_measured() {
+    for (dof, options) in [(5, json!({})), (6, json!({})), (6, json!({"model": "lite6"})), (7, json!({}))] {
+        let mut options = options;
+        options["sim"] = json!({"initial_positions": vec![0.0; dof]});
+        let (emulator, mut arm) = pair(dof, options);
+        arm.connect().unwrap();
+        let reading = read(&mut arm).unwrap();
+        assert_eq!((reading.valid, reading.position), (Some(true), [0.0; 16]));
+        emulator.inject(Fault::new(FaultKind::ZeroState).lasting(60.0)).unwrap();
+        until("the sign", || read(&mut arm).unwrap().valid == Some(false));
+    }
+    let (_emulator, mut arm) = pair(6, json!({"sim": {"faults": [{"kind": "zero_state", "duration": 60}]}}));
+    arm.connect().unwrap();
+    let reading = read(&mut arm).unwrap();
+    assert_eq!((reading.valid, reading.position), (Some(false), [0.0; 16]));
+    let (_emulator, mut arm) = pair(6, json!({}));
+    arm.connect().unwrap();
+    assert_eq!(read(&mut arm).unwrap().valid, Some(true));
+}
+
+#[test]
 fn motors_that_are_switched_on_make_the_arm_ready() {
     let (_emulator, mut arm) = pair(6, json!({}));
     arm.connect().unwrap();

@@ -72,7 +72,7 @@ pub fn done(id: u64, mut content: Map<String, Value>) -> Vec<u8> {
 pub fn refused(id: u64, error: &AdapterError) -> Vec<u8> {
     let (name, code) = match error {
         AdapterError::Io(_) => ("io", 0),
-        AdapterError::Timeout(_) | AdapterError::Busy => ("timeout", 0),
+        AdapterError::Timeout(_) => ("timeout", 0),
         AdapterError::Protocol(_) => ("protocol", 0),
         AdapterError::Fault { code, .. } => ("fault", *code),
         AdapterError::Busy | AdapterError::Rejected(_) => ("rejected", 0),

