@@ -28,6 +28,8 @@ const VERSION: Duration = Duration::from_millis(1000);
 const FIRST_REPORT: Duration = Duration::from_millis(1000);
 /// Longest wait for the second control port, which older boxes refuse.
 const SECOND: Duration = Duration::from_millis(300);
+/// Longest wait for the gripper's first answer over it.
+const FIRST_TELEGRAM: Duration = Duration::from_millis(1200);
 
 /// What is left of a time limit, at most `most`.
 fn left(until: Mono, most: Duration) -> Duration {
@@ -156,8 +158,16 @@ fn find_gripper(
         }
     }
     let telegram = Rtu::read_position();
-    let mut bus = TcpLink::connect("xarm", &address.second(), left(until, SECOND)).ok().map(Control::new);
-    let answer = ask(bus.as_mut().unwrap_or(control), &Command::Tool(telegram), left(until, SLOW))?;
+    // What listens there may be something else altogether.
+    let second = || {
+        let mut bus = Control::new(TcpLink::connect("xarm", &address.second(), left(until, SECOND))?);
+        let answer = ask(&mut bus, &Command::Tool(telegram), left(until, FIRST_TELEGRAM))?;
+        AdapterResult::Ok((Some(bus), answer))
+    };
+    let (bus, answer) = match second() {
+        Ok(found) => found,
+        Err(_) => (None, ask(control, &Command::Tool(telegram), left(until, SLOW))?),
+    };
     match telegram.answered(answer.data()).and_then(decode_position) {
         Some(pulses) => Ok((bus, Some(pulses))),
         None => rejected(
