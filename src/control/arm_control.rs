@@ -358,7 +358,7 @@ impl ArmControl {
         let phase = self.failsafe.phase();
         let held = phase == Phase::Held;
         // What somebody else does with the arm is theirs to end: it gets no set point and no stop.
-        let foreign = held && matches!(self.failsafe.cause(), Cause::ModeChanged | Cause::PowerChanged);
+        let foreign = held && self.failsafe.cause().is_foreign();
         self.stop_owed |= held && !self.was_held && !foreign;
         self.was_held = held;
         self.note_gap(now);
