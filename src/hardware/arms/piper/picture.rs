@@ -5,6 +5,7 @@
 
 use std::time::Duration;
 
+use super::belief::Belief;
 use super::protocol::{
     DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
 };
@@ -16,6 +17,8 @@ const BURST: Duration = Duration::from_millis(4);
 const FAR: u32 = 360_000;
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
+/// A motor that says no more than this stands [0.001 rad/s].
+pub const STANDSTILL: i32 = 20;
 /// Room for the text of the firmware.
 const TEXT: usize = 128;
 
@@ -50,7 +53,7 @@ pub struct Counts {
     pub decoded: u64,
     /// Complete sets of joint positions.
     pub sets: u64,
-    /// Frames too short, and sets that no arm can mean.
+    /// Frames too short, and sets of positions that are not believed.
     pub damaged: u64,
     /// Frames of no interest.
     pub other: u64,
@@ -61,7 +64,7 @@ pub struct Counts {
 /// The arm's newest feedback. `Mono::ZERO` stands for never.
 #[derive(Debug, Clone)]
 pub struct Picture {
-    /// Joint positions [0.001°] and when their last frame arrived.
+    /// The newest believed joint positions [0.001°].
     pub joints: WireJoints,
     /// When `joints` was completed.
     pub joints_at: Mono,
@@ -89,6 +92,7 @@ pub struct Picture {
     pub commanded_at: Mono,
     /// What was counted.
     pub counts: Counts,
+    belief: Belief,
     joint_parts: Triple,
     pose_parts: Triple,
     text: [u8; TEXT],
@@ -112,6 +116,7 @@ impl Default for Picture {
             limits: [None; DOF],
             commanded_at: Mono::ZERO,
             counts: Counts::default(),
+            belief: Belief::default(),
             joint_parts: Triple::default(),
             pose_parts: Triple::default(),
             text: [0; TEXT],
@@ -173,11 +178,21 @@ impl Picture {
         let far = joints.iter().any(|value| value.unsigned_abs() > FAR);
         // A controller that has just started says zero before it has asked its joints.
         let elsewhere = self.joints_at != Mono::ZERO && self.joints.iter().any(|value| value.unsigned_abs() > NOT_ZERO);
-        if far || (elsewhere && joints == [0; DOF]) {
+        if far || (elsewhere && joints == [0; DOF]) || !self.belief.take(joints, now) {
             return self.counts.damaged += 1;
         }
         (self.joints, self.joints_at) = (joints, now);
         self.counts.sets += 1;
+    }
+
+    /// Whether joint positions were refused lately, so that the believed ones may be the wrong ones.
+    pub fn disputed(&self, now: Mono) -> bool {
+        self.belief.disputed(now)
+    }
+
+    /// Whether all motors say that they stand.
+    pub fn stands(&self) -> bool {
+        self.motors.iter().all(|motor| i32::from(motor.speed).abs() <= STANDSTILL)
     }
 
     /// Whether everything was heard of that the reads need.
@@ -316,13 +331,19 @@ mod tests {
         assert_eq!((picture.joints, picture.counts.sets), ([1; 6], 1));
         (0..3).for_each(|part| joints(&mut picture, part, -5, ms(30)));
         assert_eq!((picture.joints, picture.joints_at), ([-5; 6], ms(30)));
+        // What no arm can have reached in that time.
+        (0..3).for_each(|part| joints(&mut picture, part, 60_000, ms(35)));
+        assert_eq!((picture.joints, picture.counts.damaged), ([-5; 6], 1));
+        assert!(picture.disputed(ms(35)));
     }
 
     #[test]
     fn sudden_zeros_and_impossible_angles_are_not_believed() {
         let mut picture = Picture::default();
+        let mut at = 1;
         let mut set = |value: i32| {
-            (0..3).for_each(|part| joints(&mut picture, part, value, ms(1)));
+            at += 200;
+            (0..3).for_each(|part| joints(&mut picture, part, value, ms(at)));
             picture.joints[0]
         };
         assert_eq!(set(0), 0, "the first may be zero: activation looks again");

@@ -25,8 +25,6 @@ const FILTERS: &[CanFilter] = &[
 /// Frames that may wait for the bus: the next command is not sent behind them. A healthy bus takes a burst in 1 ms, and
 /// what waits when the arm loses its power reaches it when the power returns.
 const MAY_WAIT: usize = 8;
-/// So many set points in a row that the bus does not take are more than a hiccup.
-const TOO_MANY: u32 = 3;
 /// Most events fetched in one go: a second's.
 const BATCH: usize = 4096;
 
@@ -35,8 +33,6 @@ pub struct Wire {
     port: Box<dyn CanPort>,
     /// The arm and its bus, for messages.
     peer: String,
-    /// Commands in a row that were not taken whole.
-    refused: u32,
     /// What was counted.
     pub counts: WireCounts,
 }
@@ -56,27 +52,14 @@ impl Wire {
     /// Opens a port at `address`.
     pub fn open(address: &CanAddress) -> AdapterResult<Self> {
         let port = can::open("piper", address, FILTERS)?;
-        Ok(Self { port, peer: format!("piper at {address}"), refused: 0, counts: WireCounts::default() })
+        Ok(Self { port, peer: format!("piper at {address}"), counts: WireCounts::default() })
     }
 
     /// Sends a command: an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
-        if self.offer(frames)? { Ok(()) } else { Err(self.no_room()) }
-    }
-
-    /// Sends a set point of a stream. One that the bus has no room for is dropped and counted: the next one replaces it.
-    /// Three in a row are an error.
-    pub fn stream(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
-        if self.offer(frames)? || self.refused < TOO_MANY { Ok(()) } else { Err(self.no_room()) }
-    }
-
-    /// Whether the bus has taken all of a command.
-    fn offer(&mut self, frames: &[CanFrame]) -> AdapterResult<bool> {
         let taken = if self.port.waiting() > MAY_WAIT { 0 } else { self.port.send(frames)? };
-        let whole = taken == frames.len();
-        self.refused = if whole { 0 } else { self.refused.saturating_add(1) };
         self.counts.not_taken += (frames.len() - taken) as u64;
-        Ok(whole)
+        if taken == frames.len() { Ok(()) } else { Err(self.no_room()) }
     }
 
     fn no_room(&self) -> AdapterError {
