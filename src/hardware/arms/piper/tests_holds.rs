@@ -4,9 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
+use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::protocol::DOF;
-use super::tests::{START, activate, connected, farthest, two, until};
+use super::tests::{START, activate, connected, farthest, pair, two, until};
 use crate::hardware::registry::Emulator;
 use crate::hardware::spec::ManipulatorAdapter;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
@@ -125,4 +126,73 @@ fn a_stop_keeps_what_was_written_where_the_arm_sags() {
         let held = targets(&emulator)[0];
         assert!((held[1] - START[1] - expected).abs() < 1e-4, "{above}: {} rad", held[1] - START[1]);
     }
+}
+
+/// Joints 2 and 3 rest 0.6° and 0.7° outside their limits.
+const OUTSIDE: [f64; DOF] = [0.1, -0.010_472, 0.012_217, 0.05, 0.4, -0.1];
+
+fn outside() -> (PiperEmulator, PiperAdapter) {
+    let (emulator, mut arm) = pair(serde_json::json!({ "sim": { "initial_positions": OUTSIDE } }));
+    arm.connect().unwrap();
+    emulator.record();
+    (emulator, arm)
+}
+
+/// No target is farther outside than the arm was measured, within the wire's resolution.
+fn never_farther_out(emulator: &PiperEmulator) {
+    let targets = targets(emulator);
+    assert!(!targets.is_empty());
+    for target in targets {
+        assert!(target[1] >= OUTSIDE[1] - 1e-5 && target[2] <= OUTSIDE[2] + 1e-5, "{target:?}");
+    }
+}
+
+#[test]
+fn an_arm_that_rests_just_outside_its_limits_holds_there_where_its_controller_takes_that() {
+    let (emulator, mut arm) = outside();
+    emulator.refuse_outside(false);
+    arm.activate().unwrap();
+    until("the hold", || targets(&emulator).len() == 2);
+    assert_eq!(arm.read_error(), Ok((0, String::new())));
+    assert!(farthest(&emulator.joints().0, &OUTSIDE) < 1e-3, "it did not move");
+    // Commands back are taken, and those farther out are not.
+    let mut wanted = OUTSIDE;
+    (wanted[1], wanted[2]) = (-0.05, 0.05);
+    arm.write_joint_positions(&wanted, 1.0).unwrap();
+    arm.write_stop().unwrap();
+    (wanted[1], wanted[2]) = (0.1, -0.1);
+    arm.write_joint_positions(&wanted, 1.0).unwrap();
+    until("the way back", || farthest(&emulator.joints().0, &wanted) < 1e-3);
+    (wanted[1], wanted[2]) = (-0.05, 0.05);
+    arm.write_joint_positions(&wanted, 1.0).unwrap();
+    until("the limits", || emulator.joints().0[1].abs() < 1e-4 && emulator.joints().0[2].abs() < 1e-4);
+    never_farther_out(&emulator);
+}
+
+#[test]
+fn an_arm_that_rests_just_outside_its_limits_holds_at_them_where_its_controller_refuses_more() {
+    let (emulator, mut arm) = outside();
+    arm.activate().unwrap();
+    assert_eq!((arm.read_enabled(), arm.read_error()), (Ok(true), Ok((0, String::new()))));
+    arm.set_control_mode(crate::joint::ControlMode::ServoPosition).unwrap();
+    arm.write_joint_positions(&OUTSIDE, 1.0).unwrap();
+    arm.write_stop().unwrap();
+    until("the limits", || emulator.joints().0[1].abs() < 1e-4 && emulator.joints().0[2].abs() < 1e-4);
+    assert_eq!(arm.read_error(), Ok((0, String::new())), "nothing was refused since");
+    never_farther_out(&emulator);
+    assert!(!emulator.trace().iter().any(|(_, frame)| frame.id == 0x150));
+}
+
+#[test]
+fn an_arm_that_rests_far_outside_is_not_drawn_back() {
+    let far = [0.1, -0.04, -0.7, 0.05, 0.4, -0.1];
+    let (emulator, mut arm) = pair(serde_json::json!({ "sim": { "initial_positions": far } }));
+    arm.connect().unwrap();
+    emulator.record();
+    let error = arm.activate().unwrap_err().to_string();
+    let expected =
+        "arm: joint 2 lies 0.040 rad outside its limits, and the controller takes no target there: not enabled";
+    assert!(error.starts_with(expected) && error.contains("\nhint: "), "{error}");
+    assert!(!emulator.enabled() && !emulator.trace().iter().any(|(_, frame)| frame.id == 0x471));
+    assert!(farthest(&emulator.joints().0, &far) < 1e-4);
 }
