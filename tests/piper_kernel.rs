@@ -14,6 +14,7 @@ use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
+use dimos::joint::ControlMode;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use uml::{Guest, in_guest, sh};
 
@@ -117,6 +118,35 @@ fn an_interface_may_go_down_and_come_back() {
         until("the end of the interface", || arm.read_joints(&mut reading).is_err() && !arm.is_connected());
         let error = arm.connect().unwrap_err();
         assert!(matches!(&error, AdapterError::Io(text) if text.contains("no such interface\nhint: ")), "{error}");
+    });
+}
+
+/// The interface sends nothing for a while: at most two set points wait, and after `discard_pending` nothing new goes out
+/// before they are transmitted.
+#[test]
+fn at_most_two_set_points_wait_in_the_kernel() {
+    in_guest("at_most_two_set_points_wait_in_the_kernel", &Guest::with(uml::VXCAN), || {
+        let emulator = emulator("sim0", &SimOptions::default());
+        let mut arm = adapter("can0");
+        arm.connect().unwrap();
+        arm.activate().unwrap();
+        arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+        sh("tc qdisc add dev can0 root plug limit 100000; tc qdisc change dev can0 root plug block");
+        emulator.record();
+        let mut target = [0.1, 0.6, -0.7, 0.05, 0.4, -0.1];
+        let taken = (0..20).filter(|_| {
+            target[0] += 0.002;
+            arm.write_joint_positions(&target, 1.0).is_ok()
+        });
+        let taken = taken.count();
+        assert!((1..=2).contains(&taken), "{taken} set points wait");
+        arm.discard_pending();
+        assert!(arm.write_stop().is_err() && arm.is_connected(), "they must be out first");
+        sh("tc qdisc change dev can0 root plug release_indefinite");
+        until("a stop", || arm.write_stop().is_ok());
+        until("the stop at the arm", || emulator.trace().iter().filter(|(_, f)| f.id == 0x157).count() == taken + 1);
+        let ids: Vec<u16> = emulator.trace().iter().map(|(_, frame)| frame.id).collect();
+        assert!(ids.len() <= 12, "{ids:x?}");
     });
 }
 

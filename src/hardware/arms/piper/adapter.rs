@@ -301,6 +301,12 @@ impl ManipulatorAdapter for PiperAdapter {
         Err(AdapterError::Fault { code, text })
     }
 
+    /// Set points that wait for the bus are taken back, where the bus lets them be; otherwise nothing new is sent before
+    /// they are out.
+    fn discard_pending(&mut self) {
+        self.arm.discard();
+    }
+
     // --- Optional parts ---
 
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {

@@ -96,6 +96,14 @@ impl Session {
         Ok(())
     }
 
+    /// Takes back what has not left this computer; see [`Wire::discard`]. Where that fails, the connection ends.
+    pub fn discard(&mut self) {
+        let discarded = self.wire.as_mut().map(Wire::discard);
+        if let Some(Err(_)) = discarded {
+            self.wire = None;
+        }
+    }
+
     /// Takes up feedback until `done` says so; `false` when the time is over.
     pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Picture) -> bool) -> AdapterResult<bool> {
         let end = MonotonicClock.now().after(timeout);
