@@ -199,10 +199,6 @@ pub trait ManipulatorAdapter: Send {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
     /// Clears the device's error state. Moves nothing, enables nothing.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
-    /// Discards set points that have not left this computer.
-    fn discard_pending(&mut self) {
-        self.disconnect();
-    }
 
     // --- Optional parts ---
 

@@ -21,7 +21,8 @@ const FILTERS: &[CanFilter] = &[
     CanFilter { id: 0x150, mask: 0x7F0 },
     CanFilter { id: 0x3A0, mask: 0x7F0 },
     // Commands for the motors: those of other programs, and this one's until they are transmitted.
-    CanFilter { id: 0x470, mask: 0x7F0 },
+    CanFilter { id: 0x470, mask: 0x7FC },
+    CanFilter { id: 0x474, mask: 0x7FE },
 ];
 /// Frames that may wait for the bus: two set points of four frames. A healthy bus takes one in 1 ms, and what waits when
 /// the arm loses its power reaches it when the power returns.
