@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
-use dimos::control::config::{
+use dimos::control::config::{CONTROL_VERSION, 
     ArmConfig, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
 };
 use dimos::control::request::{Envelope, Motion, Request};
@@ -56,7 +56,10 @@ impl Bed {
             limits: limits.clone(),
             modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
             gripper: true,
-            state_timeout: Duration::from_millis(30),
+            own_velocity: Vec::new(),
+        read_period: Duration::from_millis(10),
+        write_period: Duration::from_millis(10),
+        supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
         };
         let kinds = [
             TaskKind::Trajectory(TrajectoryParams::default()),
@@ -79,7 +82,7 @@ impl Bed {
             auto_start: false,
         };
         let config =
-            CoordinatorConfig { rate: 100.0, arms: (0..arms).map(arm).collect(), tasks: (0..arms).map(task).collect() };
+            CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: (0..arms).map(arm).collect(), tasks: (0..arms).map(task).collect() };
         Self { config, motion: motion(), holds: load == Load::Hold, sent: 0 }
     }
 

@@ -243,6 +243,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             position: from_wire(&state.positions),
             velocity: Some(from_wire(&state.velocities)),
             effort: Some(joints_of(&state.torques)),
+            valid: None,
         };
         Ok(())
     }

@@ -217,6 +217,7 @@ impl ManipulatorAdapter for RemoteAdapter {
             position: state.position.joints,
             velocity: state.velocity.map(|values| values.joints),
             effort: state.effort.map(|values| values.joints),
+            valid: None,
         };
         Ok(())
     }

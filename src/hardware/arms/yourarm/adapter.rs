@@ -257,6 +257,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             position: from_degrees(&self.state.positions),
             velocity: Some(from_degrees(&self.state.velocities)),
             effort: Some(joints_of(&self.state.torques)),
+            valid: None,
         };
         Ok(())
     }
