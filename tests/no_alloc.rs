@@ -173,7 +173,12 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
 fn the_tick_loop_takes_and_gives_back_no_memory() {
     const TICKS: u64 = 1_000;
     let tasks = vec![task("t", trajectory(), 0..6, 10), task("v", velocity(), 0..6, 20)];
-    let config = CoordinatorConfig { version: dimos::control::config::CONTROL_VERSION, rate: 1000.0, arms: vec![arm("arm", 6)], tasks };
+    let config = CoordinatorConfig {
+        version: dimos::control::config::CONTROL_VERSION,
+        rate: 1000.0,
+        arms: vec![arm("arm", 6)],
+        tasks,
+    };
     let (mut states, state_reader) = slot(ArmState::default());
     let (command_writer, mut commands) = slot(ArmCommand::default());
     let (mut requests, request_consumer) = rtrb::RingBuffer::new(256);

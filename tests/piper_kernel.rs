@@ -5,7 +5,9 @@
 #[path = "support/uml.rs"]
 mod uml;
 
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use dimos::hardware::arms::piper::GripperKind;
@@ -175,15 +177,86 @@ fn two_arms_on_two_interfaces_do_not_hear_each_other() {
     });
 }
 
+/// Streams the arm's pose as a device thread does, until the arm is not as ordered any more: the mode, or the motors.
+fn stream_until_changed(arm: &mut PiperAdapter, reading: &mut JointReading) {
+    let pose = reading.position;
+    until("a sign of the change", || {
+        let _ = arm.read_joints(reading);
+        if arm.get_control_mode() != ControlMode::ServoPosition || !arm.read_enabled().unwrap_or(true) {
+            return true;
+        }
+        let _ = arm.write_joint_positions(&pose[..6], 1.0);
+        std::thread::sleep(Duration::from_millis(5));
+        false
+    });
+}
+
+/// The vendor's SDK beside the adapter on one interface: the adapter does not hear it, and sees in the arm's feedback what
+/// its calls change. They are not undone.
+#[test]
+fn what_the_vendors_sdk_changes_is_seen_and_left_alone() {
+    if !has_sdk() {
+        return;
+    }
+    let name = "what_the_vendors_sdk_changes_is_seen_and_left_alone";
+    let guest = Guest { limit: Duration::from_secs(180), ..Guest::with(uml::VXCAN) };
+    in_guest(name, &guest, || {
+        // At the full rate the SDK's Python takes most of the guest's one processor.
+        let emulator = emulator("sim0", &SimOptions { feedback_hz: 20.0, ..SimOptions::default() });
+        let mut sdk = Command::new(".venv/bin/python")
+            .args(["tests/python/piper_sdk_interferes.py", "can0"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let (mut calls, mut answers) = (sdk.stdin.take().unwrap(), BufReader::new(sdk.stdout.take().unwrap()).lines());
+        let mut answered = |word: &str| assert_eq!(answers.next().unwrap().unwrap(), word);
+        answered("ready");
+        let mut arm = adapter("can0");
+        arm.connect().unwrap();
+        let mut reading = JointReading::default();
+        for (kind, pause) in ["pose", "guiding", "power"].iter().flat_map(|kind| [0, 5, 200].map(|pause| (kind, pause)))
+        {
+            until("the arm", || arm.write_clear_errors().is_ok() && arm.write_enable(true).is_ok());
+            arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+            arm.read_joints(&mut reading).unwrap();
+            arm.write_joint_positions(&reading.position[..6], 1.0).unwrap();
+            emulator.record();
+            writeln!(calls, "{kind} {pause}").unwrap();
+            stream_until_changed(&mut arm, &mut reading);
+            answered("done");
+            assert!(arm.write_joint_positions(&reading.position[..6], 1.0).is_err(), "{kind} {pause}");
+            let trace = emulator.trace();
+            // Of the frames that change a mode or switch motors, there are the SDK's only.
+            let orders = trace.iter().filter(|(_, f)| matches!(f.id, 0x150 | 0x151 | 0x471)).count();
+            assert_eq!(orders, if *kind == "pose" { 1 } else { 2 }, "{kind} {pause}: {trace:x?}");
+            println!("{kind}, {pause} ms apart: seen, left alone");
+            if *kind == "pose" {
+                let there = |joints: &[f64]| emulator.joints().1.iter().all(|v| v.abs() < 1e-3) && joints[1] > 0.0;
+                until("the SDK's pose", || there(&emulator.joints().0));
+            }
+        }
+        drop(calls);
+        sdk.wait().unwrap();
+    });
+}
+
+fn has_sdk() -> bool {
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
+    let mut import = Command::new(&python);
+    let has = import.args(["-c", "import piper_sdk"]).stderr(Stdio::null()).status().is_ok_and(|s| s.success());
+    if !has {
+        assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "piper_sdk is missing (make test-tools)");
+        println!("SKIPPED: piper_sdk in .venv (make test-tools)");
+    }
+    has
+}
+
 /// The vendor's SDK opens its sockets without local loopback: on one interface its commands would reach nobody here.
 #[test]
 fn the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces() {
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
-    let mut import = std::process::Command::new(&python);
-    if !import.args(["-c", "import piper_sdk"]).stderr(std::process::Stdio::null()).status().is_ok_and(|s| s.success())
-    {
-        assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "piper_sdk is missing (make test-tools)");
-        return println!("SKIPPED: piper_sdk in .venv (make test-tools)");
+    if !has_sdk() {
+        return;
     }
     let name = "the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces";
     let guest = Guest { limit: Duration::from_secs(180), ..Guest::with(uml::VXCAN) };

@@ -5,8 +5,9 @@ use std::time::Duration;
 
 use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
-use dimos::control::config::{CONTROL_VERSION, 
-    ArmConfig, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
+use dimos::control::config::{
+    ArmConfig, CONTROL_VERSION, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind,
+    TrajectoryParams, VelocityParams,
 };
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::tasks::cartesian::Goal;
@@ -57,9 +58,9 @@ impl Bed {
             modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
             gripper: true,
             own_velocity: Vec::new(),
-        read_period: Duration::from_millis(10),
-        write_period: Duration::from_millis(10),
-        supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
+            read_period: Duration::from_millis(10),
+            write_period: Duration::from_millis(10),
+            supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
         };
         let kinds = [
             TaskKind::Trajectory(TrajectoryParams::default()),
@@ -81,8 +82,12 @@ impl Bed {
             priority: 10,
             auto_start: false,
         };
-        let config =
-            CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: (0..arms).map(arm).collect(), tasks: (0..arms).map(task).collect() };
+        let config = CoordinatorConfig {
+            version: CONTROL_VERSION,
+            rate: 100.0,
+            arms: (0..arms).map(arm).collect(),
+            tasks: (0..arms).map(task).collect(),
+        };
         Self { config, motion: motion(), holds: load == Load::Hold, sent: 0 }
     }
 

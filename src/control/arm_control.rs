@@ -451,7 +451,9 @@ impl ArmControl {
         for j in 0..self.config.dof {
             let off = self.tracking_error(j).abs() > tolerance;
             let q = self.state.position.get(j).copied().unwrap_or_default();
-            if let Some(limiter) = self.limiters.get_mut(j).filter(|_| off && self.freshness.fresh && self.gap_since.is_none()) {
+            if let Some(limiter) =
+                self.limiters.get_mut(j).filter(|_| off && self.freshness.fresh && self.gap_since.is_none())
+            {
                 let step = (q - limiter.position()).abs() * dt / self.drawing;
                 limiter.draw(q, step.min(limiter.bounds().velocity * dt));
                 drawn = true;

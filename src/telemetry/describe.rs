@@ -295,7 +295,11 @@ pub fn cause_text(cause: Cause) -> String {
 /// Figures of a stale state in words.
 fn stale_text(age: Age) -> String {
     let ms = |us: u32| (us + 500) / 1000;
-    let own = if age.own_us >= 500 { format!("; this computer stood still for {} ms", ms(age.own_us)) } else { String::new() };
+    let own = if age.own_us >= 500 {
+        format!("; this computer stood still for {} ms", ms(age.own_us))
+    } else {
+        String::new()
+    };
     // The other reasons for a stale state: reads fail, or what is read is not plausible.
     if age.age_us <= age.limit_us {
         return "its states cannot be read".into();

@@ -363,7 +363,13 @@ impl Rig {
     /// A tick that reads these states; no arm obeys its commands.
     pub fn tick_with(&mut self, states: &[ArmState], skipped: u32) {
         let late_ns = skipped as u64 * self.config.period().as_nanos() as u64;
-        let time = TickTime { now: self.now, next: self.now.after(self.config.period()), skipped, late_ns, woke_late_ns: late_ns };
+        let time = TickTime {
+            now: self.now,
+            next: self.now.after(self.config.period()),
+            skipped,
+            late_ns,
+            woke_late_ns: late_ns,
+        };
         let inbox = &mut self.inbox;
         (self.around)(true);
         let output = self.coordinator.tick(time, states, || inbox.pop_front());
@@ -452,7 +458,8 @@ impl Rig {
             for j in 0..arm.dof {
                 // A held joint that does not follow has its set point drawn to it.
                 let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
-                let drawn = sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
+                let drawn =
+                    sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
                 let velocity = match (mode == ControlMode::Velocity, switched) {
                     (true, _) => values[j],
                     (false, false) => (values[j] - wire.values[j]) / dt,

@@ -69,7 +69,9 @@ impl Plausible {
     /// Why an arm was not enabled, with what to do.
     pub fn objection(&self, hardware_id: &str) -> String {
         match self.doubt {
-            Doubt::Unstable => "joint positions are missing or inconsistent: not enabled without a plausible pose".to_owned(),
+            Doubt::Unstable => {
+                "joint positions are missing or inconsistent: not enabled without a plausible pose".to_owned()
+            }
             Doubt::NotMeasured => "the arm reports that its joint positions are not measured yet".to_owned(),
             Doubt::Zero => format!(
                 "every joint reads exactly 0: most controllers report that before they have measured\nhint: if the arm truly \

@@ -36,7 +36,14 @@ pub struct WireGuard {
 impl WireGuard {
     /// For an arm of `dof` joints; `period` is the longer of the tick's and the arm's own for set points.
     pub fn new(dof: usize, period: Duration, supervision: Supervision) -> Self {
-        Self { last: None, velocity: [0.0; crate::joint::MAX_DOF], acceleration: [0.0; crate::joint::MAX_DOF], dof, period, supervision }
+        Self {
+            last: None,
+            velocity: [0.0; crate::joint::MAX_DOF],
+            acceleration: [0.0; crate::joint::MAX_DOF],
+            dof,
+            period,
+            supervision,
+        }
     }
 
     /// The limits that commands keep.
@@ -58,7 +65,14 @@ impl WireGuard {
 
     /// Whether a command may be written, with the arm measured at `state`, a reading of the age `age`, taken once in
     /// `read_period`.
-    pub fn admits(&self, command: &ArmCommand, mode: ControlMode, state: &ArmState, age: Duration, read_period: Duration) -> bool {
+    pub fn admits(
+        &self,
+        command: &ArmCommand,
+        mode: ControlMode,
+        state: &ArmState,
+        age: Duration,
+        read_period: Duration,
+    ) -> bool {
         match self.last.filter(|last| last.start_seq == command.start_seq && last.mode == mode) {
             Some(last) => {
                 let time = command.at.since(last.at).clamp(Duration::ZERO, PERIODS * self.period).as_secs_f64();

@@ -160,12 +160,14 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(AdapterError::Unsupported);
         }
         self.arm.known()?;
+        self.arm.ours()?;
         self.mode = mode;
         Ok(())
     }
 
+    /// The ordered mode, or another one when somebody else has changed it.
     fn get_control_mode(&self) -> ControlMode {
-        self.mode
+        self.arm.picture.guard.change.map_or(self.mode, |change| change.mode(self.mode))
     }
 
     // --- State ---
@@ -218,7 +220,8 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
-        Ok(self.arm.known()?.enabled())
+        let picture = self.arm.known()?;
+        Ok(picture.enabled() && !picture.guard.just_off(MonotonicClock.now()))
     }
 
     // --- Motion ---
@@ -240,8 +243,10 @@ impl ManipulatorAdapter for PiperAdapter {
         for (target, (here, range)) in joints.iter_mut().zip(here) {
             *target = hold::within(*target, *here, *range, self.arm.strict);
         }
-        let speed = if self.mode == ControlMode::ServoPosition { 100 } else { self.percent(velocity) };
-        self.arm.write(&protocol::joint_targets(speed, self.follow(), joints), joints)
+        match self.mode {
+            ControlMode::ServoPosition => self.arm.stream(self.follow(), joints),
+            _ => self.arm.write(self.percent(velocity), self.follow(), joints),
+        }
     }
 
     /// Holds the arm: at what was last written, 0.02 rad from where it is at most. Confirmed when its feedback shows that
@@ -268,18 +273,21 @@ impl ManipulatorAdapter for PiperAdapter {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         if !enable {
             self.arm.drain()?;
+            self.arm.release();
             return self.arm.switch_motors(false);
         }
         self.arm.refresh()?;
         self.arm.in_order()?;
         self.arm.plausible()?;
         let were_on = self.arm.picture.enabled();
+        self.arm.release();
         self.arm.written = self.arm.written.filter(|_| were_on);
         self.arm.take_up_hold(self.follow())?;
         self.arm.switch_motors(true)?;
         self.arm.refresh()?;
         self.arm.written = self.arm.written.filter(|_| were_on);
-        self.arm.hold(self.follow())
+        self.arm.hold(self.follow())?;
+        self.arm.take_control()
     }
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
@@ -296,6 +304,9 @@ impl ManipulatorAdapter for PiperAdapter {
         let asked = MonotonicClock.now();
         let cleared = |p: &Picture| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
         if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
+            if matches!(self.arm.picture.status.control, 0 | 1) {
+                self.arm.release();
+            }
             return Ok(());
         }
         let (code, text) = (self.arm.picture.error_code(), self.arm.picture.error_text());
@@ -326,7 +337,8 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.may_move()?;
         let ([x, y, z], [roll, pitch, yaw]) =
             (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
-        self.arm.written = None;
+        (self.arm.written, self.arm.control) = (None, None);
+        self.arm.picture.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
         self.arm.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
     }
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::protocol::{self, DOF, Follow, WireJoints, millidegrees};
+use super::protocol::{self, DOF, Follow, MoveMode, Status, WireJoints, millidegrees};
 use super::session::Session;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::spec::AdapterResult;
@@ -14,6 +14,8 @@ const SETTLE_TIMEOUT: Duration = Duration::from_millis(300);
 /// How long the controller gets to refuse a target outside the limits, and to clear that error.
 const REFUSAL_TIMEOUT: Duration = Duration::from_millis(100);
 const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
+/// How long the arm gets to report the mode that was ordered.
+const CONTROL_TIMEOUT: Duration = Duration::from_millis(300);
 /// A target beyond the limits, among the arm's states.
 pub const BEYOND: u8 = 4;
 
@@ -72,16 +74,16 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 impl Session {
     /// Commands the arm to stay where it is.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
-        let target = target(&self.picture.joints, self.written.as_ref(), &self.ranges, self.strict);
-        self.write(&protocol::joint_targets(100, follow, target), target)
+        let target = target(&self.picture.joints, self.written().as_ref(), &self.ranges, self.strict);
+        self.write(100, follow, target)
     }
 
     /// Waits until no measured positions contradict the believed ones, where that decides what is held: not where the
     /// arm is close to what was written. `false`: they do not agree.
     pub fn settle(&mut self) -> AdapterResult<bool> {
-        let (believed, written) = (&self.picture.joints, self.written.as_ref());
+        let (believed, written) = (&self.picture.joints, self.written());
         let near = |(here, written): (&i32, &i32)| (written - here).abs() <= millidegrees(WINDOW);
-        if written.is_some_and(|written| believed.iter().zip(written).all(near)) {
+        if written.is_some_and(|written| believed.iter().zip(&written).all(near)) {
             return Ok(true);
         }
         self.watch(SETTLE_TIMEOUT, |picture| !picture.disputed(MonotonicClock.now()))
@@ -111,6 +113,17 @@ impl Session {
             self.watch(CLEAR_TIMEOUT, |picture| picture.status_at > asked && picture.status.arm == 0)?;
             self.in_order()?;
         }
+    }
+
+    /// Waits until the arm reports the mode that the hold has ordered: changes after that are not this run's.
+    pub fn take_control(&mut self) -> AdapterResult<()> {
+        let sent = MonotonicClock.now();
+        let ours = |status: &Status| (status.control, status.mode, status.teaching) == (1, MoveMode::Joint as u8, 0);
+        self.watch(CONTROL_TIMEOUT, |picture| picture.status_at > sent && ours(&picture.status))?;
+        self.in_order()?;
+        let status = self.picture.status;
+        self.picture.guard.begin(&status, MonotonicClock.now());
+        Ok(())
     }
 
     /// Remembers what an error before its clearing says of the controller.

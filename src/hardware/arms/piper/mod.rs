@@ -5,6 +5,7 @@ mod belief;
 pub mod emulator;
 #[cfg(test)]
 mod golden;
+mod guard;
 mod hold;
 pub mod picture;
 pub mod protocol;
@@ -15,6 +16,8 @@ mod tests;
 mod tests_faults;
 #[cfg(test)]
 mod tests_holds;
+#[cfg(test)]
+mod tests_others;
 mod wire;
 
 use std::time::Duration;

@@ -6,6 +6,7 @@
 use std::time::Duration;
 
 use super::belief::Belief;
+use super::guard::Guard;
 use super::protocol::{
     DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
 };
@@ -90,6 +91,8 @@ pub struct Picture {
     pub limits: [Option<MotorLimits>; DOF],
     /// When somebody else last sent a command to an arm on this bus.
     pub commanded_at: Mono,
+    /// Changes that this run did not order.
+    pub guard: Guard,
     /// What was counted.
     pub counts: Counts,
     belief: Belief,
@@ -115,6 +118,7 @@ impl Default for Picture {
             gripper_used: false,
             limits: [None; DOF],
             commanded_at: Mono::ZERO,
+            guard: Guard::default(),
             counts: Counts::default(),
             belief: Belief::default(),
             joint_parts: Triple::default(),
@@ -136,9 +140,10 @@ impl Picture {
         match feedback {
             Feedback::Other => return self.counts.other += 1,
             Feedback::Damaged => return self.counts.damaged += 1,
-            Feedback::Leader => {
+            Feedback::Leader | Feedback::Command => {
                 self.commanded_at = now;
-                return self.counts.leader += 1;
+                self.guard.commanded();
+                return self.counts.leader += u64::from(feedback == Feedback::Leader);
             }
             _ => self.counts.decoded += 1,
         }
@@ -149,7 +154,10 @@ impl Picture {
                 }
             }
             Feedback::Pose(part, pair) => self.pose = self.pose_parts.take(part, pair, now).or(self.pose),
-            Feedback::Status(status) => (self.status, self.status_at) = (status, now),
+            Feedback::Status(status) => {
+                (self.status, self.status_at) = (status, now);
+                self.guard.status(&status, now);
+            }
             Feedback::Gripper(gripper) => self.gripper = Some(gripper),
             Feedback::Motor(joint, motor) => {
                 if let (Some(to), Some(at)) = (self.motors.get_mut(joint), self.motors_at.get_mut(joint)) {
@@ -159,6 +167,9 @@ impl Picture {
             Feedback::Driver(joint, driver) => {
                 if let (Some(to), Some(at)) = (self.drivers.get_mut(joint), self.drivers_at.get_mut(joint)) {
                     (*to, *at) = (driver, now);
+                    if !driver.enabled() {
+                        self.guard.motor_off(now);
+                    }
                 }
             }
             Feedback::Limits(joint, limits) => {
@@ -170,7 +181,7 @@ impl Picture {
                 room.iter_mut().zip(piece.iter().take(count)).for_each(|(to, from)| *to = *from);
                 self.text_length += count;
             }
-            Feedback::Other | Feedback::Damaged | Feedback::Leader => {}
+            Feedback::Other | Feedback::Damaged | Feedback::Leader | Feedback::Command => {}
         }
     }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::hold::{self, WireRanges};
 use super::limits;
 use super::picture::Picture;
-use super::protocol::{self, DOF, WireJoints, radians};
+use super::protocol::{self, DOF, Follow, MoveMode, Status, WireJoints, radians};
 use super::wire::Wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, AdapterResult};
@@ -43,6 +43,8 @@ pub struct Session {
     pub picture: Picture,
     /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
     pub written: Option<WireJoints>,
+    /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
+    pub control: Option<(u8, Follow)>,
     /// Its joint limits [0.001°].
     pub ranges: WireRanges,
     /// The controller refuses targets outside its limits.
@@ -56,13 +58,23 @@ impl Session {
     pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
         let picture = Picture::of_arm(gripper_used);
         let ranges = [(0, 0); DOF];
-        Self { hardware_id, address, wire: None, picture, written: None, ranges, strict: false, drained_at: Mono::ZERO }
+        Self {
+            hardware_id,
+            address,
+            wire: None,
+            picture,
+            written: None,
+            control: None,
+            ranges,
+            strict: false,
+            drained_at: Mono::ZERO,
+        }
     }
 
     /// Opens the port and waits for a whole state. Only asks.
     pub fn connect(&mut self) -> AdapterResult<()> {
         self.picture = Picture::of_arm(self.picture.gripper_used);
-        (self.written, self.strict) = (None, false);
+        (self.written, self.control, self.strict) = (None, None, false);
         self.wire = Some(Wire::open(&self.address)?);
         let introduced = self.introduce();
         if introduced.is_err() {
@@ -89,9 +101,25 @@ impl Session {
         self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
     }
 
-    /// Sends a joint target and remembers it.
-    pub fn write(&mut self, frames: &[CanFrame], target: WireJoints) -> AdapterResult<()> {
-        self.send(frames)?;
+    /// Sends a joint target, with its control frame, and remembers it.
+    pub fn write(&mut self, speed: u8, follow: Follow, target: WireJoints) -> AdapterResult<()> {
+        let frames = protocol::joint_targets(speed, follow, target);
+        self.picture.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
+        self.send(&frames)?;
+        (self.written, self.control) = (Some(target), Some((speed, follow)));
+        Ok(())
+    }
+
+    /// Sends a set point. The control frame is left out where the arm reports that it is in the mode: another program that
+    /// has just changed it would have that undone before it shows.
+    pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
+        const SPEED: u8 = 100;
+        let Status { control, mode, .. } = self.picture.status;
+        if self.control != Some((SPEED, follow)) || (control, mode) != (1, MoveMode::Joint as u8) {
+            return self.write(SPEED, follow, target);
+        }
+        let [_, targets @ ..] = protocol::joint_targets(SPEED, follow, target);
+        self.send(&targets)?;
         self.written = Some(target);
         Ok(())
     }
@@ -264,10 +292,35 @@ impl Session {
         }
     }
 
+    /// An error when somebody else has changed the arm's mode or power, which is left as it is.
+    pub fn ours(&self) -> AdapterResult<()> {
+        let what = match (self.picture.guard.change, self.picture.guard.lost_power()) {
+            (Some(change), _) => change.text(),
+            (None, true) => "its motors were switched off".to_owned(),
+            (None, false) => return Ok(()),
+        };
+        Err(self.refuse(format!(
+            "{what}, which this run did not order: the arm is left alone\nhint: end that, then enable the arm again"
+        )))
+    }
+
+    /// Ends the watch for changes that this run did not order, and forgets what was written before one.
+    pub fn release(&mut self) {
+        self.written = self.written();
+        self.control = None;
+        self.picture.guard.release();
+    }
+
+    /// What was written, if the arm has followed it since.
+    pub fn written(&self) -> Option<WireJoints> {
+        self.written.filter(|_| self.ours().is_ok())
+    }
+
     /// An error unless the arm may be told to move.
     pub fn may_move(&mut self) -> AdapterResult<()> {
         self.whole()?;
         self.in_order()?;
+        self.ours()?;
         if self.picture.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
     }
 

@@ -444,6 +444,7 @@ fn two_commanders_do_not_take_turns() {
         read(&mut arm).unwrap();
         arm.write_clear_errors().is_ok() && arm.write_joint_positions(&START, 0.1).is_ok()
     });
+    assert_eq!(arm.get_control_mode(), ControlMode::Position);
 }
 
 #[test]
@@ -455,8 +456,11 @@ fn an_arm_that_is_being_taught_is_left_alone() {
         read(&mut arm).unwrap();
         arm.read_state().unwrap().mode == 2
     });
-    let error = arm.write_joint_positions(&START, 0.1).unwrap_err().to_string();
-    assert!(error.contains("the arm is controlled by its teach button\nhint: "), "{error}");
+    until("the reason", || {
+        let error = arm.write_joint_positions(&START, 0.1).unwrap_err().to_string();
+        error.contains("the arm is controlled by its teach button\nhint: ")
+    });
+    assert_ne!(arm.get_control_mode(), ControlMode::Position, "the mode shows it");
     assert_eq!(arm.read_error(), Ok((0, String::new())), "which is no error");
 }
 

@@ -146,6 +146,12 @@ impl PiperEmulator {
         self.server.with(|controller, _| controller.lenient = !refuse);
     }
 
+    /// Does as a frame says that a program sends which other programs on this computer do not hear, as the vendor's SDK
+    /// does (it switches local loopback off).
+    pub fn obey_unheard(&self, frame: &CanFrame) {
+        self.server.with(|controller, now| controller.handle(frame, now, &mut Vec::new()));
+    }
+
     /// How often a client has let the motors lose their power by a reset (0x150).
     pub fn power_drops(&self) -> u64 {
         self.server.with(|controller, _| controller.power_drops)
