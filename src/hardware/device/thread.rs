@@ -76,6 +76,8 @@ pub(super) struct Worker {
     guard: WireGuard,
     /// Set points that may be on their way.
     in_flight: u32,
+    /// The newest command was not sent because others were on their way.
+    again: bool,
     /// The mode that this run brought the arm into; `None` while none was ordered.
     ordered_mode: Option<ControlMode>,
     /// Whether this run enabled or disabled the motors last.
@@ -103,6 +105,7 @@ impl Worker {
             due,
             guard: WireGuard::new(config.dof, config.write_period(), config.supervision),
             in_flight: 0,
+            again: false,
             ordered_mode: None,
             ordered_power: None,
             disagreeing: 0,
@@ -188,6 +191,10 @@ impl Worker {
             self.drop_what_is_pending(adapter);
             if self.connected && (arrived || self.config.clock.now() >= self.next_read) {
                 self.read(adapter);
+                // The reply that a set point was waiting for may have come.
+                if self.connected && self.again {
+                    self.pass_on_command(adapter);
+                }
             }
         } else if self.wanted && self.config.clock.now() >= self.reconnect.0 {
             self.connect_again(adapter);
@@ -380,9 +387,10 @@ impl Worker {
     fn pass_on_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let before = self.take_command();
         let command = self.last;
-        if command.seq == before.seq {
+        if command.seq == before.seq && !self.again {
             return;
         }
+        self.again = false;
         // A device that is asked is asked just before the tick; one that sends by itself sets its own pace.
         if adapter.state_fd().is_none() {
             self.read_before(command.next_tick);
@@ -394,7 +402,7 @@ impl Worker {
             Ok(()) if self.stop_owed => {}
             Ok(()) => self.write_errors = 0,
             // Not sent, and no failure: the tick sees that it was not written.
-            Err(AdapterError::Busy) => self.in_flight = MAX_IN_FLIGHT,
+            Err(AdapterError::Busy) => (self.in_flight, self.again) = (MAX_IN_FLIGHT, true),
             Err(error) => {
                 if matches!(error, AdapterError::Timeout(_)) {
                     self.in_flight += 1;
