@@ -216,7 +216,8 @@ impl ArmControl {
         self.estimator.fill(&mut self.state);
         self.freshness = self.age(now, stalls);
         self.written.report(self.state.written);
-        if !self.state.enabled {
+        // An arm whose connection broke has stopped by its own means, elsewhere.
+        if !self.state.enabled || matches!(self.state.link, Link::Down | Link::Faulted) {
             self.standing = false;
         }
         self.failsafe.update(&self.state, self.freshness, now);
