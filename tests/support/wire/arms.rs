@@ -178,6 +178,8 @@ impl World {
             period: PERIOD,
             rounding: arm.rounding,
             stale_after: arm.stale_after(),
+            // Its stop is a target: what was told last, within 0.02 rad of what is measured, which is a little old.
+            stopped_within: (arm.name == "piper").then_some(0.025),
             time_limit: arm.time_limit,
         };
         Ok(Bed { run, gate: self.gate.clone(), arm, bounds, world: self, _folder: folder })
@@ -240,7 +242,9 @@ impl Bed {
                 (last, since) = (here, Instant::now());
             }
             let report = &bed.run.status().arms[0];
-            since.elapsed() > Duration::from_millis(100) && report.link == "up"
+            // A link over which a write failed is faulted until the arm is reset, though states come again.
+            let heard = report.state_age_ms.is_some_and(|age| age < 100.0);
+            heard && since.elapsed() > Duration::from_millis(100)
         });
     }
 
