@@ -134,8 +134,9 @@ fn blueprints() -> Vec<String> {
     names.chain(["remote".to_owned()]).collect()
 }
 
-/// A computer that does not run a program for so long is too busy to judge anything on it.
-const STANDSTILL: Duration = Duration::from_millis(50);
+/// A computer that does not run a program for so long is too busy to judge anything on it: the cycle of a shim in Python
+/// is several such waits, one after the other.
+const STANDSTILL: Duration = Duration::from_millis(20);
 
 /// Watches runs once: how long this computer stood still meanwhile for a program like theirs, and what was held.
 fn watched(names: &[String], realtime: bool, moving: bool, time: f64) -> (Duration, Vec<String>) {
