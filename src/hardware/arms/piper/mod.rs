@@ -1,9 +1,12 @@
 //! AgileX Piper: 6 joints and a gripper on a CAN bus. `docs/arms/piper.md` is for those who run one.
 
 pub mod adapter;
+mod belief;
 pub mod emulator;
 #[cfg(test)]
 mod golden;
+mod guard;
+mod hold;
 pub mod picture;
 pub mod protocol;
 mod session;
@@ -11,7 +14,13 @@ mod session;
 mod tests;
 #[cfg(test)]
 mod tests_faults;
+#[cfg(test)]
+mod tests_holds;
+#[cfg(test)]
+mod tests_others;
 mod wire;
+
+use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -40,6 +49,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "0.001 deg, 0.001 mm",
     native_rate: NATIVE_RATE,
+    accuracy: 0.01,
+    lag: 0.05,
+    stale_after: Duration::from_millis(50),
     address: AddressForm { form: FORMS, required: true, check: can::check },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
