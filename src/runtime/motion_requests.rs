@@ -1,5 +1,7 @@
 //! Motions that are asked for: found their task, checked against every limit, handed to the tick.
 
+use std::sync::Arc;
+
 use serde_json::json;
 
 use super::dispatch::lock;
@@ -8,7 +10,7 @@ use super::service::{Service, internal};
 use crate::control::config::TaskKind;
 use crate::control::limit::Bounds;
 use crate::control::point_to_point::{NoMotion, point_to_point};
-use crate::control::request::{Motion, Request};
+use crate::control::request::Motion;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::Outcome;
@@ -60,7 +62,7 @@ impl Service {
             NoMotion::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string()),
         })?;
         let duration = motion.duration();
-        let number = self.begin(task, joints, &motion).await?;
+        let number = self.begin(task, joints, motion).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,
             task: self.parts.names.task(task),
@@ -85,8 +87,8 @@ impl Service {
             Some(name) => self.task_index(name)?,
             None => self.trajectory_task(&joints)?,
         };
-        let number = self.begin(task, joints, &trajectory).await?;
         let duration = trajectory.duration();
+        let number = self.begin(task, joints, trajectory).await?;
         Ok(Reply::Execute(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration }))
     }
 
@@ -95,18 +97,17 @@ impl Service {
         &self,
         task: u16,
         joints: Vec<u16>,
-        trajectory: &JointTrajectory,
+        trajectory: JointTrajectory,
     ) -> Result<u64, RpcError> {
-        let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
-        self.check_rest(&joints, trajectory)?;
+        let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
+        self.check_rest(&joints, &trajectory)?;
         self.check_limits(&joints, &spline)?;
         let number = self.parts.dispatcher.number();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
         let planned = Planned { task, joints: joints.clone(), goal, duration: spline.duration() };
         lock(&self.motions).plan(number, planned);
-        let log = json!({"execute": {"task": task, "motion": number, "trajectory": trajectory}});
         let motion = Box::new(Motion { id: number, joints, spline });
-        let result = self.ask_logged(Request::Execute { task, motion }, log).await;
+        let result = self.outcome(self.parts.dispatcher.execute(task, motion, Arc::new(trajectory)).await);
         if result.is_err() {
             lock(&self.motions).forget(number);
         }
