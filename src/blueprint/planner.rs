@@ -12,6 +12,9 @@ use crate::blueprint::range::{non_negative, positive};
 use crate::collision::body::MeshMode;
 use crate::yaml::{Keyed, Located, Text};
 
+/// Distance that plans keep when the blueprint does not say [m].
+const PADDING: f64 = 0.003;
+
 /// Motion planning.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
@@ -20,6 +23,11 @@ pub struct PlannerConfig {
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub planning_timeout: f64,
+    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Given up near a start or goal
+    /// that is closer itself, which every plan tells.
+    #[serde(deserialize_with = "non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub padding: f64,
     /// The robots that are planned for.
     pub robots: Vec<Located<RobotConfig>>,
     /// Obstacles that are there from the start, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0, 0]}}`.
@@ -30,7 +38,13 @@ pub struct PlannerConfig {
 
 impl Default for PlannerConfig {
     fn default() -> Self {
-        Self { planning_timeout: 10.0, robots: Vec::new(), world: Keyed::default(), visualization: None }
+        Self {
+            planning_timeout: 10.0,
+            padding: PADDING,
+            robots: Vec::new(),
+            world: Keyed::default(),
+            visualization: None,
+        }
     }
 }
 

@@ -20,6 +20,7 @@ pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Describ
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
+        padding: typed.padding,
         robots: robots.map(|(robot, described)| self::robot(checker, robot, described)).collect(),
         objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
     }

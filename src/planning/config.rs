@@ -14,6 +14,8 @@ use crate::robot::Source;
 pub struct PlannerConfig {
     /// The longest time that one request may search.
     pub timeout: Duration,
+    /// Distance that plans keep from obstacles and other arms [m].
+    pub padding: f64,
     /// The robots that are planned for.
     pub robots: Vec<RobotConfig>,
     /// What is in the world from the start.

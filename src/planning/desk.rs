@@ -308,7 +308,7 @@ mod tests {
             max_acceleration: 2.0,
             named_poses: BTreeMap::new(),
         };
-        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), robots: vec![robot], objects }).unwrap()
+        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), padding: 0.003, robots: vec![robot], objects }).unwrap()
     }
 
     /// Walls that no search gets around in the time of these tests.

@@ -5,6 +5,8 @@ use crate::collision::{CollisionChecker, Stop};
 
 /// Looks along one piece of the way out.
 const LOOKS: u32 = 8;
+/// How deep a start may touch [m].
+pub(super) const CONTACT: f64 = 0.003;
 /// How much deeper than at the start anything may go [m].
 const DEEPER: f64 = 1e-4;
 
@@ -21,6 +23,9 @@ impl Leaving {
     pub fn of<C: CollisionChecker>(checker: &mut C, path: &Path) -> Option<Self> {
         let start = path.first()?.clone();
         let depth = checker.contacts(&start).first().map(|contact| -contact.distance)?;
+        if depth > CONTACT + DEEPER {
+            return None;
+        }
         let free = path.iter().position(|q| checker.is_free(q))?;
         let reach = length(path.get(..=free)?);
         Some(Self { start, depth, reach })

@@ -15,6 +15,7 @@ mod goals;
 pub mod ik;
 mod leaving;
 pub mod nearest;
+pub mod padded;
 pub mod path;
 pub mod planner;
 pub mod review;

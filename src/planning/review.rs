@@ -16,6 +16,7 @@ const LOOKS: u32 = 64;
 pub fn review(setup: &Setup, world: &World, found: &Found, positions: &[Vec<f64>], stop: &Stop) -> Result<(), Failure> {
     let mut stage = stage(setup, world, &found.robots, positions)?;
     let checker = &mut stage.checker;
+    checker.give_up_again(&found.given_up);
     let leaving = Leaving::of(checker, &found.path);
     for pair in found.trajectory.points.windows(2) {
         let [a, b] = pair else { continue };

@@ -50,6 +50,8 @@ pub struct Setup {
     pub robots: Vec<PlannedRobot>,
     /// The world as it is at the start. Its robots are those above, in the same order.
     pub world: World,
+    /// Distance that plans keep from obstacles and other arms [m].
+    pub padding: f64,
     /// Pairs of links that touch in every pose, with their robot's name; they are not checked.
     pub always_touching: Vec<(String, [String; 2])>,
 }
@@ -68,7 +70,7 @@ impl Setup {
             let added = obstacle(object).and_then(|o| world.add(o).map_err(|e| e.to_string()));
             added.map_err(|e| format!("object {:?} of the world: {e}", object.name))?;
         }
-        let mut setup = Self { robots, world, always_touching: Vec::new() };
+        let mut setup = Self { robots, world, padding: config.padding, always_touching: Vec::new() };
         setup.leave_out_what_always_touches();
         Ok(setup)
     }

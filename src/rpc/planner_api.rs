@@ -168,6 +168,12 @@ pub struct PlanSummary {
     /// The two that come closest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closest: Option<[String; 2]>,
+    /// Distance that it keeps from obstacles and other arms [m].
+    #[serde(default)]
+    pub padding: f64,
+    /// Pairs that do not keep it, and where.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub padding_given_up: Vec<PaddingGivenUp>,
     /// Of a straight line, the part that can be done (0–1].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fraction: Option<f64>,
@@ -175,6 +181,19 @@ pub struct PlanSummary {
     pub seed: u64,
     /// Time for inverse kinematics, search, shortcuts, timing, checking [s].
     pub times: BTreeMap<String, f64>,
+}
+
+/// A pair that does not keep the padding, near the start or the goal, where it is closer itself.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PaddingGivenUp {
+    /// `start`, `goal`, or `everywhere`: the two are closer in every pose.
+    pub near: String,
+    /// The link.
+    pub link: String,
+    /// The obstacle, or the link of another arm.
+    pub other: String,
+    /// Their distance there [m]; negative: they touch.
+    pub distance: f64,
 }
 
 /// Parameters of `preview`.

@@ -8,6 +8,7 @@ use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_inde
 use super::service::internal;
 use crate::collision::Stop;
 use crate::planning::desk::{Job, NotBegun, Progress};
+use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
 use crate::planning::setup::{PlannedRobot, Setup};
 use crate::planning::solve::{Found, Goal, Request};
@@ -204,10 +205,18 @@ fn summary(job: &Job, found: &Found) -> PlanSummary {
         duration: found.trajectory.duration(),
         clearance: found.clearance.as_ref().map(|(distance, _)| *distance),
         closest: found.clearance.as_ref().map(|(_, pair)| pair.clone()),
+        padding: found.padding,
+        padding_given_up: found.given_up.iter().map(given_up).collect(),
         fraction: found.fraction,
         seed: job.request.seed,
         times: found.times.clone(),
     }
+}
+
+fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
+    let GivenUp { place, link, other, distance, .. } = given_up;
+    let (near, link, other) = (place.name().to_owned(), link.clone(), other.clone());
+    api::PaddingGivenUp { near, link, other, distance: *distance }
 }
 
 /// The trajectory as rpc has it.

@@ -1,0 +1,118 @@
+//! A planned motion under way and a world that changes: the arm comes to rest before what is in its way, in whole runs.
+//! Judged from the positions of the emulated joints and a collision checker of its own.
+
+use std::time::{Duration, Instant};
+
+use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
+use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
+use dimos::hardware::registry::Emulator;
+use dimos::planning::setup::{Setup, obstacle};
+use dimos::rpc::api::{ExecutePlan, Plan, PlanGoal, Planning, PoseSpec, ShapeSpec, WorldAdd, WorldObject};
+use dimos::rpc::place::RunFolder;
+use dimos::runtime::{Builder, Record, Run};
+
+/// Far more than anything here takes, on a machine that is busy with other things too.
+const PATIENCE: Duration = Duration::from_secs(60);
+const PADDING: f64 = 0.003;
+const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
+
+fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let began = Instant::now();
+    while !holds() {
+        assert!(began.elapsed() < PATIENCE, "never: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// A run with an emulated arm that shows where its joints truly are, and the planner's robots for the judge.
+struct Cell {
+    run: Run,
+    arm: YourArmEmulator,
+    setup: Setup,
+    _folder: tempfile::TempDir,
+}
+
+fn up() -> Cell {
+    let arm = YourArmEmulator::with(&SimOptions::default()).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let blueprint = || -> Builder {
+        Run::from_name("yourarm-planner").unwrap().set("hardware.arm.address", arm.address()).record(Record::Off)
+    };
+    let setup = Setup::load(blueprint().check().blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
+    let run = blueprint().folder(RunFolder::at(folder.path())).start().unwrap();
+    let cell = Cell { run, arm, setup, _folder: folder };
+    let begun = cell.run.move_arm("arm", &HOME, 1.0).unwrap();
+    assert_eq!(cell.run.wait(begun.motion).unwrap().state, "COMPLETED");
+    cell
+}
+
+fn at(angle: f64) -> Vec<f64> {
+    [&[angle], &HOME[1..]].concat()
+}
+
+impl Cell {
+    /// Plans to an angle of the first joint.
+    fn plan(&self, angle: f64, speed: f64) -> u64 {
+        let goal = PlanGoal { robot: "arm".into(), joints: Some(at(angle)), ..PlanGoal::default() };
+        let plan = self.run.call(Plan { goals: vec![goal], speed, seed: 0, timeout: None }).unwrap().plan;
+        eventually("planning ends", || self.run.call(Planning { plan }).unwrap().state != "PLANNING");
+        assert_eq!(self.run.call(Planning { plan }).unwrap().state, "PLANNED");
+        plan
+    }
+
+    /// Where the joints truly are.
+    fn joints(&self) -> Vec<f64> {
+        self.arm.joints().0.iter().take(6).copied().collect()
+    }
+
+    /// A ball where the flange is with the first joint at that angle.
+    fn ball(&self, name: &str, angle: f64) -> WorldObject {
+        let robot = &self.setup.robots[0];
+        let kinematics = &robot.body.kinematics;
+        let mut frames = kinematics.frames();
+        kinematics.forward_from(&robot.body.base, &at(angle), &mut frames);
+        let xyz = kinematics.link_frame(robot.end_effector, &frames).translation.to_array();
+        let pose = PoseSpec { xyz, ..PoseSpec::default() };
+        WorldObject { name: name.into(), shape: ShapeSpec::Sphere(0.03), pose, padding: 0.0, held_by: None }
+    }
+
+    /// The distance of the arm, as it truly stands, from what is around it and the objects [m].
+    fn clearance(&self, objects: &[WorldObject]) -> f64 {
+        let mut world = self.setup.world.clone();
+        for object in objects {
+            let ShapeSpec::Sphere(radius) = object.shape else { unreachable!() };
+            let [x, y, z] = object.pose.xyz;
+            let config = dimos::planning::config::ObjectConfig {
+                name: object.name.clone(),
+                shape: dimos::planning::config::ObjectShape::Sphere(radius),
+                pose: nalgebra::Isometry3::translation(x, y, z),
+                padding: 0.0,
+            };
+            world.put(obstacle(&config).unwrap()).unwrap();
+        }
+        let mut checker = ExactChecker::new(world.snapshot(), Resolution::default());
+        let q = self.joints();
+        assert!(checker.is_free(&q), "{:?}", checker.contacts(&q));
+        let near = checker.with_padding(1.0).closer_than_padding(&q);
+        let own = |name: &str| objects.iter().any(|object| object.name == name);
+        near.into_iter().filter(|(_, c)| own(&c.other)).map(|(_, c)| c.distance).fold(f64::INFINITY, f64::min)
+    }
+}
+
+#[test]
+fn an_obstacle_in_the_way_of_a_motion_under_way_is_not_driven_through() {
+    let cell = up();
+    let plan = cell.plan(1.4, 0.5);
+    let begun = cell.run.call(ExecutePlan { plan: Some(plan) }).unwrap();
+    eventually("it moves", || cell.joints()[0] > 0.15);
+    let ball = cell.ball("late", 1.1);
+    cell.run.call(WorldAdd(ball.clone())).unwrap();
+    let ended = cell.run.wait(begun.motion).unwrap();
+    let error = ended.error.unwrap_or_default();
+    assert_eq!(ended.state, "ABORTED", "{error}, at {:?}", cell.joints());
+    assert!(error.contains("obstacle \"late\"") && error.contains("link \"arm/"), "{error}");
+    eventually("it rests", || cell.arm.joints().1.iter().take(6).all(|v| *v == 0.0));
+    let clearance = cell.clearance(&[ball]);
+    println!("{error}; rests {:.1} mm from it at {:?}", clearance * 1e3, cell.joints());
+    assert!(clearance >= PADDING, "{clearance}");
+}
