@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::ahead::{Blocked, look_ahead};
 use super::review::review;
 use super::setup::Setup;
 use super::solve::{Failure, Found, Request, solve};
@@ -78,7 +79,8 @@ struct Shared {
 /// A planner that is running. Ends with its last owner.
 pub struct Desk {
     setup: Arc<Setup>,
-    world: Mutex<World>,
+    /// The world and how often it was changed.
+    world: Mutex<(World, u64)>,
     shared: Arc<Shared>,
     solver: Solver,
     timeout: Duration,
@@ -117,7 +119,7 @@ impl Desk {
 
     /// Starts the thread with what answers each request.
     pub fn with(setup: Setup, timeout: Duration, solver: Solver) -> std::io::Result<Self> {
-        let world = Mutex::new(setup.world.clone());
+        let world = Mutex::new((setup.world.clone(), 1));
         let (setup, shared) = (Arc::new(setup), Arc::new(Shared::default()));
         let worker = Mutex::new(Worker::start(&setup, &shared, &solver, 0)?);
         Ok(Self { setup, world, shared, solver, timeout, worker })
@@ -128,9 +130,16 @@ impl Desk {
         &self.setup
     }
 
-    /// Looks at the world or changes it. Requests that are being planned keep the world that they began with.
+    /// Changes the world. Requests that are being planned keep the world that they began with.
     pub fn world<T>(&self, act: impl FnOnce(&mut World) -> T) -> T {
-        act(&mut lock(&self.world))
+        let mut world = lock(&self.world);
+        world.1 += 1;
+        act(&mut world.0)
+    }
+
+    /// How often the world was changed.
+    pub fn version(&self) -> u64 {
+        lock(&self.world).1
     }
 
     /// Begins a request with this number. It ends by itself after `timeout`, or the planner's own.
@@ -151,7 +160,7 @@ impl Desk {
         if jobs.len() > KEPT {
             jobs.pop_front();
         }
-        let order = Order { id, request, world: lock(&self.world).clone(), stop };
+        let order = Order { id, request, world: lock(&self.world).0.clone(), stop };
         // The thread ends with this sender only.
         let _ = orders.send(order);
         Ok(())
@@ -202,8 +211,21 @@ impl Desk {
         positions: Vec<Vec<f64>>,
         stop: Stop,
     ) -> impl FnOnce() -> Result<(), Failure> + Send + use<> {
-        let (setup, world) = (self.setup.clone(), lock(&self.world).clone());
+        let (setup, world) = (self.setup.clone(), lock(&self.world).0.clone());
         move || review(&setup, &world, &found, &positions, &stop)
+    }
+
+    /// Looks at the rest of a motion under way, from `elapsed` [s] on, in the world as it is now: work for another
+    /// thread, which may take until `stop`.
+    pub fn look_ahead(
+        &self,
+        found: Arc<Found>,
+        positions: Vec<Vec<f64>>,
+        elapsed: f64,
+        stop: Stop,
+    ) -> impl FnOnce() -> Result<Option<Blocked>, Failure> + Send + use<> {
+        let (setup, world) = (self.setup.clone(), lock(&self.world).0.clone());
+        move || look_ahead(&setup, &world, &found, &positions, elapsed, &stop)
     }
 
     /// A request by its number.

@@ -7,6 +7,7 @@
 //!                                 JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
 //! ```
 
+pub mod ahead;
 pub mod blend;
 pub mod cartesian;
 pub mod config;

@@ -17,8 +17,9 @@ const RADII: [f64; 3] = [0.1, 0.3, 1.0];
 const TRIES: usize = 100;
 /// A pair that is closer in this many poses, of all joints' ranges, is closer in every pose.
 const POSES: usize = 32;
-/// Part of its distance at the start or goal that a pair keeps around it.
+/// Part of its distance at the start or goal that a pair keeps around it, and when the motion is looked at again.
 const KEPT: f64 = 0.5;
+const KEPT_AGAIN: f64 = 0.4;
 
 /// Where the padding is given up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -140,7 +141,7 @@ impl Padded {
                 self.zones.push(Zone { center, radius, checker: self.full.clone() });
             }
             if let Some(zone) = self.zones.get_mut(at) {
-                zone.checker.set_pad(pair, KEPT * given_up.distance.max(0.0));
+                zone.checker.set_pad(pair, KEPT_AGAIN * given_up.distance.max(0.0));
             }
         }
         self.given_up = before.to_vec();

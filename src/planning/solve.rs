@@ -24,6 +24,9 @@ const CLEARANCE_STEP: f64 = 0.05;
 const THERE: f64 = 1e-6;
 /// Configurations as close as this are the same [rad].
 const SAME: f64 = 1e-3;
+/// Searched with as much more padding [m]: between the points of its trajectory a motion is not exactly what was proved,
+/// and must still keep the padding when it is looked at again.
+const SPARE: f64 = 2e-4;
 /// How long the motion of robots takes that are there already [s].
 const MOMENT: f64 = 0.1;
 
@@ -117,7 +120,7 @@ pub(super) struct Stage<'a> {
 pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Result<Found, Failure> {
     let mut times = BTreeMap::new();
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
-    let mut stage = stage(setup, world, &moving, &request.positions)?;
+    let mut stage = stage(setup, world, &moving, &request.positions, setup.padding + SPARE)?;
     stage.checker.give_up(Place::Start, &stage.start);
     let began = Instant::now();
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
@@ -165,12 +168,13 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
     Ok(Found { robots, path, trajectory, clearance, padding, given_up, fraction, times })
 }
 
-/// The world of one request: robots that move, by index, and all others where they are [rad].
+/// The world of one request: robots that move, by index, and all others where they are [rad]; `padding` is kept [m].
 pub(super) fn stage<'a>(
     setup: &'a Setup,
     world: &World,
     moving: &[usize],
     positions: &[Vec<f64>],
+    padding: f64,
 ) -> Result<Stage<'a>, Failure> {
     let (mut robots, mut indices, mut bodies) = (Vec::new(), Vec::new(), Vec::new());
     let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
@@ -188,7 +192,7 @@ pub(super) fn stage<'a>(
         limits.extend_from_slice(&robot.limits);
         start.extend_from_slice(at);
     }
-    let checker = Padded::new(world.with_robots(bodies).snapshot(), setup.padding);
+    let checker = Padded::new(world.with_robots(bodies).snapshot(), padding);
     Ok(Stage { robots, indices, joints, limits, start, checker })
 }
 

@@ -98,6 +98,36 @@ pub struct PlannerAnswer {
     pub error: Option<RpcError>,
 }
 
+/// Name of what a run asks its planner after every change of the world, for each planned motion under way.
+pub const RECHECK: &str = "recheck";
+
+/// Parameters of `recheck`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recheck {
+    /// The plan that is being carried out.
+    pub plan: u64,
+    /// How far its motion is [s].
+    pub elapsed: f64,
+}
+
+/// Reply to `recheck`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct RecheckReply {
+    /// What is in the way of the rest of the motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blocked: Option<BlockedReport>,
+}
+
+/// What is in the way of a motion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BlockedReport {
+    /// Up to here the motion keeps its distance [s since its start].
+    pub free_until: f64,
+    /// What is in the way, with names and distances.
+    pub what: String,
+}
+
 /// A plan that is still free, for the coordinator to execute.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ReleasedPlan {

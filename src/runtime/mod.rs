@@ -20,6 +20,7 @@ mod motions;
 mod plan_requests;
 mod planner_link;
 mod planner_port;
+mod recheck;
 mod repeats;
 mod reports;
 mod service;

@@ -1,5 +1,7 @@
 //! Motions that are asked for: found their task, checked against every limit, handed to the tick.
 
+use std::sync::Arc;
+
 use serde_json::json;
 
 use super::dispatch::lock;
@@ -60,7 +62,7 @@ impl Service {
             NoMotion::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string()),
         })?;
         let duration = motion.duration();
-        let number = self.begin(task, joints, &motion).await?;
+        let number = self.begin(task, joints, &motion, None).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,
             task: self.parts.names.task(task),
@@ -72,6 +74,11 @@ impl Service {
     }
 
     pub(super) async fn execute(&self, call: api::Execute) -> Result<Reply, RpcError> {
+        self.execute_as(call, None).await.map(Reply::Execute)
+    }
+
+    /// Follows a trajectory, as the motion of a plan where it comes from one.
+    pub(super) async fn execute_as(&self, call: api::Execute, plan: Option<u64>) -> Result<api::ExecuteReply, RpcError> {
         let trajectory = trajectory_of(call.trajectory);
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
         let mut joints = Vec::new();
@@ -85,9 +92,9 @@ impl Service {
             Some(name) => self.task_index(name)?,
             None => self.trajectory_task(&joints)?,
         };
-        let number = self.begin(task, joints, &trajectory).await?;
+        let number = self.begin(task, joints, &trajectory, plan).await?;
         let duration = trajectory.duration();
-        Ok(Reply::Execute(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration }))
+        Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })
     }
 
     /// Hands a trajectory to its task. Everything about it is checked before anything moves.
@@ -96,13 +103,15 @@ impl Service {
         task: u16,
         joints: Vec<u16>,
         trajectory: &JointTrajectory,
+        plan: Option<u64>,
     ) -> Result<u64, RpcError> {
         let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_rest(&joints, trajectory)?;
         self.check_limits(&joints, &spline)?;
         let number = self.parts.dispatcher.number();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
-        let planned = Planned { task, joints: joints.clone(), goal, duration: spline.duration() };
+        let plan = plan.map(|plan| (plan, Arc::new(spline.clone())));
+        let planned = Planned { task, joints: joints.clone(), goal, duration: spline.duration(), plan, blocked: None };
         lock(&self.motions).plan(number, planned);
         let log = json!({"execute": {"task": task, "motion": number, "trajectory": trajectory}});
         let motion = Box::new(Motion { id: number, joints, spline });

@@ -1,8 +1,10 @@
 //! Remembers the motions of a run: what was planned, and how it ended.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use crate::telemetry::{Reason, TaskState};
+use crate::trajectory::Spline;
 
 /// So many motions are remembered.
 const REMEMBERED: usize = 256;
@@ -18,6 +20,25 @@ pub struct Planned {
     pub goal: Vec<f64>,
     /// How long it should take [s].
     pub duration: f64,
+    /// The plan that it carries out, and its curve; for motions that were planned.
+    pub plan: Option<(u64, Arc<Spline>)>,
+    /// What came into its way, in a sentence.
+    pub blocked: Option<String>,
+}
+
+/// A planned motion under way.
+#[derive(Debug, Clone)]
+pub struct UnderWay {
+    /// Its number.
+    pub number: u64,
+    /// The task that carries it out.
+    pub task: u16,
+    /// Its joints, over all arms.
+    pub joints: Vec<u16>,
+    /// The plan.
+    pub plan: u64,
+    /// Its curve.
+    pub spline: Arc<Spline>,
 }
 
 /// How a motion ended.
@@ -61,6 +82,23 @@ impl Motions {
         }
     }
 
+    /// The planned motions that are under way.
+    pub fn under_way(&self) -> Vec<UnderWay> {
+        let going = self.0.iter().filter(|(_, (_, end))| end.is_none());
+        let planned = going.filter_map(|(number, (planned, _))| {
+            let (plan, spline) = planned.plan.clone()?;
+            Some(UnderWay { number: *number, task: planned.task, joints: planned.joints.clone(), plan, spline })
+        });
+        planned.collect()
+    }
+
+    /// Something came into a motion's way.
+    pub fn blocked(&mut self, number: u64, text: String) {
+        if let Some((planned, _)) = self.0.get_mut(&number) {
+            planned.blocked = Some(text);
+        }
+    }
+
     /// A motion, and how it ended if it did.
     pub fn get(&self, number: u64) -> Option<&(Planned, Option<End>)> {
         self.0.get(&number)
@@ -73,7 +111,7 @@ mod tests {
 
     #[test]
     fn motions_of_a_task_end_in_their_order_and_old_ones_are_forgotten() {
-        let planned = |task| Planned { task, joints: vec![1], goal: vec![0.5], duration: 1.0 };
+        let planned = |task| Planned { task, joints: vec![1], goal: vec![0.5], duration: 1.0, plan: None, blocked: None };
         let mut m = Motions::default();
         (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));
         m.task_changed(1, TaskState::Executing, Reason::None, &[]);

@@ -65,7 +65,9 @@ impl PlannerPort {
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
         let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
         let task = task.map(|task| (*task).clone());
+        let version = self.desk.version();
         self.still_free(&job, &found, moment).await?;
+        self.remember(job.id, found.clone(), version);
         Ok(ReleasedPlan { plan: job.id, trajectory: travelling(&found), task })
     }
 
@@ -115,7 +117,7 @@ impl PlannerPort {
 }
 
 /// Where every robot is [rad], in the setup's order.
-fn all_positions(setup: &Setup, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
+pub(super) fn all_positions(setup: &Setup, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
     let configs = setup.robots.iter().map(|robot| &robot.config);
     configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
 }

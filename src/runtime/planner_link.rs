@@ -13,7 +13,8 @@ use super::service::{Service, internal};
 use crate::control::config::{CoordinatorConfig, TaskKind};
 use crate::control::limit::Bounds;
 use crate::rpc::api::{
-    self, CommandLimits, Moment, PlannerReport, RegisterPlanner, Registered, ReleasedPlan, Reply, Request as Call,
+    self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered, ReleasedPlan,
+    Reply, Request as Call,
 };
 use crate::rpc::planner_line::{PlannerLine, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
@@ -37,7 +38,7 @@ pub(super) struct Attached {
 }
 
 /// Where a run's planner is.
-enum Planner<'a> {
+pub(super) enum Planner<'a> {
     Own(&'a PlannerPort),
     Attached(Arc<Attached>),
 }
@@ -49,6 +50,24 @@ impl Planner<'_> {
             Self::Attached(planner) => {
                 let (method, params) = call.written();
                 Reply::read(method, planner.line.ask(method, params, moment, limit).await?)
+            }
+        }
+    }
+
+    /// What is in the way of a planned motion under way.
+    pub(super) async fn recheck(
+        &self,
+        call: &Recheck,
+        moment: Moment,
+        limit: Duration,
+    ) -> Result<RecheckReply, RpcError> {
+        match self {
+            Self::Own(port) => port.recheck(call, &moment).await,
+            Self::Attached(planner) => {
+                let params = serde_json::to_value(call).unwrap_or_default();
+                let reply = planner.line.ask(RECHECK, params, moment, limit).await?;
+                let unlike = |e: serde_json::Error| RpcError::new(Code::Internal, format!("reply to {RECHECK}: {e}"));
+                serde_json::from_value(reply).map_err(unlike)
             }
         }
     }
@@ -86,27 +105,34 @@ impl Service {
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(execute.plan, self.moment(0)).await?;
-                self.execute_released(released).await
+                self.execute_released(&planner, released).await
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
             Call::Plan(_) => planner.answer(call, self.moment(self.parts.dispatcher.number()), limit).await,
-            Call::Attach(_) | Call::Detach(_) => planner.answer(call, self.moment(0), limit).await,
+            Call::WorldAdd(_) | Call::WorldMove(_) | Call::WorldRemove(_) | Call::Attach(_) | Call::Detach(_) => {
+                let moment = if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
+                let changed = planner.answer(call, moment, limit).await;
+                // Also where it was refused, or not answered in time: it may have happened all the same.
+                self.recheck(&planner).await;
+                changed
+            }
             _ => planner.answer(call, Moment::default(), limit).await,
         }
     }
 
-    async fn execute_released(&self, released: ReleasedPlan) -> Result<Reply, RpcError> {
+    async fn execute_released(&self, planner: &Planner<'_>, released: ReleasedPlan) -> Result<Reply, RpcError> {
         let ReleasedPlan { plan, trajectory, task } = released;
         // What comes from another process is checked like what comes from any client.
         let execute = api::Execute { trajectory, task };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
-        match self.execute(execute).await? {
-            Reply::Execute(begun) => {
-                *lock(&self.executed) = Some((plan, begun.motion));
-                Ok(Reply::ExecutePlan(begun))
-            }
-            other => Ok(other),
+        let begun = self.execute_as(execute, Some(plan)).await?;
+        *lock(&self.executed) = Some((plan, begun.motion));
+        // The world may have changed since the plan was found free.
+        let under_way = lock(&self.motions).under_way().into_iter().find(|motion| motion.number == begun.motion);
+        if let Some(motion) = under_way {
+            self.recheck_motion(planner, &motion).await;
         }
+        Ok(Reply::ExecutePlan(begun))
     }
 
     /// Ends planning, where something is being planned.
@@ -230,7 +256,7 @@ impl Service {
     }
 
     /// What a planner needs to know of this run now.
-    fn moment(&self, plan: u64) -> Moment {
+    pub(super) fn moment(&self, plan: u64) -> Moment {
         let (now, mut positions) = (self.now(), BTreeMap::new());
         for (index, arm) in self.parts.names.arms.iter().enumerate() {
             let fresh = |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= FRESH;
@@ -263,6 +289,10 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
 /// A planner in a process of its own: answers what a run asks, as it travels.
 pub(super) async fn answer_travelling(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
     let encoded = |e: serde_json::Error| RpcError::new(Code::Internal, e.to_string());
+    if asked.method == RECHECK {
+        let call = serde_json::from_value(asked.params).map_err(encoded)?;
+        return serde_json::to_value(port.recheck(&call, &asked.moment).await?).map_err(encoded);
+    }
     match Call::read(&asked.method, asked.params)? {
         Call::ExecutePlan(execute) => {
             let released = port.release(execute.plan, &asked.moment).await?;

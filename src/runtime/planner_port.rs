@@ -8,6 +8,7 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 use super::dispatch::lock;
 use super::plan_requests::job;
+use super::recheck::Released;
 use super::service::internal;
 use super::world_requests::typed;
 use crate::planning::config::{JointBounds, PlannerConfig};
@@ -23,6 +24,8 @@ pub struct PlannerPort {
     pub(super) desk: Desk,
     /// The objects of the world, as they were given.
     pub(super) objects: Mutex<BTreeMap<String, WorldObject>>,
+    /// The plans that were handed over, by number.
+    pub(super) released: Mutex<BTreeMap<u64, Released>>,
 }
 
 impl PlannerPort {
@@ -43,7 +46,7 @@ impl PlannerPort {
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
         let desk = Desk::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
         let desk = desk.map_err(|e| format!("no planner thread: {e}"))?;
-        Ok(Self { desk, objects: Mutex::new(objects) })
+        Ok(Self { desk, objects: Mutex::new(objects), released: Mutex::default() })
     }
 
     /// Answers one of the planner's methods, but for `execute_plan`: see [`release`](Self::release).

@@ -200,7 +200,10 @@ impl Service {
         };
         report.state = end.state.name().to_owned();
         report.done = true;
-        report.error = self.reason(&end.reason);
+        // That it was cancelled or held is how it ended; what was in its way is why.
+        let was_stopped = matches!(end.reason, Reason::Cancelled | Reason::ArmHeld(..));
+        let blocked = planned.blocked.clone().filter(|_| was_stopped);
+        report.error = blocked.or_else(|| self.reason(&end.reason));
         if end.state == TaskState::Completed {
             (report.progress, report.remaining) = (1.0, 0.0);
         }
