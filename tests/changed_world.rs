@@ -103,7 +103,7 @@ impl Cell {
 fn an_obstacle_in_the_way_of_a_motion_under_way_is_not_driven_through() {
     let cell = up();
     let plan = cell.plan(1.4, 0.5);
-    let begun = cell.run.call(ExecutePlan { plan: Some(plan) }).unwrap();
+    let begun = cell.run.call(ExecutePlan { plan: Some(plan), ..Default::default() }).unwrap();
     eventually("it moves", || cell.joints()[0] > 0.15);
     let ball = cell.ball("late", 1.1);
     cell.run.call(WorldAdd(ball.clone())).unwrap();
@@ -115,4 +115,47 @@ fn an_obstacle_in_the_way_of_a_motion_under_way_is_not_driven_through() {
     let clearance = cell.clearance(&[ball]);
     println!("{error}; rests {:.1} mm from it at {:?}", clearance * 1e3, cell.joints());
     assert!(clearance >= PADDING, "{clearance}");
+}
+
+#[test]
+fn with_replan_it_goes_around_and_arrives() {
+    let cell = up();
+    let plan = cell.plan(1.4, 0.5);
+    let begun = cell.run.call(ExecutePlan { plan: Some(plan), replan: true, presence: None }).unwrap();
+    eventually("it moves", || cell.joints()[0] > 0.15);
+    let ball = cell.ball("late", 0.9);
+    cell.run.call(WorldAdd(ball.clone())).unwrap();
+    let first = {
+        eventually("the first motion ends", || cell.run.motion(begun.motion).unwrap().done);
+        cell.run.motion(begun.motion).unwrap()
+    };
+    assert!(first.state == "ABORTED" && first.next.is_some(), "{first:?}");
+    let ended = cell.run.wait(begun.motion).unwrap();
+    assert_eq!(ended.state, "COMPLETED", "{:?}", ended.error);
+    assert_eq!(Some(ended.motion), first.next);
+    let there = cell.joints().iter().zip(at(1.4)).all(|(is, goal)| (is - goal).abs() < 0.01);
+    assert!(there && cell.clearance(&[ball]) >= PADDING, "{:?}", cell.joints());
+    // With no way around it stays where it rests, and says why.
+    let back = cell.plan(0.0, 0.5);
+    let begun = cell.run.call(ExecutePlan { plan: Some(back), replan: true, presence: None }).unwrap();
+    eventually("it moves", || cell.joints()[0] < 1.3);
+    let goal = cell.ball("goal", 0.0);
+    cell.run.call(WorldAdd(goal)).unwrap();
+    let ended = cell.run.wait(begun.motion).unwrap();
+    let error = ended.error.unwrap_or_default();
+    assert!(ended.state == "ABORTED" && error.contains("no way around: the goal collides"), "{error}");
+    assert!(cell.joints()[0] > 0.2);
+}
+
+#[test]
+fn what_appears_inside_the_braking_distance_is_met_with_a_stop_that_says_so() {
+    let cell = up();
+    let plan = cell.plan(1.4, 1.0);
+    let begun = cell.run.call(ExecutePlan { plan: Some(plan), ..Default::default() }).unwrap();
+    eventually("it is fast", || cell.arm.joints().1[0] > 0.9);
+    cell.run.call(WorldAdd(cell.ball("sudden", cell.joints()[0] + 0.05))).unwrap();
+    let ended = cell.run.wait(begun.motion).unwrap();
+    let error = ended.error.unwrap_or_default();
+    assert!(ended.state == "ABORTED" && error.contains("closer than the arm can brake"), "{error}");
+    assert_eq!(cell.run.status().arms[0].phase, "held");
 }

@@ -1,7 +1,7 @@
 //! What is in the way of a motion under way, in a world that has changed since it was planned, and where the motion
 //! comes to rest when it is cancelled.
 
-use super::leaving::{Leaving, passes};
+use super::leaving::passes;
 use super::path::between;
 use super::setup::Setup;
 use super::solve::{Failure, Found, stage};
@@ -46,14 +46,13 @@ pub fn look_ahead(
     let mut stage = stage(setup, world, &found.robots, positions, setup.padding)?;
     let checker = &mut stage.checker;
     checker.give_up_again(&found.given_up);
-    let leaving = Leaving::of(checker, &found.path);
     let way = samples(&spline, elapsed);
     let last = way.len() - 1;
     // Stretches that are not looked at yet, the earliest last. One that is not straight or not free is cut in two.
     let mut stretches = vec![(0, last)];
     while let Some((first, end)) = stretches.pop() {
         let ((time, from), (_, to)) = (&way[first], &way[end]);
-        if is_straight(&way[first..=end]) && passes(checker, leaving.as_ref(), from, to, stop) {
+        if is_straight(&way[first..=end]) && passes(checker, found.leaving.as_ref(), from, to, stop) {
             continue;
         }
         if stop.is_over() {

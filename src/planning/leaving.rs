@@ -11,8 +11,8 @@ pub(super) const CONTACT: f64 = 0.003;
 const DEEPER: f64 = 1e-4;
 
 /// The start of a path that touches, and how far the path goes until nothing does.
-#[derive(Debug, Clone)]
-pub(super) struct Leaving {
+#[derive(Debug, Clone, PartialEq)]
+pub struct Leaving {
     start: Vec<f64>,
     depth: f64,
     reach: f64,
@@ -22,7 +22,7 @@ impl Leaving {
     /// That of a path; none where its start is free.
     pub fn of<C: CollisionChecker>(checker: &mut C, path: &Path) -> Option<Self> {
         let start = path.first()?.clone();
-        let depth = checker.contacts(&start).first().map(|contact| -contact.distance)?;
+        let depth = checker.contacts(&start).first().map(|contact| -contact.distance).filter(|depth| *depth >= 0.0)?;
         if depth > CONTACT + DEEPER {
             return None;
         }

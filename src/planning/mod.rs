@@ -14,7 +14,7 @@ pub mod config;
 pub mod desk;
 mod goals;
 pub mod ik;
-mod leaving;
+pub mod leaving;
 pub mod nearest;
 pub mod padded;
 pub mod path;

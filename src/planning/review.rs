@@ -2,7 +2,7 @@
 //! changed since.
 
 use super::ahead::in_the_way;
-use super::leaving::{Leaving, passes};
+use super::leaving::passes;
 use super::path::between;
 use super::setup::Setup;
 use super::solve::{Failure, Found, stage};
@@ -18,11 +18,10 @@ pub fn review(setup: &Setup, world: &World, found: &Found, positions: &[Vec<f64>
     let mut stage = stage(setup, world, &found.robots, positions, setup.padding)?;
     let checker = &mut stage.checker;
     checker.give_up_again(&found.given_up);
-    let leaving = Leaving::of(checker, &found.path);
     for pair in found.trajectory.points.windows(2) {
         let [a, b] = pair else { continue };
         let (from, to) = (&a.positions, &b.positions);
-        if passes(checker, leaving.as_ref(), from, to, stop) {
+        if passes(checker, found.leaving.as_ref(), from, to, stop) {
             continue;
         }
         if stop.is_over() {

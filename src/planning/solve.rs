@@ -68,6 +68,8 @@ pub struct Found {
     /// Smallest distance on the path [m], and between which two; none where there is nothing to be near to, or where
     /// time was up before it was known.
     pub clearance: Option<(f64, [String; 2])>,
+    /// The way out of its start, where that touches something.
+    pub leaving: Option<Leaving>,
     /// Distance that it keeps [m].
     pub padding: f64,
     /// Where it does not.
@@ -160,12 +162,13 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
     let looking = lap(&mut times, "timing", timing);
     let clearance = clearance(&mut stage.checker, &path, stop);
     lap(&mut times, "clearance", looking);
+    let leaving = Leaving::of(&mut stage.checker, &path);
     // Of several goals one was reached.
     let reached = |center: &[f64]| path.last().is_some_and(|end| distance(end, center) < SAME);
     let at_end = |given_up: &&GivenUp| given_up.place != Place::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
     let (robots, padding) = (stage.indices, setup.padding);
-    Ok(Found { robots, path, trajectory, clearance, padding, given_up, fraction, times })
+    Ok(Found { robots, path, trajectory, clearance, leaving, padding, given_up, fraction, times })
 }
 
 /// The world of one request: robots that move, by index, and all others where they are [rad]; `padding` is kept [m].

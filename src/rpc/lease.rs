@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use super::api::{Backend, ExecutePlan, Reply, Request};
+use super::api::{Backend, ExecutePlan, Presence, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
 
@@ -105,12 +105,14 @@ pub(super) struct Lessee {
     leases: Arc<Leases>,
     connection: u64,
     pid: Option<i32>,
+    /// Dropped with the connection.
+    alive: Arc<()>,
 }
 
 impl Lessee {
     /// `connection` is a number given once; `pid` is the process at its other end.
     pub fn new(leases: Arc<Leases>, connection: u64, pid: Option<i32>) -> Self {
-        Self { leases, connection, pid }
+        Self { leases, connection, pid, alive: Arc::default() }
     }
 
     /// The process at the connection's other end, where the system tells.
@@ -133,7 +135,9 @@ impl Lessee {
             Need::Plan(plan) => {
                 let (plan, joints) = backend.plan_of(plan).await?;
                 self.take(&backend.arms_of(Subject::Joints(&joints)))?;
-                return Ok(Request::ExecutePlan(ExecutePlan { plan: Some(plan) }));
+                let replan = matches!(&request, Request::ExecutePlan(execute) if execute.replan);
+                let presence = Some(Presence::of(&self.alive));
+                return Ok(Request::ExecutePlan(ExecutePlan { plan: Some(plan), replan, presence }));
             }
         }
         Ok(request)

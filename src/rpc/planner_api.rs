@@ -2,6 +2,7 @@
 //! begins, `planning` tells how it goes.
 
 use std::collections::BTreeMap;
+use std::sync::{Arc, Weak};
 
 use serde::{Deserialize, Serialize};
 
@@ -219,13 +220,43 @@ pub struct PreviewReply {
 }
 
 /// Parameters of `execute_plan`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
     /// The plan's number; without it the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
+    /// Whether a motion that must end before something that gets in its way is planned again from there and goes on.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub replan: bool,
+    /// The connection that asks for it, where there is one: with its end nothing is planned again.
+    #[serde(skip)]
+    pub presence: Option<Presence>,
 }
+
+/// Whether a connection still lives.
+#[derive(Debug, Clone)]
+pub struct Presence(Weak<()>);
+
+impl Presence {
+    /// That of a connection which keeps `alive` to its end.
+    pub fn of(alive: &Arc<()>) -> Self {
+        Self(Arc::downgrade(alive))
+    }
+
+    /// Whether the connection has ended.
+    pub fn is_over(&self) -> bool {
+        self.0.strong_count() == 0
+    }
+}
+
+impl PartialEq for Presence {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.ptr_eq(&other.0)
+    }
+}
+
+impl Eq for Presence {}
 
 /// Parameters of `planner`: none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

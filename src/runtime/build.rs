@@ -115,7 +115,7 @@ impl Run {
             metadata: metadata(blueprint),
             wall,
         };
-        let service = Arc::new(Service::new(ServiceParts {
+        let parts = ServiceParts {
             run: name.clone(),
             blueprint: blueprint.clone(),
             config: config.clone(),
@@ -132,7 +132,8 @@ impl Run {
             log: log.clone(),
             endings: endings.clone(),
             planner,
-        }));
+        };
+        let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
         let notice = {
             let (service, wall) = (service.clone(), wall);
             move |notice: Notice<'_>| service.notice(notice, wall)

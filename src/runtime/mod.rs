@@ -22,6 +22,7 @@ mod planner_link;
 mod planner_port;
 mod recheck;
 mod repeats;
+mod replan;
 mod reports;
 mod service;
 mod service_manager;

@@ -76,7 +76,7 @@ impl Planner<'_> {
         match self {
             Self::Own(port) => port.release(plan, &moment).await,
             Self::Attached(planner) => {
-                let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan }).written();
+                let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan, ..Default::default() }).written();
                 let released = planner.line.ask(method, params, moment, LONG).await?;
                 serde_json::from_value(released)
                     .map_err(|e| RpcError::new(Code::Internal, format!("the planner released no plan: {e}")))
@@ -105,10 +105,16 @@ impl Service {
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(execute.plan, self.moment(0)).await?;
-                self.execute_released(&planner, released).await
+                let replan = execute.replan.then_some(execute.presence);
+                self.execute_released(&planner, released, replan).await
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
-            Call::Plan(_) => planner.answer(call, self.moment(self.parts.dispatcher.number()), limit).await,
+            Call::Plan(ref plan) => {
+                let (number, plan) = (self.parts.dispatcher.number(), plan.clone());
+                let begun = planner.answer(call, self.moment(number), limit).await?;
+                self.remember_request(number, plan);
+                Ok(begun)
+            }
             Call::WorldAdd(_) | Call::WorldMove(_) | Call::WorldRemove(_) | Call::Attach(_) | Call::Detach(_) => {
                 let moment = if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
                 let changed = planner.answer(call, moment, limit).await;
@@ -120,12 +126,17 @@ impl Service {
         }
     }
 
-    async fn execute_released(&self, planner: &Planner<'_>, released: ReleasedPlan) -> Result<Reply, RpcError> {
+    async fn execute_released(
+        &self,
+        planner: &Planner<'_>,
+        released: ReleasedPlan,
+        replan: Option<Option<api::Presence>>,
+    ) -> Result<Reply, RpcError> {
         let ReleasedPlan { plan, trajectory, task } = released;
         // What comes from another process is checked like what comes from any client.
         let execute = api::Execute { trajectory, task };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
-        let begun = self.execute_as(execute, Some(plan)).await?;
+        let begun = self.execute_as(execute, Some((plan, replan))).await?;
         *lock(&self.executed) = Some((plan, begun.motion));
         // The world may have changed since the plan was found free.
         let under_way = lock(&self.motions).under_way().into_iter().find(|motion| motion.number == begun.motion);

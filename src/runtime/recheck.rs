@@ -100,9 +100,12 @@ impl Service {
             ),
         };
         tracing::warn!("motion {} on {}: {text}", motion.number, self.parts.names.task(motion.task));
-        lock(&self.motions).blocked(motion.number, text);
+        let again = lock(&self.motions).blocked(motion.number, text, in_time);
         if in_time {
             let _ = self.ask(Request::Cancel { task: Some(motion.task) }).await;
+            if again {
+                self.go_around(motion);
+            }
             return;
         }
         let arms = motion.joints.iter().filter_map(|joint| self.locate(*joint)).map(|(arm, _)| arm as u16);

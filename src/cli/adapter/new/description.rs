@@ -182,7 +182,12 @@ mod tests {
             pose: Isometry3::translation(0.0, 0.0, -0.02),
             padding: 0.0,
         };
-        Setup::load(&PlannerConfig { timeout: Duration::from_secs(1), robots: vec![robot], objects: vec![table] })
+        Setup::load(&PlannerConfig {
+            timeout: Duration::from_secs(1),
+            padding: 0.0,
+            robots: vec![robot],
+            objects: vec![table],
+        })
             .unwrap()
     }
 
