@@ -12,7 +12,7 @@ use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::planning::ahead::{look_ahead, rests_before};
-use dimos::planning::config::{ObjectConfig, ObjectShape};
+use dimos::planning::config::{JointBounds, ObjectConfig, ObjectShape};
 use dimos::planning::setup::{Setup, obstacle};
 use dimos::planning::solve::{self, Found, Goal, solve};
 use dimos::robot::random::Random;
@@ -27,6 +27,7 @@ const PERIOD: Duration = Duration::from_millis(10);
 const TICK: f64 = 0.01;
 const DOF: usize = 6;
 const ACCELERATION: f64 = 2.0;
+const JERK: f64 = 100.0;
 
 fn config() -> CoordinatorConfig {
     let limits = JointLimits { acceleration_max: vec![ACCELERATION; DOF], ..JointLimits::uniform(DOF, 3.2, 1.0) };
@@ -165,13 +166,45 @@ fn too_close(judge: &ExactChecker, q: &[f64]) -> Option<f64> {
     near.map(|(_, contact)| contact.distance)
 }
 
+/// The planner's robots, as a run narrows them to what its arm may be commanded.
+fn setup() -> Setup {
+    let loaded = Run::from_name("yourarm-planner").unwrap().check();
+    let setup = Setup::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
+    let bounds = JointBounds { position: [-3.0, 3.0], velocity: 3.0, acceleration: ACCELERATION, jerk: JERK };
+    setup.within(&(1..=DOF).map(|j| (format!("arm_joint{j}"), bounds)).collect()).unwrap()
+}
+
+#[test]
+fn planned_motions_keep_the_jerk_limit_in_what_is_commanded() {
+    let (setup, mut random) = (setup(), Random::new(4));
+    let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
+    let mut motions = 0;
+    while motions < 10 {
+        let Some(found) = motion(&setup, &mut checker, &mut random) else { continue };
+        motions += 1;
+        let mut run = Virtual::executing(&found);
+        let mut commanded = vec![run.position(); 3];
+        while run.task.0 == TaskState::Executing {
+            run.step();
+            commanded.push(run.position());
+        }
+        // Steps of the acceleration, from one tick to the next; the last tick is on its way to the hold.
+        for four in commanded[..commanded.len() - 1].windows(4) {
+            for j in 0..DOF {
+                let [a, b, c, d] = [0, 1, 2, 3].map(|k: usize| four[k][j]);
+                let step = (d - 3.0 * c + 3.0 * b - a) / (TICK * TICK);
+                assert!(step.abs() <= JERK * TICK * 1.02 + 1e-6, "joint {j}: a step of {step} rad/s²");
+            }
+        }
+    }
+}
+
 #[test]
 fn a_thousand_motions_brake_before_what_gets_in_their_way() {
     let seed = std::env::var("SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(9);
     println!("SEED={seed}");
     let mut random = Random::new(seed);
-    let loaded = Run::from_name("yourarm-planner").unwrap().check();
-    let setup = Setup::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
+    let setup = setup();
     assert!(setup.padding > 0.0);
     let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
     let (mut held, mut too_late, mut beside, mut nearest) = (0, 0, 0, f64::INFINITY);

@@ -8,7 +8,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::range::{non_negative, positive};
+use crate::blueprint::range::{non_negative, optional_positive, positive};
 use crate::collision::body::MeshMode;
 use crate::yaml::{Keyed, Located, Text};
 
@@ -106,6 +106,10 @@ pub struct RobotConfig {
     #[serde(default = "max_acceleration", deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_acceleration: f64,
+    /// Highest joint jerk, on top of the model's and the arm's own limits [rad/s³].
+    #[serde(default, deserialize_with = "optional_positive")]
+    #[schemars(extend("exclusiveMinimum" = 0.0))]
+    pub max_jerk: Option<f64>,
     /// Poses with a name: one position for each of `joint_names` [rad].
     #[serde(default)]
     pub named_poses: Keyed<Located<Vec<f64>>>,

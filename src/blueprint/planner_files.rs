@@ -65,6 +65,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Describ
         exclusions: typed.collision_exclusion_pairs.clone(),
         max_velocity: typed.max_velocity,
         max_acceleration: typed.max_acceleration,
+        max_jerk: typed.max_jerk,
         named_poses: typed
             .named_poses
             .0

@@ -59,6 +59,8 @@ pub struct RobotConfig {
     pub max_velocity: f64,
     /// Highest joint acceleration, on top of the model's limits [rad/s²].
     pub max_acceleration: f64,
+    /// Highest joint jerk, on top of the model's and the arm's limits [rad/s³].
+    pub max_jerk: Option<f64>,
     /// Poses with a name: a position for each of `joints` [rad].
     pub named_poses: BTreeMap<String, Vec<f64>>,
 }
@@ -86,6 +88,8 @@ pub struct JointBounds {
     pub velocity: f64,
     /// Highest acceleration [rad/s²].
     pub acceleration: f64,
+    /// Highest jerk [rad/s³].
+    pub jerk: f64,
 }
 
 /// An object in the world.

@@ -328,9 +328,11 @@ mod tests {
             exclusions: Vec::new(),
             max_velocity: 1.0,
             max_acceleration: 2.0,
+            max_jerk: None,
             named_poses: BTreeMap::new(),
         };
-        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), padding: 0.003, robots: vec![robot], objects }).unwrap()
+        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), padding: 0.003, robots: vec![robot], objects })
+            .unwrap()
     }
 
     /// Walls that no search gets around in the time of these tests.

@@ -37,9 +37,8 @@ pub(super) fn configurations(
         first += robot.joints.len();
         let goal = wanted.iter().find(|(wanted, _)| wanted == index).map(|(_, goal)| goal);
         let checker = &mut stage.checker;
-        let mut free = |q: &[f64], padded: bool| {
-            !alone || if padded { checker.is_free(q) } else { checker.touches_nothing(q) }
-        };
+        let mut free =
+            |q: &[f64], padded: bool| !alone || if padded { checker.is_free(q) } else { checker.touches_nothing(q) };
         let several = match goal {
             Some(Goal::Joints(values)) => {
                 // Where the model lets a joint turn without end, but the arm does not, whole turns are the same goal.

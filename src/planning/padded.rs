@@ -261,9 +261,7 @@ impl CollisionChecker for Padded {
             between(from, to, pair[0], &mut a);
             between(from, to, pair[1], &mut b);
             between(from, to, 0.5 * (pair[0] + pair[1]), &mut middle);
-            zones
-                .iter_mut()
-                .any(|zone| zone.holds(&middle, full.turns()) && zone.checker.motion_is_free(&a, &b, stop))
+            zones.iter_mut().any(|zone| zone.holds(&middle, full.turns()) && zone.checker.motion_is_free(&a, &b, stop))
                 || full.motion_is_free(&a, &b, stop)
         };
         !cuts.is_empty() && cuts.windows(2).all(&mut piece_is_free)

@@ -32,7 +32,8 @@ pub fn review(setup: &Setup, world: &World, found: &Found, positions: &[Vec<f64>
             between(from, to, f64::from(k) / f64::from(LOOKS), &mut at);
             checker.contacts(&at).into_iter().next()
         });
-        let what = contact.map_or_else(|| "it is no longer free".to_owned(), |contact| in_the_way(&contact, setup.padding));
+        let what =
+            contact.map_or_else(|| "it is no longer free".to_owned(), |contact| in_the_way(&contact, setup.padding));
         return Err(Failure::new(format!("after {:.2} s, {what}", a.time_from_start)));
     }
     Ok(())

@@ -147,6 +147,8 @@ impl PlannedRobot {
                 let own = joint.limits.acceleration.unwrap_or(DEFAULT_ACCELERATION.max(config.max_acceleration));
                 joint.limits.velocity = joint.limits.velocity.min(config.max_velocity);
                 joint.limits.acceleration = Some(own.min(config.max_acceleration));
+                let jerks = [joint.limits.jerk, config.max_jerk].into_iter().flatten();
+                joint.limits.jerk = jerks.reduce(f64::min);
             }
         }
         let link = |name: &str| {
@@ -201,6 +203,7 @@ impl PlannedRobot {
             joint.limits.upper = own.upper.min(upper);
             joint.limits.velocity = own.velocity.min(b.velocity);
             joint.limits.acceleration = Some(own.acceleration.map_or(b.acceleration, |a| a.min(b.acceleration)));
+            joint.limits.jerk = Some(own.jerk.map_or(b.jerk, |jerk| jerk.min(b.jerk)));
         }
         let kinematics = Kinematics::new(&model, &self.joints, &[]).map_err(|e| e.to_string())?;
         self.limits = kinematics.limits().to_vec();

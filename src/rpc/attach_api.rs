@@ -57,6 +57,8 @@ pub struct CommandLimits {
     pub velocity: f64,
     /// Highest acceleration [rad/s²].
     pub acceleration: f64,
+    /// Highest jerk [rad/s³].
+    pub jerk: f64,
 }
 
 /// What a run asks its planner: `data` of a message of the stream `planner_requests`.

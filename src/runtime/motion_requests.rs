@@ -81,7 +81,11 @@ impl Service {
     }
 
     /// Follows a trajectory, as the motion of a plan where it comes from one.
-    pub(super) async fn execute_as(&self, call: api::Execute, plan: Option<Carries>) -> Result<api::ExecuteReply, RpcError> {
+    pub(super) async fn execute_as(
+        &self,
+        call: api::Execute,
+        plan: Option<Carries>,
+    ) -> Result<api::ExecuteReply, RpcError> {
         let trajectory = trajectory_of(call.trajectory);
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
         let mut joints = Vec::new();
@@ -114,7 +118,15 @@ impl Service {
         let number = self.parts.dispatcher.number();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
         let plan = plan.map(|(plan, replan)| Carried { plan, spline: Arc::new(spline.clone()), replan });
-        let planned = Planned { task, joints: joints.clone(), goal, duration: spline.duration(), plan, blocked: None, next: None };
+        let planned = Planned {
+            task,
+            joints: joints.clone(),
+            goal,
+            duration: spline.duration(),
+            plan,
+            blocked: None,
+            next: None,
+        };
         lock(&self.motions).plan(number, planned);
         let log = json!({"execute": {"task": task, "motion": number, "trajectory": trajectory}});
         let motion = Box::new(Motion { id: number, joints, spline });

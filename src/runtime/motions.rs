@@ -165,7 +165,15 @@ mod tests {
 
     #[test]
     fn motions_of_a_task_end_in_their_order_and_old_ones_are_forgotten() {
-        let planned = |task| Planned { task, joints: vec![1], goal: vec![0.5], duration: 1.0, plan: None, blocked: None, next: None };
+        let planned = |task| Planned {
+            task,
+            joints: vec![1],
+            goal: vec![0.5],
+            duration: 1.0,
+            plan: None,
+            blocked: None,
+            next: None,
+        };
         let mut m = Motions::default();
         (1..=3).for_each(|n| m.plan(n, planned((n % 2) as u16)));
         m.task_changed(1, TaskState::Executing, Reason::None, &[]);

@@ -12,9 +12,10 @@ use super::planner_port::PlannerPort;
 use super::service::{Service, internal};
 use crate::control::config::{CoordinatorConfig, TaskKind};
 use crate::control::limit::Bounds;
+use crate::joint::DEFAULT_JERK;
 use crate::rpc::api::{
-    self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered, ReleasedPlan,
-    Reply, Request as Call,
+    self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered,
+    ReleasedPlan, Reply, Request as Call,
 };
 use crate::rpc::planner_line::{PlannerLine, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
@@ -116,7 +117,8 @@ impl Service {
                 Ok(begun)
             }
             Call::WorldAdd(_) | Call::WorldMove(_) | Call::WorldRemove(_) | Call::Attach(_) | Call::Detach(_) => {
-                let moment = if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
+                let moment =
+                    if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
                 let changed = planner.answer(call, moment, limit).await;
                 // Also where it was refused, or not answered in time: it may have happened all the same.
                 self.recheck(&planner).await;
@@ -286,11 +288,13 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
     let mut all = BTreeMap::new();
     for (arm, named) in config.arms.iter().zip(&names.arms) {
         let l = &arm.limits;
-        let bounds = l.position_lower.iter().zip(&l.position_upper).zip(&l.velocity_max).zip(&l.acceleration_max);
-        for (joint, (((lower, upper), velocity), acceleration)) in named.joints.iter().zip(bounds) {
-            let b = Bounds::inside(*lower, *upper, *velocity, *acceleration);
-            let limits =
-                CommandLimits { position: [b.lower, b.upper], velocity: b.velocity, acceleration: b.acceleration };
+        for (j, joint) in named.joints.iter().enumerate() {
+            let of = |limits: &[f64]| limits.get(j).copied();
+            let (Some(lower), Some(upper)) = (of(&l.position_lower), of(&l.position_upper)) else { continue };
+            let (Some(velocity), Some(acceleration)) = (of(&l.velocity_max), of(&l.acceleration_max)) else { continue };
+            let b = Bounds::inside(lower, upper, velocity, acceleration);
+            let jerk = of(&l.jerk_max).unwrap_or(DEFAULT_JERK);
+            let limits = CommandLimits { position: [b.lower, b.upper], velocity, acceleration, jerk };
             all.insert(joint.clone(), limits);
         }
     }

@@ -41,6 +41,7 @@ impl PlannerPort {
             position: l.position,
             velocity: l.velocity,
             acceleration: l.acceleration,
+            jerk: l.jerk,
         };
         let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();

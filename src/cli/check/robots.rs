@@ -1,10 +1,13 @@
 //! What `dimos check` says of the planner's robots. Their descriptions and shapes are read as a run reads them.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::blueprint::Blueprint;
+use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
+use crate::planning::config::JointBounds;
 use crate::planning::setup::{PlannedRobot, Setup};
 
 /// A robot that is planned for.
@@ -37,8 +40,20 @@ pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
     let Some(planner) = blueprint.planner.as_ref().filter(|_| blueprint.awaited_assets().is_empty()) else {
         return Ok(Vec::new());
     };
-    let setup = Setup::load(planner)?;
+    // As a run narrows them to the velocities, accelerations and jerks of its arms.
+    let setup = Setup::load(planner)?.within(&commanded(&Summary::of(blueprint)))?;
     Ok(setup.robots.iter().map(|planned| robot(planned, &setup)).collect())
+}
+
+/// How fast the joints of a blueprint's arms are commanded, as far as that is known without the arms.
+fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
+    let bounds = |joint: &JointSummary| {
+        // Ranges are shown as the model has them, beside those of the arm.
+        let position = [f64::NEG_INFINITY, f64::INFINITY];
+        let velocity = joint.velocity.map_or(f64::INFINITY, |limit| limit.value);
+        JointBounds { position, velocity, acceleration: joint.acceleration.value, jerk: joint.jerk.value }
+    };
+    summary.arms.iter().flat_map(|arm| &arm.joints).map(|joint| (joint.name.clone(), bounds(joint))).collect()
 }
 
 fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {

@@ -174,6 +174,7 @@ mod tests {
             exclusions: Vec::new(),
             max_velocity: 1.0,
             max_acceleration: 2.0,
+            max_jerk: None,
             named_poses: BTreeMap::from([("home".to_owned(), home), ("zero".to_owned(), vec![0.0; dof.into()])]),
         };
         let table = ObjectConfig {
@@ -188,7 +189,7 @@ mod tests {
             robots: vec![robot],
             objects: vec![table],
         })
-            .unwrap()
+        .unwrap()
     }
 
     #[test]
