@@ -85,6 +85,10 @@ pub struct RobotConfig {
     /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
     #[serde(default)]
     pub joint_name_mapping: Keyed<Located<String>>,
+    /// The joint of the model that the arm's gripper moves: `{joint: finger, closed: 0, open: 0.04}`. Without it a gripper is
+    /// planned for at its widest opening.
+    #[serde(default)]
+    pub gripper_joint: Option<Located<GripperJointEntry>>,
     /// The trajectory task that executes the robot's motions.
     #[serde(default)]
     pub coordinator_task_name: Option<Located<String>>,
@@ -113,6 +117,18 @@ pub struct RobotConfig {
     /// Poses with a name: one position for each of `joint_names` [rad].
     #[serde(default)]
     pub named_poses: Keyed<Located<Vec<f64>>>,
+}
+
+/// The joint of a model that a gripper moves. Joints that follow it by `mimic` move with it.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GripperJointEntry {
+    /// Its name in the model.
+    pub joint: Located<String>,
+    /// Its position when the gripper is closed [rad or m].
+    pub closed: f64,
+    /// Its position when the gripper is open [rad or m]; between the two it follows the opening in proportion.
+    pub open: f64,
 }
 
 /// The joints of a robot that are planned for.

@@ -11,7 +11,7 @@ use crate::blueprint::planner::{
 };
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
@@ -61,6 +61,12 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Describ
         end_effector_link: typed.end_effector_link.value.clone(),
         coordinator_joints: joints.iter().map(ours).collect(),
         joints,
+        joint_prefix: typed.joint_prefix.as_ref().map_or_else(String::new, |prefix| prefix.value.clone()),
+        gripper_joint: typed.gripper_joint.as_ref().map(|gripper| GripperJoint {
+            joint: gripper.joint.value.clone(),
+            closed: gripper.closed,
+            open: gripper.open,
+        }),
         task: typed.coordinator_task_name.as_ref().map(|name| name.value.clone()),
         exclusions: typed.collision_exclusion_pairs.clone(),
         max_velocity: typed.max_velocity,

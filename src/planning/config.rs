@@ -51,6 +51,10 @@ pub struct RobotConfig {
     pub joints: Vec<String>,
     /// The coordinator's names of the same joints.
     pub coordinator_joints: Vec<String>,
+    /// What comes before a joint's name in the model to make the coordinator's name of one that is not planned.
+    pub joint_prefix: String,
+    /// The joint of the model that the arm's gripper moves.
+    pub gripper_joint: Option<GripperJoint>,
     /// The trajectory task that executes its motions.
     pub task: Option<String>,
     /// Pairs of links that may touch.
@@ -63,6 +67,17 @@ pub struct RobotConfig {
     pub max_jerk: Option<f64>,
     /// Poses with a name: a position for each of `joints` [rad].
     pub named_poses: BTreeMap<String, Vec<f64>>,
+}
+
+/// The joint of a model that a gripper moves; others follow it by `mimic`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GripperJoint {
+    /// Its name in the model.
+    pub joint: String,
+    /// Its position when the gripper is closed [rad or m].
+    pub closed: f64,
+    /// Its position when the gripper is open [rad or m].
+    pub open: f64,
 }
 
 impl RobotConfig {

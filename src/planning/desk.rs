@@ -11,6 +11,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::ahead::{Blocked, look_ahead};
+use super::idle::Measured;
 use super::review::review;
 use super::setup::Setup;
 use super::solve::{Failure, Found, Request, solve};
@@ -64,6 +65,7 @@ impl Job {
 
 struct Order {
     id: u64,
+    setup: Arc<Setup>,
     request: Arc<Request>,
     world: World,
     stop: Stop,
@@ -79,6 +81,8 @@ struct Shared {
 /// A planner that is running. Ends with its last owner.
 pub struct Desk {
     setup: Arc<Setup>,
+    /// The same with the joints that are not planned where they were measured last.
+    now: Mutex<Arc<Setup>>,
     /// The world and how often it was changed.
     world: Mutex<(World, u64)>,
     shared: Arc<Shared>,
@@ -121,13 +125,28 @@ impl Desk {
     pub fn with(setup: Setup, timeout: Duration, solver: Solver) -> std::io::Result<Self> {
         let world = Mutex::new((setup.world.clone(), 1));
         let (setup, shared) = (Arc::new(setup), Arc::new(Shared::default()));
-        let worker = Mutex::new(Worker::start(&setup, &shared, &solver, 0)?);
-        Ok(Self { setup, world, shared, solver, timeout, worker })
+        let worker = Mutex::new(Worker::start(&shared, &solver, 0)?);
+        let now = Mutex::new(setup.clone());
+        Ok(Self { setup, now, world, shared, solver, timeout, worker })
     }
 
     /// The robots.
     pub fn setup(&self) -> &Setup {
         &self.setup
+    }
+
+    /// The robots with the joints that are not planned where they were measured last.
+    pub fn now(&self) -> Arc<Setup> {
+        lock(&self.now).clone()
+    }
+
+    /// Takes note of where the joints that are not planned are.
+    pub fn measured(&self, measured: &Measured) {
+        let mut now = lock(&self.now);
+        if let Some(changed) = now.with_idle_joints(measured) {
+            *now = Arc::new(changed);
+            lock(&self.world).1 += 1;
+        }
     }
 
     /// Changes the world. Requests that are being planned keep the world that they began with.
@@ -160,7 +179,7 @@ impl Desk {
         if jobs.len() > KEPT {
             jobs.pop_front();
         }
-        let order = Order { id, request, world: lock(&self.world).0.clone(), stop };
+        let order = Order { id, setup: self.now(), request, world: lock(&self.world).0.clone(), stop };
         // The thread ends with this sender only.
         let _ = orders.send(order);
         Ok(())
@@ -196,7 +215,7 @@ impl Desk {
         job.progress = Progress::Failed(failure, since.elapsed());
         let mut worker = lock(&self.worker);
         let hanging = worker.hanging + 1;
-        let fresh = (hanging < MAX_HANGING).then(|| Worker::start(&self.setup, &self.shared, &self.solver, hanging));
+        let fresh = (hanging < MAX_HANGING).then(|| Worker::start(&self.shared, &self.solver, hanging));
         *worker = match fresh {
             Some(Ok(fresh)) => fresh,
             _ => Worker { orders: None, thread: None, hanging },
@@ -211,7 +230,7 @@ impl Desk {
         positions: Vec<Vec<f64>>,
         stop: Stop,
     ) -> impl FnOnce() -> Result<(), Failure> + Send + use<> {
-        let (setup, world) = (self.setup.clone(), lock(&self.world).0.clone());
+        let (setup, world) = (self.now(), lock(&self.world).0.clone());
         move || review(&setup, &world, &found, &positions, &stop)
     }
 
@@ -224,7 +243,7 @@ impl Desk {
         elapsed: f64,
         stop: Stop,
     ) -> impl FnOnce() -> Result<Option<Blocked>, Failure> + Send + use<> {
-        let (setup, world) = (self.setup.clone(), lock(&self.world).0.clone());
+        let (setup, world) = (self.now(), lock(&self.world).0.clone());
         move || look_ahead(&setup, &world, &found, &positions, elapsed, &stop)
     }
 
@@ -243,13 +262,13 @@ impl Desk {
 }
 
 impl Worker {
-    fn start(setup: &Arc<Setup>, shared: &Arc<Shared>, solver: &Solver, hanging: usize) -> std::io::Result<Self> {
+    fn start(shared: &Arc<Shared>, solver: &Solver, hanging: usize) -> std::io::Result<Self> {
         let (orders, receiver) = channel();
-        let (setup, shared, solver) = (setup.clone(), shared.clone(), solver.clone());
+        let (shared, solver) = (shared.clone(), solver.clone());
         let thread = std::thread::Builder::new()
             .name("planner".into())
             .stack_size(STACK)
-            .spawn(move || work(&solver, &setup, &shared, &receiver))?;
+            .spawn(move || work(&solver, &shared, &receiver))?;
         Ok(Self { orders: Some(orders), thread: Some(thread), hanging })
     }
 }
@@ -271,10 +290,10 @@ impl Drop for Desk {
     }
 }
 
-fn work(solver: &Solver, setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
+fn work(solver: &Solver, shared: &Shared, orders: &Receiver<Order>) {
     while let Ok(order) = orders.recv() {
         let began = Instant::now();
-        let outcome = catch_unwind(AssertUnwindSafe(|| solver(setup, &order.world, &order.request, &order.stop)));
+        let outcome = catch_unwind(AssertUnwindSafe(|| solver(&order.setup, &order.world, &order.request, &order.stop)));
         let took = began.elapsed();
         let progress = match outcome {
             Ok(Ok(found)) => Progress::Found(Arc::new(found), took),
@@ -329,6 +348,8 @@ mod tests {
             max_velocity: 1.0,
             max_acceleration: 2.0,
             max_jerk: None,
+            joint_prefix: String::new(),
+            gripper_joint: None,
             named_poses: BTreeMap::new(),
         };
         Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), padding: 0.003, robots: vec![robot], objects })

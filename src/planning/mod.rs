@@ -13,6 +13,7 @@ pub mod cartesian;
 pub mod config;
 pub mod desk;
 mod goals;
+pub mod idle;
 pub mod ik;
 pub mod leaving;
 pub mod nearest;

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glamx::DVec3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::idle::{Measured, idle};
 use super::timing::DEFAULT_ACCELERATION;
 use crate::collision::always::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
@@ -39,6 +40,8 @@ pub struct PlannedRobot {
     pub end_effector: usize,
     /// Limits of the planned joints.
     pub limits: Vec<Limits>,
+    /// Where the joints that are not planned are, among positions of all joints of the model [rad or m].
+    pub rest: Vec<f64>,
     /// As it stands in the world, with all its planned joints.
     pub body: Robot,
 }
@@ -159,7 +162,9 @@ impl PlannedRobot {
         let (base, end_effector) = (link(&config.base_link)?, link(&config.end_effector_link)?);
         let shape = |link: &str| config.shapes.get(link).copied().unwrap_or_default();
         let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
-        let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
+        let idle = idle(config, &model, &joints, &Measured::default());
+        let posed = model.positions(&idle);
+        let kinematics = Kinematics::new(&model, &joints, &posed).map_err(|e| e.to_string())?;
         let limits = kinematics.limits().to_vec();
         let rest = model.positions(&HashMap::new());
         let base_in_model = model.link_poses(&rest).get(base).copied().unwrap_or_default();
@@ -184,7 +189,7 @@ impl PlannedRobot {
         for (name, pose) in semantics.poses_of(&config.joints).into_iter().filter(|(_, pose)| outside(pose).is_none()) {
             config.named_poses.entry(name.to_owned()).or_insert(pose);
         }
-        Ok(Self { config, model, joints, end_effector, limits, body })
+        Ok(Self { config, model, joints, end_effector, limits, rest: posed, body })
     }
 
     fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
@@ -205,7 +210,7 @@ impl PlannedRobot {
             joint.limits.acceleration = Some(own.acceleration.map_or(b.acceleration, |a| a.min(b.acceleration)));
             joint.limits.jerk = Some(own.jerk.map_or(b.jerk, |jerk| jerk.min(b.jerk)));
         }
-        let kinematics = Kinematics::new(&model, &self.joints, &[]).map_err(|e| e.to_string())?;
+        let kinematics = Kinematics::new(&model, &self.joints, &self.rest).map_err(|e| e.to_string())?;
         self.limits = kinematics.limits().to_vec();
         self.model = Arc::new(model);
         self.body = Robot { model: self.model.clone(), kinematics: Arc::new(kinematics), ..self.body.clone() };
@@ -214,7 +219,9 @@ impl PlannedRobot {
 
     /// The robot as it stands in the world while it does not move: no joint of it is planned.
     pub fn standing(&self, positions: &[f64]) -> Result<Robot, String> {
-        let named = self.config.joints.iter().cloned().zip(positions.iter().copied()).collect();
+        let mut named: HashMap<String, f64> =
+            self.model.joints.iter().zip(&self.rest).map(|(joint, q)| (joint.name.clone(), *q)).collect();
+        named.extend(self.config.joints.iter().cloned().zip(positions.iter().copied()));
         let rest = self.model.positions(&named);
         let kinematics = Kinematics::new(&self.model, &[], &rest).map_err(|e| e.to_string())?;
         Ok(Robot { kinematics: Arc::new(kinematics), ..self.body.clone() })

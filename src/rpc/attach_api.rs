@@ -84,6 +84,9 @@ pub struct Moment {
     /// Where joints are [rad]: where they are commanded to be, where positions are commanded. Without those whose arm has
     /// not been heard of for 1 s.
     pub positions: BTreeMap<String, f64>,
+    /// How far the grippers of arms are open, 0–1, by each of their arm's joints.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub grippers: BTreeMap<String, f64>,
 }
 
 /// Parameters of `planner_answer`: one of `result` and `error`.

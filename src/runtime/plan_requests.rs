@@ -20,6 +20,7 @@ const REVIEW_LIMIT: Duration = Duration::from_secs(2);
 
 impl PlannerPort {
     pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
+        self.measured(moment);
         let setup = self.desk.setup();
         let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
         let positions = all_positions(setup, moment)?;
@@ -37,7 +38,7 @@ impl PlannerPort {
 
     pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
         let (job, found) = found(self, plan)?;
-        let setup = self.desk.setup();
+        let setup = self.desk.now();
         let mut end_effectors = BTreeMap::new();
         let mut first = 0;
         for &index in &found.robots {
@@ -65,6 +66,7 @@ impl PlannerPort {
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
         let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
         let task = task.map(|task| (*task).clone());
+        self.measured(moment);
         let version = self.desk.version();
         self.still_free(&job, &found, moment).await?;
         self.remember(job.id, found.clone(), version);

@@ -270,7 +270,7 @@ impl Service {
 
     /// What a planner needs to know of this run now.
     pub(super) fn moment(&self, plan: u64) -> Moment {
-        let (now, mut positions) = (self.now(), BTreeMap::new());
+        let (now, mut positions, mut grippers) = (self.now(), BTreeMap::new(), BTreeMap::new());
         for (index, arm) in self.parts.names.arms.iter().enumerate() {
             let fresh = |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= FRESH;
             let Some(view) = self.arm_view(index).filter(fresh) else { continue };
@@ -278,8 +278,15 @@ impl Service {
             let values = if commanded { view.command.values } else { view.state.position };
             let known = arm.joints.iter().cloned().zip(values).filter(|(_, value)| value.is_finite());
             positions.extend(known);
+            let range = self.parts.connected.get(index).and_then(|connected| connected.gripper_range);
+            if let (Some(opening), Some((closed, open))) = (view.state.gripper, range)
+                && open > closed
+            {
+                let part = ((opening - closed) / (open - closed)).clamp(0.0, 1.0);
+                grippers.extend(arm.joints.iter().map(|joint| (joint.clone(), part)));
+            }
         }
-        Moment { plan, positions }
+        Moment { plan, positions, grippers }
     }
 }
 

@@ -13,6 +13,7 @@ use super::service::internal;
 use super::world_requests::typed;
 use crate::planning::config::{JointBounds, PlannerConfig};
 use crate::planning::desk::{Desk, Solver};
+use crate::planning::idle::Measured;
 use crate::planning::setup::Setup;
 use crate::planning::solve::solve;
 use crate::rpc::api::{CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject};
@@ -48,6 +49,12 @@ impl PlannerPort {
         let desk = Desk::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
         let desk = desk.map_err(|e| format!("no planner thread: {e}"))?;
         Ok(Self { desk, objects: Mutex::new(objects), released: Mutex::default() })
+    }
+
+    /// Takes note of where the joints are that are not planned.
+    pub(super) fn measured(&self, moment: &Moment) {
+        let (positions, grippers) = (moment.positions.clone(), moment.grippers.clone());
+        self.desk.measured(&Measured { positions, grippers });
     }
 
     /// Answers one of the planner's methods, but for `execute_plan`: see [`release`](Self::release).

@@ -40,6 +40,7 @@ impl PlannerPort {
     pub(super) async fn recheck(&self, call: &Recheck, moment: &Moment) -> Result<RecheckReply, RpcError> {
         let unknown = || RpcError::new(Code::UnknownPlan, format!("the planner does not know plan {}", call.plan));
         let (found, verified) = lock(&self.released).get(&call.plan).cloned().ok_or_else(unknown)?;
+        self.measured(moment);
         let version = self.desk.version();
         if version == verified {
             return Ok(RecheckReply::default());

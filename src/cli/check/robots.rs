@@ -18,6 +18,8 @@ pub(super) struct Robot {
     end_effector_link: String,
     joints: Vec<Joint>,
     named_poses: Vec<String>,
+    /// Gripper joints of which nothing says where they are: they are planned for wide open.
+    taken_as_open: Vec<String>,
     /// Pairs of links that touch in every pose.
     always_touching: Vec<[String; 2]>,
 }
@@ -75,6 +77,7 @@ fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {
         end_effector_link: config.end_effector_link.clone(),
         joints: joints.collect(),
         named_poses: config.named_poses.keys().cloned().collect(),
+        taken_as_open: planned.taken_as_open().into_iter().map(|(name, _)| name).collect(),
         always_touching: touching.map(|(_, pair)| pair.clone()).collect(),
     }
 }
@@ -100,6 +103,10 @@ pub(super) fn print(robot: &Robot) {
     table.print();
     if !robot.named_poses.is_empty() {
         output::line(format_args!("  named poses: {}", robot.named_poses.join(", ")));
+    }
+    for joint in &robot.taken_as_open {
+        output::line(format_args!("  {joint} is planned for wide open: nothing says where it is"));
+        output::line("  hint: gripper_joint: {joint: …, closed: …, open: …} lets it follow the gripper");
     }
     for [a, b] in &robot.always_touching {
         output::line(format_args!(

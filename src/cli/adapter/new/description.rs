@@ -175,6 +175,8 @@ mod tests {
             max_velocity: 1.0,
             max_acceleration: 2.0,
             max_jerk: None,
+            joint_prefix: String::new(),
+            gripper_joint: None,
             named_poses: BTreeMap::from([("home".to_owned(), home), ("zero".to_owned(), vec![0.0; dof.into()])]),
         };
         let table = ObjectConfig {
