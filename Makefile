@@ -1,11 +1,11 @@
-# run install check test · test-tools test-rerun · bench jitter
+# run install check test · test-tools test-rerun · bench bench-quick jitter soak
 
 PYTHON ?= python3
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
-.PHONY: run install check test test-tools test-rerun bench jitter
+.PHONY: run install check test test-tools test-rerun bench bench-quick jitter soak
 
 # Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
@@ -57,6 +57,18 @@ test-rerun: .venv/readers-installed
 bench:
 	cargo bench --locked --bench control --bench wire --bench rpc --bench verify
 
+# Starts every benchmark in a form of a few seconds, without optimization: to see that each still runs. Fails where a part
+# of one does not; its figures mean nothing.
+bench-quick:
+	cargo bench --locked --profile dev --bench control --bench jitter --bench planning --bench rpc --bench verify \
+	--bench wire -- --quick
+
 # Lateness of the tick beside cyclictest.
 jitter:
 	cargo bench --locked --bench jitter
+
+# Arms idle and moving beside eight busy processes, half an hour each, and runs that are stopped and continued 200 times:
+# no arm may be held by that. Two and a half hours.
+soak:
+	DIMOS_SOAK=1800 DIMOS_STALLS=200 cargo test --locked --test stalls --test stalls_soak -- --nocapture --test-threads 1
+	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --locked --test stalls_soak -- --nocapture --test-threads 1

@@ -1,11 +1,11 @@
 //! `make bench`: what talking to a run costs: the round trip, and what readers do to the tick. Prints; judges, but
-//! never fails.
+//! fails on no figure.
 
 #[path = "support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmarks")]
 mod support;
 
-use std::process::Command;
+use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -23,13 +23,14 @@ const READERS: usize = 4;
 /// Requests per second in the flood.
 const FLOOD: f64 = 10_000.0;
 
-fn main() {
+fn main() -> ExitCode {
     let effort = Effort::told();
     println!("\ndimos: what talking to a run costs{}\n", effort.of(" (quick)", ""));
     machine::print();
     if let Err(e) = round_trip(effort).and_then(|()| readers(effort)).and_then(|()| python(effort)) {
-        println!("SKIPPED: {e}");
+        support::skipped(&e);
     }
+    effort.end()
 }
 
 fn fast_run() -> Result<LiveRun, String> {
@@ -39,10 +40,10 @@ fn fast_run() -> Result<LiveRun, String> {
 /// Request and reply of `state`, one after the other.
 fn round_trip(effort: Effort) -> Result<(), String> {
     let (mut p50, mut p99) = (Vec::new(), Vec::new());
-    for _ in 0..effort.of(2, 5) {
+    for _ in 0..effort.of(1, 5) {
         let mut run = fast_run()?;
         let mut client = run.client()?;
-        let times: Result<Vec<f64>, String> = (0..effort.of(2_000, 10_000))
+        let times: Result<Vec<f64>, String> = (0..effort.of(200, 10_000))
             .map(|_| {
                 let began = Instant::now();
                 client.call(State {}).map_err(|e| e.to_string())?;
@@ -65,9 +66,9 @@ fn round_trip(effort: Effort) -> Result<(), String> {
 
 /// Lateness of the tick alone, with readers of the stream, and in a flood of requests, in turns.
 fn readers(effort: Effort) -> Result<(), String> {
-    let time = Duration::from_secs(effort.of(3, 10));
+    let time = Duration::from_secs(effort.of(1, 10));
     let (mut alone, mut read, mut flooded) = (Vec::new(), Vec::new(), Vec::new());
-    for _ in 0..effort.of(2, 5) {
+    for _ in 0..effort.of(1, 5) {
         alone.push(lateness(time, |_| Ok(Vec::new()))?);
         read.push(lateness(time, |stop| (0..READERS).map(|_| Ok(reader(stop))).collect())?);
         flooded.push(lateness(time, |stop| Ok(vec![flood(stop)]))?);
@@ -147,7 +148,7 @@ fn python(effort: Effort) -> Result<(), String> {
     let mut run = LiveRun::start(&blueprint.display().to_string(), &[]).map_err(|e| e.to_string())?;
     run.client()?;
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/assets/python/example_policy.py");
-    let seconds = effort.of("10", "60");
+    let seconds = effort.of("2", "60");
     let output = Command::new("python3")
         .args([script, "servo_arm", "--rate", "100", "--seconds", seconds])
         .env("XDG_RUNTIME_DIR", run.folder())

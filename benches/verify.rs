@@ -1,8 +1,12 @@
-//! `dimos replay --verify`: how many ticks a second, on a log of ten minutes at 100 Hz.
+//! `dimos replay --verify`: how many ticks a second, on a log of ten minutes at 100 Hz (`--quick`: of 20 s).
 
 #[path = "../tests/support/virtual_run.rs"]
 #[allow(dead_code, reason = "shared with tests")]
 mod virtual_run;
+
+#[path = "support/mod.rs"]
+#[allow(dead_code, reason = "shared with the other benchmarks")]
+mod support;
 
 use std::time::Instant;
 
@@ -13,19 +17,19 @@ use dimos::replay::verify::{Finding, verify};
 use dimos::telemetry::TaskState;
 use virtual_run::{VirtualRun, one_arm};
 
-const TICKS: u64 = 60_000;
 const GOAL: f64 = 200_000.0;
 
 fn main() {
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
+    let ticks = support::Effort::told().of(2_000, 60_000);
     for dof in [6, 7] {
         let log = folder.path().join(format!("{dof}.mcap"));
-        record(dof, &log);
+        record(dof, ticks, &log);
         let size = std::fs::metadata(&log).map_or(0, |m| m.len()) as f64 / 1e6;
         // The best of a few: others use this machine as well.
         let best = (0..5).map(|_| ticks_per_second(&log)).fold(0.0, f64::max);
         let verdict = if best >= GOAL { "met" } else { "missed" };
-        println!("verify, {dof} joints, {TICKS} ticks, {size:.1} MB: {best:.0} ticks/s (goal {GOAL:.0}: {verdict})");
+        println!("verify, {dof} joints, {ticks} ticks, {size:.1} MB: {best:.0} ticks/s (goal {GOAL:.0}: {verdict})");
     }
 }
 
@@ -37,14 +41,14 @@ fn ticks_per_second(log: &std::path::Path) -> f64 {
 }
 
 /// An arm that goes to and fro.
-fn record(dof: usize, log: &std::path::Path) {
+fn record(dof: usize, ticks: u64, log: &std::path::Path) {
     let mut run = VirtualRun::start(&one_arm(dof), log);
     let limits = JointLimits::uniform(dof, 3.0, 2.0).with_defaults();
     let names = make_joints("arm", dof);
     let (mut from, mut to) = (vec![0.0; dof], vec![0.7; dof]);
     run.step();
     run.ask(Request::Ready { arm: 0 });
-    while run.tick < TICKS {
+    while run.tick < ticks {
         if run.tick > 100 && run.tasks[0].state != TaskState::Executing {
             let motion = point_to_point(&names, &from, &to, &limits, 0.7).expect("the way is free");
             run.execute(0, &motion);

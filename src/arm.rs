@@ -1,8 +1,73 @@
 //! What crosses between an arm's device thread and the tick: the latest state one way, the latest command the
 //! other. Plain data of fixed size, so that neither side ever allocates or waits.
 
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
+
+/// Figures with which an arm's measurements and its motion are checked: the adapter's row, overridden by the blueprint.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Supervision {
+    /// How far a joint at rest may be from its set point under load [rad].
+    pub accuracy: f64,
+    /// Time from a set point to the measured motion that follows it [s].
+    pub lag: f64,
+    /// Age limit of a state.
+    pub stale_after: Duration,
+    /// Largest distance of a joint from its set points of the last `lag` seconds [rad].
+    pub tracking_tolerance: f64,
+    /// Whether a pose with every joint at exactly zero is believed without the device's confirmation.
+    pub accept_zero_pose: bool,
+}
+
+impl Supervision {
+    /// Default of `tracking_tolerance` [rad].
+    pub const TRACKING_TOLERANCE: f64 = 0.15;
+
+    /// How far the first set point after enabling may be from the measured position [rad].
+    pub fn seed_tolerance(&self) -> f64 {
+        self.accuracy.max(0.005)
+    }
+}
+
+impl Default for Supervision {
+    fn default() -> Self {
+        Self {
+            accuracy: 0.005,
+            lag: 0.05,
+            stale_after: Duration::from_millis(50),
+            tracking_tolerance: Self::TRACKING_TOLERANCE,
+            accept_zero_pose: false,
+        }
+    }
+}
+
+/// A change of the arm's condition that this run did not order: made at its panel, by hand guiding, or by another
+/// program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Interference {
+    /// None was seen.
+    #[default]
+    None,
+    /// The arm is in another mode than the one that was ordered.
+    Mode,
+    /// The motors were enabled.
+    Power,
+}
+
+impl Interference {
+    /// The name used in logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::None => "",
+            Self::Mode => "mode",
+            Self::Power => "power",
+        }
+    }
+}
 
 /// Where a velocity came from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -97,6 +162,10 @@ pub struct ArmState {
     pub self_held: bool,
     /// `ArmCommand::seq` of the newest command that was written to the wire.
     pub written: u64,
+    /// Seen of the arm that this run did not order. Cleared when errors are cleared.
+    pub interference: Interference,
+    /// Part of this state's age in which the device thread could not run [ns]: not the arm's fault.
+    pub own_delay_ns: u64,
 }
 
 impl Default for ArmState {
@@ -118,6 +187,8 @@ impl Default for ArmState {
             link: Link::Down,
             self_held: false,
             written: 0,
+            interference: Interference::None,
+            own_delay_ns: 0,
         }
     }
 }
@@ -139,6 +210,11 @@ pub struct ArmCommand {
     pub stop_seq: u32,
     /// When the tick will read states next: the device thread reads shortly before.
     pub next_tick: Mono,
+    /// The tick's time of this command.
+    pub at: Mono,
+    /// Counts the starts of commanded motion: after enabling and after a change of mode. The first set point of each is
+    /// compared with the measured pose before it is written.
+    pub start_seq: u32,
 }
 
 impl Default for ArmCommand {
@@ -151,6 +227,8 @@ impl Default for ArmCommand {
             gripper_seq: 0,
             stop_seq: 0,
             next_tick: Mono::ZERO,
+            at: Mono::ZERO,
+            start_seq: 0,
         }
     }
 }

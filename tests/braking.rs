@@ -4,10 +4,10 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use dimos::arm::{ArmState, Link, VelocitySource};
+use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::control::config::{ArmConfig, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::joint::{ControlMode, JointLimits, joints_of};
@@ -37,7 +37,10 @@ fn config() -> CoordinatorConfig {
         limits: limits.with_defaults(),
         modes: vec![ControlMode::ServoPosition],
         gripper: false,
-        state_timeout: Duration::from_millis(50),
+        own_velocity: Vec::new(),
+        read_period: Duration::from_millis(10),
+        write_period: Duration::from_millis(10),
+        supervision: Supervision { stale_after: Duration::from_millis(50), ..Supervision::default() },
     };
     let task = TaskConfig {
         name: "traj_arm".into(),
@@ -46,7 +49,7 @@ fn config() -> CoordinatorConfig {
         priority: 10,
         auto_start: false,
     };
-    CoordinatorConfig { rate: 100.0, arms: vec![arm], tasks: vec![task] }
+    CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
 }
 
 /// The coordinator on a clock that is set forward, with an arm that does what it is told, a period later.
@@ -94,12 +97,13 @@ impl Virtual {
         self.arm.seq += 1;
         self.arm.stamp = self.now.before(Duration::from_micros(1500));
         let next = self.now.after(PERIOD);
-        let time = TickTime { now: self.now, next, skipped: 0, late_ns: 20_000 };
+        let time = TickTime { now: self.now, next, skipped: 0, late_ns: 20_000, woke_late_ns: 20_000 };
         let states = [self.arm];
         let output = self.coordinator.tick(time, &states, || self.inbox.pop_front());
         let command = output.commands[0];
         self.task = (output.tasks[0].state, output.tasks[0].elapsed);
-        if command.mode.is_some() {
+        if let Some(mode) = command.mode {
+            (self.arm.mode, self.arm.written) = (mode, command.seq);
             for j in 0..DOF {
                 let before = self.arm.position[j];
                 self.arm.position[j] = command.values[j];

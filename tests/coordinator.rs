@@ -189,7 +189,10 @@ fn a_waiting_arm_makes_the_other_one_wait_too() {
 #[test]
 fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
     for (stop_takes_hold, lag, sag) in [(false, 0.0, 0.0), (true, 0.0, 0.0), (true, 0.06, 0.0), (false, 0.06, 0.03)] {
-        let mut rig = Rig::one_arm(one(trajectory()));
+        let mut sagging = arm("arm", 6);
+        sagging.supervision.accuracy = 0.02;
+        let mut rig = Rig::new(100.0, vec![sagging], one(trajectory()));
+        rig.make_ready();
         (rig.arms[0].stop_takes_hold, rig.arms[0].lag, rig.arms[0].sag) = (stop_takes_hold, lag, sag);
         rig.run_for(1.0);
         let commanded = rig.commanded(0)[0];
@@ -266,7 +269,10 @@ fn a_stop_while_an_arm_is_being_enabled_is_not_lost() {
 
 #[test]
 fn activating_again_and_again_does_not_sink() {
-    let mut rig = Rig::one_arm(one(trajectory()));
+    let mut sagging = arm("arm", 6);
+    sagging.supervision.accuracy = 0.02;
+    let mut rig = Rig::new(100.0, vec![sagging], one(trajectory()));
+    rig.make_ready();
     rig.arms[0].sag = 0.02;
     rig.arms[0].lag = 0.03;
     rig.run_for(1.0);
@@ -291,8 +297,11 @@ fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
         rig.arms[0].enabled = !off;
         rig.run(3);
         assert_eq!(rig.phase(0), if off { Phase::Disabled } else { Phase::Standby });
-        rig.arms[0].q.iter_mut().for_each(|q| *q += carried);
         rig.arms[0].setpoint = None;
+        for _ in 0..40 {
+            rig.arms[0].q.iter_mut().for_each(|q| *q += carried / 40.0);
+            rig.run(1);
+        }
         let there = rig.arms[0].q[0];
         rig.run(3);
         rig.arms[0].enabled = true;
@@ -335,7 +344,7 @@ fn an_arm_is_not_taken_up_without_a_fresh_state() {
 
 fn time(rig: &Rig) -> dimos::control::coordinator::TickTime {
     let next = rig.now.after(rig.config.period());
-    dimos::control::coordinator::TickTime { now: rig.now, next, skipped: 0, late_ns: 0 }
+    dimos::control::coordinator::TickTime { now: rig.now, next, skipped: 0, late_ns: 0, woke_late_ns: 0 }
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-use dimos::arm::{ArmCommand, ArmState, Link};
+use dimos::arm::{ArmCommand, ArmState, Link, Supervision};
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
@@ -38,12 +38,11 @@ fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate
     let (state_writer, states) = slot(ArmState::default());
     let (commands, command_reader) = slot(ArmCommand::default());
     let config = DeviceConfig {
-        realtime: true,
         hardware_id: "arm".into(),
         dof: 6,
         tick_period: Duration::from_millis(10),
         native_rate,
-        velocity_max: 2.0,
+        supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
         beat: beat.clone(),
         clock: Arc::new(MonotonicClock),
         notes: Box::new(|_| {}),
@@ -87,7 +86,7 @@ impl Bench {
 #[test]
 fn a_stop_that_fails_is_sent_again_and_confirmed() {
     let mut bench = bench(100.0);
-    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.5));
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.03));
     bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
     bench.mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
     bench.mock.fail("write_stop", AdapterError::Rejected("busy".into()));
@@ -120,7 +119,7 @@ fn a_slow_arm_is_held_too_when_the_tick_falls_silent() {
     // It is read once a second, and must be stopped long before the next time.
     let mut bench = bench(1.0);
     bench.mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
-    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.5));
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.03));
     bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
     bench.mock.clear_calls();
     bench.until("the stops", |b| b.stops() == 2);

@@ -59,9 +59,9 @@ fn f02_joints_never_vanish_and_their_age_grows() {
         // 30 ms is the timeout: two missed states are ridden through, three are not.
         assert_eq!(rig.phase(1), if k < 3 { Phase::Ready } else { Phase::Held }, "after {k} missed states");
     }
-    assert_eq!(rig.samples[1].cause, Cause::Stale);
+    assert_eq!(rig.samples[1].cause.name(), "stale");
     assert_eq!(rig.count(|e| matches!(e, Event::Arm(1, ..))), 1, "told once");
-    assert_eq!(rig.tasks[1].reason, Reason::ArmHeld(1, Cause::Stale));
+    assert!(matches!(rig.tasks[1].reason, Reason::ArmHeld(1, Cause::Stale(_))));
     rig.run_until(2.0, |r| r.tasks[0].state == TaskState::Completed);
     rig.arms[1].silent = false;
     rig.run_for(1.0);
@@ -154,7 +154,7 @@ fn f07_measurements_that_are_not_finite_reach_no_command() {
             assert_eq!(rig.phase(0), if k < 2 { Phase::Ready } else { Phase::Held }, "they age");
         }
         rig.arms[0].q = q;
-        assert_eq!(rig.samples[0].cause, Cause::Stale);
+        assert_eq!(rig.samples[0].cause.name(), "stale");
         assert_eq!(rig.ask(Request::Ready { arm: 0 }).name(), "ARM_LATCHED");
     }
 }
@@ -170,11 +170,13 @@ fn f07_velocities_that_are_not_finite_are_estimated() {
         let mut state = rig.arms[0].state;
         state.seq += 1;
         state.stamp = rig.now;
+        state.written = rig.commands[0].seq;
         state.mode = rig.commands[0].mode.unwrap_or(state.mode);
         if rig.commands[0].mode.is_some_and(|m| m.is_position()) {
             state.position = rig.commands[0].values;
         }
         rig.arms[0].state = state;
+        (rig.arms[0].written_at, rig.arms[0].written_start) = (rig.commands[0].at, rig.commands[0].start_seq);
         state.velocity = joints_of(&[f64::NAN; 6]);
         rig.tick_with(&[state], 0);
     }
@@ -648,9 +650,9 @@ fn f20_skipped_periods_are_told_and_never_caught_up_with() {
     assert!(rig.told(Event::Overrun(5, 50_000_000)));
     assert!(rig.commanded(0)[0] - before <= V_MAX * rig.dt(), "one step, not six");
     assert_eq!(rig.tasks[0].state, TaskState::Executing, "50 ms are ridden through");
+    rig.tick_after(8);
+    assert_eq!(rig.phase(0), Phase::Ready, "90 ms between two ticks as well");
     rig.tick_after(9);
-    assert_eq!(rig.phase(0), Phase::Ready, "90 ms as well");
-    rig.tick_after(10);
     assert_eq!((rig.phase(0), rig.samples[0].cause), (Phase::Held, Cause::Overrun), "100 ms are not");
     assert_eq!(rig.tasks[0].reason, Reason::ArmHeld(0, Cause::Overrun));
     rig.run_for(0.5);
@@ -662,7 +664,7 @@ fn f20_all_arms_hold_after_100_ms_at_every_rate() {
     for rate in [20.0, 100.0, 250.0, 500.0, 1000.0, 2000.0] {
         let mut rig = Rig::new(rate, vec![arm("a", 6), arm("b", 6)], vec![]);
         rig.make_ready();
-        rig.tick_after((0.1 * rate - 1.0) as u32);
+        rig.tick_after(((0.1 * rate) as u32).saturating_sub(2));
         assert!(rig.samples.iter().all(|s| s.phase == Phase::Ready), "{rate}");
         rig.tick_after((0.1 * rate) as u32);
         assert!(rig.samples.iter().all(|s| s.cause == Cause::Overrun), "{rate}");
@@ -735,8 +737,9 @@ fn f36_a_start_elsewhere_names_joint_and_amount_and_moves_nothing() {
 
 #[test]
 fn a_coordinator_without_arms_or_tasks_ticks() {
-    let config = CoordinatorConfig { rate: 100.0, arms: vec![], tasks: vec![] };
+    let config = CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![], tasks: vec![] };
     let rig = Rig::new(100.0, vec![], vec![]);
-    let time = dimos::control::coordinator::TickTime { now: rig.now, next: rig.now, skipped: 0, late_ns: 0 };
+    let time =
+        dimos::control::coordinator::TickTime { now: rig.now, next: rig.now, skipped: 0, late_ns: 0, woke_late_ns: 0 };
     assert!(Coordinator::new(&config).tick(time, &[], || None).commands.is_empty());
 }

@@ -155,7 +155,7 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
                 Event::Task(_, TaskState::Aborted, _) => seen[2] += 1,
                 Event::Preempted(..) => seen[3] += 1,
                 Event::ModeConflict(..) => seen[4] += 1,
-                Event::Arm(_, Phase::Held, Cause::Fault(_) | Cause::Stale | Cause::Jump) => seen[5] += 1,
+                Event::Arm(_, Phase::Held, Cause::Fault(_) | Cause::Stale(_) | Cause::Jump) => seen[5] += 1,
                 Event::Limited(..) => seen[6] += 1,
                 Event::Task(6 | 7, TaskState::Executing, _) => seen[7] += 1,
                 _ => {}
@@ -173,7 +173,12 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
 fn the_tick_loop_takes_and_gives_back_no_memory() {
     const TICKS: u64 = 1_000;
     let tasks = vec![task("t", trajectory(), 0..6, 10), task("v", velocity(), 0..6, 20)];
-    let config = CoordinatorConfig { rate: 1000.0, arms: vec![arm("arm", 6)], tasks };
+    let config = CoordinatorConfig {
+        version: dimos::control::config::CONTROL_VERSION,
+        rate: 1000.0,
+        arms: vec![arm("arm", 6)],
+        tasks,
+    };
     let (mut states, state_reader) = slot(ArmState::default());
     let (command_writer, mut commands) = slot(ArmCommand::default());
     let (mut requests, request_consumer) = rtrb::RingBuffer::new(256);
@@ -195,6 +200,7 @@ fn the_tick_loop_takes_and_gives_back_no_memory() {
         states: vec![state_reader],
         commands: vec![command_writer],
         wakes: vec![Wake::new().unwrap()],
+        dues: vec![Arc::default()],
         requests: request_consumer,
         replies,
         reply_wake: Wake::new().unwrap(),
@@ -365,12 +371,11 @@ fn a_device_thread_in_health_takes_and_gives_back_no_memory() {
     let (state_writer, mut states) = slot(ArmState::default());
     let (mut commands, command_reader) = slot(ArmCommand::default());
     let device = DeviceConfig {
-        realtime: true,
         hardware_id: "arm".into(),
         dof: 6,
         tick_period: Duration::from_millis(2),
         native_rate: 500.0,
-        velocity_max: 3.0,
+        supervision: dimos::arm::Supervision::default(),
         beat: beat.clone(),
         clock: Arc::new(MonotonicClock),
         notes: Box::new(|_| {}),

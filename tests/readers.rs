@@ -66,6 +66,7 @@ fn sample(tick: u64) -> Vec<Sample> {
             link: if arm == 1 && tick > 100 { Link::Faulted } else { Link::Up },
             self_held: false,
             written: tick,
+            ..ArmState::default()
         };
         let mode = [None, Some(ControlMode::ServoPosition), Some(ControlMode::Velocity), Some(ControlMode::Torque)];
         let mode = mode[(tick / 10 % 4) as usize];

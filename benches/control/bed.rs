@@ -3,10 +3,11 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::control::config::{
-    ArmConfig, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams,
+    ArmConfig, CONTROL_VERSION, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind,
+    TrajectoryParams, VelocityParams,
 };
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::tasks::cartesian::Goal;
@@ -56,7 +57,10 @@ impl Bed {
             limits: limits.clone(),
             modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
             gripper: true,
-            state_timeout: Duration::from_millis(30),
+            own_velocity: Vec::new(),
+            read_period: Duration::from_millis(10),
+            write_period: Duration::from_millis(10),
+            supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
         };
         let kinds = [
             TaskKind::Trajectory(TrajectoryParams::default()),
@@ -78,8 +82,12 @@ impl Bed {
             priority: 10,
             auto_start: false,
         };
-        let config =
-            CoordinatorConfig { rate: 100.0, arms: (0..arms).map(arm).collect(), tasks: (0..arms).map(task).collect() };
+        let config = CoordinatorConfig {
+            version: CONTROL_VERSION,
+            rate: 100.0,
+            arms: (0..arms).map(arm).collect(),
+            tasks: (0..arms).map(task).collect(),
+        };
         Self { config, motion: motion(), holds: load == Load::Hold, sent: 0 }
     }
 

@@ -9,7 +9,7 @@ use dimos::recording::replay::{LogReader, Payload, Selection};
 use crate::support::process::{self, Memory};
 use crate::support::run::{LiveRun, keep_moving};
 
-/// How long a run settles before anything is measured.
+/// How long a run settles at most before anything is measured.
 const SETTLE: Duration = Duration::from_secs(2);
 
 /// From the start of the process to its first joint state [ms].
@@ -73,8 +73,9 @@ impl Cost {
 pub fn cost(blueprint: &str, arguments: &[&str], time: Duration) -> Result<Cost, String> {
     let mut run = LiveRun::start(blueprint, arguments).map_err(|e| e.to_string())?;
     let mut client = run.client()?;
-    keep_moving(&mut client, (SETTLE + time).as_secs_f64() + 4.0)?;
-    std::thread::sleep(SETTLE);
+    let settle = SETTLE.min(time / 2);
+    keep_moving(&mut client, (settle + time).as_secs_f64() + 4.0)?;
+    std::thread::sleep(settle);
     let (before, began, from) = (process::threads(run.pid()), Instant::now(), dimos::clock::wall_now());
     std::thread::sleep(time);
     let (after, took, to) = (process::threads(run.pid()), began.elapsed(), dimos::clock::wall_now());

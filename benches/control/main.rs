@@ -1,4 +1,4 @@
-//! `make bench`: what a tick and a run cost. Prints; judges, but never fails.
+//! `make bench`: what a tick and a run cost. Prints; judges, but fails on no figure.
 //! `cargo bench --bench control -- ticks arms tasks start runs` measures only what is named.
 
 mod bed;
@@ -9,6 +9,7 @@ mod support;
 mod tick;
 
 use std::collections::BTreeMap;
+use std::process::ExitCode;
 use std::time::Duration;
 
 use bed::Load;
@@ -20,7 +21,7 @@ use tick::{Pace, Plant, Ticks};
 /// Two 7-joint arms, for the goal of the tick.
 const TWO_ARMS: &str = include_str!("two-arms.yaml");
 
-fn main() {
+fn main() -> ExitCode {
     let effort = Effort::told();
     println!("\ndimos: what a tick and a run cost{}\n", effort.of(" (quick)", ""));
     machine::print();
@@ -37,6 +38,7 @@ fn main() {
     }
     let (busy, stolen) = machine::CpuTimes::since(before);
     println!("meanwhile: {busy:.0} % of all cores busy, {stolen:.2} % stolen by the hypervisor");
+    effort.end()
 }
 
 fn repeat(times: usize, mut measure: impl FnMut() -> Ticks) -> Vec<Ticks> {
@@ -49,12 +51,12 @@ fn micros(repeats: &[Ticks], q: f64) -> Vec<f64> {
 }
 
 fn ticks(effort: Effort) {
-    let (free, paced) = (effort.of(20_000, 100_000), effort.of(200, 1000));
-    let alone = repeat(effort.of(3, 7), || tick::coordinator(2, Load::Trajectory, Pace::Free, free));
-    let whole = repeat(effort.of(3, 7), || tick::whole(2, Load::Trajectory, Pace::Free, Plant::Ideal, free));
+    let (free, paced) = (effort.of(1_000, 100_000), effort.of(30, 1000));
+    let alone = repeat(effort.of(1, 7), || tick::coordinator(2, Load::Trajectory, Pace::Free, free));
+    let whole = repeat(effort.of(1, 7), || tick::whole(2, Load::Trajectory, Pace::Free, Plant::Ideal, free));
     let cold = repeat(effort.of(1, 3), || tick::coordinator(2, Load::Trajectory, Pace::Paced, paced));
     let whole_cold = repeat(effort.of(1, 3), || tick::whole(2, Load::Trajectory, Pace::Paced, Plant::Ideal, paced));
-    let mock = repeat(effort.of(3, 7), || tick::whole(1, Load::Trajectory, Pace::Free, Plant::Mock, free));
+    let mock = repeat(effort.of(1, 7), || tick::whole(1, Load::Trajectory, Pace::Free, Plant::Mock, free));
     let sleeper = (0..effort.of(1, 3)).map(|_| tick::sleeper(paced)).collect();
     let sleeper = Measure::new("for comparison: a thread that only sleeps, p50", "µs", sleeper);
     let goal = Goal::AtMost(20.0);
@@ -83,12 +85,12 @@ fn ticks(effort: Effort) {
 }
 
 fn arms(effort: Effort) {
-    let ticks = effort.of(10_000, 50_000);
+    let ticks = effort.of(1_000, 50_000);
     let mut rows = Vec::new();
     for arms in [1, 2, 8, 32] {
-        let alone = repeat(effort.of(3, 5), || tick::coordinator(arms, Load::Trajectory, Pace::Free, ticks / arms));
+        let alone = repeat(effort.of(1, 5), || tick::coordinator(arms, Load::Trajectory, Pace::Free, ticks / arms));
         let whole =
-            repeat(effort.of(3, 5), || tick::whole(arms, Load::Trajectory, Pace::Free, Plant::Ideal, ticks / arms));
+            repeat(effort.of(1, 5), || tick::whole(arms, Load::Trajectory, Pace::Free, Plant::Ideal, ticks / arms));
         let name = |what| format!("{arms:2} arms, {what}");
         rows.push(Measure::new(name("Coordinator::tick p50"), "µs", micros(&alone, 0.5)));
         rows.push(Measure::new(name("Coordinator::tick p99"), "µs", micros(&alone, 0.99)));
@@ -99,7 +101,7 @@ fn arms(effort: Effort) {
 }
 
 fn task_types(effort: Effort) {
-    let ticks = effort.of(10_000, 50_000);
+    let ticks = effort.of(1_000, 50_000);
     let mut rows = Vec::new();
     for (name, arms, load) in [
         ("two arms that hold", 2, Load::Hold),
@@ -109,7 +111,7 @@ fn task_types(effort: Effort) {
         ("two end effectors, a twist each tick", 2, Load::Twist),
         ("three arms: trajectory, servo, velocity", 3, Load::EveryType),
     ] {
-        let alone = repeat(effort.of(3, 5), || tick::coordinator(arms, load, Pace::Free, ticks));
+        let alone = repeat(effort.of(1, 5), || tick::coordinator(arms, load, Pace::Free, ticks));
         rows.push(Measure::new(format!("{name}, p50"), "µs", micros(&alone, 0.5)));
         rows.push(Measure::new(format!("{name}, p99"), "µs", micros(&alone, 0.99)));
     }
@@ -117,12 +119,12 @@ fn task_types(effort: Effort) {
 }
 
 fn start(effort: Effort) {
-    let repeats = |blueprint| (0..effort.of(5, 15)).map(move |_| live::start_up(blueprint));
+    let repeats = |blueprint| (0..effort.of(1, 15)).map(move |_| live::start_up(blueprint));
     let mut rows = Vec::new();
     for blueprint in ["coordinator-yourarm", "coordinator-mock"] {
         let (known, readable) = match repeats(blueprint).collect::<Result<Vec<_>, _>>() {
             Ok(all) => all.into_iter().map(|s| (s.known, s.readable)).unzip(),
-            Err(e) => return println!("SKIPPED: start-up of {blueprint}: {e}\n"),
+            Err(e) => return support::skipped(&format!("start-up of {blueprint}: {e}")),
         };
         rows.push(Measure::new(format!("{blueprint}, until the tick has it"), "ms", known));
         let goal = Goal::AtMost(50.0);
@@ -142,7 +144,7 @@ struct Case<'a> {
 
 fn runs(effort: Effort) {
     if let Err(e) = try_runs(effort) {
-        println!("SKIPPED: runs of the binary: {e}\n");
+        support::skipped(&format!("runs of the binary: {e}"));
     }
 }
 
@@ -156,14 +158,14 @@ fn try_runs(effort: Effort) -> Result<(), String> {
         case("coordinator-mock", "coordinator-mock", Some(1.5), Some(20.0)),
         case("two 7-joint mock arms", two.to_str().unwrap_or_default(), None, None),
     ];
-    let time = Duration::from_secs(effort.of(4, 10));
+    let time = Duration::from_secs(effort.of(1, 10));
     let mut all: Vec<Vec<Cost>> = cases.iter().map(|_| Vec::new()).collect();
     // One after the other and again, so that a busy minute of the machine meets all of them.
     for _ in 0..effort.of(1, 5) {
         for (case, costs) in cases.iter().zip(&mut all) {
             match live::cost(case.blueprint, case.arguments, time) {
                 Ok(cost) => costs.push(cost),
-                Err(e) => println!("SKIPPED: a run of {}: {e}", case.blueprint),
+                Err(e) => support::skipped(&format!("a run of {}: {e}", case.blueprint)),
             }
         }
     }

@@ -59,7 +59,7 @@ pub fn coordinator(arms: usize, load: Load, pace: Pace, ticks: usize) -> Ticks {
             if pace == Pace::Paced && tick > SETTLED {
                 host::sleep_until(now);
             }
-            let time = TickTime { now, next: now.after(PERIOD), skipped: 0, late_ns: 0 };
+            let time = TickTime { now, next: now.after(PERIOD), skipped: 0, late_ns: 0, woke_late_ns: 0 };
             let before = Instant::now();
             let output = coordinator.tick(time, &states, || queue.pop_front());
             let took = before.elapsed();
@@ -212,6 +212,7 @@ impl World {
             states: state_out,
             commands: command_in,
             wakes: (0..arms).map(|_| wake()).collect(),
+            dues: (0..arms).map(|_| Arc::default()).collect(),
             requests: request_out,
             replies: reply_in,
             reply_wake: wake(),

@@ -68,7 +68,7 @@ struct Arguments {
     /// Given by cargo.
     #[arg(long, hide = true)]
     bench: bool,
-    /// Do little: to see that it works.
+    /// Do little: to see that it works (or DIMOS_BENCH_QUICK=1).
     #[arg(long, hide = true)]
     quick: bool,
 }
@@ -106,7 +106,9 @@ struct Row {
 }
 
 fn main() -> ExitCode {
-    match run(&Arguments::parse()) {
+    let mut arguments = Arguments::parse();
+    arguments.quick |= std::env::var_os("DIMOS_BENCH_QUICK").is_some_and(|v| v == "1");
+    match run(&arguments) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error}");
@@ -119,7 +121,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     machine::print();
     let nothing = arguments.problems.is_none() && arguments.ik.is_none();
     if arguments.timing || nothing {
-        parts::timing(if arguments.quick { 5 } else { 100 }, arguments.seed)?;
+        parts::timing(if arguments.quick { 1 } else { 100 }, arguments.seed)?;
     }
     if nothing {
         println!("nothing else to do: --problems FILE.jsonl or --ik LINK, with --urdf FILE");

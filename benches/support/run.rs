@@ -88,29 +88,34 @@ impl Drop for LiveRun {
     }
 }
 
-/// Lets every arm of a run swing for so long [s], each by a trajectory task of its own.
+/// Lets every arm of a run swing for so long [s] or a little longer, each by a trajectory task of its own. A swing ends
+/// where it began, at rest: a trajectory that does not is refused.
 pub fn keep_moving(client: &mut Client, seconds: f64) -> Result<(), String> {
     let state = client.call(State {}).map_err(|e| e.to_string())?;
+    let swings = (seconds / SWING).ceil().max(1.0) as usize;
     for arm in &state.arms {
         let joint_names = arm.joints.iter().map(|j| j.name.clone()).collect();
         let start: Vec<f64> = arm.joints.iter().map(|j| j.command.or(j.position).unwrap_or_default()).collect();
-        let points = (0..=(seconds / SWING_STEP) as usize).map(|i| swing(&start, i as f64 * SWING_STEP)).collect();
+        let points = (0..=swings * STEPS).map(|i| swing(&start, i)).collect();
         let trajectory = Trajectory { joint_names, points };
         client.call(Execute { trajectory, task: None }).map_err(|e| e.to_string())?;
     }
     Ok(())
 }
 
-/// Time between two points of a swing [s].
-const SWING_STEP: f64 = 0.25;
+/// Time of a swing out and back [s], and points in it.
+const SWING: f64 = 4.0;
+const STEPS: usize = 16;
 
-/// Where joints are that swing out from `start` by 0.2 rad and back every 4 s.
-fn swing(start: &[f64], time: f64) -> Point {
-    let turn = std::f64::consts::TAU / 4.0;
+/// Step `i` of joints that swing out from `start` by 0.2 rad and back, at rest at both ends.
+fn swing(start: &[f64], i: usize) -> Point {
+    let turn = std::f64::consts::TAU / SWING;
+    let time = i as f64 * SWING / STEPS as f64;
+    let velocity = if i.is_multiple_of(STEPS) { 0.0 } else { 0.1 * turn * (turn * time).sin() };
     Point {
         time_from_start: time,
         positions: start.iter().map(|p| p + 0.1 * (1.0 - (turn * time).cos())).collect(),
-        velocities: Some(vec![0.1 * turn * (turn * time).sin(); start.len()]),
+        velocities: Some(vec![velocity; start.len()]),
         accelerations: None,
     }
 }

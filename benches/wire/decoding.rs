@@ -17,7 +17,7 @@ fn rate(packets: u64, mut decode: impl FnMut(u64)) -> f64 {
 
 /// Measures all decoders.
 pub fn measure(effort: Effort) -> Result<(), String> {
-    let (repeats, packets) = (effort.of(3, 11), effort.of(200_000, 1_000_000));
+    let (repeats, packets) = (effort.of(1, 11), effort.of(10_000, 1_000_000));
     let full = [0_u8; 804];
     let xarm = (0..repeats).map(|_| {
         rate(packets, |_| {

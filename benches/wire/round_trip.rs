@@ -103,9 +103,9 @@ impl Drop for Shim {
 /// p50 and p99 [µs] of several series.
 fn repeats(effort: Effort, address: &str) -> Result<(Vec<f64>, Vec<f64>), String> {
     let (mut p50, mut p99) = (Vec::new(), Vec::new());
-    for _ in 0..effort.of(2, 5) {
+    for _ in 0..effort.of(1, 5) {
         let address = address.to_owned();
-        let series = std::thread::spawn(move || series(&address, effort.of(300, 2000))).join();
+        let series = std::thread::spawn(move || series(&address, effort.of(30, 2000))).join();
         let times = series.map_err(|_| "the series panicked")?.map_err(|e| e.to_string())?;
         p50.push(quantile(&times, 0.5));
         p99.push(quantile(&times, 0.99));

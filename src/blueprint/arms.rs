@@ -1,5 +1,8 @@
 //! Checks `hardware`: names, joints, adapters, addresses, options, limits.
 
+use std::time::Duration;
+
+use crate::arm::Supervision;
 use crate::blueprint::limits;
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
@@ -114,9 +117,21 @@ fn arm(
         auto_enable: entry.auto_enable,
         on_exit: entry.on_exit.unwrap_or(default_on_exit),
         on_exit_given: entry.on_exit.is_some(),
+        supervision: supervision(entry, &row),
         options,
         own_limits: own.unwrap_or_default(),
         limits,
+    }
+}
+
+/// The adapter's figures, with those that the blueprint gives in their place.
+fn supervision(entry: &HardwareEntry, row: &AdapterSpec) -> Supervision {
+    Supervision {
+        accuracy: entry.accuracy.unwrap_or(row.accuracy),
+        lag: entry.lag.unwrap_or(row.lag),
+        stale_after: entry.stale_after.map_or(row.stale_after, Duration::from_secs_f64),
+        tracking_tolerance: entry.tracking_tolerance.unwrap_or(Supervision::TRACKING_TOLERANCE),
+        accept_zero_pose: entry.accept_zero_pose,
     }
 }
 

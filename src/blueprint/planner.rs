@@ -8,7 +8,7 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::range::{non_negative, optional_positive, positive};
+use crate::blueprint::range::{maybe_positive, non_negative, positive};
 use crate::collision::body::MeshMode;
 use crate::yaml::{Keyed, Located, Text};
 
@@ -111,7 +111,7 @@ pub struct RobotConfig {
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_acceleration: f64,
     /// Highest joint jerk, on top of the model's and the arm's own limits [rad/s³].
-    #[serde(default, deserialize_with = "optional_positive")]
+    #[serde(default, deserialize_with = "maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_jerk: Option<f64>,
     /// Poses with a name: one position for each of `joint_names` [rad].

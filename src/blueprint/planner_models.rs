@@ -206,8 +206,11 @@ fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Desc
     let diag = match model.joint_index(name).and_then(|index| model.joints.get(index)) {
         None => {
             let names = model.joints.iter().map(|joint| joint.name.as_str());
-            Diag::error(format!("the model has no joint {}", quote(name)))
-                .maybe_hint(did_you_mean(name, names, "its joints"))
+            Diag::error(format!("the model has no joint {}", quote(name))).maybe_hint(did_you_mean(
+                name,
+                names,
+                "its joints",
+            ))
         }
         Some(_) if planned => Diag::error(format!("the joint {} is planned for", quote(name)))
             .hint("name the joint that the gripper moves, which is none of `joint_names`"),

@@ -29,7 +29,17 @@ pub fn positive<'de, D: Deserializer<'de>>(d: D) -> Result<f64, D::Error> {
     number(d, "a number above 0", |v| v > 0.0)
 }
 
-/// The same, where nothing need be given.
-pub fn optional_positive<'de, D: Deserializer<'de>>(d: D) -> Result<Option<f64>, D::Error> {
+/// More than zero, where it is given.
+pub fn maybe_positive<'de, D: Deserializer<'de>>(d: D) -> Result<Option<f64>, D::Error> {
     positive(d).map(Some)
+}
+
+/// A delay of an arm [s], where it is given.
+pub fn maybe_lag<'de, D: Deserializer<'de>>(d: D) -> Result<Option<f64>, D::Error> {
+    number(d, "a time from 0 to 1 s", |v| (0.0..=1.0).contains(&v)).map(Some)
+}
+
+/// An age limit of states [s], where it is given.
+pub fn maybe_age<'de, D: Deserializer<'de>>(d: D) -> Result<Option<f64>, D::Error> {
+    number(d, "a time from 0.02 to 2 s", |v| (0.02..=2.0).contains(&v)).map(Some)
 }

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use crate::arm::Supervision;
 use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::limits::JointOverride;
@@ -90,6 +91,8 @@ pub struct Arm {
     pub on_exit: OnExit,
     /// Whether the blueprint says so, or the default was taken.
     pub on_exit_given: bool,
+    /// Figures with which its measurements and its motion are checked.
+    pub supervision: Supervision,
     /// The adapter's own options: an object.
     pub options: serde_json::Value,
     /// The arm's own nominal limits, by its number of joints and its options.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::planner::{PlannerConfig, ViewConfig};
-use crate::blueprint::range::tick_rate;
+use crate::blueprint::range::{self, tick_rate};
 use crate::yaml::{Keyed, Located, Raw};
 
 /// A blueprint: which arms there are, and what is done with them.
@@ -86,6 +86,28 @@ pub struct HardwareEntry {
     /// disabled, `disable` where it has brakes.
     #[serde(default)]
     pub on_exit: Option<OnExit>,
+    /// How far a joint at rest may be from its set point under load [rad]. Default: the adapter's.
+    #[serde(default, deserialize_with = "range::maybe_positive")]
+    #[schemars(extend("exclusiveMinimum" = 0))]
+    pub accuracy: Option<f64>,
+    /// Time from a set point to the measured motion that follows it [s]; `dimos adapter test --lag` measures it. Default:
+    /// the adapter's.
+    #[serde(default, deserialize_with = "range::maybe_lag")]
+    #[schemars(extend("minimum" = 0, "maximum" = 1))]
+    pub lag: Option<f64>,
+    /// Age limit of a state [s]: an arm without a newer one is held. At least three of the device's periods are granted.
+    /// Default: the adapter's.
+    #[serde(default, deserialize_with = "range::maybe_age")]
+    #[schemars(extend("minimum" = 0.02, "maximum" = 2))]
+    pub stale_after: Option<f64>,
+    /// Largest distance of a joint from its set points of the last `lag` seconds [rad]: beyond it for 100 ms, the arm is
+    /// held. Default: 0.15.
+    #[serde(default, deserialize_with = "range::maybe_positive")]
+    #[schemars(extend("exclusiveMinimum" = 0))]
+    pub tracking_tolerance: Option<f64>,
+    /// Whether a pose with every joint at exactly zero is believed although the device does not confirm it.
+    #[serde(default)]
+    pub accept_zero_pose: bool,
     /// The adapter's own options.
     #[serde(default)]
     #[schemars(with = "Option<serde_json::Map<String, serde_json::Value>>")]

@@ -1,22 +1,38 @@
 //! One arm inside the tick: its state as read, its phase, the limiters of its joints, and the way its commands
 //! take: one mode at a time, a hold per mode, a mode switch only at standstill.
 
+use std::time::Duration;
+
+use super::belief::{Belief, Verdict};
 use super::config::ArmConfig;
 use super::estimate::VelocityEstimator;
-use super::failsafe::Failsafe;
+use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Bounds, Limiter, Refusal};
+use super::set_points::SetPoints;
+use super::stalls::Stalls;
 use super::task::Demand;
+use super::written::{Issued, Written};
 use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
-use crate::telemetry::{Cause, LimitKind, Phase};
+use crate::telemetry::{Age, Cause, LimitKind, Phase};
 
 /// A joint that measures no more than this is at a standstill for a change of mode [rad/s].
 const STANDSTILL: f64 = 0.05;
 /// How long an arm that lags gets to come to where its last command is, before it is asked to stop [s].
 const SETTLING_LIMIT: f64 = 0.5;
-/// Further than this from the last command, a re-activated arm is taken to have been moved by hand [rad].
-const CARRIED_BY_POSITION_ERROR: f64 = 0.05;
+/// A joint that moves this far while its arm is being enabled does so for another reason [rad].
+const MOVED: f64 = 0.02;
+/// How long a joint may be too far from its set points before the arm is held [s]: positions, velocities.
+const TRACKING_LIMIT: (f64, f64) = (0.1, 0.2);
+/// In velocity mode, how far the measured velocity may be from the set points [rad/s], and as a part of itself.
+const VELOCITY_TOLERANCE: (f64, f64) = (0.2, 0.2);
+/// A held joint further than this from its set points, besides its accuracy, has its set point drawn to it [rad].
+const DRAW: f64 = 0.02;
+/// How long that takes at most, within the joint's top speed [s].
+const DRAW_TIME: f64 = 0.1;
+/// The longest delay of this computer that is not taken for a state's age.
+const LONGEST_DELAY: Duration = Duration::from_millis(100);
 
 /// One arm inside the tick.
 #[derive(Debug)]
@@ -24,17 +40,33 @@ pub struct ArmControl {
     config: ArmConfig,
     /// Index of its first joint over all arms.
     first: usize,
-    /// The latest state, with estimated velocities.
+    /// The latest state that is believed, with estimated velocities.
     pub state: ArmState,
+    /// The latest state as it was read.
+    raw: ArmState,
+    belief: Belief,
     estimator: VelocityEstimator,
-    fresh: bool,
+    freshness: Freshness,
     /// Its phase.
     pub failsafe: Failsafe,
     limiters: Vec<Limiter>,
     limited: Vec<bool>,
     command: ArmCommand,
-    /// The last command still stands at the arm: it has been under power since.
-    command_stands: bool,
+    written: Written,
+    set_points: SetPoints,
+    /// The positions that were written last still stand at the arm: it has been under power since.
+    standing: bool,
+    /// Where the joints were measured when the arm was enabled.
+    seed: Joints,
+    /// The first set point after a start was not written yet: the sequence number of its first command.
+    starting: Option<u64>,
+    /// Nothing reached the arm for more than two periods, or what did is not what is commanded: the first command that
+    /// was made from what had been written.
+    gap_since: Option<u64>,
+    /// How long a joint has been too far from its set points [s].
+    astray: f64,
+    /// Time left to draw set points to the measured pose [s].
+    drawing: f64,
     /// The arm is to be asked to stop by its own means, once it is at rest.
     stop_owed: bool,
     was_held: bool,
@@ -66,8 +98,12 @@ pub enum Routed {
 
 impl ArmControl {
     /// An arm of which nothing is known yet.
-    pub fn new(config: ArmConfig, first: usize) -> Self {
+    pub fn new(config: ArmConfig, first: usize, period: Duration) -> Self {
         let l = &config.limits;
+        let own = if config.own_velocity.len() == config.dof { &config.own_velocity } else { &l.velocity_max };
+        let read = config.read_period.max(Duration::from_micros(100));
+        let belief = Belief::new(own, &l.position_lower, &l.position_upper, read.as_secs_f64());
+        let window = config.supervision.lag + config.supervision.stale_after.as_secs_f64() + 2.0 * period.as_secs_f64();
         let bound = |j: usize| {
             let at = |list: &[f64], otherwise: f64| list.get(j).copied().unwrap_or(otherwise);
             Bounds::inside(
@@ -80,14 +116,23 @@ impl ArmControl {
         Self {
             limiters: (0..config.dof).map(|j| Limiter::new(bound(j))).collect(),
             limited: vec![false; config.dof],
+            set_points: SetPoints::new(config.dof, window),
+            written: Written::new(period, config.write_period),
             config,
             first,
             state: ArmState::default(),
+            raw: ArmState::default(),
+            belief,
             estimator: VelocityEstimator::default(),
-            fresh: false,
+            freshness: Freshness::default(),
             failsafe: Failsafe::default(),
             command: ArmCommand::default(),
-            command_stands: false,
+            standing: false,
+            seed: [0.0; MAX_DOF],
+            starting: None,
+            gap_since: None,
+            astray: 0.0,
+            drawing: DRAW_TIME,
             stop_owed: false,
             was_held: false,
             settling: 0.0,
@@ -111,7 +156,44 @@ impl ArmControl {
 
     /// Whether the latest state is recent enough to act on.
     pub fn fresh(&self) -> bool {
-        self.fresh
+        self.freshness.fresh
+    }
+
+    /// Whether the latest state is recent enough to act on, with its age.
+    pub fn freshness(&self) -> Freshness {
+        self.freshness
+    }
+
+    /// The state as it was read, refused positions included, with estimated velocities: for the log.
+    pub fn measured(&self) -> ArmState {
+        if self.raw.position.iter().take(self.config.dof).any(|q| !q.is_finite()) {
+            return self.state; // what is not a number is no measurement
+        }
+        ArmState { velocity: self.state.velocity, velocity_source: self.state.velocity_source, ..self.raw }
+    }
+
+    /// When nothing reached the arm for too long: the time of the command that was written last.
+    pub fn gap(&self) -> Option<Mono> {
+        self.gap_since.map(|_| self.written.last().at)
+    }
+
+    /// How far a joint is outside the range of its set points of the last `lag` seconds [rad]; 0 inside, and in velocity
+    /// mode.
+    pub fn tracking_error(&self, joint: usize) -> f64 {
+        if !self.command.mode.is_some_and(ControlMode::is_position) || self.starting.is_some() {
+            return 0.0;
+        }
+        let (Some(q), Some(limiter)) = (self.state.position.get(joint), self.limiters.get(joint)) else { return 0.0 };
+        // The newest set point is in every window.
+        if (q - limiter.position()).abs() <= DRAW / 2.0 {
+            return 0.0;
+        }
+        self.set_points.distance(joint, *q, self.window_start())
+    }
+
+    /// Where the set points begin that the latest state may still be following.
+    fn window_start(&self) -> Mono {
+        self.state.stamp.before(Duration::from_secs_f64(self.config.supervision.lag))
     }
 
     /// Whether nothing that it commands moves.
@@ -119,42 +201,126 @@ impl ArmControl {
         self.command.mode.is_none() || self.limiters.iter().all(Limiter::at_rest)
     }
 
-    /// Takes in the latest state. `true`: its phase changed.
-    pub fn read(&mut self, state: &ArmState, now: Mono) -> bool {
-        let dof = self.config.dof;
-        let finite = |values: &Joints| values.iter().take(dof).all(|v| v.is_finite());
+    /// Takes in the latest state. `stalls`: when the tick could not run. `true`: its phase changed.
+    pub fn read(&mut self, state: &ArmState, now: Mono, stalls: &Stalls, dt: f64) -> bool {
+        let before = (self.failsafe.phase(), self.failsafe.cause());
+        let verdict = self.take(state);
+        self.estimator.fill(&mut self.state);
+        self.freshness = self.age(now, stalls);
+        self.written.report(self.state.written);
+        if !self.state.enabled {
+            self.standing = false;
+        }
+        self.failsafe.update(&self.state, self.freshness, now);
+        if let Verdict::Jumped(joint, step) = verdict {
+            self.failsafe.hold(Cause::PositionJump(joint as u16, step), now);
+        }
+        if let Some(cause) = self.strayed(dt) {
+            self.failsafe.hold(cause, now);
+        }
+        before != (self.failsafe.phase(), self.failsafe.cause())
+    }
+
+    /// Takes what is believed of a state.
+    fn take(&mut self, state: &ArmState) -> Verdict {
+        let finite = |values: &Joints| values.iter().take(self.config.dof).all(|v| v.is_finite());
+        self.raw = *state;
         let before = std::mem::replace(&mut self.state, *state);
-        if !finite(&state.position) {
-            // Positions that are not numbers are no measurement: the last one stays, and ages.
+        // Positions that are not numbers are no measurement.
+        let verdict = if finite(&state.position) { self.belief.take(state) } else { Verdict::Refused };
+        if verdict == Verdict::Refused || (verdict == Verdict::Same && self.belief.refused() > 0) {
+            // The last believed measurement stays, and ages.
             (self.state.seq, self.state.stamp) = (before.seq, before.stamp);
             (self.state.position, self.state.velocity) = (before.position, before.velocity);
             (self.state.velocity_source, self.state.effort) = (before.velocity_source, before.effort);
         } else if !finite(&state.velocity) {
             self.state.velocity_source = VelocitySource::Absent;
         }
-        self.estimator.fill(&mut self.state);
-        self.fresh = self.state.seq != 0
-            && self.state.link == Link::Up
-            && now.since(self.state.stamp) <= self.config.state_timeout;
-        if !self.state.enabled {
-            self.command_stands = false;
-        }
-        self.failsafe.update(&self.state, self.fresh, now)
+        verdict
     }
 
-    /// The arm was enabled: starts the hold. Where the arm has been under power since the last command and is
-    /// still near it, that command stays: starting from the measured pose would sink a little at every enable. An
-    /// arm that is still being brought to rest goes on with that.
+    /// The age of the state that is believed, without the time in which this computer could not have seen a newer one.
+    fn age(&self, now: Mono, stalls: &Stalls) -> Freshness {
+        let limit = self.config.supervision.stale_after.max(3 * self.config.read_period);
+        // While readings are refused, the arm still answers: they have three readings to agree with each other.
+        let waiting = 3 * self.config.read_period.max(Duration::from_millis(1));
+        let refused = self.belief.refused() > 0 && now.since(self.belief.stamp()) <= limit + waiting;
+        let stamp = if refused { self.raw.stamp } else { self.state.stamp };
+        let age = now.since(stamp);
+        let device = Duration::from_nanos(self.state.own_delay_ns);
+        let device = if device < LONGEST_DELAY { device } else { Duration::ZERO };
+        let own = stalls.between(stamp, now).max(device).min(age);
+        let seen = age - own;
+        let us = |d: Duration| d.as_micros().min(u128::from(u32::MAX)) as u32;
+        let fresh = self.state.seq != 0 && self.state.link == Link::Up && seen <= limit;
+        Freshness { fresh, age: Age { age_us: us(seen), limit_us: us(limit), own_us: us(own) } }
+    }
+
+    /// Whether the arm moves in a way that nobody commanded: why it is to be held.
+    fn strayed(&mut self, dt: f64) -> Option<Cause> {
+        let measured = self.freshness.fresh && self.belief.refused() == 0;
+        let supervised = measured && self.command.mode == Some(self.state.mode) && !self.set_points.is_empty();
+        match self.failsafe.phase() {
+            Phase::Activating if measured => {
+                let limit = MOVED.max(2.0 * self.config.supervision.accuracy);
+                let moved = self.state.position.iter().zip(&self.seed).take(self.config.dof).map(|(q, seed)| q - seed);
+                let (joint, by) = furthest(moved)?;
+                (by.abs() > limit).then_some(Cause::MovedWhileActivating(joint, by))
+            }
+            Phase::Ready if supervised => {
+                let velocity = self.command.mode == Some(ControlMode::Velocity);
+                let error = |joint| if velocity { self.velocity_error(joint) } else { self.tracking_error(joint) };
+                let (joint, by) = furthest((0..self.config.dof).map(error))?;
+                let tolerance = if velocity { 0.0 } else { self.config.supervision.tracking_tolerance };
+                self.astray = if by.abs() > tolerance { self.astray + dt } else { 0.0 };
+                let limit = if velocity { TRACKING_LIMIT.1 } else { TRACKING_LIMIT.0 };
+                (self.astray > limit).then_some(Cause::Tracking(joint, by))
+            }
+            _ => {
+                self.astray = 0.0;
+                None
+            }
+        }
+    }
+
+    /// How far a joint's velocity is beyond the tolerance around its set points of the last `lag` seconds [rad/s].
+    fn velocity_error(&self, joint: usize) -> f64 {
+        let Some(v) = self.state.velocity.get(joint) else { return 0.0 };
+        let tolerance = VELOCITY_TOLERANCE.0.max(VELOCITY_TOLERANCE.1 * v.abs());
+        let distance = self.set_points.distance(joint, *v, self.window_start());
+        if distance.abs() > tolerance { distance } else { 0.0 }
+    }
+
+    /// The arm was enabled: starts the hold. An arm that is still being brought to rest goes on with that.
     pub fn seed(&mut self) {
         if self.command.mode.is_some() {
             return;
         }
-        for (limiter, q) in self.limiters.iter_mut().zip(&self.state.position) {
-            let near = (limiter.position() - q).abs() <= CARRIED_BY_POSITION_ERROR;
-            let start = if self.command_stands && near { limiter.position() } else { *q };
-            limiter.seed(start);
-        }
+        self.start();
+        self.seed = self.state.position;
         self.stop_owed = false;
+    }
+
+    /// From here on the commands do not continue the ones before: the first of them must be where the arm is.
+    fn start(&mut self) {
+        self.command.start_seq = self.command.start_seq.wrapping_add(1);
+        self.starting = Some(self.command.seq + 1);
+        self.set_points.clear();
+        self.astray = 0.0;
+        self.drawing = DRAW_TIME;
+        self.seed_limiters();
+    }
+
+    /// Where the arm has been under power since the last position was written, and is at it within its accuracy, that
+    /// position stays: starting from the measured pose would sink a little at every start. Otherwise it starts from where
+    /// it is measured.
+    fn seed_limiters(&mut self) {
+        for (j, limiter) in self.limiters.iter_mut().enumerate() {
+            let q = self.state.position.get(j).copied().unwrap_or_default();
+            let stands = self.written.last().position.get(j).copied().filter(|_| self.standing);
+            let near = |stands: &f64| (stands - q).abs() <= 2.0 * self.config.supervision.accuracy;
+            limiter.seed(stands.filter(near).unwrap_or(q));
+        }
     }
 
     /// A new gripper opening [m].
@@ -175,21 +341,25 @@ impl ArmControl {
         demand: Demand,
         ask: impl Fn(usize) -> Option<Ask>,
         dt: f64,
+        now: Mono,
         next_tick: Mono,
         tell: impl FnMut(usize, LimitKind, f64),
     ) -> Routed {
         self.command.seq += 1;
-        self.command.next_tick = next_tick;
+        (self.command.at, self.command.next_tick) = (now, next_tick);
         let phase = self.failsafe.phase();
         let held = phase == Phase::Held;
-        self.stop_owed |= held && !self.was_held;
+        // What somebody else does with the arm is theirs to end: it gets no set point and no stop.
+        let foreign = held && matches!(self.failsafe.cause(), Cause::ModeChanged | Cause::PowerChanged);
+        self.stop_owed |= held && !self.was_held && !foreign;
         self.was_held = held;
+        self.note_gap(now);
         let routed = match phase {
             Phase::Unknown | Phase::Disabled => {
                 self.command.mode = None;
                 Routed::NotReady
             }
-            _ if !self.state.enabled => {
+            _ if !self.state.enabled || foreign => {
                 self.command.mode = None;
                 Routed::NotReady
             }
@@ -210,16 +380,59 @@ impl ArmControl {
             }
             Phase::Ready => self.follow(demand, ask, dt, tell),
         };
-        if self.command.mode.is_some() {
-            self.command_stands = true;
-        }
+        self.issue(now);
         routed
+    }
+
+    /// Keeps what leaves the tick, to know later what reached the arm.
+    fn issue(&mut self, now: Mono) {
+        let Some(mode) = self.command.mode else { return };
+        let mut issued = Issued { seq: self.command.seq, at: now, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
+        let out = issued.position.iter_mut().zip(&mut issued.velocity);
+        for ((q, v), limiter) in out.zip(&self.limiters) {
+            (*q, *v) = (limiter.position(), limiter.velocity());
+        }
+        self.written.issue(issued);
+        self.set_points.push(now, &self.command.values);
+        self.standing &= mode.is_position();
+    }
+
+    /// Finds out whether what is commanded reaches the arm. Where it does not, the commands go back to what did.
+    fn note_gap(&mut self, now: Mono) {
+        if let Some(first) = self.starting {
+            // Until the first set point is written, each tick makes it again from the newest measurement.
+            if self.state.written >= first
+                && let Some(mode) = self.command.mode
+            {
+                self.starting = None;
+                self.standing = mode.is_position();
+            } else {
+                self.seed_limiters();
+            }
+        }
+        let moved = self.starting.is_none() && self.command.mode.is_some();
+        let last = *self.written.last();
+        // A command from before the gap may still have been written after its beginning was seen.
+        let late = self.gap_since.is_some_and(|first| last.seq < first);
+        if !(moved && (late || self.written.gap(now))) {
+            self.gap_since = None;
+            return;
+        }
+        self.gap_since.get_or_insert(self.command.seq);
+        let rest = self.command.mode.is_some_and(ControlMode::is_position);
+        for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
+            // Joints that follow positions have come to rest at the last one; velocities go on.
+            limiter.rewind(*q, if rest { 0.0 } else { *v });
+        }
     }
 
     /// Slows down by commands; when at rest, asks the arm to stop by its own means and leaves it alone.
     fn come_to_rest(&mut self, dt: f64) {
         if let Some(mode) = self.command.mode {
-            if !self.settled(dt) {
+            // A velocity that cannot be reduced, because nothing gets through, goes on: the stop replaces it.
+            let stuck = self.gap_since.is_some() && mode == ControlMode::Velocity;
+            let drawn = mode.is_position() && self.draw(dt);
+            if drawn || !(stuck || self.settled(dt)) {
                 return self.hold(mode, dt);
             }
             self.command.mode = None;
@@ -228,6 +441,25 @@ impl ArmControl {
         if self.stop_owed {
             self.stop();
         }
+    }
+
+    /// Draws the set points of joints that do not follow them to where they are. `true`: there are such joints.
+    fn draw(&mut self, dt: f64) -> bool {
+        let tolerance = DRAW + self.config.supervision.accuracy;
+        let mut drawn = false;
+        self.drawing = (self.drawing - dt).max(dt);
+        for j in 0..self.config.dof {
+            let off = self.tracking_error(j).abs() > tolerance;
+            let q = self.state.position.get(j).copied().unwrap_or_default();
+            if let Some(limiter) =
+                self.limiters.get_mut(j).filter(|_| off && self.freshness.fresh && self.gap_since.is_none())
+            {
+                let step = (q - limiter.position()).abs() * dt / self.drawing;
+                limiter.draw(q, step.min(limiter.bounds().velocity * dt));
+                drawn = true;
+            }
+        }
+        drawn
     }
 
     fn stop(&mut self) {
@@ -244,7 +476,7 @@ impl ArmControl {
             return false;
         }
         self.settling += dt;
-        self.at_standstill() || !self.fresh || self.settling > SETTLING_LIMIT
+        self.at_standstill() || !self.freshness.fresh || self.settling > SETTLING_LIMIT
     }
 
     fn follow(
@@ -267,23 +499,25 @@ impl ArmControl {
                 return Routed::Waiting;
             }
             // Each mode holds in its own way: positions from where the arm is, velocities from zero.
-            if mode.is_position() {
-                for (limiter, q) in self.limiters.iter_mut().zip(&self.state.position) {
-                    limiter.seed(*q);
-                }
-            }
+            self.standing &= present.is_position();
+            self.start();
         }
         self.command.mode = Some(mode);
-        if self.state.mode != mode {
+        if self.state.mode != mode || self.starting.is_some() {
             self.hold(mode, dt);
             return Routed::Waiting;
         }
+        if self.gap_since.is_some() {
+            return self.wait_for_the_wire(mode, ask, dt);
+        }
+        let ahead = self.ahead(dt);
         let mut before = [None; MAX_DOF];
         for (b, l) in before.iter_mut().zip(&self.limiters) {
             *b = Some(*l);
         }
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
             let at = self.state.position.get(j).copied().unwrap_or_default();
+            let within = ahead.get(j).copied().unwrap_or((at, at));
             let value = match ask(j) {
                 None if mode == ControlMode::Velocity => limiter.hold_velocity(at, dt),
                 None => limiter.hold_position(dt),
@@ -292,7 +526,7 @@ impl ArmControl {
                         limiter.hand_over();
                     }
                     let limited = match mode {
-                        ControlMode::Velocity => limiter.follow_velocity(ask.value, at, dt),
+                        ControlMode::Velocity => limiter.follow_velocity(ask.value, within, dt),
                         _ => limiter.follow_position(ask.value, dt),
                     };
                     match limited {
@@ -320,6 +554,42 @@ impl ArmControl {
             }
         }
         Routed::Sent
+    }
+
+    /// Nothing reaches the arm: it is asked for what it was given last. Requests go on, so that a jump in them shows.
+    fn wait_for_the_wire(&mut self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>, dt: f64) -> Routed {
+        let mut refused = None;
+        for (j, limiter) in self.limiters.iter_mut().enumerate() {
+            if let (Some(ask), true) = (ask(j), mode.is_position()) {
+                refused = refused.or(limiter.pass(ask.value).err().map(|refusal| (j, refusal)));
+            }
+            if let Some(out) = self.command.values.get_mut(j) {
+                *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
+            }
+        }
+        match refused {
+            Some((j, refusal)) => {
+                self.hold(mode, dt);
+                Routed::Refused(j, refusal)
+            }
+            None => Routed::Waiting,
+        }
+    }
+
+    /// Where each joint may be by the time a velocity command takes effect [rad], lowest and highest: the measurement is
+    /// old, and the joint still follows what was commanded since.
+    fn ahead(&self, dt: f64) -> [(f64, f64); MAX_DOF] {
+        let mut out = [(0.0, 0.0); MAX_DOF];
+        if self.command.mode != Some(ControlMode::Velocity) {
+            return out;
+        }
+        let age = f64::from(self.freshness.age.age_us + self.freshness.age.own_us) * 1e-6;
+        let time = self.config.supervision.lag + age + dt;
+        for (j, (out, q)) in out.iter_mut().zip(&self.state.position).enumerate().take(self.config.dof) {
+            let (low, high) = self.set_points.range(j, self.window_start()).unwrap_or_default();
+            *out = (q + low.min(0.0) * time, q + high.max(0.0) * time);
+        }
+        out
     }
 
     fn mode_for(&self, demand: Demand) -> Option<ControlMode> {
@@ -353,4 +623,9 @@ impl ArmControl {
             Refusal::Jump(_) => Cause::Jump,
         }
     }
+}
+
+/// The joint with the largest value by amount, and the value.
+fn furthest(values: impl Iterator<Item = f64>) -> Option<(u16, f64)> {
+    values.zip(0u16..).map(|(v, j)| (j, v)).max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
 }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use crate::arm::Supervision;
 use crate::joint::{ControlMode, JointLimits};
 use crate::robot::kinematics::Kinematics;
 
@@ -14,9 +15,20 @@ pub const POSITION_MARGIN: f64 = 0.01;
 /// How long an arm only holds after it was enabled.
 pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 
+/// Version of the tick's rules. The same states and requests give the same commands only under the same version.
+pub const CONTROL_VERSION: u32 = 2;
+
+/// Logs without a version are of the first one.
+fn first_version() -> u32 {
+    1
+}
+
 /// Everything a coordinator knows beforehand.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CoordinatorConfig {
+    /// Which rules its ticks follow, [`CONTROL_VERSION`] of the program that recorded it.
+    #[serde(default = "first_version")]
+    pub version: u32,
     /// Ticks per second [Hz].
     pub rate: f64,
     /// The arms, in the blueprint's order.
@@ -45,8 +57,18 @@ pub struct ArmConfig {
     pub modes: Vec<ControlMode>,
     /// Whether it has a gripper.
     pub gripper: bool,
-    /// A state older than this is stale.
-    pub state_timeout: Duration,
+    /// Its own velocity limits, before the blueprint narrows them [rad/s]; empty: `limits` are its own.
+    #[serde(default)]
+    pub own_velocity: Vec<f64>,
+    /// Period of the device's states, as the device thread reads them.
+    #[serde(default)]
+    pub read_period: Duration,
+    /// Longest regular time between two set points on the wire; the tick's period where that is longer.
+    #[serde(default)]
+    pub write_period: Duration,
+    /// Figures with which its measurements and its motion are checked.
+    #[serde(default)]
+    pub supervision: Supervision,
 }
 
 impl ArmConfig {
@@ -105,7 +127,7 @@ impl TaskKind {
 pub struct TrajectoryParams {
     /// How far the first point may be from the arm [rad].
     pub start_position_tolerance: f64,
-    /// How far the arm may be from the path while it moves [rad]; 0 = not checked.
+    /// How far the arm may be from its set points of the last `lag` seconds while it moves [rad]; 0 = not checked.
     pub path_tolerance: f64,
     /// How near the arm must come to the goal [rad].
     pub goal_tolerance: f64,
@@ -115,7 +137,7 @@ pub struct TrajectoryParams {
 
 impl Default for TrajectoryParams {
     fn default() -> Self {
-        Self { start_position_tolerance: 0.05, path_tolerance: 0.2, goal_tolerance: 0.01, goal_time: 2.0 }
+        Self { start_position_tolerance: 0.05, path_tolerance: 0.1, goal_tolerance: 0.01, goal_time: 2.0 }
     }
 }
 

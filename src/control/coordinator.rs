@@ -2,11 +2,14 @@
 //! sleeps never, does no I/O, takes no lock, allocates and frees nothing; the same states, requests and times give
 //! the same commands, bit for bit. A tick and what it keeps belong together, hence the length.
 
+use std::time::Duration;
+
 use super::arbitrate::Arbiter;
 use super::arm_control::{ArmControl, Ask, Routed};
 use super::config::CoordinatorConfig;
 use super::limit::Refusal;
 use super::request::{Envelope, Motion, Request};
+use super::stalls::Stalls;
 use super::task::{Body, Context, JointView, Task};
 use super::tasks::cartesian::Goal;
 use crate::arm::{ArmCommand, ArmState};
@@ -17,7 +20,7 @@ use crate::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, TaskStat
 /// At most this many requests are handled in one tick: as many as can wait, so that a stop is never kept waiting
 /// by a flood of targets.
 const REQUESTS_PER_TICK: usize = 256;
-/// So much lost time makes all arms hold [s].
+/// A tick this long after the one before makes all arms hold [s].
 const LOST_TIME: f64 = 0.1;
 /// So many overruns in a row are told as degraded.
 const DEGRADED_AFTER: u32 = 10;
@@ -33,6 +36,8 @@ pub struct TickTime {
     pub skipped: u32,
     /// The lateness that cost them [ns].
     pub late_ns: u64,
+    /// Wake-up of this tick after the deadline that it was waiting for [ns].
+    pub woke_late_ns: u64,
 }
 
 /// What a tick leaves behind. Reused from tick to tick.
@@ -74,6 +79,7 @@ pub struct Coordinator {
     arm_of: Vec<u16>,
     joints: Vec<JointView>,
     overruns_in_a_row: u32,
+    stalls: Stalls,
     shutting_down: bool,
     started: bool,
     auto_start: Vec<bool>,
@@ -88,7 +94,7 @@ impl Coordinator {
             .map(|(i, arm)| {
                 let first = arm_of.len();
                 arm_of.extend(std::iter::repeat_n(i as u16, arm.dof));
-                ArmControl::new(arm.clone(), first)
+                ArmControl::new(arm.clone(), first, config.period())
             })
             .collect();
         let tasks: Vec<Task> = config.tasks.iter().map(Task::new).collect();
@@ -112,6 +118,7 @@ impl Coordinator {
             tasks,
             arm_of,
             overruns_in_a_row: 0,
+            stalls: Stalls::default(),
             shutting_down: false,
             started: false,
         }
@@ -133,6 +140,9 @@ impl Coordinator {
         self.output.events.clear();
         // Whoever runs the ticks has freed them elsewhere; what is left is only what it could not take.
         self.output.retired.clear();
+        let late = Duration::from_nanos(time.woke_late_ns);
+        let period = Duration::from_secs_f64(self.period).as_nanos().max(1) as u64;
+        self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % period)), late);
         self.read(time, states);
         self.account_for_lost_time(time);
         for _ in 0..REQUESTS_PER_TICK {
@@ -153,7 +163,7 @@ impl Coordinator {
     fn read(&mut self, time: TickTime, states: &[ArmState]) {
         for (i, arm) in self.arms.iter_mut().enumerate() {
             let Some(state) = states.get(i) else { continue };
-            if arm.read(state, time.now) {
+            if arm.read(state, time.now, &self.stalls, self.period) {
                 let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
                 self.output.tell(Event::Arm(i as u16, phase, cause));
             }
@@ -168,6 +178,8 @@ impl Coordinator {
                     upper: limiter.bounds().upper,
                     acceleration: limiter.bounds().acceleration,
                     velocity_limit: limiter.bounds().velocity,
+                    jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(crate::joint::DEFAULT_JERK),
+                    tracking_error: arm.tracking_error(j),
                 };
             }
         }
@@ -184,8 +196,8 @@ impl Coordinator {
         if self.overruns_in_a_row == DEGRADED_AFTER {
             self.output.tell(Event::Degraded);
         }
-        let lost = time.skipped as f64 * self.period;
-        if lost >= LOST_TIME.max(2.0 * self.period) {
+        let since_last = time.late_ns as f64 * 1e-9 + self.period;
+        if since_last >= LOST_TIME.max(3.0 * self.period) {
             for i in 0..self.arms.len() {
                 self.hold(i, Cause::Overrun, time.now);
             }
@@ -243,7 +255,7 @@ impl Coordinator {
             Request::Servo { task, target } => self.stream(now, task, &target, true),
             Request::Velocity { task, target } => self.stream(now, task, &target, false),
             Request::Steer { task, goal } => self.steer(now, task, &goal),
-            Request::Reset { arm } => self.with_arm(arm, |a| a.failsafe.reset(arm, &a.state, a.fresh(), now)),
+            Request::Reset { arm } => self.with_arm(arm, |a| a.failsafe.reset(arm, &a.state, a.freshness(), now)),
             Request::Ready { arm } => self.ready(arm, now),
             Request::Park { arm } => {
                 let outcome = self.with_arm(arm, |a| {
@@ -272,7 +284,7 @@ impl Coordinator {
     fn ready(&mut self, arm: u16, now: Mono) -> Outcome {
         self.with_arm(arm, |a| {
             let before = a.failsafe.phase();
-            let outcome = a.failsafe.ready(arm, &a.state, a.fresh(), now);
+            let outcome = a.failsafe.ready(arm, &a.state, a.freshness(), now);
             if outcome == Outcome::Accepted && !matches!(before, Phase::Activating | Phase::Ready) {
                 a.seed();
             }
@@ -344,6 +356,9 @@ impl Coordinator {
         }
         if let Err(outcome) = self.admit(&t.joints) {
             return outcome;
+        }
+        if positions != matches!(t.body, Body::Servo(_)) {
+            return Outcome::WrongTask(task);
         }
         let idle = !t.is_active();
         if positions && idle {
@@ -483,6 +498,7 @@ impl Coordinator {
                     Some(Ask { value, new_hands: arbiter.changed_hands(first + j) })
                 },
                 self.period,
+                time.now,
                 time.next,
                 |j, kind, asked| output.tell(Event::Limited((first + j) as u16, kind, asked)),
             );
@@ -492,6 +508,13 @@ impl Coordinator {
                         && let Some(t) = self.tasks.get_mut(task as usize)
                     {
                         t.granted = false;
+                    }
+                }
+            }
+            if let Some(at) = arm.gap() {
+                for task in self.tasks.iter_mut().filter(|t| t.is_active()) {
+                    if task.joints.iter().any(|&joint| (first..first + dof).contains(&usize::from(joint))) {
+                        task.rewind(at, time.now);
                     }
                 }
             }
@@ -520,7 +543,7 @@ impl Coordinator {
             }
             self.output.arms.push(ArmSample {
                 arm: i as u16,
-                state: arm.state,
+                state: arm.measured(),
                 command: *arm.command(),
                 phase: arm.failsafe.phase(),
                 cause: arm.failsafe.cause(),

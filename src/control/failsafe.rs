@@ -7,12 +7,12 @@
 //! ```
 
 use super::config::ACTIVATION_RAMP;
-use crate::arm::{ArmState, Link};
+use crate::arm::{ArmState, Interference, Link};
 use crate::clock::Mono;
-use crate::telemetry::{Cause, Outcome, Phase};
+use crate::telemetry::{Age, Cause, Outcome, Phase};
 
 /// Phase of one arm.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Failsafe {
     phase: Phase,
     cause: Cause,
@@ -25,13 +25,24 @@ impl Default for Failsafe {
     }
 }
 
+/// Whether the latest state is recent enough to act on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Freshness {
+    /// It is.
+    pub fresh: bool,
+    /// Its age.
+    pub age: Age,
+}
+
 /// What stands against an arm's motion.
-pub fn trouble(state: &ArmState, fresh: bool) -> Option<Cause> {
+pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
     match state.link {
         _ if state.error != 0 => Some(Cause::Fault(state.error)),
         Link::Down | Link::Faulted => Some(Cause::LinkLost),
-        Link::Stale => Some(Cause::Stale),
-        Link::Up if !fresh => Some(Cause::Stale),
+        Link::Stale => Some(Cause::Stale(freshness.age)),
+        Link::Up if !freshness.fresh => Some(Cause::Stale(freshness.age)),
+        Link::Up if state.interference == Interference::Mode => Some(Cause::ModeChanged),
+        Link::Up if state.interference == Interference::Power => Some(Cause::PowerChanged),
         Link::Up if state.self_held => Some(Cause::HeartbeatLost),
         Link::Up => None,
     }
@@ -53,19 +64,22 @@ impl Failsafe {
     }
 
     /// Follows the arm's condition. `true`: the phase changed.
-    pub fn update(&mut self, state: &ArmState, fresh: bool, now: Mono) -> bool {
+    pub fn update(&mut self, state: &ArmState, fresh: Freshness, now: Mono) -> bool {
         let before = (self.phase, self.cause);
         match self.phase {
             Phase::Unknown if state.seq == 0 => {}
             Phase::Unknown if state.enabled => self.enter(Phase::Standby, Cause::None, now),
             Phase::Unknown => self.enter(Phase::Disabled, Cause::None, now),
+            Phase::Disabled if state.interference == Interference::Power => {
+                self.enter(Phase::Held, Cause::PowerChanged, now);
+            }
             Phase::Disabled | Phase::Held => {}
-            Phase::Standby if !state.enabled && fresh => self.enter(Phase::Disabled, Cause::None, now),
+            Phase::Standby if !state.enabled && fresh.fresh => self.enter(Phase::Disabled, Cause::None, now),
             Phase::Standby => {
                 // A self-held arm is at rest already; `enable` takes it over again. One that is being enabled or
                 // disabled keeps its device thread busy, and its states wait: nobody moves it meanwhile, `ready`
                 // asks for a fresh one, and a connection that breaks is told as such.
-                let passes = |cause: &Cause| matches!(cause, Cause::HeartbeatLost | Cause::Stale);
+                let passes = |cause: &Cause| matches!(cause, Cause::HeartbeatLost | Cause::Stale(_));
                 if let Some(cause) = trouble(state, fresh).filter(|cause| !passes(cause)) {
                     self.enter(Phase::Held, cause, now);
                 }
@@ -103,7 +117,7 @@ impl Failsafe {
     }
 
     /// Clears a latch, unless its reason still stands.
-    pub fn reset(&mut self, arm: u16, state: &ArmState, fresh: bool, now: Mono) -> Outcome {
+    pub fn reset(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         if self.phase != Phase::Held {
             return Outcome::Accepted;
         }
@@ -118,12 +132,12 @@ impl Failsafe {
     }
 
     /// The arm was enabled: hold first, then be ready.
-    pub fn ready(&mut self, arm: u16, state: &ArmState, fresh: bool, now: Mono) -> Outcome {
+    pub fn ready(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         match self.phase {
             Phase::Activating | Phase::Ready => Outcome::Accepted,
             Phase::Held => Outcome::ArmLatched(arm, self.cause),
             Phase::Unknown | Phase::Disabled | Phase::Standby => match trouble(state, fresh) {
-                Some(Cause::Stale | Cause::LinkLost) => Outcome::StartStateUnavailable(arm),
+                Some(Cause::Stale(_) | Cause::LinkLost) => Outcome::StartStateUnavailable(arm),
                 Some(cause) => Outcome::StillFaulted(arm, cause),
                 None if !state.enabled => Outcome::ArmNotReady(arm, self.phase, Cause::PowerLost),
                 None => {

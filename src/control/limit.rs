@@ -9,10 +9,6 @@ use crate::telemetry::LimitKind;
 /// Slack for rounding: a command at its limit is not "limited".
 const ROUNDING: f64 = 1e-9;
 
-/// How far an arm may lag behind its velocity commands and still stop inside its position range [s]: its own
-/// delay and the age of its state.
-const VELOCITY_LAG: f64 = 0.03;
-
 /// Limits of one joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
@@ -97,6 +93,32 @@ impl Limiter {
         *self = Self { position, ..Self::new(self.bounds) };
     }
 
+    /// Goes back to what was written last: the commands after it did not reach the arm. What is requested goes on.
+    pub fn rewind(&mut self, position: f64, velocity: f64) {
+        (self.position, self.velocity) = (position, velocity);
+    }
+
+    /// A request that is not followed, because nothing can be sent just now: the next one counts from it.
+    pub fn pass(&mut self, target: f64) -> Result<(), Refusal> {
+        if !target.is_finite() {
+            return Err(Refusal::NonFinite);
+        }
+        let step = target - self.request.unwrap_or(self.position);
+        if step.abs() > JUMP {
+            return Err(Refusal::Jump(step));
+        }
+        self.request = Some(target);
+        Ok(())
+    }
+
+    /// Brings the command to where the joint is measured, at rest there: what holds the joint back must not find it
+    /// under way when it lets go. `step` is the largest change [rad].
+    pub fn draw(&mut self, at: f64, step: f64) {
+        self.hand_over();
+        self.position += (at - self.position).clamp(-step, step);
+        self.velocity = 0.0;
+    }
+
     /// Whether nothing moves.
     pub fn at_rest(&self) -> bool {
         self.velocity == 0.0
@@ -161,24 +183,25 @@ impl Limiter {
         Ok(Limited { value: self.position, by })
     }
 
-    /// The velocity to command for a requested velocity [rad/s] with the joint measured at `at` [rad].
-    pub fn follow_velocity(&mut self, target: f64, at: f64, dt: f64) -> Result<Limited, Refusal> {
+    /// The velocity to command for a requested velocity [rad/s]. `at`: where the joint may be by now [rad], lowest and
+    /// highest, with all that was commanded since it was measured.
+    pub fn follow_velocity(&mut self, target: f64, at: (f64, f64), dt: f64) -> Result<Limited, Refusal> {
         if !target.is_finite() {
             return Err(Refusal::NonFinite);
         }
         self.hand_over();
         let b = self.bounds;
         let change = b.acceleration * dt;
-        let ahead = at + self.velocity * VELOCITY_LAG;
-        let (slowest, fastest) = self.speeds_inside(b.lower, b.upper, ahead, dt);
+        let slowest = self.speeds_inside(b.lower, b.upper, at.0, dt).0;
+        let fastest = self.speeds_inside(b.lower, b.upper, at.1, dt).1;
         let capped = target.clamp(-b.velocity, b.velocity);
         let inside = capped.clamp(slowest, fastest);
         self.velocity = inside.clamp(self.velocity - change, self.velocity + change);
-        self.position = at;
+        self.position = (at.0 + at.1) / 2.0;
         let by = if capped != target {
             Some((LimitKind::Velocity, target))
         } else if inside != capped {
-            Some((LimitKind::Position, at))
+            Some((LimitKind::Position, target))
         } else if self.velocity != inside {
             Some((LimitKind::Acceleration, target))
         } else {
@@ -341,7 +364,7 @@ mod tests {
             l.seed(0.0);
             let (mut q, mut last) = (0.0, 0.0);
             for t in targets {
-                let v = l.follow_velocity(t, q, DT).unwrap().value;
+                let v = l.follow_velocity(t, (q, q), DT).unwrap().value;
                 prop_assert!(v.abs() <= 1.5 && (v - last).abs() <= 4.0 * DT + 1e-12);
                 q += v * DT;
                 last = v;
@@ -356,7 +379,7 @@ mod tests {
             l.seed(0.1);
             for t in targets {
                 if let Ok(out) = l.follow_position(t, DT) { prop_assert!(out.value.is_finite()); }
-                if let Ok(out) = l.follow_velocity(t, 0.1, DT) { prop_assert!(out.value.is_finite()); }
+                if let Ok(out) = l.follow_velocity(t, (0.1, 0.1), DT) { prop_assert!(out.value.is_finite()); }
                 prop_assert!(l.hold_position(DT).is_finite());
             }
         }

@@ -6,13 +6,18 @@
 
 pub mod arbitrate;
 pub mod arm_control;
+pub mod belief;
 pub mod config;
 pub mod coordinator;
 pub mod estimate;
 pub mod failsafe;
 pub mod limit;
+pub mod path_clock;
 pub mod point_to_point;
 pub mod request;
+pub mod set_points;
+pub mod stalls;
 pub mod task;
 pub mod tasks;
 pub mod tick_loop;
+pub mod written;

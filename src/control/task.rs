@@ -28,6 +28,10 @@ pub struct JointView {
     pub acceleration: f64,
     /// Velocity limit [rad/s].
     pub velocity_limit: f64,
+    /// Jerk limit [rad/s³].
+    pub jerk: f64,
+    /// How far the joint is outside the range of its set points of the last `lag` seconds [rad].
+    pub tracking_error: f64,
 }
 
 /// What a task sees when it computes.
@@ -177,6 +181,14 @@ impl Task {
                     Some((state, reason)) => self.end(state, reason),
                 }
             }
+        }
+    }
+
+    /// Nothing reached an arm since the tick of `at`: it goes on from what was commanded then, from rest.
+    pub fn rewind(&mut self, at: Mono, now: Mono) {
+        self.granted = false;
+        if let Body::Trajectory(t) = &mut self.body {
+            t.rewind(at, now);
         }
     }
 

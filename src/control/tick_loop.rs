@@ -11,6 +11,7 @@ use super::request::{Envelope, Motion};
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::{Clock, Mono};
 use crate::rt::beat::Beat;
+use crate::rt::due::Due;
 use crate::rt::histogram::Histogram;
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, SlotWriter};
@@ -54,6 +55,8 @@ pub struct TickPorts {
     pub commands: Vec<SlotWriter<ArmCommand>>,
     /// Wakes the device threads, one per arm.
     pub wakes: Vec<Wake>,
+    /// When the device threads mean to be awake, one per arm.
+    pub dues: Vec<Arc<Due>>,
     /// What it is told.
     pub requests: rtrb::Consumer<Envelope>,
     /// What came of it: id and outcome.
@@ -116,13 +119,14 @@ pub fn run(
         deadline = deadline.after(period * missed);
         let skipped = skips_before + missed;
         let (next, skips_after) = next_deadline(deadline, woke, period);
-        for (state, slot) in states.iter_mut().zip(&mut ports.states) {
+        for ((state, slot), due) in states.iter_mut().zip(&mut ports.states).zip(&ports.dues) {
             *state = slot.read();
+            state.own_delay_ns = due.overdue(woke).as_nanos() as u64;
         }
         let requests = &mut ports.requests;
         // What was skipped before this tick is told with the lateness that cost it.
         let worst = if skips_before > 0 { late_ns.max(late_before) } else { late_ns };
-        let time = TickTime { now: deadline, next, skipped, late_ns: worst };
+        let time = TickTime { now: deadline, next, skipped, late_ns: worst, woke_late_ns: late_ns };
         let output = coordinator.tick(time, &states, || requests.pop().ok());
         let mut overwritten = 0;
         for (slot, command) in ports.commands.iter_mut().zip(&output.commands) {

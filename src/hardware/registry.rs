@@ -1,6 +1,7 @@
 //! The compile-time adapter table: one row per arm, in `arms/mod.rs`. `dimos list-adapters` prints it.
 
 use std::net::{IpAddr, SocketAddr};
+use std::time::Duration;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
@@ -136,6 +137,12 @@ pub struct AdapterSpec {
     pub wire_units: &'static str,
     /// How often the device delivers its state [Hz].
     pub native_rate: f64,
+    /// How far a joint at rest may be from its set point under load [rad].
+    pub accuracy: f64,
+    /// Time from a set point to the measured motion that follows it [s]; `dimos adapter test --lag` measures it.
+    pub lag: f64,
+    /// Age limit of a state: an arm without a newer one is held. At least three of the device's periods are granted.
+    pub stale_after: Duration,
     /// The form of `address`.
     pub address: AddressForm,
     /// Whether the arm keeps its pose when its motors are disabled (brakes), or falls.

@@ -37,6 +37,9 @@ pub enum AdapterError {
     /// The device refused a command.
     #[error("{0}")]
     Rejected(String),
+    /// Two set points are on their way and not acknowledged: this one was not sent. No failure of the device.
+    #[error("two set points are still unacknowledged")]
+    Busy,
     /// The device has no such feature.
     #[error("not supported by this arm")]
     Unsupported,
@@ -83,6 +86,10 @@ pub struct JointReading {
     pub velocity: Option<Joints>,
     /// Joint torques [Nm], where the device has them.
     pub effort: Option<Joints>,
+    /// The device's own sign that the positions are measured: `Some(true)` confirms them, `Some(false)` says that they
+    /// are not measured yet, `None`: the device has no such sign. Without a confirmation, exactly zero on all joints
+    /// counts as missing when the motors are to be enabled.
+    pub valid: Option<bool>,
 }
 
 /// The device's own state words, as it reports them.
@@ -199,6 +206,12 @@ pub trait ManipulatorAdapter: Send {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
     /// Clears the device's error state. Moves nothing, enables nothing.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
+    /// Discards set points that have not left this computer. Called when the arm stopped answering, before anything else
+    /// is sent: a set point that waits in a queue must not reach the arm later. By default the connection is dropped, and
+    /// the device thread connects again; a TCP connection is reset, not closed, so that its send buffer is discarded.
+    fn discard_pending(&mut self) {
+        self.disconnect();
+    }
 
     // --- Optional parts ---
 

@@ -293,7 +293,8 @@ impl Drop for Desk {
 fn work(solver: &Solver, shared: &Shared, orders: &Receiver<Order>) {
     while let Ok(order) = orders.recv() {
         let began = Instant::now();
-        let outcome = catch_unwind(AssertUnwindSafe(|| solver(&order.setup, &order.world, &order.request, &order.stop)));
+        let outcome =
+            catch_unwind(AssertUnwindSafe(|| solver(&order.setup, &order.world, &order.request, &order.stop)));
         let took = began.elapsed();
         let progress = match outcome {
             Ok(Ok(found)) => Progress::Found(Arc::new(found), took),

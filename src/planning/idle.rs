@@ -94,7 +94,8 @@ fn widest(model: &RobotModel, joint: usize) -> f64 {
     if !own.limits.lower.is_finite() || !own.limits.upper.is_finite() {
         return 0.0;
     }
-    let moves = |j: usize| j == joint || model.joints.get(j).is_some_and(|o| o.mimic.is_some_and(|m| m.leader == joint));
+    let moves =
+        |j: usize| j == joint || model.joints.get(j).is_some_and(|o| o.mimic.is_some_and(|m| m.leader == joint));
     let fingers: Vec<usize> = (0..model.joints.len()).filter(|j| moves(*j)).collect();
     let spread = |position: f64| {
         let named = HashMap::from([(own.name.clone(), position)]);

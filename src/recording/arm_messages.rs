@@ -10,12 +10,13 @@ use crate::telemetry::{ArmSample, TickSample};
 pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     let values = |s: &ArmState| (s.gripper, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
-    values(a) != values(b) || flags(a) != flags(b)
+    let more = |s: &ArmState| (s.interference, s.own_delay_ns);
+    values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b)
 }
 
 /// Whether two commands differ in what `ArmOutput` says, other than its counters that go on by themselves.
 pub(super) fn output_differs(a: &ArmCommand, b: &ArmCommand) -> bool {
-    let parts = |c: &ArmCommand| (c.mode, c.gripper.to_bits(), c.gripper_seq, c.stop_seq);
+    let parts = |c: &ArmCommand| (c.mode, c.gripper.to_bits(), c.gripper_seq, c.stop_seq, c.start_seq);
     parts(a) != parts(b)
 }
 
@@ -37,6 +38,8 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         link: s.link.name().into(),
         self_held: s.self_held,
         written: s.written,
+        interference: s.interference.name().into(),
+        own_delay_ns: s.own_delay_ns,
     }
 }
 
@@ -51,6 +54,7 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
         gripper_seq: c.gripper_seq,
         stop_seq: c.stop_seq,
         next_tick_ns: c.next_tick.0,
+        start_seq: c.start_seq,
     }
 }
 

@@ -228,6 +228,10 @@ message! {
         self_held: bool,
         /// Number of the newest command that was written to the wire.
         written: u64,
+        /// What was seen of the arm that this run did not order: mode, power, or empty.
+        interference: String,
+        /// Part of the state's age in which the device thread could not run [ns].
+        own_delay_ns: u64,
     }
 }
 
@@ -251,5 +255,7 @@ message! {
         stop_seq: u32,
         /// When the tick will read states next, in monotonic time [ns].
         next_tick_ns: u64,
+        /// Counts starts of commanded motion: after enabling and after a change of mode.
+        start_seq: u32,
     }
 }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use super::recorded::Recorded;
 use super::requests;
-use crate::arm::{ArmState, Link, VelocitySource};
+use crate::arm::{ArmState, Interference, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::control::coordinator::TickTime;
 use crate::control::request::{Envelope, Request};
@@ -90,6 +90,7 @@ impl LoggedTick {
             next: Mono(self.tick.next_ns),
             skipped: self.tick.skipped,
             late_ns: self.tick.overrun_ns,
+            woke_late_ns: self.tick.late_ns,
         }
     }
 }
@@ -269,9 +270,16 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         link: link(&input.link)?,
         self_held: input.self_held,
         written: input.written,
+        interference: interference(&input.interference)?,
+        own_delay_ns: input.own_delay_ns,
         ..ArmState::default()
     };
     Ok(())
+}
+
+fn interference(name: &str) -> Result<Interference, String> {
+    let all = [Interference::None, Interference::Mode, Interference::Power];
+    all.into_iter().find(|i| i.name() == name).ok_or_else(|| format!("{name:?} is no interference"))
 }
 
 fn source(name: &str) -> Result<VelocitySource, String> {

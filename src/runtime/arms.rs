@@ -18,7 +18,7 @@ use crate::rt::slot::{SlotReader, SlotWriter, slot};
 /// An adapter must know within this time whether its device answers; a little is added for the machine.
 const CONNECT_LIMIT: Duration = Duration::from_millis(3_500);
 /// How long an arm gets to enable.
-const ENABLE_LIMIT: Duration = Duration::from_secs(4);
+const ENABLE_LIMIT: Duration = Duration::from_secs(10);
 /// How long all arms together get to be released.
 const RELEASE_LIMIT: Duration = Duration::from_secs(2);
 
@@ -54,7 +54,6 @@ pub struct BroughtUp {
 /// Connects all arms at once, or none: on the first that fails, all others are let go again.
 pub fn bring_up(
     blueprint: &Blueprint,
-    realtime: bool,
     beat: &Arc<Beat>,
     note: impl Fn(usize, Note) + Clone + Send + 'static,
 ) -> Result<BroughtUp, StartError> {
@@ -72,8 +71,7 @@ pub fn bring_up(
             dof: arm.joints.len(),
             tick_period: period,
             native_rate: arm.adapter.native_rate,
-            velocity_max: arm.own_limits.velocity_max.iter().copied().fold(0.1, f64::max),
-            realtime,
+            supervision: arm.supervision,
             beat: beat.clone(),
             clock: Arc::new(MonotonicClock),
             notes: Box::new(move |what| note(index, what)),
@@ -95,7 +93,13 @@ pub fn bring_up(
             Ok((c, limits))
         });
         match brought {
-            Ok(pair) => connected.push(pair),
+            Ok(pair) => {
+                if let Some(device) = arms.devices.get(connected.len()) {
+                    // Taken before any command: the thread handles its orders in turn.
+                    drop(device.set_limits(pair.1.clone()));
+                }
+                connected.push(pair);
+            }
             Err(error) => {
                 arms.release();
                 return Err(error);

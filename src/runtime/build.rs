@@ -19,7 +19,7 @@ use super::{Ending, Handle, Options, Record, Run, StartError};
 use crate::arm::ArmState;
 use crate::blueprint::{Arm, Blueprint};
 use crate::clock::{Clock, MonotonicClock, WallOffset};
-use crate::control::config::{ArmConfig, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Request;
 use crate::control::tick_loop::{self, Pulse, TickPorts};
@@ -68,8 +68,7 @@ impl Run {
             let (notes, names) = (notes.clone(), names.clone());
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
-        let realtime = grants.iter().any(|g| g.granted && g.what == host::SCHEDULING);
-        let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, realtime, &pulse.beat, device_notes)?;
+        let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, &pulse.beat, device_notes)?;
         let config = coordinator_config(blueprint, &connected, kinds);
         let limits = command_limits(&names, &config);
         let planner = blueprint.planner.as_ref().zip(robots);
@@ -147,6 +146,7 @@ impl Run {
             states: slots.states,
             commands: slots.commands,
             wakes: arms.devices.iter().map(|d| d.wake()).collect(),
+            dues: arms.devices.iter().map(|d| d.due()).collect(),
             requests: request_consumer,
             replies: reply_producer,
             reply_wake: reply_wake.clone(),
@@ -324,6 +324,7 @@ fn coordinator_config(
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
+        version: CONTROL_VERSION,
         rate: blueprint.coordinator.tick_rate,
         arms: arms
             .map(|(arm, (said, limits))| ArmConfig {
@@ -332,7 +333,10 @@ fn coordinator_config(
                 limits: limits.clone(),
                 modes: said.info.modes.to_vec(),
                 gripper: arm.adapter.gripper,
-                state_timeout: said.state_timeout,
+                own_velocity: said.limits.velocity_max.clone(),
+                read_period: said.read_period,
+                write_period: said.write_period,
+                supervision: arm.supervision,
             })
             .collect(),
         tasks: blueprint

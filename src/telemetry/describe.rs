@@ -4,7 +4,7 @@
 
 use serde::Serialize;
 
-use super::{Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
+use super::{Age, Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
 
 /// The names behind the tick's indices, in the blueprint's order.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -267,16 +267,44 @@ pub fn cause_text(cause: Cause) -> String {
     match cause {
         Cause::None => String::new(),
         Cause::Operator => "an operator stopped it".into(),
-        Cause::Stale => "its states stopped coming".into(),
+        Cause::Stale(age) => stale_text(age),
         Cause::Fault(code) => format!("the arm reports error {code}"),
         Cause::LinkLost => "the connection to it was lost".into(),
         Cause::NonFinite => "a command was not a finite number".into(),
         Cause::Jump => "a command jumped".into(),
         Cause::Overrun => "the tick lost too much time".into(),
         Cause::HeartbeatLost => "its device thread saw no heartbeat of the tick".into(),
-        Cause::PowerLost => "its motors went off without being asked".into(),
+        Cause::PowerLost => "the motors were disabled unexpectedly".into(),
+        Cause::Tracking(joint, by) => format!(
+            "tracking error of joint {} is {}: it is blocked, pushed or moved by another program",
+            joint + 1,
+            angle(by)
+        ),
+        Cause::PositionJump(joint, by) => {
+            format!("the position of joint {} jumped by {}", joint + 1, angle(by))
+        }
+        Cause::MovedWhileActivating(joint, by) => {
+            format!("joint {} moved by {} while the arm was being enabled", joint + 1, angle(by))
+        }
+        Cause::ModeChanged => "the panel, hand guiding or another program changed the control mode".into(),
+        Cause::PowerChanged => "the panel or another program enabled the motors".into(),
         Cause::Shutdown => "the run is ending".into(),
     }
+}
+
+/// Figures of a stale state in words.
+fn stale_text(age: Age) -> String {
+    let ms = |us: u32| (us + 500) / 1000;
+    let own = if age.own_us >= 500 {
+        format!("; this computer stood still for {} ms", ms(age.own_us))
+    } else {
+        String::new()
+    };
+    // The other reasons for a stale state: reads fail, or what is read is not plausible.
+    if age.age_us <= age.limit_us {
+        return "its states cannot be read".into();
+    }
+    format!("no state for {} ms (limit {} ms{own})", ms(age.age_us), ms(age.limit_us))
 }
 
 fn because(cause: Cause) -> String {
@@ -284,7 +312,11 @@ fn because(cause: Cause) -> String {
 }
 
 fn code(cause: Cause) -> Vec<f64> {
-    if let Cause::Fault(code) = cause { vec![f64::from(code)] } else { Vec::new() }
+    match cause {
+        Cause::Fault(code) => vec![f64::from(code)],
+        Cause::Tracking(_, by) | Cause::PositionJump(_, by) | Cause::MovedWhileActivating(_, by) => vec![by],
+        _ => Vec::new(),
+    }
 }
 
 fn angle(rad: f64) -> String {

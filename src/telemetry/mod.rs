@@ -87,16 +87,27 @@ impl Phase {
     }
 }
 
-/// Why an arm is held.
+/// Age of a state, and what it is compared with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Age {
+    /// Age without this computer's own delays [µs].
+    pub age_us: u32,
+    /// Its limit [µs].
+    pub limit_us: u32,
+    /// Time in which this computer's threads could not run [µs].
+    pub own_us: u32,
+}
+
+/// Why an arm is held.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Cause {
     /// Nothing happened.
     #[default]
     None,
     /// An operator's `stop`.
     Operator,
-    /// Its states stopped coming.
-    Stale,
+    /// No state for longer than its age limit.
+    Stale(Age),
     /// The arm reports an error.
     Fault(i32),
     /// The device thread lost the arm.
@@ -111,6 +122,17 @@ pub enum Cause {
     HeartbeatLost,
     /// The motors went off without being asked.
     PowerLost,
+    /// A joint of the arm (counted from 0) is this far from its set points of the last `lag` seconds [rad, or rad/s in
+    /// velocity mode].
+    Tracking(u16, f64),
+    /// A joint of the arm was measured this far from where it can be [rad].
+    PositionJump(u16, f64),
+    /// A joint of the arm moved this far while the arm was being enabled [rad].
+    MovedWhileActivating(u16, f64),
+    /// The arm is in a mode that this run did not order.
+    ModeChanged,
+    /// The motors were enabled, and not by this run.
+    PowerChanged,
     /// The run is ending.
     Shutdown,
 }
@@ -121,7 +143,7 @@ impl Cause {
         match self {
             Self::None => "none",
             Self::Operator => "operator_stop",
-            Self::Stale => "stale",
+            Self::Stale(_) => "stale",
             Self::Fault(_) => "arm_fault",
             Self::LinkLost => "link_lost",
             Self::NonFinite => "non_finite_command",
@@ -129,6 +151,11 @@ impl Cause {
             Self::Overrun => "overrun",
             Self::HeartbeatLost => "heartbeat_lost",
             Self::PowerLost => "power_lost",
+            Self::Tracking(..) => "tracking",
+            Self::PositionJump(..) => "position_jump",
+            Self::MovedWhileActivating(..) => "moved_while_activating",
+            Self::ModeChanged => "mode_changed",
+            Self::PowerChanged => "power_changed",
             Self::Shutdown => "shutdown",
         }
     }

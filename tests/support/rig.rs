@@ -9,7 +9,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use dimos::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::control::config::*;
 use dimos::control::coordinator::{Coordinator, TickTime};
@@ -46,6 +46,8 @@ pub struct SimArm {
     pub blocked: bool,
     /// No new states come.
     pub silent: bool,
+    /// Commands do not reach it.
+    pub deaf: bool,
     /// How old a state is when the tick reads it.
     pub age: Duration,
     pub enabled: bool,
@@ -58,6 +60,10 @@ pub struct SimArm {
     pub state: ArmState,
     pub stops: u32,
     pub gripper: f64,
+    /// The last set points that reached it, and the tick's time of them.
+    pub written: Option<Vec<f64>>,
+    pub written_at: Mono,
+    pub written_start: u32,
     switching: u32,
     last: ArmCommand,
 }
@@ -75,6 +81,7 @@ impl SimArm {
             stop_takes_hold: false,
             blocked: false,
             silent: false,
+            deaf: false,
             age: Duration::from_millis(1),
             enabled: true,
             error: 0,
@@ -85,6 +92,9 @@ impl SimArm {
             state: ArmState::default(),
             stops: 0,
             gripper: 0.0,
+            written: None,
+            written_at: Mono::ZERO,
+            written_start: 0,
             switching: 0,
             last: ArmCommand::default(),
         }
@@ -123,7 +133,7 @@ impl SimArm {
             self.gripper = command.gripper;
         }
         self.last = *command;
-        if let Some(mode) = command.mode.filter(|_| self.enabled && self.link == Link::Up) {
+        if let Some(mode) = command.mode.filter(|_| self.enabled && self.link == Link::Up && !self.deaf) {
             if mode != self.mode {
                 self.switching += 1;
                 if self.switching > self.mode_delay {
@@ -131,6 +141,9 @@ impl SimArm {
                 }
             }
             if mode == self.mode {
+                self.state.written = command.seq;
+                self.written = Some(command.values[..self.dof].to_vec());
+                (self.written_at, self.written_start) = (command.at, command.start_seq);
                 self.setpoint = Some(command.values[..self.dof].to_vec());
             }
         }
@@ -193,7 +206,10 @@ pub fn arm(name: &str, dof: usize) -> ArmConfig {
         limits,
         modes: vec![ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: true,
-        state_timeout: Duration::from_millis(30),
+        own_velocity: Vec::new(),
+        read_period: Duration::from_millis(10),
+        write_period: Duration::from_millis(10),
+        supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
     }
 }
 
@@ -235,7 +251,7 @@ pub fn sweep(id: u64, joints: std::ops::Range<u16>, from: f64, to: f64, seconds:
 
 impl Rig {
     pub fn new(rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
-        let config = CoordinatorConfig { rate, arms, tasks };
+        let config = CoordinatorConfig { version: CONTROL_VERSION, rate, arms, tasks };
         let wire = |a: &ArmConfig| Wire {
             mode: None,
             values: vec![0.0; a.dof],
@@ -347,7 +363,13 @@ impl Rig {
     /// A tick that reads these states; no arm obeys its commands.
     pub fn tick_with(&mut self, states: &[ArmState], skipped: u32) {
         let late_ns = skipped as u64 * self.config.period().as_nanos() as u64;
-        let time = TickTime { now: self.now, next: self.now.after(self.config.period()), skipped, late_ns };
+        let time = TickTime {
+            now: self.now,
+            next: self.now.after(self.config.period()),
+            skipped,
+            late_ns,
+            woke_late_ns: late_ns,
+        };
         let inbox = &mut self.inbox;
         (self.around)(true);
         let output = self.coordinator.tick(time, states, || inbox.pop_front());
@@ -408,7 +430,11 @@ impl Rig {
             let at = |what: &str| format!("tick {}: arm {i}: {what}: {command:?} after {was:?}", self.ticks);
             assert!(command.values.iter().all(|v| v.is_finite()) && command.gripper.is_finite(), "{}", at("F07"));
             let values = command.values[..arm.dof].to_vec();
-            let resting = wire.velocity.iter().all(|v| v.abs() < 1e-9);
+            // Nothing was written for more than two periods: the command is what was written last, from rest.
+            let starts = command.start_seq != arm.written_start;
+            let unwritten = self.now.since(arm.written_at) > 2 * self.config.period();
+            let gap = unwritten && !starts;
+            let resting = unwritten || wire.velocity.iter().all(|v| v.abs() < 1e-9);
             let Some(mode) = command.mode else {
                 let reachable = arm.link == Link::Up && arm.enabled;
                 assert!(wire.mode.is_none() || resting || !reachable, "{}", at("let go while it moves"));
@@ -418,7 +444,7 @@ impl Rig {
             };
             let may_move = matches!(sample.phase, Phase::Activating | Phase::Ready | Phase::Held | Phase::Standby);
             assert!(may_move && arm.enabled, "{}", at("commanded without power"));
-            let switched = wire.mode != Some(mode);
+            let switched = wire.mode != Some(mode) || starts;
             if switched {
                 let still = arm.state.velocity[..arm.dof].iter().all(|v| v.abs() <= 0.05);
                 assert!(resting, "{}", at("F11: mode switched while commands move"));
@@ -430,6 +456,10 @@ impl Rig {
                 }
             }
             for j in 0..arm.dof {
+                // A held joint that does not follow has its set point drawn to it.
+                let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
+                let drawn =
+                    sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
                 let velocity = match (mode == ControlMode::Velocity, switched) {
                     (true, _) => values[j],
                     (false, false) => (values[j] - wire.values[j]) / dt,
@@ -443,6 +473,14 @@ impl Rig {
                 let change = velocity - wire.velocity[j];
                 assert!(velocity.abs() <= limits.velocity_max[j] * (1.0 + 1e-9) + 1e-12, "{}", at("F08 velocity"));
                 let most = limits.acceleration_max[j] * dt * (1.0 + 1e-6) + 1e-8;
+                if (drawn || gap) && mode != ControlMode::Velocity {
+                    wire.velocity[j] = if drawn { 0.0 } else { velocity };
+                    if gap {
+                        assert_eq!(Some(to), arm.written.as_ref().map(|w| w[j]), "{}", at("in a gap"));
+                        wire.velocity[j] = 0.0;
+                    }
+                    continue;
+                }
                 assert!(change.abs() <= most, "{} joint {j} by {}", at("F08 acceleration"), change / dt);
                 wire.velocity[j] = velocity;
                 if mode != ControlMode::Velocity {

@@ -6,9 +6,9 @@ use std::path::Path;
 use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
-use dimos::arm::{ArmState, Link, VelocitySource};
+use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::{Mono, WallOffset};
-use dimos::control::config::{ArmConfig, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::joint::{ControlMode, JointLimits, make_joints};
@@ -33,7 +33,10 @@ pub fn one_arm(dof: usize) -> CoordinatorConfig {
         limits: JointLimits::uniform(dof, 3.0, 2.0).with_defaults(),
         modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
         gripper: true,
-        state_timeout: Duration::from_millis(50),
+        own_velocity: Vec::new(),
+        read_period: Duration::from_millis(10),
+        write_period: Duration::from_millis(10),
+        supervision: Supervision { stale_after: Duration::from_millis(50), ..Supervision::default() },
     };
     let task = TaskConfig {
         name: "traj_arm".into(),
@@ -42,7 +45,7 @@ pub fn one_arm(dof: usize) -> CoordinatorConfig {
         priority: 10,
         auto_start: false,
     };
-    CoordinatorConfig { rate: 100.0, arms: vec![arm], tasks: vec![task] }
+    CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
 }
 
 /// A run on a clock that is set forward.
@@ -153,7 +156,7 @@ impl VirtualRun {
             state.stamp = self.now.before(Duration::from_micros(1500));
         }
         let late_ns = 20_000 + u64::from(skipped) * PERIOD.as_nanos() as u64;
-        let time = TickTime { now: self.now, next, skipped, late_ns };
+        let time = TickTime { now: self.now, next, skipped, late_ns, woke_late_ns: late_ns };
         let output = self.coordinator.tick(time, &self.states, || self.inbox.pop_front());
         let (tick, dropped) = (self.tick, std::mem::take(&mut self.dropped));
         let (deadline, overrun_ns) = (self.now, late_ns);
@@ -169,7 +172,7 @@ impl VirtualRun {
         let period = PERIOD.as_secs_f64();
         for ((state, command), arm) in self.states.iter_mut().zip(&output.commands).zip(&self.config.arms) {
             let Some(mode) = command.mode.filter(|_| state.enabled) else { continue };
-            state.mode = mode;
+            (state.mode, state.written) = (mode, command.seq);
             for j in 0..arm.dof {
                 let before = state.position[j];
                 state.position[j] = match mode {

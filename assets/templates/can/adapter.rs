@@ -309,6 +309,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             position: from_wire(&state.positions),
             velocity: Some(from_wire(&state.velocities)),
             effort: None, // YOUR ARM: its torques [Nm], if it measures them; then write `read_joint_efforts` too
+            valid: None,
         };
         Ok(())
     }

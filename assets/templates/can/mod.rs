@@ -8,6 +8,8 @@ pub mod emulator;
 mod golden;
 pub mod protocol;
 
+use std::time::Duration;
+
 use dimos::hardware::fit::{Fit, Misfit};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use dimos::hardware::sim::arm::SimOptions;
@@ -38,6 +40,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "deg",
     native_rate: NATIVE_RATE,
+    accuracy: 0.01,
+    lag: 0.05,
+    stale_after: Duration::from_millis(50),
     address: AddressForm {
         form: FORMS,
         required: true,

@@ -25,6 +25,9 @@ use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 const HELLO: Patience = Patience { each: Duration::from_millis(250), times: 5 };
 /// Longest wait for any other reply. YOUR ARM: several times what the controller needs.
 const REPLY: Patience = Patience::once(Duration::from_millis(100));
+/// Longest wait for measurements, and for the reply to a set point. YOUR ARM: all tries together stay below `stale_after`,
+/// so that a single lost reply does not hold the arm.
+const CYCLE: Patience = Patience { each: Duration::from_millis(18), times: 3 };
 /// A reply answers further questions for one period of the controller.
 const STATE_AGE: Duration = Duration::from_micros((1e6 / NATIVE_RATE) as u64);
 
@@ -97,10 +100,16 @@ impl AcmeAdapter {
         self.request(command, REPLY, |_| Some(()))
     }
 
+    /// A set point: it may be obeyed twice, so it may be sent again when its reply is lost.
+    fn set_point(&mut self, command: &Command) -> AdapterResult<()> {
+        self.state = None;
+        self.request(command, CYCLE, |_| Some(()))
+    }
+
     /// Asks for what is measured.
     fn fetch(&mut self) -> AdapterResult<State> {
         self.state = None;
-        let state = self.request(&Command::State, REPLY, State::decode)?;
+        let state = self.request(&Command::State, CYCLE, State::decode)?;
         self.state = Some((state, MonotonicClock.now()));
         self.mode = state.mode;
         Ok(state)
@@ -243,6 +252,7 @@ impl ManipulatorAdapter for AcmeAdapter {
             position: from_wire(&state.positions),
             velocity: Some(from_wire(&state.velocities)),
             effort: Some(joints_of(&state.torques)),
+            valid: None,
         };
         Ok(())
     }
@@ -267,13 +277,13 @@ impl ManipulatorAdapter for AcmeAdapter {
         let joints = to_wire(positions)?;
         match self.mode {
             Mode::Planned => self.command(&Command::Move((velocity * 100.0).clamp(1.0, 100.0), joints)),
-            Mode::SetPoints => self.command(&Command::Servo(joints)),
+            Mode::SetPoints => self.set_point(&Command::Servo(joints)),
             Mode::Velocities => Err(AdapterError::Rejected("joint positions in velocity mode".into())),
         }
     }
 
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
-        self.command(&Command::Velocity(to_wire(velocities)?)) // the controller checks the mode
+        self.set_point(&Command::Velocity(to_wire(velocities)?)) // the controller checks the mode
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
@@ -287,6 +297,11 @@ impl ManipulatorAdapter for AcmeAdapter {
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.command(&Command::Clear)
+    }
+
+    fn discard_pending(&mut self) {
+        self.line.abort(); // what the controller did not acknowledge must not reach it later
+        self.disconnect();
     }
 
     // --- Optional parts. YOUR ARM: `read_cartesian_position`, `write_gripper_position`, `read_force_torque` … are in

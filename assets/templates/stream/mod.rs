@@ -9,6 +9,8 @@ mod golden;
 pub mod protocol;
 pub mod wire;
 
+use std::time::Duration;
+
 use dimos::hardware::fit::{Fit, Misfit};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use dimos::hardware::sim::arm::{PLAYABLE, SimOptions};
@@ -36,6 +38,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "deg",
     native_rate: NATIVE_RATE,
+    accuracy: 0.01,
+    lag: 0.05,
+    stale_after: Duration::from_millis(60),
     address: AddressForm {
         form: wire::FORM,
         required: true,

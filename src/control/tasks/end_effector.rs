@@ -72,7 +72,7 @@ impl EndEffector {
     pub fn strayed(&self, cx: &Context<'_>, joints: &[u16]) -> Option<(u16, f64)> {
         joints.iter().find_map(|&joint| {
             let view = cx.joint(joint);
-            let error = view.position - view.commanded;
+            let error = view.tracking_error;
             (error.is_nan() || error.abs() > self.params.max_tracking_error).then_some((joint, error))
         })
     }

@@ -1,6 +1,8 @@
 //! Executes a trajectory: positions along its curve, from where the arm is, until the arm has arrived.
 
+use crate::clock::Mono;
 use crate::control::config::TrajectoryParams;
+use crate::control::path_clock::{PathClock, RateLimits};
 use crate::control::request::Motion;
 use crate::control::task::{Claim, Context};
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
@@ -17,21 +19,19 @@ pub struct TrajectoryTask {
     params: TrajectoryParams,
     motion: Option<Box<Motion>>,
     cursor: Cursor,
-    /// Time along the trajectory [s].
-    elapsed: f64,
-    /// Speed along the trajectory: 1, or less on the way to a stop.
-    rate: f64,
+    /// Time along the trajectory.
+    clock: PathClock,
     slowing: bool,
     /// The arm has taken it up.
     begun: bool,
-    /// Time since the trajectory's end [s].
+    /// Its last point was commanded.
+    at_end: bool,
+    /// Time since then [s].
     settling: f64,
     /// What the last commands were ahead of the first point, joint by joint [rad].
     offsets: Vec<f64>,
     fade: f64,
     samples: Vec<Sample>,
-    /// What was asked of the arm in the tick before, to compare its state with.
-    asked: Vec<f64>,
     last: TaskView,
 }
 
@@ -42,15 +42,14 @@ impl TrajectoryTask {
             params,
             motion: None,
             cursor: Cursor::default(),
-            elapsed: 0.0,
-            rate: 1.0,
+            clock: PathClock::default(),
             slowing: false,
             begun: false,
+            at_end: false,
             settling: 0.0,
             offsets: Vec::with_capacity(width),
             fade: SHORTEST_FADE,
             samples: Vec::with_capacity(width),
-            asked: Vec::with_capacity(width),
             last: TaskView::default(),
         }
     }
@@ -75,7 +74,8 @@ impl TrajectoryTask {
     /// Takes on a motion. Answers the one before, if any.
     pub fn start(&mut self, cx: &Context<'_>, motion: Box<Motion>) -> Option<Box<Motion>> {
         self.cursor = Cursor::default();
-        (self.elapsed, self.rate, self.slowing, self.begun, self.settling) = (0.0, 1.0, false, false, 0.0);
+        self.clock.start();
+        (self.slowing, self.begun, self.at_end, self.settling) = (false, false, false, 0.0);
         self.samples.clear();
         self.samples.resize(motion.joints.len(), Sample::default());
         self.last = TaskView { motion: motion.id, remaining: motion.spline.duration(), ..TaskView::default() };
@@ -89,17 +89,23 @@ impl TrajectoryTask {
         let Some(motion) = self.motion.as_deref() else { return };
         self.fade = SHORTEST_FADE;
         self.offsets.clear();
-        self.asked.clear();
         for (k, &joint) in motion.joints.iter().enumerate() {
             let view = cx.joint(joint);
             let offset = view.commanded - motion.spline.start(k);
             self.offsets.push(offset);
-            self.asked.push(view.commanded);
             // The fade may use a quarter of the joint's speed and acceleration: peaks of a quintic step are
             // 1.875 offset / T and 5.774 offset / T².
             let by_speed = 1.875 * offset.abs() / (0.25 * view.velocity_limit);
             let by_acceleration = (5.774 * offset.abs() / (0.25 * view.acceleration)).sqrt();
             self.fade = self.fade.max(by_speed).max(by_acceleration);
+        }
+    }
+
+    /// Nothing reached an arm since the tick of `at`: goes back to what was commanded then, at rest.
+    pub fn rewind(&mut self, at: Mono, now: Mono) {
+        if self.begun {
+            self.clock.rewind(at, now);
+            self.at_end = false;
         }
     }
 
@@ -134,19 +140,20 @@ impl TrajectoryTask {
             if let Some(reason) = self.off_path(cx, motion) {
                 return Some((TaskState::Aborted, reason));
             }
-            self.elapsed += cx.dt * self.rate;
+            self.clock.advance(cx.dt);
         }
         let duration = motion.spline.duration();
-        motion.spline.sample(self.elapsed, &mut self.cursor, &mut self.samples);
+        motion.spline.sample(self.clock.elapsed(), &mut self.cursor, &mut self.samples);
+        note_progress(&mut self.last, self.clock.elapsed(), duration);
         if self.slowing {
-            self.rate -= cx.dt * steepest_slowdown(cx, motion, &self.samples, self.rate);
-            if self.rate <= 0.0 || self.elapsed >= duration {
-                note_progress(&mut self.last, self.elapsed, duration);
+            self.clock.slow_down(cx.dt * steepest_slowdown(cx, motion, &self.samples, self.clock.rate()));
+            if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration {
                 return Some((TaskState::Aborted, Reason::Cancelled));
             }
+        } else if granted {
+            self.clock.speed_up(rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);
         }
-        note_progress(&mut self.last, self.elapsed, duration);
-        if self.elapsed >= duration.max(self.fade) {
+        if granted && self.at_end {
             self.settling += cx.dt;
             match self.away_from_goal(cx, motion) {
                 None => return Some((TaskState::Completed, Reason::None)),
@@ -156,15 +163,12 @@ impl TrajectoryTask {
                 Some(_) => {}
             }
         }
-        let left = 1.0 - smooth_step(self.elapsed / self.fade);
+        self.at_end = self.clock.elapsed() >= duration.max(self.fade);
+        self.clock.mark(cx.now);
+        let left = 1.0 - smooth_step(self.clock.elapsed() / self.fade);
         for (k, &joint) in motion.joints.iter().enumerate() {
-            let (Some(s), Some(offset), Some(asked)) =
-                (self.samples.get(k), self.offsets.get(k), self.asked.get_mut(k))
-            else {
-                continue;
-            };
-            *asked = s.position + offset * left;
-            claims.push(Claim { joint, value: *asked });
+            let (Some(s), Some(offset)) = (self.samples.get(k), self.offsets.get(k)) else { continue };
+            claims.push(Claim { joint, value: s.position + offset * left });
         }
         None
     }
@@ -174,8 +178,8 @@ impl TrajectoryTask {
         if tolerance <= 0.0 {
             return None;
         }
-        let errors = motion.joints.iter().zip(&self.asked).map(|(&j, asked)| (j, cx.joint(j).position - asked));
-        errors.into_iter().find(|(_, e)| e.abs() > tolerance).map(|(j, e)| Reason::PathTolerance(j, e))
+        let mut errors = motion.joints.iter().map(|&j| (j, cx.joint(j).tracking_error));
+        errors.find(|(_, e)| e.abs() > tolerance).map(|(j, e)| Reason::PathTolerance(j, e))
     }
 
     /// The first joint that has not arrived, and its error [rad].
@@ -211,6 +215,15 @@ fn steepest_slowdown(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate
         steepest = steepest.min(spare / s.velocity.abs().max(1e-3));
     }
     steepest
+}
+
+/// How fast the speed along the path may rise: see [`steepest_slowdown`], and q''' = … + q_s r'' for the jerk.
+fn rate_limits(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate: f64) -> RateLimits {
+    let mut second = f64::MAX;
+    for (&joint, s) in motion.joints.iter().zip(samples) {
+        second = second.min(cx.joint(joint).jerk / s.velocity.abs().max(1e-3));
+    }
+    RateLimits { first: steepest_slowdown(cx, motion, samples, rate), second }
 }
 
 /// 0 → 1 with zero velocity and acceleration at both ends.

@@ -42,6 +42,8 @@ pub struct Health {
     pub read_errors: AtomicU64,
     /// Commands written.
     pub writes: AtomicU64,
+    /// Commands that were not written because they were too far from the last one written, or from the arm.
+    pub withheld: AtomicU64,
     /// Writes that failed.
     pub write_errors: AtomicU64,
     /// Times the connection was made again.

@@ -8,7 +8,9 @@
 
 pub mod gripper;
 mod health;
+mod plausible;
 mod thread;
+mod wire_guard;
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, channel, sync_channel};
@@ -17,16 +19,19 @@ use std::time::Duration;
 
 pub use health::{Episode, Health, Note};
 
-use crate::arm::{ArmCommand, ArmState};
+use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Clock;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::JointLimits;
 use crate::rt::beat::Beat;
+use crate::rt::due::Due;
 use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
 
-/// Without real-time scheduling the computer itself stalls this long when it is busy; nothing is to be read into that.
-const STALLS: Duration = Duration::from_millis(100);
+/// Longest silence of the tick before the device thread holds the arm by itself, where the tick is fast.
+const BEAT_TIMEOUT: Duration = Duration::from_millis(40);
+/// The longest time between two set points that counts as regular, however seldom the device reports.
+const LONGEST_WRITE_PERIOD: Duration = Duration::from_millis(20);
 
 /// What a device thread is made from.
 pub struct DeviceConfig {
@@ -38,10 +43,8 @@ pub struct DeviceConfig {
     pub tick_period: Duration,
     /// How often the device can deliver its state [Hz].
     pub native_rate: f64,
-    /// The fastest any joint may move [rad/s], to tell a plausible pose from an impossible one.
-    pub velocity_max: f64,
-    /// Whether the process may schedule in real time: silence is then noticed sooner.
-    pub realtime: bool,
+    /// Figures with which the arm's measurements and its motion are checked.
+    pub supervision: Supervision,
     /// The tick's heartbeat.
     pub beat: Arc<Beat>,
     /// Time.
@@ -57,14 +60,20 @@ impl DeviceConfig {
         self.tick_period.min(Duration::from_millis(10)).max(own)
     }
 
+    /// The longer of the tick's period and the arm's own for set points.
+    pub fn write_period(&self) -> Duration {
+        let own = Duration::from_secs_f64(1.0 / self.native_rate.max(0.1));
+        self.tick_period.max(own.min(LONGEST_WRITE_PERIOD))
+    }
+
     /// A state older than this is stale.
     pub fn state_timeout(&self) -> Duration {
-        (3 * self.read_period()).max(if self.realtime { Duration::from_millis(30) } else { STALLS })
+        self.supervision.stale_after.max(3 * self.read_period())
     }
 
     /// Without the tick's heartbeat for this long, the device thread holds the arm by itself.
     pub fn beat_timeout(&self) -> Duration {
-        (3 * self.tick_period).max(if self.realtime { Duration::from_millis(40) } else { STALLS })
+        (3 * self.tick_period).max(BEAT_TIMEOUT)
     }
 }
 
@@ -77,8 +86,10 @@ pub struct Connected {
     pub limits: JointLimits,
     /// How far its gripper closes and opens [m], where it has one and says so.
     pub gripper_range: Option<(f64, f64)>,
-    /// A state older than this is stale, at the rate that the arm has told.
-    pub state_timeout: Duration,
+    /// Period of its states, as they are read.
+    pub read_period: Duration,
+    /// The longer of the tick's period and the arm's own for set points.
+    pub write_period: Duration,
 }
 
 enum Order {
@@ -86,6 +97,7 @@ enum Order {
     Activate(SyncSender<AdapterResult<()>>),
     Disable(SyncSender<AdapterResult<()>>),
     ClearErrors(SyncSender<AdapterResult<()>>),
+    SetLimits(JointLimits, SyncSender<AdapterResult<()>>),
     Finish { disable: bool, reply: SyncSender<AdapterResult<()>> },
 }
 
@@ -95,6 +107,7 @@ pub struct Device {
     orders: std::sync::mpsc::Sender<Order>,
     wake: Wake,
     health: Arc<Health>,
+    due: Arc<Due>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -110,12 +123,14 @@ impl Device {
         let wake = Wake::new()?;
         let health = Arc::new(Health::default());
         let hardware_id = config.hardware_id.clone();
-        let worker = thread::Worker::new(config, states, commands, wake.clone(), health.clone());
+        let due = Arc::new(Due::default());
+        let shared = thread::Shared { wake: wake.clone(), health: health.clone(), due: due.clone() };
+        let worker = thread::Worker::new(config, states, commands, shared);
         let thread = std::thread::Builder::new()
             .name(format!("device/{hardware_id}").chars().take(15).collect())
             .stack_size(crate::rt::host::STACK)
             .spawn(move || worker.run(adapter, receiver))?;
-        Ok(Self { hardware_id, orders, wake, health, thread: Some(thread) })
+        Ok(Self { hardware_id, orders, wake, health, due, thread: Some(thread) })
     }
 
     /// The arm's name in the blueprint.
@@ -151,6 +166,16 @@ impl Device {
     /// Clears the device's error state.
     pub fn clear_errors(&self) -> Answer<()> {
         self.order(Order::ClearErrors)
+    }
+
+    /// Sets the limits that commands keep: the arm's own, narrowed by the blueprint.
+    pub fn set_limits(&self, limits: JointLimits) -> Answer<()> {
+        self.order(|reply| Order::SetLimits(limits, reply))
+    }
+
+    /// When the thread means to be awake.
+    pub fn due(&self) -> Arc<Due> {
+        self.due.clone()
     }
 
     /// Ends commanded motion, disables the motors if asked, disconnects, ends the thread.

@@ -7,21 +7,29 @@ use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::Duration;
 
 use super::gripper::GripperStop;
+use super::plausible::Plausible;
+use super::wire_guard::WireGuard;
 use super::{Connected, DeviceConfig, Health, Note, Order};
-use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
+use crate::arm::{ArmCommand, ArmState, Interference, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, Stop};
-use crate::joint::ControlMode;
+use crate::joint::{ControlMode, JointLimits};
+use crate::rt::due::Due;
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
 
-/// So many failed reads or writes in a row are more than a hiccup.
-const TOO_MANY: u32 = 3;
+/// Consecutive failures before the connection is `Stale` (reads) or `Faulted` (writes).
+const MAX_FAILURES: u32 = 3;
+/// Unacknowledged set points before the connection is dropped.
+const MAX_IN_FLIGHT: u32 = 2;
+/// Consecutive readings that show a change that this run did not order, before it is one: a report may be older than the
+/// order.
+const INTERFERENCE_READINGS: u32 = 2;
+/// The longest delay of this thread that does not count for the tick's silence.
+const LONGEST_DELAY: Duration = Duration::from_millis(100);
 /// Waits between two attempts to connect again.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(5));
-/// So many readings in a row must agree before the motors are enabled.
-const PLAUSIBLE_AFTER: u32 = 3;
 /// How long an arm may refuse a change of mode because it still moves.
 const MODE_LIMIT: Duration = Duration::from_secs(1);
 /// How long `activate` waits for plausible states, and for the motors.
@@ -31,12 +39,20 @@ const REST_LIMIT: Duration = Duration::from_secs(1);
 const STANDSTILL: f64 = 0.02;
 const STILL_FOR: f64 = 0.03;
 
+/// What the thread shares with its handle.
+pub(super) struct Shared {
+    pub wake: Wake,
+    pub health: Arc<Health>,
+    pub due: Arc<Due>,
+}
+
 pub(super) struct Worker {
     config: DeviceConfig,
     states: SlotWriter<ArmState>,
     commands: SlotReader<ArmCommand>,
     wake: Wake,
     health: Arc<Health>,
+    due: Arc<Due>,
     state: ArmState,
     reading: JointReading,
     last: ArmCommand,
@@ -54,7 +70,22 @@ pub(super) struct Worker {
     turn: u8,
     read_errors: u32,
     write_errors: u32,
-    plausible: u32,
+    plausible: Plausible,
+    /// The fastest joint's top speed [rad/s].
+    speed: f64,
+    guard: WireGuard,
+    /// Set points that may be on their way.
+    in_flight: u32,
+    /// The newest command was not sent because others were on their way.
+    again: bool,
+    /// The mode that this run brought the arm into; `None` while none was ordered.
+    ordered_mode: Option<ControlMode>,
+    /// Whether this run enabled or disabled the motors last.
+    ordered_power: Option<bool>,
+    /// Consecutive readings that disagree with what was ordered.
+    disagreeing: u32,
+    /// How late this thread was since the tick's last beat.
+    delay: (Option<Mono>, Duration),
     last_read: Mono,
     next_read: Mono,
     read_time: f64,
@@ -66,11 +97,20 @@ impl Worker {
         config: DeviceConfig,
         states: SlotWriter<ArmState>,
         commands: SlotReader<ArmCommand>,
-        wake: Wake,
-        health: Arc<Health>,
+        shared: Shared,
     ) -> Self {
         let state = ArmState { dof: config.dof, ..ArmState::default() };
+        let Shared { wake, health, due } = shared;
         Self {
+            due,
+            guard: WireGuard::new(config.dof, config.write_period(), config.supervision),
+            in_flight: 0,
+            again: false,
+            ordered_mode: None,
+            ordered_power: None,
+            disagreeing: 0,
+            delay: (None, Duration::ZERO),
+            speed: 0.0,
             config,
             states,
             commands,
@@ -89,7 +129,7 @@ impl Worker {
             turn: 0,
             read_errors: 0,
             write_errors: 0,
-            plausible: 0,
+            plausible: Plausible::default(),
             last_read: Mono::ZERO,
             next_read: Mono::ZERO,
             read_time: 0.0,
@@ -119,6 +159,8 @@ impl Worker {
         let now = self.config.clock.now();
         let idle = if self.wanted { due.since(now) } else { Duration::from_secs(1) };
         let idle = idle.min(Duration::from_secs(1)).min(self.until_silent(now));
+        let due = now.after(idle);
+        self.due.wait_until(due);
         let arrived = match adapter.state_fd() {
             Some(states) if self.connected => self.wake.wait_or_readable(states, idle),
             _ => {
@@ -126,6 +168,8 @@ impl Worker {
                 false
             }
         };
+        self.due.awake();
+        self.note_delay(self.config.clock.now().since(due));
         loop {
             match orders.try_recv() {
                 Ok(order) => {
@@ -144,8 +188,13 @@ impl Worker {
             self.pass_on_command(adapter);
             self.watch_the_tick();
             self.stop(adapter);
-            if arrived || self.config.clock.now() >= self.next_read {
+            self.drop_what_is_pending(adapter);
+            if self.connected && (arrived || self.config.clock.now() >= self.next_read) {
                 self.read(adapter);
+                // The reply that a set point was waiting for may have come.
+                if self.connected && self.again {
+                    self.pass_on_command(adapter);
+                }
             }
         } else if self.wanted && self.config.clock.now() >= self.reconnect.0 {
             self.connect_again(adapter);
@@ -162,15 +211,21 @@ impl Worker {
                 let _ = reply.send(self.activate(adapter));
             }
             Order::Disable(reply) => {
+                self.expect_nothing(Some(false));
                 let result = self.while_connected(adapter, |a| a.write_enable(false));
                 self.read(adapter);
                 let _ = reply.send(result);
             }
             Order::ClearErrors(reply) => {
                 self.write_errors = 0;
+                self.expect_nothing(Some(self.state.enabled));
                 let result = self.while_connected(adapter, |a| a.write_clear_errors());
                 self.read(adapter);
                 let _ = reply.send(result);
+            }
+            Order::SetLimits(limits, reply) => {
+                self.set_limits(&limits);
+                let _ = reply.send(Ok(()));
             }
             Order::Finish { disable, reply } => {
                 let _ = reply.send(self.finish(adapter, disable));
@@ -205,11 +260,28 @@ impl Worker {
         self.connected = true;
         self.write_errors = 0;
         self.reconnect.1 = BACK_OFF.0;
-        self.plausible = 0;
+        self.plausible.reset();
+        self.expect_nothing(None);
+        self.guard.forget();
+        self.in_flight = 0;
+        if self.speed == 0.0 {
+            self.set_limits(&limits);
+        }
         self.take_command();
         self.read(adapter);
-        let (gripper_range, state_timeout) = (adapter.get_gripper_range(), self.config.state_timeout());
-        Ok(Connected { info, limits, gripper_range, state_timeout })
+        let (read_period, write_period) = (self.config.read_period(), self.config.write_period());
+        Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range(), read_period, write_period })
+    }
+
+    fn set_limits(&mut self, limits: &JointLimits) {
+        self.speed = limits.velocity_max.iter().copied().fold(0.1, f64::max);
+        self.guard.set_limits(limits);
+    }
+
+    /// From here on no mode is expected of the arm, and its motors are expected to be on or off, or either way.
+    fn expect_nothing(&mut self, power: Option<bool>) {
+        (self.ordered_mode, self.ordered_power, self.disagreeing) = (None, power, 0);
+        self.state.interference = Interference::None;
     }
 
     fn connect_again(&mut self, adapter: &mut dyn ManipulatorAdapter) {
@@ -232,11 +304,9 @@ impl Worker {
             return Err(AdapterError::NotConnected);
         }
         let limit = self.config.clock.now().after(ACTIVATION_LIMIT);
-        while self.plausible < PLAUSIBLE_AFTER {
+        while !self.plausible.stable(self.state.stamp) {
             if self.config.clock.now() >= limit {
-                return Err(AdapterError::Rejected(
-                    "its states are missing or jump: not enabled without a plausible pose".to_owned(),
-                ));
+                return Err(AdapterError::Rejected(self.plausible.objection(&self.config.hardware_id)));
             }
             std::thread::sleep(self.config.read_period().min(Duration::from_millis(10)));
             self.read(adapter);
@@ -244,6 +314,7 @@ impl Worker {
                 return Err(AdapterError::NotConnected);
             }
         }
+        self.expect_nothing(None);
         adapter.activate()?;
         let limit = self.config.clock.now().after(ACTIVATION_LIMIT);
         while !adapter.read_enabled()? {
@@ -253,6 +324,7 @@ impl Worker {
             std::thread::sleep(Duration::from_millis(5));
             self.read(adapter);
         }
+        self.ordered_power = Some(true);
         self.state.self_held = false;
         self.stop_owed = false;
         self.gripper_stop.end();
@@ -315,9 +387,10 @@ impl Worker {
     fn pass_on_command(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let before = self.take_command();
         let command = self.last;
-        if command.seq == before.seq {
+        if command.seq == before.seq && !self.again {
             return;
         }
+        self.again = false;
         // A device that is asked is asked just before the tick; one that sends by itself sets its own pace.
         if adapter.state_fd().is_none() {
             self.read_before(command.next_tick);
@@ -328,8 +401,47 @@ impl Worker {
         match self.write(adapter, &before, &command) {
             Ok(()) if self.stop_owed => {}
             Ok(()) => self.write_errors = 0,
-            Err(error) => self.not_taken(adapter, "a command was not taken", &error),
+            // Not sent, and no failure: the tick sees that it was not written.
+            Err(AdapterError::Busy) => (self.in_flight, self.again) = (MAX_IN_FLIGHT, true),
+            Err(error) => {
+                if matches!(error, AdapterError::Timeout(_)) {
+                    self.in_flight += 1;
+                }
+                self.not_taken(adapter, "a command was not taken", &error);
+            }
         }
+        // At once: the next tick continues from what was written.
+        self.states.write(&self.state);
+    }
+
+    /// Set points that the arm did not acknowledge must not reach it later: with two of them, or with one and no state,
+    /// what is still on its way is discarded before anything new goes out.
+    fn drop_what_is_pending(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let age = self.config.clock.now().since(self.state.stamp.max(self.last_read));
+        let stale = age > self.config.state_timeout() && self.state.seq != 0;
+        if self.connected && self.in_flight > 0 && stale {
+            self.trouble("set points are not acknowledged and no state arrives: what is pending is discarded");
+            self.discard(adapter);
+        }
+    }
+
+    fn discard(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        self.in_flight = 0;
+        self.guard.forget();
+        self.state.self_held = true;
+        adapter.discard_pending();
+        if !adapter.is_connected() {
+            self.lost();
+        }
+        self.states.write(&self.state);
+    }
+
+    /// The connection is gone; it is made again.
+    fn lost(&mut self) {
+        self.connected = false;
+        self.plausible.reset();
+        self.state.link = Link::Faulted;
+        self.reconnect = (self.config.clock.now().after(BACK_OFF.0), BACK_OFF.0);
     }
 
     /// Sets the next read so that it ends just before the tick at `next_tick`.
@@ -354,7 +466,13 @@ impl Worker {
             }
         };
         let Some(mode) = command.mode else { return gripper };
+        // Another mode than the one that was ordered is somebody else's: it is left alone, and shows in the next state.
+        let foreign = self.ordered_mode == Some(mode) && adapter.get_control_mode() != mode;
+        if foreign || self.state.interference != Interference::None {
+            return gripper;
+        }
         if adapter.get_control_mode() != mode {
+            self.ordered_mode = None;
             match adapter.set_control_mode(mode) {
                 // The arm may hold itself to be moving for a moment longer than we do: the tick waits for the mode,
                 // and this is asked again with the next command.
@@ -363,12 +481,24 @@ impl Worker {
             }
         }
         self.mode_wanted = None;
-        let values = command.values.get(..self.config.dof).unwrap_or_default();
-        match mode {
-            ControlMode::Velocity => adapter.write_joint_velocities(values)?,
-            _ => adapter.write_joint_positions(values, 1.0)?,
+        self.ordered_mode = Some(mode);
+        let age = self.config.clock.now().since(self.state.stamp);
+        if !self.guard.admits(command, mode, &self.state, age, self.config.read_period()) {
+            self.health.withheld.fetch_add(1, Relaxed);
+            return gripper;
         }
-        self.state.written = command.seq;
+        let values = command.values.get(..self.config.dof).unwrap_or_default();
+        let written = match mode {
+            ControlMode::Velocity => adapter.write_joint_velocities(values),
+            _ => adapter.write_joint_positions(values, 1.0),
+        };
+        // A set point without an answer may have reached the arm: what comes next continues from it.
+        if matches!(written, Ok(()) | Err(AdapterError::Timeout(_))) {
+            self.guard.wrote(command, mode);
+            self.state.written = command.seq;
+        }
+        written?;
+        self.in_flight = 0;
         self.health.writes.fetch_add(1, Relaxed);
         gripper
     }
@@ -384,9 +514,13 @@ impl Worker {
         if !self.stop_owed || !self.connected {
             return;
         }
+        let power = self.ordered_power;
         match adapter.write_stop() {
             Ok(stop) => {
                 self.stop_owed = false;
+                let interference = self.state.interference;
+                self.expect_nothing(power);
+                self.state.interference = interference;
                 self.gripper_stop.begin(self.config.clock.now());
                 if stop == Stop::Confirmed {
                     self.health.stop_confirmed.store(self.last.stop_seq, Relaxed);
@@ -423,7 +557,19 @@ impl Worker {
     /// How long the tick may still be silent, where its silence would matter.
     fn until_silent(&self, now: Mono) -> Duration {
         let silence = self.config.beat.silence(now).filter(|_| self.moving());
-        silence.map_or(Duration::MAX, |silence| self.config.beat_timeout().saturating_sub(silence))
+        let limit = self.config.beat_timeout() + self.delay.1;
+        silence.map_or(Duration::MAX, |silence| limit.saturating_sub(silence))
+    }
+
+    /// This thread woke late: it could not have seen the tick meanwhile, and the tick could hardly have run.
+    fn note_delay(&mut self, late: Duration) {
+        let beat = self.config.beat.last();
+        if self.delay.0 != beat {
+            self.delay = (beat, Duration::ZERO);
+        }
+        if (Duration::from_millis(1)..LONGEST_DELAY).contains(&late) {
+            self.delay.1 = (self.delay.1 + late).min(LONGEST_DELAY);
+        }
     }
 
     /// The checker is not the checked: when the tick falls silent, this thread holds the arm.
@@ -431,7 +577,9 @@ impl Worker {
         if self.until_silent(self.config.clock.now()).is_zero() {
             self.state.self_held = true;
             self.stop_owed = true;
-            self.trouble("the tick fell silent: held by the device thread");
+            let silence = self.config.beat.silence(self.config.clock.now()).unwrap_or_default().as_millis();
+            let limit = self.config.beat_timeout().as_millis();
+            self.trouble(&format!("no tick for {silence} ms (limit {limit} ms): held by the device thread"));
             self.states.write(&self.state);
         }
     }
@@ -448,7 +596,7 @@ impl Worker {
                 self.read_time += 0.1 * (ended.seconds_since(began) - self.read_time);
                 self.take_reading(began);
                 self.read_errors = 0;
-                self.state.link = if self.write_errors >= TOO_MANY { Link::Faulted } else { Link::Up };
+                self.state.link = if self.write_errors >= MAX_FAILURES { Link::Faulted } else { Link::Up };
                 if self.state.link == Link::Up && self.write_errors == 0 && !self.state.self_held {
                     self.well_again();
                 }
@@ -456,9 +604,10 @@ impl Worker {
             Err(error) => {
                 self.health.read_errors.fetch_add(1, Relaxed);
                 self.read_errors += 1;
-                self.plausible = 0;
+                self.plausible.reset();
                 self.trouble(&format!("no state: {error}"));
-                if self.read_errors >= TOO_MANY {
+                let age = self.config.clock.now().since(self.last_read);
+                if self.read_errors >= MAX_FAILURES && age > self.config.state_timeout() {
                     self.state.link = Link::Stale;
                 }
                 self.after_error(adapter, &error);
@@ -496,7 +645,22 @@ impl Worker {
             self.state.pose = adapter.read_cartesian_position()?;
         }
         self.state.mode = adapter.get_control_mode();
+        self.compare_with_orders();
         Ok(())
+    }
+
+    /// Whether the arm is in the condition that this run ordered.
+    fn compare_with_orders(&mut self) {
+        if !self.state.enabled {
+            self.guard.forget();
+        }
+        let mode = self.ordered_mode.is_some_and(|ordered| ordered != self.state.mode);
+        // Motors that go off are the tick's to see: it names that by itself.
+        let power = self.ordered_power == Some(false) && self.state.enabled;
+        self.disagreeing = if mode || power { self.disagreeing + 1 } else { 0 };
+        if self.disagreeing >= INTERFERENCE_READINGS && self.state.interference == Interference::None {
+            self.state.interference = if mode { Interference::Mode } else { Interference::Power };
+        }
     }
 
     fn take_reading(&mut self, began: Mono) {
@@ -504,12 +668,7 @@ impl Worker {
         if self.state.seq != 0 && self.reading.stamp == Some(self.state.stamp) {
             return; // nothing new; its age tells
         }
-        let interval = stamp.seconds_since(self.state.stamp);
-        let reach = self.config.velocity_max * 1.5 * interval.clamp(0.0, 0.1) + 0.02;
-        let dof = self.config.dof;
-        let mut moved = self.reading.position.iter().zip(&self.state.position).take(dof);
-        let agrees = self.state.seq != 0 && moved.all(|(new, old)| (new - old).abs() <= reach);
-        self.plausible = if agrees { self.plausible.saturating_add(1) } else { 1 };
+        self.plausible.take(&self.reading, stamp, &self.state, self.speed, &self.config.supervision);
         self.health.state_came(if self.state.seq == 0 { 0.0 } else { began.seconds_since(self.last_read) });
         self.last_read = began;
         self.state.seq += 1;
@@ -524,12 +683,12 @@ impl Worker {
     /// What an error means for the connection.
     fn after_error(&mut self, adapter: &mut dyn ManipulatorAdapter, error: &AdapterError) {
         if matches!(error, AdapterError::NotConnected) || !adapter.is_connected() {
+            adapter.discard_pending();
             adapter.disconnect();
-            self.connected = false;
-            self.plausible = 0;
-            self.state.link = Link::Faulted;
-            self.reconnect = (self.config.clock.now().after(BACK_OFF.0), BACK_OFF.0);
-        } else if self.write_errors >= TOO_MANY {
+            self.lost();
+        } else if self.in_flight >= MAX_IN_FLIGHT {
+            self.discard(adapter);
+        } else if self.write_errors >= MAX_FAILURES {
             self.state.link = Link::Faulted;
         }
         self.states.write(&self.state);

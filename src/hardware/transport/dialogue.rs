@@ -16,6 +16,12 @@ pub trait ByteLink {
     fn send(&mut self, bytes: &[u8]) -> AdapterResult<()>;
     /// Waits up to `timeout` for what `scan` takes. `Timeout` leaves the link usable; other errors do not.
     fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T>;
+    /// Closes the link and discards what has not left this computer.
+    fn abort(self)
+    where
+        Self: Sized,
+    {
+    }
 }
 
 impl ByteLink for TcpLink {
@@ -26,6 +32,10 @@ impl ByteLink for TcpLink {
     fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
         self.receive(timeout, scan)
     }
+
+    fn abort(self) {
+        self.abort();
+    }
 }
 
 impl ByteLink for SerialLink {
@@ -35,6 +45,10 @@ impl ByteLink for SerialLink {
 
     fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
         self.receive(timeout, scan)
+    }
+
+    fn abort(self) {
+        self.abort();
     }
 }
 
@@ -79,6 +93,14 @@ impl<L: ByteLink> Dialogue<L> {
         *self = Self::default();
     }
 
+    /// Ends the connection and discards what has not left this computer: the arm did not acknowledge it in time.
+    pub fn abort(&mut self) {
+        self.lost = 0;
+        if let Some(link) = self.link.take() {
+            link.abort();
+        }
+    }
+
     /// Whether there is a connection, as far as is known.
     pub fn is_open(&self) -> bool {
         self.link.is_some()
@@ -104,7 +126,7 @@ impl<L: ByteLink> Dialogue<L> {
         match result {
             Ok(_) => self.lost = 0,
             Err(AdapterError::Timeout(_)) if self.lost + 1 < LOST_AFTER => self.lost += 1,
-            Err(_) => self.close(),
+            Err(_) => self.abort(),
         }
         result
     }

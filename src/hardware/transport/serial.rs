@@ -67,6 +67,12 @@ pub struct SerialLink {
 }
 
 impl SerialLink {
+    /// Closes the line and discards what has not left this computer.
+    pub fn abort(self) {
+        // A line that cannot be flushed is gone.
+        let _ = tcflush(&self.line, QueueSelector::OFlush);
+    }
+
     /// Opens the serial device at `path` with `baud` [bit/s]. `device` names the arm in messages, `timeout` bounds each
     /// write. That anybody is at the other end shows only when they answer.
     pub fn connect(device: &str, path: &str, baud: u32, timeout: Duration) -> AdapterResult<Self> {

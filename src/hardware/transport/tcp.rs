@@ -133,6 +133,13 @@ impl TcpLink {
         self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))
     }
 
+    /// Closes the connection and discards what has not left this computer yet (linger 0: the peer sees a reset). A plain
+    /// drop would let the kernel go on sending it for as long as the peer takes it. Never blocks.
+    pub fn abort(self) {
+        // Where the option is refused the connection is broken already, and nothing more is sent either.
+        let _ = rustix::net::sockopt::set_socket_linger(&self.stream, Some(Duration::ZERO));
+    }
+
     /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
     /// a frame; it must skip what is not for it. `Timeout` leaves the connection usable; `Io` does not.
     pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
@@ -258,6 +265,38 @@ mod tests {
         let mut link = TcpLink::connect("test", &peer(vec![endless]), Duration::from_secs(2)).unwrap();
         let result = link.receive::<()>(Duration::from_secs(5), |_| Scan::More);
         assert!(matches!(result, Err(AdapterError::Protocol(_))), "{result:?}");
+    }
+
+    /// What a peer that does not read at first gets in the end: how many bytes, and how the connection ended.
+    fn received_after(close: impl FnOnce(TcpLink)) -> (usize, usize, std::io::Result<usize>) {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let endpoint = Endpoint { host: "127.0.0.1".into(), port: listener.local_addr().unwrap().port() };
+        let mut link = TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap();
+        let (mut peer, _) = listener.accept().unwrap();
+        rustix::net::sockopt::set_socket_send_buffer_size(&link.stream, 1 << 20).unwrap();
+        link.stream.set_nonblocking(true).unwrap();
+        let mut sent = 0;
+        while let Ok(n) = link.stream.write(&[1; 4096]) {
+            sent += n;
+        }
+        close(link);
+        let (mut received, mut buffer) = (0, vec![0; 1 << 16]);
+        peer.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        loop {
+            match peer.read(&mut buffer) {
+                Ok(n @ 1..) => received += n,
+                end => return (sent, received, end),
+            }
+        }
+    }
+
+    #[test]
+    fn what_has_not_left_is_discarded_by_an_abort_and_sent_by_a_drop() {
+        let (sent, received, end) = received_after(TcpLink::abort);
+        assert!(received < sent, "{received} of {sent} bytes");
+        assert_eq!(end.unwrap_err().kind(), ErrorKind::ConnectionReset);
+        let (sent, received, end) = received_after(drop);
+        assert_eq!((received, end.unwrap()), (sent, 0));
     }
 
     #[test]

@@ -13,7 +13,7 @@ use super::log_writer::LogAttachment;
 use super::messages::{ArmInput, JointState};
 use super::recorder::{Note, Notice, Recorder, RecorderConfig};
 use super::replay::{Entry, LogReader, Payload, ReplayError, Selection};
-use crate::arm::{ArmCommand, ArmState, Link, Pose, VelocitySource};
+use crate::arm::{ArmCommand, ArmState, Interference, Link, Pose, VelocitySource};
 use crate::clock::{Mono, WallOffset};
 use crate::joint::{ControlMode, MAX_DOF, joints_of, make_joints};
 use crate::telemetry::describe::{ArmNames, Names, Severity};
@@ -69,6 +69,8 @@ fn state(arm: u16, tick: u64) -> ArmState {
         link: if tick == 7 { Link::Faulted } else { Link::Up },
         self_held: tick == 8,
         written: tick.saturating_sub(1),
+        interference: if tick == 9 { Interference::Mode } else { Interference::None },
+        own_delay_ns: tick % 2,
     }
 }
 
@@ -171,6 +173,8 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         link: links.into_iter().find(|l| l.name() == input.link).unwrap(),
         self_held: input.self_held,
         written: input.written,
+        interference: if input.interference == "mode" { Interference::Mode } else { Interference::None },
+        own_delay_ns: input.own_delay_ns,
     }
 }
 

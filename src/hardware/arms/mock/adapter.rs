@@ -153,6 +153,7 @@ impl ManipulatorAdapter for MockArm {
         reading.velocity = self.options.velocity_feedback.then(|| self.device.plant.velocities());
         reading.effort = self.options.effort_feedback.then(|| self.device.plant.efforts());
         reading.stamp = Some(self.device.advanced_to);
+        reading.valid = Some(position == self.device.plant.positions());
         self.measured = Some(*reading);
         Ok(())
     }

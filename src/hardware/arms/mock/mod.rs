@@ -9,6 +9,8 @@ mod tests;
 pub use adapter::MockArm;
 pub use options::Options;
 
+use std::time::Duration;
+
 use crate::hardware::fit::{Fit, Misfit};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
@@ -30,6 +32,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
+    accuracy: 0.001,
+    lag: 0.02,
+    stale_after: Duration::from_millis(50),
     address: AddressForm { form: "none", required: false, check: |address| Ok(address.to_owned()) },
     holds_when_disabled: true,
     gripper: true,

@@ -220,6 +220,7 @@ impl ManipulatorAdapter for PiperAdapter {
             position: joints_of(&self.arm.picture.joints.map(radians)),
             velocity: self.velocities(),
             effort: self.efforts(),
+            valid: None,
         };
         Ok(())
     }

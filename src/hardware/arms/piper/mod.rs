@@ -13,6 +13,8 @@ mod tests;
 mod tests_faults;
 mod wire;
 
+use std::time::Duration;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -40,6 +42,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "0.001 deg, 0.001 mm",
     native_rate: NATIVE_RATE,
+    accuracy: 0.01,
+    lag: 0.05,
+    stale_after: Duration::from_millis(50),
     address: AddressForm { form: FORMS, required: true, check: can::check },
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,

@@ -96,7 +96,7 @@ impl RemoteAdapter {
         let sent = self.session()?.command(Command { mode, velocity, values });
         // A refusal leaves the connection as it is.
         sent.inspect_err(|error| {
-            if !matches!(error, AdapterError::Rejected(_)) {
+            if !matches!(error, AdapterError::Rejected(_) | AdapterError::Busy) {
                 self.session = None;
             }
         })
@@ -217,6 +217,7 @@ impl ManipulatorAdapter for RemoteAdapter {
             position: state.position.joints,
             velocity: state.velocity.map(|values| values.joints),
             effort: state.effort.map(|values| values.joints),
+            valid: None,
         };
         Ok(())
     }
@@ -273,6 +274,12 @@ impl ManipulatorAdapter for RemoteAdapter {
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.act(&Act::ClearErrors, END_TIMEOUT)
+    }
+
+    fn discard_pending(&mut self) {
+        if let Some(session) = self.session.take() {
+            session.abort();
+        }
     }
 
     // --- Optional parts ---

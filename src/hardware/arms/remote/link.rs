@@ -77,6 +77,12 @@ impl Link {
         }
     }
 
+    /// Closes the connection and discards what has not left this computer.
+    pub fn abort(self) {
+        // Only a TCP socket keeps what it was given; a UNIX socket has handed it over already.
+        let _ = rustix::net::sockopt::set_socket_linger(&self.socket, Some(Duration::ZERO));
+    }
+
     /// Waits until something arrives, so long at most.
     pub fn wait(&self, timeout: Duration) {
         let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos() as i64 };

@@ -13,6 +13,7 @@ mod session;
 mod tests;
 
 use std::f64::consts::PI;
+use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -40,6 +41,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "rad, m",
     native_rate: NATIVE_RATE,
+    accuracy: 0.02,
+    lag: 0.1,
+    stale_after: Duration::from_millis(150),
     address: AddressForm {
         form: address::FORM,
         required: true,

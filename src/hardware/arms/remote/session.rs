@@ -13,7 +13,6 @@ use super::protocol::{self, Act, Command, Description, Measured, Reply};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
-use crate::joint::{ControlMode, Joints, joints_of};
 
 /// Longest waits for the connection and for the description: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(500);
@@ -45,10 +44,8 @@ pub struct Session {
     commanded: Mono,
     /// When the last cycle was sent.
     asked: Mono,
-    /// The number of the cycle that is not answered yet, if there is one, and the command that waits for its answer:
-    /// a peer gets one cycle at a time, and then the newest command.
+    /// The number of the last cycle: a peer gets one at a time.
     cycling: u32,
-    waiting: Option<(ControlMode, Joints, f64)>,
     /// The act that was asked last, until its answer is handed over, and when it was last waited for.
     act: Option<(Act, Mono)>,
     /// Number of the last act: a state that is older is of the time before it.
@@ -145,7 +142,7 @@ impl Session {
             awaited: 0,
             acted: None,
         };
-        let (owed_since, commanded, cycling, waiting, act) = (None, Mono::ZERO, 1, None, None);
+        let (owed_since, commanded, cycling, act) = (None, Mono::ZERO, 1, None);
         let mut session = Self {
             link,
             description,
@@ -156,7 +153,6 @@ impl Session {
             commanded,
             asked: Mono::ZERO,
             cycling,
-            waiting,
             act,
             last_act: 1,
         };
@@ -214,26 +210,25 @@ impl Session {
         }
         if any {
             self.owed_since = (self.heard.answered != self.sequence).then(|| MonotonicClock.now());
-            if !self.is_cycling()
-                && let Some((mode, joints, velocity)) = self.waiting.take()
-            {
-                let values = joints.get(..self.heard.dof).unwrap_or_default();
-                return self.cycle(Some(Command { mode, values, velocity }));
-            }
         }
         Ok(())
     }
 
-    /// Sends a command, or keeps it until the peer has answered the last cycle. Answers why an earlier one was not
-    /// taken, where that is so.
+    /// Sends a command; `Busy` while the peer has not answered the last cycle. Answers why an earlier one was not taken,
+    /// where that is so.
     pub fn command(&mut self, command: Command<'_>) -> AdapterResult<()> {
         self.commanded = MonotonicClock.now();
+        self.take_up()?;
         if self.is_cycling() {
-            self.waiting = Some((command.mode, joints_of(command.values), command.velocity));
-        } else {
-            self.cycle(Some(command))?;
+            return Err(AdapterError::Busy);
         }
+        self.cycle(Some(command))?;
         self.heard.refused.take().map_or(Ok(()), Err)
+    }
+
+    /// Closes the connection and discards what has not left this computer.
+    pub fn abort(self) {
+        self.link.abort();
     }
 
     /// The newest state and when it was measured, without waiting; asks for a newer one. The outer error ends the
@@ -326,7 +321,6 @@ impl Session {
         if !(matches!(act, Act::Stop | Act::Mode(_)) && self.act.as_ref().is_some_and(same)) {
             let number = self.next_number();
             (self.heard.awaited, self.heard.acted, self.last_act) = (number, None, number);
-            self.waiting = None; // it was meant for the time before the act
             protocol::act(number, act, &mut self.line);
             self.link.send(&self.line)?;
         }

@@ -220,6 +220,7 @@ impl ManipulatorAdapter for XArmAdapter {
             position: self.only(&motion.position),
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
+            valid: None,
         };
         Ok(())
     }

@@ -24,6 +24,8 @@ mod stream;
 #[cfg(test)]
 mod tests;
 
+use std::time::Duration;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -53,6 +55,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "rad, mm",
     native_rate: NATIVE_RATE,
+    accuracy: 0.002,
+    lag: 0.05,
+    stale_after: Duration::from_millis(50),
     address: AddressForm {
         form: "HOST[:CONTROL_PORT[:REPORT_PORT]]",
         required: true,

@@ -26,8 +26,11 @@ use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 /// Longest wait for the connection and for the controller's introduction: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1500);
 const HELLO: Patience = Patience::once(Duration::from_millis(1000));
-/// Longest wait for any other reply. The controller answers within 1 ms; the rest is for a busy host.
+/// Longest wait for the reply to an order. The controller answers within 1 ms; the rest is for a busy host.
 const REPLY: Patience = Patience::once(Duration::from_millis(100));
+/// Longest wait for measurements, and for the reply to a set point. One lost reply is asked for again, and both tries
+/// together stay below `stale_after`: a single lost packet must not hold the arm.
+const CYCLE: Patience = Patience { each: Duration::from_millis(22), times: 2 };
 /// A packet answers further questions for one period of the controller.
 const PACKET_AGE: Duration = Duration::from_millis(2);
 
@@ -86,10 +89,16 @@ impl YourArmAdapter {
         self.request(command, REPLY, |_| Some(()))
     }
 
+    /// A set point: it may be obeyed twice, so it may be sent twice.
+    fn set_point(&mut self, command: &Command) -> AdapterResult<()> {
+        self.state_at = Mono::ZERO;
+        self.request(command, CYCLE, |_| Some(()))
+    }
+
     /// Asks for a packet of measurements.
     fn fetch(&mut self) -> AdapterResult<()> {
         self.state_at = Mono::ZERO;
-        self.state = self.request(&Command::GetState, REPLY, protocol::State::decode)?;
+        self.state = self.request(&Command::GetState, CYCLE, protocol::State::decode)?;
         self.state_at = MonotonicClock.now();
         Ok(())
     }
@@ -257,6 +266,7 @@ impl ManipulatorAdapter for YourArmAdapter {
             position: from_degrees(&self.state.positions),
             velocity: Some(from_degrees(&self.state.velocities)),
             effort: Some(joints_of(&self.state.torques)),
+            valid: None,
         };
         Ok(())
     }
@@ -281,14 +291,14 @@ impl ManipulatorAdapter for YourArmAdapter {
         let joints = to_degrees(positions)?;
         match self.get_control_mode() {
             ControlMode::Position => self.command(&Command::MoveJoints { speed: self.percent(velocity), joints }),
-            ControlMode::ServoPosition => self.command(&Command::ServoJoints(joints)),
+            ControlMode::ServoPosition => self.set_point(&Command::ServoJoints(joints)),
             mode => Err(AdapterError::Rejected(format!("joint positions in {} mode", mode.name()))),
         }
     }
 
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         let joints = to_degrees(velocities)?;
-        self.command(&Command::VelocityJoints(joints)) // the controller checks the mode
+        self.set_point(&Command::VelocityJoints(joints)) // the controller checks the mode
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
@@ -302,6 +312,11 @@ impl ManipulatorAdapter for YourArmAdapter {
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.command(&Command::ClearError)
+    }
+
+    fn discard_pending(&mut self) {
+        self.line.abort(); // what the controller did not acknowledge must not reach it later
+        self.disconnect();
     }
 
     // --- Optional parts: leave out what your arm does not have ---

@@ -11,6 +11,8 @@ pub mod protocol;
 #[cfg(test)]
 mod tests;
 
+use std::time::Duration;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
@@ -42,6 +44,9 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     modes: MODES,
     wire_units: "deg, mm",
     native_rate: NATIVE_RATE,
+    accuracy: 0.002,
+    lag: 0.03,
+    stale_after: Duration::from_millis(50),
     address: AddressForm {
         form: "HOST[:PORT]",
         required: true,

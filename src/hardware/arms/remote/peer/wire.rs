@@ -75,7 +75,7 @@ pub fn refused(id: u64, error: &AdapterError) -> Vec<u8> {
         AdapterError::Timeout(_) => ("timeout", 0),
         AdapterError::Protocol(_) => ("protocol", 0),
         AdapterError::Fault { code, .. } => ("fault", *code),
-        AdapterError::Rejected(_) => ("rejected", 0),
+        AdapterError::Busy | AdapterError::Rejected(_) => ("rejected", 0),
         AdapterError::Unsupported => ("unsupported", 0),
         AdapterError::NotConnected => ("not_connected", 0),
     };

@@ -1,0 +1,142 @@
+//! Time along a path. It runs at rate 1, slows down for a cancel, and after a gap starts again from rest where the arm is
+//! on the path: the path stays the same, only the time along it is scaled, within acceleration and jerk.
+
+use crate::clock::Mono;
+
+/// Ticks for which the time along the path is remembered.
+const KEPT: usize = 64;
+/// Part of the limits that the start from rest uses: the rest is for the path's own curvature and for rounding.
+const SHARE: f64 = 0.9;
+
+/// How far the rate may change so that no joint exceeds its limits.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RateLimits {
+    /// Largest change of the rate [1/s].
+    pub first: f64,
+    /// Largest change of that [1/s²].
+    pub second: f64,
+}
+
+/// Time along a path.
+#[derive(Debug, Clone)]
+pub struct PathClock {
+    /// Time along the path [s].
+    elapsed: f64,
+    /// Time along the path per time.
+    rate: f64,
+    /// Its change [1/s].
+    change: f64,
+    kept: [(Mono, f64); KEPT],
+    next: usize,
+}
+
+impl Default for PathClock {
+    fn default() -> Self {
+        Self { elapsed: 0.0, rate: 1.0, change: 0.0, kept: [(Mono::ZERO, 0.0); KEPT], next: 0 }
+    }
+}
+
+impl PathClock {
+    /// Time along the path [s].
+    pub fn elapsed(&self) -> f64 {
+        self.elapsed
+    }
+
+    /// Time along the path per time.
+    pub fn rate(&self) -> f64 {
+        self.rate
+    }
+
+    /// Whether it runs at full rate.
+    pub fn full(&self) -> bool {
+        self.rate >= 1.0
+    }
+
+    /// Begins at the start of a path, at full rate: a path starts from rest by itself.
+    pub fn start(&mut self) {
+        *self = Self::default();
+    }
+
+    /// Remembers which point of the path the tick of `now` commands.
+    pub fn mark(&mut self, now: Mono) {
+        if let Some(slot) = self.kept.get_mut(self.next) {
+            *slot = (now, self.elapsed);
+        }
+        self.next = (self.next + 1) % KEPT;
+    }
+
+    /// Goes to the point that the tick of `at` commanded, at rest; the tick of `now` commands the same.
+    pub fn rewind(&mut self, at: Mono, now: Mono) {
+        let known = self.kept.iter().find(|(when, _)| *when == at && at != Mono::ZERO);
+        if let Some((_, elapsed)) = known {
+            self.elapsed = *elapsed;
+        }
+        (self.rate, self.change) = (0.0, 0.0);
+        if let Some(mark) = self.kept.iter_mut().find(|(when, _)| *when == now) {
+            mark.1 = self.elapsed;
+        }
+    }
+
+    /// A step of `dt` [s] forward.
+    pub fn advance(&mut self, dt: f64) {
+        self.elapsed += dt * self.rate;
+    }
+
+    /// Lets the rate fall by `by`.
+    pub fn slow_down(&mut self, by: f64) {
+        (self.rate, self.change) = (self.rate - by, 0.0);
+    }
+
+    /// Raises the rate towards 1 over a step of `dt` [s].
+    pub fn speed_up(&mut self, limits: RateLimits, dt: f64) {
+        if self.full() {
+            return;
+        }
+        let (first, second) = (SHARE * limits.first, SHARE * limits.second);
+        // The fastest change from which the rate still arrives at 1 with no change left.
+        let arriving = (2.0 * second * (1.0 - self.rate).max(0.0)).sqrt();
+        let wanted = first.min(arriving);
+        self.change += (wanted - self.change).clamp(-second * dt, second * dt);
+        self.rate += self.change.max(0.0) * dt;
+        if self.rate >= 1.0 - 1e-9 || !self.rate.is_finite() {
+            (self.rate, self.change) = (1.0, 0.0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn after_a_gap_it_goes_on_from_the_point_that_was_written() {
+        let mut clock = PathClock::default();
+        for k in 0..100u64 {
+            clock.mark(Mono(10 * k + 10));
+            clock.advance(0.01);
+        }
+        clock.rewind(Mono(10 * 96 + 10), Mono(1000));
+        assert!((clock.elapsed() - 0.96).abs() < 1e-9 && clock.rate() == 0.0);
+        clock.rewind(Mono(3), Mono(1000));
+        assert!((clock.elapsed() - 0.96).abs() < 1e-9, "a tick that is not known leaves it");
+        clock.rewind(Mono(1000), Mono(1000));
+        assert!((clock.elapsed() - 0.96).abs() < 1e-9, "the tick of the gap commanded the same");
+        clock.rewind(Mono(10 * 98 + 10), Mono(1010));
+        assert!((clock.elapsed() - 0.98).abs() < 1e-9, "written late after all");
+    }
+
+    #[test]
+    fn the_rate_rises_within_its_limits_and_ends_at_one() {
+        let (mut clock, limits, dt) = (PathClock::default(), RateLimits { first: 5.0, second: 100.0 }, 0.01);
+        clock.rewind(Mono::ZERO, Mono::ZERO);
+        let (mut rate, mut change, mut steps) = (0.0, 0.0, 0);
+        while !clock.full() {
+            clock.speed_up(limits, dt);
+            let now = (clock.rate() - rate) / dt;
+            assert!(now <= 5.0 + 1e-9 && (now - change).abs() <= 100.0 * dt + 1e-6, "{now} after {change}");
+            (rate, change, steps) = (clock.rate(), now, steps + 1);
+            assert!(steps < 200);
+        }
+        assert!(steps > 20);
+    }
+}

@@ -1,0 +1,145 @@
+//! The set points of the last moments, and how far an arm is from them. A joint that follows with a delay is somewhere in
+//! the range of the set points of its `lag`; one that is outside is blocked, pushed or moved by somebody else.
+
+use crate::clock::Mono;
+use crate::joint::{Joints, MAX_DOF};
+
+/// Parts that the window is kept in: its edge is exact to one of them.
+const PARTS: usize = 16;
+
+/// The range of the set points in one part of the window.
+#[derive(Debug, Clone, Copy)]
+struct Part {
+    /// Time of its first and of its last set point.
+    from: Mono,
+    to: Mono,
+    low: Joints,
+    high: Joints,
+}
+
+/// Set points of one arm over its `lag`.
+#[derive(Debug, Clone)]
+pub struct SetPoints {
+    dof: usize,
+    /// Length of a part [ns].
+    part: u64,
+    parts: [Part; PARTS + 1],
+    newest: usize,
+    count: usize,
+}
+
+impl SetPoints {
+    /// For an arm of `dof` joints, over `span` [s]: its lag and the age of its states.
+    pub fn new(dof: usize, span: f64) -> Self {
+        let none = Part { from: Mono::ZERO, to: Mono::ZERO, low: [0.0; MAX_DOF], high: [0.0; MAX_DOF] };
+        let part = (span.clamp(0.0, 10.0) * 1e9 / (PARTS - 2) as f64) as u64;
+        Self { dof: dof.min(MAX_DOF), part, parts: [none; PARTS + 1], newest: 0, count: 0 }
+    }
+
+    /// Forgets all: another mode, or a new start.
+    pub fn clear(&mut self) {
+        self.count = 0;
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// Adds the set points of a tick [rad or rad/s].
+    pub fn push(&mut self, now: Mono, values: &Joints) {
+        let grown = self.count > 0
+            && self.parts.get_mut(self.newest).is_some_and(|part| {
+                let same = now.0.saturating_sub(part.from.0) < self.part;
+                if same {
+                    part.to = now;
+                    let ranges = part.low.iter_mut().zip(&mut part.high);
+                    for ((low, high), v) in ranges.zip(values).take(self.dof) {
+                        (*low, *high) = (low.min(*v), high.max(*v));
+                    }
+                }
+                same
+            });
+        if !grown {
+            self.newest = (self.newest + 1) % self.parts.len();
+            self.count = (self.count + 1).min(self.parts.len());
+            if let Some(part) = self.parts.get_mut(self.newest) {
+                *part = Part { from: now, to: now, low: *values, high: *values };
+            }
+        }
+    }
+
+    /// Lowest and highest set point of a joint since `since`, with the one that was in force then.
+    pub fn range(&self, joint: usize, since: Mono) -> Option<(f64, f64)> {
+        let mut range: Option<(f64, f64)> = None;
+        for back in 0..self.count {
+            let index = (self.newest + self.parts.len() - back) % self.parts.len();
+            let part = self.parts.get(index)?;
+            let (low, high) = (*part.low.get(joint)?, *part.high.get(joint)?);
+            range = Some(range.map_or((low, high), |(l, h)| (l.min(low), h.max(high))));
+            if part.to < since {
+                break;
+            }
+        }
+        range
+    }
+
+    /// How far `value` is outside the range of the set points since `since`; 0 inside, or when there are none.
+    pub fn distance(&self, joint: usize, value: f64, since: Mono) -> f64 {
+        match self.range(joint, since) {
+            Some((low, _)) if value < low => value - low,
+            Some((_, high)) if value > high => value - high,
+            _ => 0.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ms(t: u64) -> Mono {
+        Mono(t * 1_000_000)
+    }
+
+    fn ramp() -> SetPoints {
+        let mut points = SetPoints::new(1, 0.06);
+        for k in 0..100u64 {
+            points.push(ms(10 * k), &crate::joint::joints_of(&[0.03 * k as f64]));
+        }
+        points
+    }
+
+    #[test]
+    fn a_joint_that_lags_is_inside_the_window() {
+        let points = ramp();
+        let since = ms(990 - 60);
+        assert_eq!(points.distance(0, 0.03 * 99.0, since), 0.0);
+        assert_eq!(points.distance(0, 0.03 * 93.0, since), 0.0);
+        let behind = points.distance(0, 0.03 * 80.0, since);
+        assert!((-0.39..-0.33).contains(&behind), "{behind}");
+        assert!((points.distance(0, 3.5, since) - (3.5 - 2.97)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_joint_at_rest_is_compared_with_where_it_was_sent() {
+        let mut points = ramp();
+        for k in 100..120u64 {
+            points.push(ms(10 * k), &crate::joint::joints_of(&[2.97]));
+        }
+        let off = points.distance(0, 2.8, ms(1190 - 60));
+        assert!((off + 0.17).abs() < 1e-12, "{off}");
+        points.clear();
+        assert!(points.is_empty() && points.distance(0, 9.0, ms(0)) == 0.0);
+    }
+
+    #[test]
+    fn a_fast_tick_needs_no_more_room() {
+        let mut points = SetPoints::new(1, 0.06);
+        for k in 0..1000u64 {
+            points.push(ms(k), &crate::joint::joints_of(&[0.003 * k as f64]));
+        }
+        let (low, high) = points.range(0, ms(999 - 60)).unwrap();
+        assert!((2.997 - 1e-9..2.998).contains(&high) && (2.75..=0.003 * 939.0).contains(&low), "{low} {high}");
+    }
+}

@@ -1,0 +1,99 @@
+//! What reached the wire. The device thread reports the newest command that it wrote; with the commands of the last ticks
+//! that is the set point the arm has. When nothing was written for more than two periods there is a gap: commands stay at
+//! what was written last, and motion goes on from there.
+
+use std::time::Duration;
+
+use crate::clock::Mono;
+use crate::joint::{Joints, MAX_DOF};
+
+/// Set points written later than this after the one before are a gap [periods].
+const PERIODS: u32 = 2;
+
+/// A command as it was issued.
+#[derive(Debug, Clone, Copy)]
+pub struct Issued {
+    /// `ArmCommand::seq`.
+    pub seq: u64,
+    /// The tick's time.
+    pub at: Mono,
+    /// Commanded positions [rad].
+    pub position: Joints,
+    /// Commanded velocities [rad/s].
+    pub velocity: Joints,
+}
+
+/// The commands of the last ticks of one arm, and the newest of them that was written.
+#[derive(Debug, Clone)]
+pub struct Written {
+    issued: Vec<Issued>,
+    next: usize,
+    last: Issued,
+    limit: Duration,
+}
+
+impl Written {
+    /// For a tick of this period and an arm that takes set points once in `write` at best.
+    pub fn new(tick: Duration, write: Duration) -> Self {
+        let limit = PERIODS * tick.max(write);
+        let kept = (limit.as_nanos() / tick.as_nanos().max(1)) as usize + 4;
+        let none = Issued { seq: 0, at: Mono::ZERO, position: [0.0; MAX_DOF], velocity: [0.0; MAX_DOF] };
+        // Time stamps lie on the tick's grid; a period is rounded to ns.
+        Self { issued: vec![none; kept.min(4096)], next: 0, last: none, limit: limit + Duration::from_micros(1) }
+    }
+
+    /// A command leaves the tick.
+    pub fn issue(&mut self, issued: Issued) {
+        if let Some(slot) = self.issued.get_mut(self.next) {
+            *slot = issued;
+        }
+        self.next = (self.next + 1) % self.issued.len().max(1);
+    }
+
+    /// The device thread reports the newest command that it wrote.
+    pub fn report(&mut self, seq: u64) {
+        if seq != self.last.seq
+            && let Some(found) = self.issued.iter().find(|issued| issued.seq == seq && seq != 0)
+        {
+            self.last = *found;
+        }
+    }
+
+    /// The newest command that was written.
+    pub fn last(&self) -> &Issued {
+        &self.last
+    }
+
+    /// Whether more than two periods will have passed between the last written set point and one of `now`.
+    pub fn gap(&self, now: Mono) -> bool {
+        now.since(self.last.at) > self.limit
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_lost_write_is_no_gap_and_two_are() {
+        let period = Duration::from_millis(10);
+        let mut written = Written::new(period, Duration::from_millis(4));
+        let at = |k: u64| Mono(k * 10_000_000);
+        let issue = |w: &mut Written, k: u64| {
+            let position = crate::joint::joints_of(&[k as f64]);
+            w.issue(Issued { seq: k, at: at(k), position, velocity: [0.0; MAX_DOF] });
+        };
+        for k in 1..50 {
+            written.report(k - 1);
+            issue(&mut written, k);
+            assert!(k == 1 || !written.gap(at(k)), "{k}");
+        }
+        written.report(48);
+        assert!(!written.gap(at(50)) && written.gap(at(51)));
+        assert_eq!(written.last().position[0], 48.0);
+        written.report(7);
+        assert_eq!(written.last().seq, 48, "too old to be known: the last one stays");
+        written.report(49);
+        assert_eq!(written.last().position[0], 49.0);
+    }
+}

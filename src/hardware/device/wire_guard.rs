@@ -1,0 +1,166 @@
+//! The last look at a set point before it is written. The tick keeps the limits between its commands; this keeps them
+//! between what reaches the wire, where commands are skipped and time passes.
+
+use std::time::Duration;
+
+use crate::arm::{ArmCommand, ArmState, Supervision};
+use crate::clock::Mono;
+use crate::joint::{ControlMode, JointLimits, Joints};
+
+/// Periods that one step may cover.
+const PERIODS: u32 = 2;
+/// Rounding of computed set points, as a part of a step and beyond it [rad, rad/s].
+const ROUNDING: (f64, f64) = (1e-6, 1e-6);
+
+/// What was written last.
+#[derive(Debug, Clone, Copy)]
+struct Last {
+    mode: ControlMode,
+    values: Joints,
+    at: Mono,
+    start_seq: u32,
+}
+
+/// Decides whether a command may be written.
+#[derive(Debug)]
+pub struct WireGuard {
+    last: Option<Last>,
+    velocity: Joints,
+    acceleration: Joints,
+    dof: usize,
+    /// The longer of the tick's and the arm's period.
+    period: Duration,
+    supervision: Supervision,
+}
+
+impl WireGuard {
+    /// For an arm of `dof` joints; `period` is the longer of the tick's and the arm's own for set points.
+    pub fn new(dof: usize, period: Duration, supervision: Supervision) -> Self {
+        Self {
+            last: None,
+            velocity: [0.0; crate::joint::MAX_DOF],
+            acceleration: [0.0; crate::joint::MAX_DOF],
+            dof,
+            period,
+            supervision,
+        }
+    }
+
+    /// The limits that commands keep.
+    pub fn set_limits(&mut self, limits: &JointLimits) {
+        let limits = limits.clone().with_defaults();
+        self.velocity = crate::joint::joints_of(&limits.velocity_max);
+        self.acceleration = crate::joint::joints_of(&limits.acceleration_max);
+    }
+
+    /// Motors off, or another connection: what was written before counts no more.
+    pub fn forget(&mut self) {
+        self.last = None;
+    }
+
+    /// A set point was written, or may have been.
+    pub fn wrote(&mut self, command: &ArmCommand, mode: ControlMode) {
+        self.last = Some(Last { mode, values: command.values, at: command.at, start_seq: command.start_seq });
+    }
+
+    /// Whether a command may be written, with the arm measured at `state`, a reading of the age `age`, taken once in
+    /// `read_period`.
+    pub fn admits(
+        &self,
+        command: &ArmCommand,
+        mode: ControlMode,
+        state: &ArmState,
+        age: Duration,
+        read_period: Duration,
+    ) -> bool {
+        match self.last.filter(|last| last.start_seq == command.start_seq && last.mode == mode) {
+            Some(last) => {
+                let time = command.at.since(last.at).clamp(Duration::ZERO, PERIODS * self.period).as_secs_f64();
+                let limits = if mode == ControlMode::Velocity { &self.acceleration } else { &self.velocity };
+                self.within(&command.values, &last.values, |j| {
+                    limits.get(j).copied().unwrap_or_default() * time * (1.0 + ROUNDING.0) + ROUNDING.1
+                })
+            }
+            None if age > 2 * read_period => false,
+            None if mode == ControlMode::Velocity => {
+                let time = (PERIODS * self.period).as_secs_f64();
+                self.within(&command.values, &[0.0; crate::joint::MAX_DOF], |j| {
+                    self.acceleration.get(j).copied().unwrap_or_default() * time + ROUNDING.1
+                })
+            }
+            None => self.starts_at(command, state),
+        }
+    }
+
+    /// Whether the first position is where the arm is, or where it was sent last and has been since.
+    fn starts_at(&self, command: &ArmCommand, state: &ArmState) -> bool {
+        let seed = self.supervision.seed_tolerance();
+        let standing = self.last.filter(|last| last.mode.is_position());
+        (0..self.dof).all(|j| {
+            let (Some(value), Some(q)) = (command.values.get(j), state.position.get(j)) else { return false };
+            let stands = standing.and_then(|last| last.values.get(j).copied());
+            let near = stands.is_some_and(|s| s == *value && (s - q).abs() <= 2.0 * self.supervision.accuracy + seed);
+            (value - q).abs() <= seed || near
+        })
+    }
+
+    fn within(&self, values: &Joints, from: &Joints, reach: impl Fn(usize) -> f64) -> bool {
+        let steps = values.iter().zip(from).take(self.dof).enumerate();
+        steps.into_iter().all(|(j, (to, from))| (to - from).abs() <= reach(j))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::joint::joints_of;
+
+    const P: Duration = Duration::from_millis(10);
+
+    fn guard() -> WireGuard {
+        let mut guard = WireGuard::new(1, P, Supervision::default());
+        let mut limits = JointLimits::uniform(1, 3.0, 2.0);
+        limits.acceleration_max = vec![10.0];
+        guard.set_limits(&limits);
+        guard
+    }
+
+    fn command(ms: u64, value: f64, start_seq: u32) -> ArmCommand {
+        ArmCommand { at: Mono(ms * 1_000_000), values: joints_of(&[value]), start_seq, ..ArmCommand::default() }
+    }
+
+    fn state(q: f64) -> ArmState {
+        ArmState { position: joints_of(&[q]), ..ArmState::default() }
+    }
+
+    #[test]
+    fn a_step_covers_two_periods_at_most() {
+        let (mut g, servo) = (guard(), ControlMode::ServoPosition);
+        g.wrote(&command(100, 0.0, 1), servo);
+        let admits = |g: &WireGuard, ms, q| g.admits(&command(ms, q, 1), servo, &state(9.0), Duration::ZERO, P);
+        assert!(admits(&g, 110, 0.02) && !admits(&g, 110, 0.021));
+        assert!(admits(&g, 120, 0.04) && !admits(&g, 120, 0.041));
+        assert!(admits(&g, 900, 0.04) && !admits(&g, 900, 0.041), "however long the gap");
+    }
+
+    #[test]
+    fn the_first_set_point_is_where_the_arm_is_measured_now() {
+        let (mut g, servo) = (guard(), ControlMode::ServoPosition);
+        let admits = |g: &WireGuard, value, q, age| g.admits(&command(100, value, 2), servo, &state(q), age, P);
+        assert!(admits(&g, 0.504, 0.5, P) && !admits(&g, 0.506, 0.5, P));
+        assert!(!admits(&g, 0.5, 0.5, 3 * P), "an old reading");
+        g.wrote(&command(90, 0.509, 1), servo);
+        assert!(admits(&g, 0.509, 0.5, P), "it stands there");
+        g.forget();
+        assert!(!admits(&g, 0.509, 0.5, P));
+    }
+
+    #[test]
+    fn velocities_change_by_the_acceleration() {
+        let (mut g, velocity) = (guard(), ControlMode::Velocity);
+        let admits = |g: &WireGuard, ms, v| g.admits(&command(ms, v, 1), velocity, &state(0.0), Duration::ZERO, P);
+        assert!(admits(&g, 100, 0.1) && !admits(&g, 100, 0.3));
+        g.wrote(&command(100, 1.0, 1), velocity);
+        assert!(admits(&g, 110, 1.1) && !admits(&g, 110, 1.11));
+    }
+}

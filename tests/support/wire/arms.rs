@@ -1,0 +1,311 @@
+//! The arms of the tests of the wire: an emulator, the wire in front of it, and a run of this program at the other end.
+
+use std::any::Any;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry};
+use dimos::hardware::sim::faults::Fault;
+use dimos::rpc::place::RunFolder;
+use dimos::runtime::{Record, Run};
+use serde_json::{Value, json};
+
+use super::can::CanProxy;
+use super::judge::Bounds;
+use super::stream::Proxy;
+use super::{Gate, decode, lock};
+
+/// Nothing here takes longer.
+pub const PATIENCE: Duration = Duration::from_secs(20);
+/// Period of the tick of all these runs [s].
+pub const PERIOD: f64 = 0.01;
+
+/// An arm as the tests need it.
+#[derive(Clone, Copy)]
+pub struct Arm {
+    pub name: &'static str,
+    /// Its row, where it is not in the box.
+    pub row: Option<&'static AdapterSpec>,
+    /// Two poses far apart: from one to the other some joint reaches its top speed [rad].
+    pub ends: [[f64; 6]; 2],
+    /// What a set point is rounded to on the wire [rad].
+    pub rounding: f64,
+    /// In velocity mode it stops by itself after this time without a set point [s]; `None`: it has no such mode.
+    pub time_limit: Option<f64>,
+    /// Age limit of a state [s].
+    pub stale_after: f64,
+}
+
+/// The template arm over TCP.
+pub const YOURARM: Arm = Arm {
+    name: "yourarm",
+    row: None,
+    ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -4.4], [2.7, 0.4, 1.4, 2.5, 1.4, 4.4]],
+    rounding: 1e-6,
+    time_limit: Some(0.2),
+    stale_after: 0.03,
+};
+/// UFACTORY's arm: set points without waiting for replies, reports on ports of their own.
+pub const XARM: Arm = Arm {
+    name: "xarm",
+    row: None,
+    ends: [[-3.6, -0.6, -1.2, -3.6, 0.6, -3.6], [3.6, 0.6, -0.4, 3.6, 1.6, 3.6]],
+    rounding: 1e-6,
+    time_limit: Some(0.2),
+    stale_after: 0.03,
+};
+/// AgileX's arm on CAN.
+pub const PIPER: Arm = Arm {
+    name: "piper",
+    row: None,
+    ends: [[-2.5, 0.6, -1.6, -1.2, -0.8, -1.7], [2.5, 1.6, -0.6, 1.2, 0.8, 1.7]],
+    rounding: 2e-5,
+    time_limit: None,
+    stale_after: 0.03,
+};
+/// An arm behind another process; a simple one.
+pub const REMOTE: Arm = Arm {
+    name: "remote",
+    row: None,
+    ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], [2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
+    rounding: 1e-9,
+    time_limit: Some(0.5),
+    stale_after: 0.1,
+};
+
+/// An arm on a serial line: the template of `dimos adapter new --transport serial`.
+pub fn serial(row: &'static AdapterSpec) -> Arm {
+    Arm {
+        name: "acme",
+        row: Some(row),
+        ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], [2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
+        rounding: 1e-6,
+        time_limit: Some(0.2),
+        stale_after: 0.03,
+    }
+}
+
+impl Arm {
+    /// The end that is nearer to a pose, and the other.
+    pub fn near_and_far(&self, pose: &[f64]) -> [[f64; 6]; 2] {
+        let [a, b] = self.ends;
+        if furthest(&a, pose) < furthest(&b, pose) { [a, b] } else { [b, a] }
+    }
+
+    fn spec(&self) -> AdapterSpec {
+        self.row.copied().unwrap_or_else(|| *Registry::builtin().get(self.name).unwrap())
+    }
+}
+
+/// How an arm of a test differs from one that is well.
+#[derive(Debug, Clone, Default)]
+pub struct Setup {
+    /// Where it stands at the start [rad]; one of its ends when empty.
+    pub start: Vec<f64>,
+    pub faults: Vec<Fault>,
+}
+
+/// An arm and its wire.
+pub struct World {
+    pub arm: Arm,
+    pub gate: Gate,
+    /// Where a run finds the arm.
+    pub address: String,
+    _proxy: Box<dyn Any>,
+    emulator: Arc<Mutex<Box<dyn Emulator>>>,
+}
+
+/// An arm, its wire, and a run that is up. Ends in this order.
+pub struct Bed {
+    pub run: Run,
+    pub gate: Gate,
+    pub arm: Arm,
+    pub bounds: Bounds,
+    world: World,
+    _folder: tempfile::TempDir,
+}
+
+impl World {
+    pub fn new(arm: Arm, setup: &Setup) -> Self {
+        let start = if setup.start.is_empty() { arm.ends[0].to_vec() } else { setup.start.clone() };
+        let options = json!({ "sim": { "initial_positions": start, "faults": setup.faults } });
+        let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof: 6, options };
+        let emulator = arm.spec().emulate.unwrap()(&config, &Place::InProcess).unwrap();
+        let address = emulator.address();
+        let emulator = Arc::new(Mutex::new(emulator));
+        let watched = emulator.clone();
+        let gate = Gate::new(Arc::new(move || {
+            lock(&watched).true_positions().map(|all| all[..6].to_vec()).unwrap_or_default()
+        }));
+        let (proxy, address): (Box<dyn Any>, String) = match arm.name {
+            "yourarm" => boxed(Proxy::tcp(&address, &gate, decode::yourarm())),
+            "xarm" => boxed(Proxy::xarm(&address, &gate, decode::xarm(6))),
+            "remote" => {
+                let proxy = Proxy::tcp(address.trim_start_matches("tcp:"), &gate, decode::remote());
+                let address = format!("tcp:{}", proxy.address);
+                (Box::new(proxy), address)
+            }
+            "piper" => {
+                let proxy = CanProxy::start(&address, &gate);
+                let address = proxy.address.clone();
+                (Box::new(proxy), address)
+            }
+            _ => boxed(Proxy::serial(&address, &gate, decode::template())),
+        };
+        Self { arm, gate, address, _proxy: proxy, emulator }
+    }
+
+    /// Starts a run; or hands the world back, and why the run did not start.
+    #[allow(clippy::result_large_err, reason = "a test's own")]
+    pub fn run(self) -> Result<Bed, (String, Self)> {
+        let folder = tempfile::tempdir().unwrap();
+        let arm = self.arm;
+        let builder = Run::from_yaml("wire", &blueprint(&arm, &self.address))
+            .record(Record::Off)
+            .folder(RunFolder::at(folder.path()))
+            .adapters(arm.row.map(std::slice::from_ref).unwrap_or_default());
+        let run = match builder.start() {
+            Ok(run) => run,
+            Err(error) => return Err((format!("{error}\n{}", error.hint()), self)),
+        };
+        let limits = &run.config().arms[0].limits;
+        let bounds = Bounds {
+            velocity: limits.velocity_max.clone(),
+            acceleration: limits.acceleration_max.clone(),
+            period: PERIOD,
+            rounding: arm.rounding,
+            stale_after: arm.stale_after,
+            time_limit: arm.time_limit,
+        };
+        Ok(Bed { run, gate: self.gate.clone(), arm, bounds, world: self, _folder: folder })
+    }
+
+    /// Where the joints truly are [rad]; nothing where the emulator does not tell.
+    pub fn truth(&self) -> Vec<f64> {
+        lock(&self.emulator).true_positions().map(|all| all[..6].to_vec()).unwrap_or_default()
+    }
+}
+
+impl Bed {
+    #[track_caller]
+    pub fn new(arm: Arm, setup: &Setup) -> Self {
+        World::new(arm, setup).run().unwrap_or_else(|(why, _)| panic!("{}: {why}", arm.name))
+    }
+
+    /// Where the joints truly are [rad]; nothing where the emulator does not tell.
+    pub fn truth(&self) -> Vec<f64> {
+        self.world.truth()
+    }
+
+    pub fn inject(&self, fault: Fault) {
+        lock(&self.world.emulator).inject(fault).unwrap();
+    }
+
+    /// The phase of the arm, and why it is held.
+    pub fn phase(&self) -> (String, String) {
+        let arm = &self.run.status().arms[0];
+        (arm.phase.clone(), arm.cause.as_ref().map(|c| c.name.clone()).unwrap_or_default())
+    }
+
+    /// Measured positions as the run has them [rad].
+    pub fn measured(&self) -> Vec<f64> {
+        self.run.state().arms[0].joints.iter().filter_map(|j| j.position).collect()
+    }
+
+    /// Waits until `holds`.
+    #[track_caller]
+    pub fn until(&self, what: &str, mut holds: impl FnMut(&Self) -> bool) {
+        let began = Instant::now();
+        while !holds(self) {
+            assert!(
+                began.elapsed() < PATIENCE,
+                "{}: not within {PATIENCE:?}: {what}: {:?}",
+                self.arm.name,
+                self.phase()
+            );
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    /// Waits until the arm has stood for 0.1 s and the run hears of it.
+    #[track_caller]
+    pub fn rest(&self) {
+        let (mut last, mut since) = (self.place(), Instant::now());
+        self.until("it stands", |bed| {
+            let here = bed.place();
+            if here.iter().zip(&last).any(|(a, b)| (a - b).abs() > 1e-4) {
+                (last, since) = (here, Instant::now());
+            }
+            let report = &bed.run.status().arms[0];
+            since.elapsed() > Duration::from_millis(100) && report.link == "up"
+        });
+    }
+
+    fn place(&self) -> Vec<f64> {
+        let truth = self.truth();
+        if truth.is_empty() { self.measured() } else { truth }
+    }
+
+    /// Makes the arm ready again, whatever held it.
+    #[track_caller]
+    pub fn ready(&self) {
+        self.until("it is ready", |bed| match bed.phase().0.as_str() {
+            "ready" => true,
+            "activating" => false,
+            _ => {
+                let _ = bed.run.reset("arm");
+                let _ = bed.run.enable("arm");
+                false
+            }
+        });
+    }
+
+    /// Goes from one end to the other as fast as the arm can, and returns in the middle of the way.
+    #[track_caller]
+    pub fn at_full_speed(&self) -> u64 {
+        let [near, far] = self.arm.near_and_far(&self.measured());
+        let go =
+            |to: &[f64]| self.run.move_arm("arm", to, 1.0).unwrap_or_else(|e| panic!("{}: {e}", self.arm.name)).motion;
+        if furthest(&near, &self.measured()) > 0.2 {
+            let motion = go(&near);
+            let there = self.run.wait(motion).unwrap();
+            assert_eq!(there.state, "COMPLETED", "{}: {:?}: {:?}", self.arm.name, there.error, self.phase());
+            self.gate.forget();
+        }
+        let motion = go(&far);
+        self.until("it moves at full speed", |bed| bed.is_fast());
+        motion
+    }
+
+    pub fn is_fast(&self) -> bool {
+        let speed = self.gate.speed(PERIOD);
+        speed.iter().zip(&self.bounds.velocity).any(|(v, most)| v.abs() > 0.9 * most)
+    }
+}
+
+/// How far the joint that is furthest from another pose is from it [rad].
+pub fn furthest(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
+fn boxed(proxy: Proxy) -> (Box<dyn Any>, String) {
+    let address = proxy.address.clone();
+    (Box::new(proxy), address)
+}
+
+fn blueprint(arm: &Arm, address: &str) -> String {
+    let row = arm.spec();
+    let velocity = row.modes.contains(&dimos::joint::ControlMode::Velocity);
+    let mut tasks = vec![
+        json!({ "name": "traj_arm", "type": "trajectory", "joint_names": { "hardware": "arm" } }),
+        json!({ "name": "servo_arm", "type": "servo", "joint_names": { "hardware": "arm" }, "priority": 15 }),
+    ];
+    tasks.extend(velocity.then(
+        || json!({ "name": "velocity_arm", "type": "velocity", "joint_names": { "hardware": "arm" }, "priority": 15 }),
+    ));
+    let hardware: Value = json!([{
+        "hardware_id": "arm", "joints": { "prefix": "arm", "count": 6 }, "adapter_type": arm.name, "address": address,
+    }]);
+    // JSON is YAML.
+    json!({ "name": "wire", "hardware": hardware, "tasks": tasks }).to_string()
+}

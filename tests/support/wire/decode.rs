@@ -1,0 +1,189 @@
+//! Commands out of bytes, by the arms' protocol sheets alone: none of this calls an adapter's or emulator's own code.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use dimos::hardware::transport::can::CanFrame;
+use serde_json::Value;
+
+use super::{Decoder, NewDecoder, What};
+
+/// What stands at the front of the bytes that have arrived.
+enum Front {
+    /// Not all of it is there yet.
+    More,
+    /// So many bytes are no frame.
+    Skip(usize),
+    /// A frame of so many bytes, and what it commands if anything.
+    Frame(usize, Option<What>),
+}
+
+/// A decoder from a function that looks at the front.
+fn by(look: impl Fn(&[u8]) -> Front + Send + Sync + Clone + 'static) -> NewDecoder {
+    Arc::new(move || -> Decoder {
+        let (look, mut bytes) = (look.clone(), VecDeque::new());
+        Box::new(move |new, found| {
+            bytes.extend(new);
+            loop {
+                match look(bytes.make_contiguous()) {
+                    Front::More => break,
+                    Front::Skip(n) => drop(bytes.drain(..n)),
+                    Front::Frame(n, what) => {
+                        bytes.drain(..n);
+                        found.extend(what);
+                    }
+                }
+            }
+        })
+    })
+}
+
+fn floats(bytes: &[u8], of: fn([u8; 4]) -> f32) -> Vec<f64> {
+    bytes.as_chunks::<4>().0.iter().map(|b| f64::from(of(*b))).collect()
+}
+
+fn radians(degrees: Vec<f64>) -> Vec<f64> {
+    degrees.into_iter().map(f64::to_radians).collect()
+}
+
+/// `docs/yourarm-protocol.md`: little-endian, degrees, CRC-16/CCITT-FALSE.
+pub fn yourarm() -> NewDecoder {
+    by(|bytes| {
+        match bytes {
+            [] | [0x59] => return Front::More,
+            [0x59, 0x41, ..] => {}
+            _ => return Front::Skip(1),
+        }
+        let Some(length) = bytes.get(6..8).map(|b| usize::from(u16::from_le_bytes([b[0], b[1]]))) else {
+            return Front::More;
+        };
+        if length > 256 {
+            return Front::Skip(1);
+        }
+        let Some(frame) = bytes.get(..8 + length + 2) else { return Front::More };
+        let (body, check) = frame.split_at(8 + length);
+        if crc16(body) != u16::from_le_bytes([check[0], check[1]]) {
+            return Front::Skip(1);
+        }
+        let payload = &body[8..];
+        let what = match (body[3], payload) {
+            (0x03, [mode]) => Some(What::Mode(mode.to_string())),
+            (0x04, [on]) => Some(What::Enable(*on == 1)),
+            (0x06, []) => Some(What::Stop),
+            (0x10, [_, _, _, _, target @ ..]) => Some(What::Planned(radians(floats(target, f32::from_le_bytes)))),
+            (0x11, target) => Some(What::Position(radians(floats(target, f32::from_le_bytes)))),
+            (0x12, target) => Some(What::Velocity(radians(floats(target, f32::from_le_bytes)))),
+            _ => None,
+        };
+        Front::Frame(frame.len(), what)
+    })
+}
+
+fn crc16(bytes: &[u8]) -> u16 {
+    bytes.iter().fold(0xFFFF, |crc, byte| {
+        (0..8).fold(crc ^ (u16::from(*byte) << 8), |crc, _| match crc & 0x8000 {
+            0 => crc << 1,
+            _ => (crc << 1) ^ 0x1021,
+        })
+    })
+}
+
+/// xArm's control port: a big-endian header, registers, little-endian floats in radians. Seven joints always go over the
+/// wire; `dof` of them count.
+pub fn xarm(dof: usize) -> NewDecoder {
+    by(move |bytes| {
+        let Some(header) = bytes.first_chunk::<6>() else { return Front::More };
+        let (protocol, length) =
+            (u16::from_be_bytes([header[2], header[3]]), usize::from(u16::from_be_bytes([header[4], header[5]])));
+        if !matches!(protocol, 2 | 3) || length == 0 || length > 1024 {
+            return Front::Skip(1);
+        }
+        let Some(frame) = bytes.get(..6 + length) else { return Front::More };
+        let joints = |payload: &[u8]| floats(payload, f32::from_le_bytes).into_iter().take(dof).collect::<Vec<_>>();
+        let what = match (frame[6], &frame[7..]) {
+            (11, [_, on]) => Some(What::Enable(*on == 1)),
+            (12, [4 | 6]) => Some(What::Stop),
+            (12, [state]) => Some(What::Mode(format!("state {state}"))),
+            (19, [mode, ..]) => Some(What::Mode(mode.to_string())),
+            (23, payload) => Some(What::Planned(joints(payload))),
+            (29, payload) => Some(What::Position(joints(payload))),
+            (81, payload) => Some(What::Velocity(joints(payload))),
+            _ => None,
+        };
+        Front::Frame(frame.len(), what)
+    })
+}
+
+/// `docs/remote-adapter.md`: a JSON object a line.
+pub fn remote() -> NewDecoder {
+    by(|bytes| {
+        let Some(end) = bytes.iter().position(|b| *b == b'\n') else { return Front::More };
+        let Ok(line) = serde_json::from_slice::<Value>(&bytes[..end]) else { return Front::Skip(end + 1) };
+        let numbers = |v: &Value| v.as_array().into_iter().flatten().filter_map(Value::as_f64).collect::<Vec<_>>();
+        let what = match line["do"].as_str() {
+            Some("cycle") => match line["command"]["mode"].as_str() {
+                Some("velocity") => Some(What::Velocity(numbers(&line["command"]["values"]))),
+                Some(_) => Some(What::Position(numbers(&line["command"]["values"]))),
+                None => None,
+            },
+            Some("activate") => Some(What::Enable(true)),
+            Some("write_enable") => Some(What::Enable(line["args"][0] == true)),
+            Some("set_control_mode") => line["args"][0].as_str().map(|mode| What::Mode(mode.to_owned())),
+            Some("write_stop") => Some(What::Stop),
+            _ => None,
+        };
+        Front::Frame(end + 1, what)
+    })
+}
+
+/// The template of an arm on a stream of bytes (the sheet in `assets/templates/stream/protocol.rs`): big-endian floats in
+/// degrees, a sum at the end.
+pub fn template() -> NewDecoder {
+    by(|bytes| {
+        let Some([start, opcode, _, length]) = bytes.first_chunk::<4>() else {
+            return if matches!(bytes, [] | [0xA5, ..]) { Front::More } else { Front::Skip(1) };
+        };
+        if *start != 0xA5 {
+            return Front::Skip(1);
+        }
+        let Some(frame) = bytes.get(..4 + usize::from(*length) + 2) else { return Front::More };
+        let (body, check) = frame.split_at(frame.len() - 2);
+        let sum = body.iter().fold(0_u16, |sum, b| sum.wrapping_add(u16::from(*b)));
+        if sum != u16::from_be_bytes([check[0], check[1]]) {
+            return Front::Skip(1);
+        }
+        let what = match (opcode, &body[4..]) {
+            (0x03, [mode]) => Some(What::Mode(mode.to_string())),
+            (0x04, [on]) => Some(What::Enable(*on == 1)),
+            (0x06, []) => Some(What::Stop),
+            (0x10, [_, _, _, _, target @ ..]) => Some(What::Planned(radians(floats(target, f32::from_be_bytes)))),
+            (0x11, target) => Some(What::Position(radians(floats(target, f32::from_be_bytes)))),
+            (0x12, target) => Some(What::Velocity(radians(floats(target, f32::from_be_bytes)))),
+            _ => None,
+        };
+        Front::Frame(frame.len(), what)
+    })
+}
+
+/// A Piper's CAN frames, put together to set points: 0x155 to 0x157 carry two joints each, big-endian in 0.001°.
+pub fn piper() -> impl FnMut(&CanFrame) -> Option<What> + Send {
+    let mut joints = [None; 6];
+    move |frame| {
+        let pair = |at: usize| {
+            i32::from_be_bytes([frame.data[at], frame.data[at + 1], frame.data[at + 2], frame.data[at + 3]])
+        };
+        match frame.id {
+            0x150 if frame.data[0] == 1 => Some(What::Stop),
+            0x151 => Some(What::Mode(format!("{} {}", frame.data[0], frame.data[1]))),
+            0x471 => Some(What::Enable(frame.data[1] == 2)),
+            0x155..=0x157 => {
+                let first = 2 * usize::from(frame.id - 0x155);
+                joints[first] = Some((f64::from(pair(0)) * 1e-3).to_radians());
+                joints[first + 1] = Some((f64::from(pair(4)) * 1e-3).to_radians());
+                let whole: Option<Vec<f64>> = joints.iter().copied().collect();
+                whole.filter(|_| frame.id == 0x157).map(What::Position)
+            }
+            _ => None,
+        }
+    }
+}

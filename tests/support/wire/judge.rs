@@ -1,0 +1,180 @@
+//! What no wire may ever carry, whatever happened to it.
+
+use dimos::clock::Mono;
+
+use super::{Told, What};
+
+/// Limits of an arm, and how its set points come.
+#[derive(Debug, Clone)]
+pub struct Bounds {
+    /// Top speeds of the joints [rad/s].
+    pub velocity: Vec<f64>,
+    /// [rad/s²]
+    pub acceleration: Vec<f64>,
+    /// The longer of the tick's and the arm's write period [s].
+    pub period: f64,
+    /// What a set point is rounded to on the wire [rad].
+    pub rounding: f64,
+    /// Age limit of a state [s].
+    pub stale_after: f64,
+    /// In velocity mode the arm stands after this time without a set point [s].
+    pub time_limit: Option<f64>,
+}
+
+/// The window in which an arm may travel no further than its top speed allows [s].
+pub const WINDOW: f64 = 0.05;
+/// What is noted of times is this uncertain [s].
+const CLOCK: f64 = 1e-3;
+
+/// Set points of one kind that follow one another: neither a change of mode nor new torque stands between them.
+fn chains(told: &[Told], values: fn(&What) -> Option<&Vec<f64>>) -> Vec<Vec<(Mono, &Vec<f64>)>> {
+    let (mut chains, mut mode) = (vec![Vec::new()], None);
+    for one in told {
+        let breaks = match &one.what {
+            What::Enable(_) | What::Planned(_) => true,
+            What::Mode(new) => mode.replace(new.clone()).is_some_and(|old| old != *new),
+            _ => false,
+        };
+        match values(&one.what) {
+            Some(values) => chains.last_mut().unwrap().push((one.at, values)),
+            None if breaks => chains.push(Vec::new()),
+            None => {}
+        }
+    }
+    chains
+}
+
+pub fn position(what: &What) -> Option<&Vec<f64>> {
+    match what {
+        What::Position(values) => Some(values),
+        _ => None,
+    }
+}
+
+pub fn velocity(what: &What) -> Option<&Vec<f64>> {
+    match what {
+        What::Velocity(values) => Some(values),
+        _ => None,
+    }
+}
+
+/// Where a rule was broken worst.
+#[derive(Debug, Clone, Copy, Default)]
+struct Worst {
+    /// Of what is allowed.
+    share: f64,
+    joint: usize,
+    found: f64,
+    allowed: f64,
+    at: Mono,
+}
+
+impl Worst {
+    fn look(&mut self, joint: usize, at: Mono, found: f64, allowed: f64) {
+        let share = found / allowed;
+        if share > self.share {
+            *self = Self { share, joint, found, allowed, at };
+        }
+    }
+
+    fn verdict(self, rule: &str, unit: &str, since: Mono) -> Result<(), String> {
+        let Self { joint, found, allowed, at, .. } = self;
+        match self.share <= 1.0 {
+            true => Ok(()),
+            false => Err(format!(
+                "{rule}: joint {}: {found:.4} {unit}, allowed {allowed:.4}, {:.1} ms after the stall began",
+                joint + 1,
+                at.seconds_since(since) * 1e3
+            )),
+        }
+    }
+}
+
+impl Bounds {
+    /// Neighbouring set points: at most two periods at top speed apart; in velocity mode, at most acceleration.
+    pub fn neighbours(&self, told: &[Told], since: Mono) -> Result<(), String> {
+        let mut worst = Worst::default();
+        for chain in chains(told, position) {
+            for pair in chain.windows(2) {
+                for (j, (a, b)) in pair[0].1.iter().zip(pair[1].1).enumerate() {
+                    let most = self.velocity[j] * self.period * 2.0 + self.rounding;
+                    worst.look(j, pair[1].0, (b - a).abs(), most);
+                }
+            }
+        }
+        worst.verdict("neighbouring set points", "rad", since)?;
+        let mut worst = Worst::default();
+        for chain in chains(told, velocity) {
+            for pair in chain.windows(2) {
+                // An arm that has stopped by itself meanwhile may begin at rest.
+                let silence = pair[1].0.seconds_since(pair[0].0);
+                let stands = self.time_limit.is_some_and(|limit| silence > limit);
+                for (j, (a, b)) in pair[0].1.iter().zip(pair[1].1).enumerate() {
+                    let most = self.acceleration[j] * self.period * 2.0 + self.rounding;
+                    worst.look(j, pair[1].0, if stands { b.abs().min((b - a).abs()) } else { (b - a).abs() }, most);
+                }
+            }
+        }
+        worst.verdict("neighbouring velocities", "rad/s", since)
+    }
+
+    /// The way within any 50 ms: at top speed, and two periods.
+    pub fn windows(&self, delivered: &[Told], since: Mono) -> Result<(), String> {
+        let mut worst = Worst::default();
+        for chain in chains(delivered, position) {
+            let steps: Vec<(Mono, Vec<f64>)> = chain
+                .windows(2)
+                .map(|pair| (pair[1].0, pair[0].1.iter().zip(pair[1].1).map(|(a, b)| (b - a).abs()).collect()))
+                .collect();
+            for (i, (end, _)) in steps.iter().enumerate() {
+                let inside = steps[..=i].iter().rev().take_while(|(at, _)| end.seconds_since(*at) < WINDOW - CLOCK);
+                let mut way = vec![0.0; self.velocity.len()];
+                inside.for_each(|(_, step)| way.iter_mut().zip(step).for_each(|(sum, s)| *sum += s));
+                for (j, way) in way.into_iter().enumerate() {
+                    let most = self.velocity[j] * (WINDOW + 2.0 * self.period) + 10.0 * self.rounding;
+                    worst.look(j, *end, way, most);
+                }
+            }
+        }
+        worst.verdict("the way within 50 ms", "rad", since)
+    }
+
+    /// How far an arm may still go after the last set point before a stall that it is held for [rad].
+    pub fn stopping(&self, joint: usize, delay: f64) -> f64 {
+        let (v, a) = (self.velocity[joint], self.acceleration[joint]);
+        v * (delay + 2.0 * self.period) + v * v / (2.0 * a)
+    }
+
+    /// Where set points go after a stall that the arm is held for.
+    pub fn travel(&self, delivered: &[Told], began: Mono) -> Result<(), String> {
+        let mut worst = Worst::default();
+        let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| position(&t.what));
+        let Some(last) = last else { return Ok(()) };
+        for one in delivered.iter().filter(|t| t.at >= began) {
+            for (j, (a, b)) in last.iter().zip(position(&one.what).unwrap_or(last)).enumerate() {
+                worst.look(j, one.at, (b - a).abs(), self.stopping(j, self.stale_after) + self.rounding);
+            }
+        }
+        worst.verdict("the way after a stall", "rad", began)
+    }
+
+    /// How far the arm itself went.
+    pub fn went(&self, from: &[f64], to: &[f64], delay: f64, slack: f64, since: Mono) -> Result<(), String> {
+        let mut worst = Worst::default();
+        for (j, (a, b)) in from.iter().zip(to).enumerate() {
+            worst.look(j, since, (b - a).abs(), self.stopping(j, delay) + slack);
+        }
+        worst.verdict("the way of the arm itself", "rad", since)
+    }
+
+    /// Set points beside the pose at which the arm truly was when they reached it.
+    pub fn beside_the_truth(&self, delivered: &[Told], most: f64) -> Result<(), String> {
+        let (mut worst, first) = (Worst::default(), delivered.first().map_or(Mono::ZERO, |t| t.at));
+        for one in delivered {
+            if let (Some(told), Some(truth)) = (position(&one.what), &one.truth) {
+                told.iter().zip(truth).enumerate().for_each(|(j, (a, b))| worst.look(j, one.at, (a - b).abs(), most));
+            }
+        }
+        worst.verdict("a set point beside the true pose", "rad", first)
+    }
+}

@@ -1,0 +1,197 @@
+//! What an arm is told when the wire to it stalls at full speed, judged on the wire: five arms, every kind of stall, from
+//! 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and every
+//! length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm.
+
+#[allow(dead_code, reason = "a library's public parts")]
+#[path = "../assets/templates/serial/mod.rs"]
+mod serial;
+#[path = "support/wire/mod.rs"]
+mod wire;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use dimos::hardware::sim::faults::{Fault, FaultKind};
+use wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, XARM, YOURARM};
+use wire::watch::Watch;
+use wire::{Stall, now};
+
+/// What stalls.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Wire(Stall),
+    /// The arm's controller: it reads nothing and says nothing, then goes on.
+    Controller,
+}
+
+const KINDS: [Kind; 6] = [
+    Kind::Wire(Stall::Both),
+    Kind::Wire(Stall::ToArm),
+    Kind::Wire(Stall::FromArm),
+    Kind::Wire(Stall::Drop),
+    Kind::Wire(Stall::Trickle),
+    Kind::Controller,
+];
+const TIMES: [u64; 5] = [20, 60, 90, 300, 3000];
+/// A case that this computer spoilt by standing still for longer is tried again, so often at most.
+const SPOILT: Duration = Duration::from_millis(4);
+const TRIES: usize = 3;
+
+fn arms() -> Vec<Arm> {
+    let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC)];
+    let only = std::env::var("DIMOS_WIRE_ARM").ok();
+    all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect()
+}
+
+/// The cases of an arm: `n` tells arms apart, so that together they have more than each.
+fn cases(n: usize) -> Vec<(Kind, Duration)> {
+    let full = std::env::var("DIMOS_WIRE").is_ok_and(|v| v == "full");
+    let all =
+        KINDS.iter().enumerate().flat_map(|(k, kind)| TIMES.iter().enumerate().map(move |(t, ms)| (k, kind, t, ms)));
+    // Every kind has one length of its own for this arm, and a cut of both ways has those that hurt most.
+    let some = all.filter(|(k, kind, t, _)| {
+        full || (k + n) % (TIMES.len() - 1) == *t || (**kind == Kind::Wire(Stall::Both) && *t >= 3)
+    });
+    some.map(|(_, kind, _, ms)| (*kind, Duration::from_millis(*ms))).collect()
+}
+
+/// Runs the cases of all arms, the arms side by side, and tells all that went wrong.
+fn judge_all(arms: &[Arm], case: fn(&Bed, Kind, Duration) -> Vec<String>) {
+    let watch = Watch::start();
+    let failures: Vec<String> = std::thread::scope(|scope| {
+        let threads: Vec<_> = arms
+            .iter()
+            .enumerate()
+            .map(|(n, arm)| {
+                let watch = &watch;
+                scope.spawn(move || {
+                    let bed = Bed::new(*arm, &Setup::default());
+                    let mut failures = Vec::new();
+                    for (kind, time) in cases(n) {
+                        let mut found = Vec::new();
+                        for _ in 0..TRIES {
+                            watch.stood_still();
+                            found = catch_unwind(AssertUnwindSafe(|| case(&bed, kind, time))).unwrap_or_else(said);
+                            if found.is_empty() || watch.stood_still() < SPOILT {
+                                break;
+                            }
+                        }
+                        println!("{:8} {kind:?} {time:?}: {found:?}", arm.name);
+                        failures.extend(found.into_iter().map(|f| format!("{} {kind:?} {time:?}: {f}", arm.name)));
+                    }
+                    failures
+                })
+            })
+            .collect();
+        threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect()
+    });
+    assert!(failures.is_empty(), "{} failures:\n{}", failures.len(), failures.join("\n"));
+}
+
+/// What a case said that came to no end.
+fn said(panic: Box<dyn std::any::Any + Send>) -> Vec<String> {
+    vec![panic.downcast_ref::<String>().cloned().unwrap_or_else(|| "panicked".to_owned())]
+}
+
+fn begin(bed: &Bed, kind: Kind, time: Duration) -> dimos::clock::Mono {
+    match kind {
+        Kind::Wire(stall) => bed.gate.stall(stall, time),
+        Kind::Controller => {
+            bed.inject(Fault::new(FaultKind::Stall).lasting(time.as_secs_f64()));
+            now()
+        }
+    }
+}
+
+/// Whether the arm's states stop coming in such a stall for longer than they may.
+fn must_hold(arm: &Arm, kind: Kind, time: Duration) -> bool {
+    let silent = matches!(kind, Kind::Controller | Kind::Wire(Stall::Both | Stall::FromArm | Stall::Drop));
+    silent && time.as_secs_f64() > arm.stale_after + 3.0 * PERIOD
+}
+
+fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
+    bed.ready();
+    bed.rest();
+    bed.gate.forget();
+    bed.at_full_speed();
+    let began = begin(bed, kind, time);
+    std::thread::sleep(time);
+    bed.rest();
+    let (phase, cause) = bed.phase();
+    let (sent, delivered) = (bed.gate.sent(), bed.gate.delivered());
+    let mut verdicts = vec![bed.bounds.neighbours(&sent, began), bed.bounds.windows(&delivered, began)];
+    if kind != Kind::Wire(Stall::Drop) {
+        verdicts.push(bed.bounds.neighbours(&delivered, began).map_err(|e| format!("delivered: {e}")));
+    }
+    if phase == "held" {
+        verdicts.push(bed.bounds.travel(&delivered, began));
+    } else if must_hold(&bed.arm, kind, time) {
+        verdicts.push(Err(format!("it is {phase} after {time:?} of silence")));
+    }
+    // What is lost is waited for in vain, for longer than the stall.
+    let lossless = !matches!(kind, Kind::Wire(Stall::Trickle | Stall::Drop));
+    if phase == "held" && lossless && time.as_secs_f64() < bed.bounds.stale_after {
+        verdicts.push(Err(format!("held ({cause}) though no state was older than it may be")));
+    }
+    verdicts.into_iter().filter_map(Result::err).collect()
+}
+
+fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
+    bed.ready();
+    let start = bed.arm.ends[0].map(|q| q * 0.95);
+    let there = bed.run.move_arm("arm", &start, 1.0).and_then(|m| bed.run.wait(m.motion));
+    if there.is_err() {
+        bed.ready();
+    }
+    bed.rest();
+    bed.gate.forget();
+    let handle = bed.run.handle();
+    let streaming = AtomicBool::new(true);
+    let failures = std::thread::scope(|scope| {
+        let (streaming, top) = (&streaming, bed.bounds.velocity[0]);
+        scope.spawn(move || {
+            let mut target = vec![0.0; 6];
+            target[0] = top;
+            let began = Instant::now();
+            // Refused once it is held.
+            while streaming.load(Ordering::Relaxed) && began.elapsed() < Duration::from_millis(900) {
+                let _ = handle.velocity("velocity_arm", &target);
+                std::thread::sleep(Duration::from_millis(8));
+            }
+        });
+        bed.until("it moves at full speed", |bed| bed.is_fast());
+        let (began, from) = (begin(bed, kind, time), bed.truth());
+        std::thread::sleep(time.max(Duration::from_millis(200)));
+        if time < Duration::from_millis(200) {
+            streaming.store(false, Ordering::Relaxed);
+        }
+        bed.rest();
+        streaming.store(false, Ordering::Relaxed);
+        let (held, sent, delivered) = (bed.phase().0 == "held", bed.gate.sent(), bed.gate.delivered());
+        let mut verdicts = vec![bed.bounds.neighbours(&sent, began)];
+        if kind != Kind::Wire(Stall::Drop) {
+            verdicts.push(bed.bounds.neighbours(&delivered, began).map_err(|e| format!("delivered: {e}")));
+        }
+        if held {
+            // The arm's own lag, too.
+            let delay = bed.arm.time_limit.unwrap_or_default() + bed.arm.stale_after;
+            verdicts.push(bed.bounds.went(&from, &bed.truth(), delay, 0.1, began));
+        } else if must_hold(&bed.arm, kind, time) {
+            verdicts.push(Err(format!("it is {} after {time:?} of silence", bed.phase().0)));
+        }
+        verdicts.into_iter().filter_map(Result::err).collect()
+    });
+    failures
+}
+
+#[test]
+fn a_stall_at_full_speed_makes_no_arm_jump_or_drives_it_on() {
+    judge_all(&arms(), position_case);
+}
+
+#[test]
+fn a_stall_in_velocity_mode_makes_no_arm_jump_or_drives_it_on() {
+    let with_velocity: Vec<Arm> = arms().into_iter().filter(|arm| arm.time_limit.is_some()).collect();
+    judge_all(&with_velocity, velocity_case);
+}
