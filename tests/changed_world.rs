@@ -7,7 +7,9 @@ use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::planning::setup::{Setup, obstacle};
-use dimos::rpc::api::{ExecutePlan, Plan, PlanGoal, Planning, PoseSpec, ShapeSpec, WorldAdd, WorldObject};
+use dimos::rpc::api::{
+    ExecutePlan, Plan, PlanGoal, Planning, PoseSpec, Preview, ShapeSpec, WorldAdd, WorldObject, WorldRemove,
+};
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Builder, Record, Run};
 
@@ -78,6 +80,11 @@ impl Cell {
 
     /// The distance of the arm, as it truly stands, from what is around it and the objects [m].
     fn clearance(&self, objects: &[WorldObject]) -> f64 {
+        self.clearance_at(&self.joints(), objects)
+    }
+
+    /// The same at a configuration.
+    fn clearance_at(&self, q: &[f64], objects: &[WorldObject]) -> f64 {
         let mut world = self.setup.world.clone();
         for object in objects {
             let ShapeSpec::Sphere(radius) = object.shape else { unreachable!() };
@@ -91,12 +98,62 @@ impl Cell {
             world.put(obstacle(&config).unwrap()).unwrap();
         }
         let mut checker = ExactChecker::new(world.snapshot(), Resolution::default());
-        let q = self.joints();
-        assert!(checker.is_free(&q), "{:?}", checker.contacts(&q));
-        let near = checker.with_padding(1.0).closer_than_padding(&q);
+        assert!(checker.is_free(q), "{:?}", checker.contacts(q));
+        let near = checker.with_padding(1.0).closer_than_padding(q);
         let own = |name: &str| objects.iter().any(|object| object.name == name);
         near.into_iter().filter(|(_, c)| own(&c.other)).map(|(_, c)| c.distance).fold(f64::INFINITY, f64::min)
     }
+}
+
+impl Cell {
+    /// A ball above the flange at an angle of the first joint, at a distance from the arm there [m].
+    fn ball_at(&self, name: &str, angle: f64, distance: f64) -> WorldObject {
+        let mut ball = self.ball(name, angle);
+        ball.pose.xyz[2] += 0.12;
+        ball.shape = ShapeSpec::Sphere(0.001);
+        ball.shape = ShapeSpec::Sphere(0.001 + self.clearance_at(&at(angle), &[ball.clone()]) - distance);
+        ball
+    }
+
+    /// The least distance from the objects on a plan's trajectory, for each of its points [rad, m].
+    fn distances(&self, plan: u64, objects: &[WorldObject]) -> Vec<(Vec<f64>, f64)> {
+        let preview = self.run.call(Preview { plan: Some(plan) }).unwrap();
+        let ends = preview.trajectory.points.windows(2);
+        let between = ends.flat_map(|pair| {
+            let mix =
+                |part: f64| pair[0].positions.iter().zip(&pair[1].positions).map(|(a, b)| a + (b - a) * part).collect();
+            [0.0, 0.25, 0.5, 0.75, 1.0].map(mix).to_vec()
+        });
+        between.map(|q: Vec<f64>| (q.clone(), self.clearance_at(&q, objects))).collect()
+    }
+}
+
+#[test]
+fn plans_keep_the_padding_and_give_it_up_only_near_a_goal_that_is_closer() {
+    let cell = up();
+    // Beside the straight way: a path that only does not touch passes at 1.5 mm.
+    let beside = cell.ball_at("beside", 0.5, 0.0015);
+    cell.run.call(WorldAdd(beside.clone())).unwrap();
+    let plan = cell.plan(1.0, 0.5);
+    let least = cell.distances(plan, &[beside]).into_iter().map(|(_, distance)| distance).fold(f64::INFINITY, f64::min);
+    assert!(least >= PADDING, "{least}");
+    let summary = cell.run.call(Planning { plan }).unwrap().summary.unwrap();
+    assert!(summary.padding == PADDING && summary.padding_given_up.is_empty(), "{summary:?}");
+    // Beside the goal.
+    cell.run.call(WorldRemove { name: None }).unwrap();
+    let near = cell.ball_at("near", 1.0, 0.0015);
+    cell.run.call(WorldAdd(near.clone())).unwrap();
+    let plan = cell.plan(1.0, 0.5);
+    let summary = cell.run.call(Planning { plan }).unwrap().summary.unwrap();
+    let [given_up] = &summary.padding_given_up[..] else { panic!("{summary:?}") };
+    assert!(given_up.near == "goal" && given_up.other == "near", "{given_up:?}");
+    assert!((given_up.distance - 0.0015).abs() < 1e-5, "{given_up:?}");
+    for (q, distance) in cell.distances(plan, &[near]) {
+        let away = q.iter().zip(at(1.0)).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+        assert!(distance > 0.0007 && (away < 0.3 || distance >= PADDING), "{distance} m at {away} rad from the goal");
+    }
+    let begun = cell.run.call(ExecutePlan { plan: Some(plan), ..Default::default() }).unwrap();
+    assert_eq!(cell.run.wait(begun.motion).unwrap().state, "COMPLETED");
 }
 
 #[test]

@@ -63,6 +63,8 @@ pub struct ArmControl {
     /// Nothing reached the arm for more than two periods, or what did is not what is commanded: the first command that
     /// was made from what had been written.
     gap_since: Option<u64>,
+    /// How far each joint coasts beyond the last set point that it got before a gap [rad], and for how long that counts.
+    coast: (Joints, Mono),
     /// How long a joint has been too far from its set points [s].
     astray: f64,
     /// Time left to draw set points to the measured pose [s].
@@ -131,6 +133,7 @@ impl ArmControl {
             seed: [0.0; MAX_DOF],
             starting: None,
             gap_since: None,
+            coast: ([0.0; MAX_DOF], Mono::ZERO),
             astray: 0.0,
             drawing: DRAW_TIME,
             stop_owed: false,
@@ -188,7 +191,12 @@ impl ArmControl {
         if (q - limiter.position()).abs() <= DRAW / 2.0 {
             return 0.0;
         }
-        self.set_points.distance(joint, *q, self.window_start())
+        let distance = self.set_points.distance(joint, *q, self.window_start());
+        let coast = self.coast.0.get(joint).copied().unwrap_or_default();
+        if coast * distance > 0.0 && self.command.at < self.coast.1 {
+            return distance - distance.clamp(-coast.abs(), coast.abs());
+        }
+        distance
     }
 
     /// Where the set points begin that the latest state may still be following.
@@ -208,7 +216,8 @@ impl ArmControl {
         self.estimator.fill(&mut self.state);
         self.freshness = self.age(now, stalls);
         self.written.report(self.state.written);
-        if !self.state.enabled {
+        // An arm whose connection broke has stopped by its own means, elsewhere.
+        if !self.state.enabled || matches!(self.state.link, Link::Down | Link::Faulted) {
             self.standing = false;
         }
         self.failsafe.update(&self.state, self.freshness, now);
@@ -350,7 +359,7 @@ impl ArmControl {
         let phase = self.failsafe.phase();
         let held = phase == Phase::Held;
         // What somebody else does with the arm is theirs to end: it gets no set point and no stop.
-        let foreign = held && matches!(self.failsafe.cause(), Cause::ModeChanged | Cause::PowerChanged);
+        let foreign = held && self.failsafe.cause().is_foreign();
         self.stop_owed |= held && !self.was_held && !foreign;
         self.was_held = held;
         self.note_gap(now);
@@ -397,6 +406,18 @@ impl ArmControl {
         self.standing &= mode.is_position();
     }
 
+    /// An arm at speed that gets no set point comes to rest beyond the last one, by its own means, and then returns to it.
+    fn begin_to_coast(&mut self, now: Mono) {
+        let mut longest = 0.0f64;
+        for (coast, limiter) in self.coast.0.iter_mut().zip(&self.limiters) {
+            let (v, a) = (limiter.velocity(), limiter.bounds().acceleration);
+            *coast = v * v.abs() / (2.0 * a);
+            longest = longest.max(v.abs() / a);
+        }
+        let time = (2.0 * longest + self.config.supervision.lag).clamp(0.0, 60.0);
+        self.coast.1 = now.after(Duration::from_secs_f64(time));
+    }
+
     /// Finds out whether what is commanded reaches the arm. Where it does not, the commands go back to what did.
     fn note_gap(&mut self, now: Mono) {
         if let Some(first) = self.starting {
@@ -418,7 +439,10 @@ impl ArmControl {
             self.gap_since = None;
             return;
         }
-        self.gap_since.get_or_insert(self.command.seq);
+        if self.gap_since.is_none() {
+            self.gap_since = Some(self.command.seq);
+            self.begin_to_coast(now);
+        }
         let rest = self.command.mode.is_some_and(ControlMode::is_position);
         for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
             // Joints that follow positions have come to rest at the last one; velocities go on.
