@@ -56,6 +56,8 @@ pub enum Interference {
     Mode,
     /// The motors were enabled.
     Power,
+    /// The arm was stopped, paused or reset.
+    Stop,
 }
 
 impl Interference {
@@ -65,6 +67,7 @@ impl Interference {
             Self::None => "",
             Self::Mode => "mode",
             Self::Power => "power",
+            Self::Stop => "stop",
         }
     }
 }

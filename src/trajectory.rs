@@ -6,6 +6,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Longest trajectory that a client or a file may give [s].
+pub const MAX_DURATION: f64 = 24.0 * 3600.0;
+
 /// A trajectory as clients send it and files hold it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -121,6 +121,22 @@ fn coordinator_piper_xarm() {
     exercise("coordinator-piper-xarm", &arms);
 }
 
+/// Everything that `dimos list-blueprints` offers runs as its header says: with emulated arms.
+#[test]
+fn every_shipped_blueprint_is_without_mistakes_and_starts() {
+    let home = Home::new();
+    let listed = home.dimos("list-blueprints --json").with(0).json();
+    let shipped: Vec<&Value> = listed.as_array().unwrap().iter().filter(|b| b["source"] == "embedded").collect();
+    assert!(shipped.len() >= 18, "{listed}");
+    for blueprint in shipped {
+        let name = blueprint["name"].as_str().unwrap();
+        assert_eq!(blueprint["problem"], Value::Null, "{name}");
+        home.dimos(&format!("check {name} --sim")).with(0);
+        let started = home.dimos(&format!("run {name} --sim --no-record --duration 200ms")).with(0);
+        started.says(&[&format!("run {name}  "), "ready", "its time is over"]);
+    }
+}
+
 #[test]
 #[cfg(feature = "can")]
 fn a_piper_that_cannot_be_reached_or_leads_is_told_in_one_line() {

@@ -29,14 +29,18 @@ fn answer(name: &str) -> String {
 fn shipped_blueprints_have_no_mistakes() {
     let (builtin, fake) = (Registry::builtin(), fake_arms::registry());
     let has_arms = builtin.get("yourarm").is_some() && builtin.get("mock").is_some();
-    let mut names = vec!["coordinator-yourarm", "coordinator-mock", "coordinator-dual-mock"];
-    if cfg!(feature = "can") {
-        names.extend(["coordinator-piper", "coordinator-piper-xarm"]);
-    }
+    let listed = blueprint::list(&builtin);
+    let shipped = listed.iter().map(|listing| listing.name.as_str());
+    let needs_can = |name: &&str| cfg!(feature = "can") || !name.contains("piper");
+    let names: Vec<&str> = shipped.filter(needs_can).collect();
+    assert!(names.len() >= 15, "{names:?}");
     for name in names {
         let adapters = if has_arms { &builtin } else { &fake };
         let loaded = load(&find(name).unwrap(), &Overrides::default(), adapters);
-        assert_eq!(loaded.render(false), "", "{name}");
+        let text = loaded.render(false);
+        // Keys for the end effector and for single joints are not pressed at once.
+        let warned = name.starts_with("keyboard-teleop-") && !text.contains("error:");
+        assert!(text.is_empty() || warned, "{name}: {text}");
         let blueprint = loaded.blueprint.unwrap();
         assert_eq!(blueprint.name, name);
         assert!(!blueprint.description.is_empty());

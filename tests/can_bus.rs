@@ -133,6 +133,23 @@ fn unacknowledged_frames_wait_even_when_the_port_closes() {
 }
 
 #[test]
+fn a_port_takes_back_its_own_frames_where_the_bus_lets_it() {
+    let bus = Bus::new();
+    let mut arm = bus.attach().unwrap();
+    let (mut one, mut two) = (port(&bus, &[]), port(&bus, &[]));
+    bus.withhold(8);
+    one.send(&[frame(1, 1), frame(1, 2)]).unwrap();
+    two.send(&[frame(2, 1)]).unwrap();
+    assert_eq!((one.discard(), one.waiting(), two.waiting()), (Ok(0), 0, 1));
+    one.send(&[frame(1, 3)]).unwrap();
+    bus.keep_waiting(true);
+    assert_eq!((one.discard(), one.waiting()), (Ok(1), 1), "as on an interface of the system");
+    assert_eq!(bus.acknowledge(), 2);
+    assert_eq!(frames(&mut arm), [frame(2, 1), frame(1, 3)]);
+    assert_eq!((one.discard(), two.discard()), (Ok(0), Ok(0)));
+}
+
+#[test]
 fn an_interface_that_went_down_breaks_its_ports_for_good() {
     let bus = Bus::new();
     let mut arm = bus.attach().unwrap();

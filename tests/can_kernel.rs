@@ -140,6 +140,49 @@ fn a_queue_that_nobody_empties_takes_fewer_frames() {
     });
 }
 
+/// What a port has sent is followed until it is transmitted, and never heard by the port itself.
+fn followed_until_transmitted(name: &str, peer: &str) {
+    let commands = [CanFilter { id: 0x150, mask: 0x7F0 }];
+    let (mut port, mut arm) = (open(name, &commands), open(peer, &[CanFilter { id: 0x155, mask: 0x7FF }]));
+    sh(&format!("tc qdisc add dev {name} root plug limit 100000; tc qdisc change dev {name} root plug block"));
+    let sent = numbered(5);
+    assert_eq!((port.send(&sent), port.waiting()), (Ok(5), 5));
+    assert_eq!((port.receive(), port.waiting()), (Ok(None), 5));
+    assert_eq!(port.discard(), Ok(5), "nothing of it can be taken back");
+    assert!((SEND_QUEUE / 2..=SEND_QUEUE).contains(&(5 + port.send(&numbered(100)).unwrap())), "nor does more fit");
+    sh(&format!("tc qdisc change dev {name} root plug release_indefinite"));
+    assert!(readable(&*arm, WAIT));
+    let heard = std::iter::from_fn(|| arm.receive().unwrap()).take(5);
+    assert_eq!(heard.collect::<Vec<_>>(), sent.iter().map(|frame| CanEvent::Frame(*frame)).collect::<Vec<_>>());
+    assert_eq!((port.receive(), port.waiting(), port.discard()), (Ok(None), 0, Ok(0)));
+    let rest = std::iter::from_fn(|| arm.receive().unwrap()).count();
+    assert!(rest < SEND_QUEUE, "{rest}");
+    for _ in 0..100 {
+        assert_eq!(port.send(&sent[..4]), Ok(4), "and goes on");
+        assert_eq!((port.receive(), port.waiting()), (Ok(None), 0));
+    }
+    assert_eq!(frames(&mut arm, 400).len(), 400);
+}
+
+/// An interface whose driver does not say when a frame was transmitted: what waits shows in the kernel's memory.
+#[test]
+fn frames_are_followed_by_the_memory_that_they_take() {
+    in_guest("frames_are_followed_by_the_memory_that_they_take", &Guest::with(uml::VXCAN), || {
+        followed_until_transmitted("can0", "sim0");
+    });
+}
+
+/// An interface whose driver echoes a frame when it was transmitted, as those of real controllers do.
+#[test]
+fn frames_are_followed_by_their_echoes() {
+    let setup = "
+        rmmod vcan; insmod $(find /usr/lib/uml/modules/$(uname -r) -name vcan.ko) echo=1
+        ip link add vcan9 type vcan; ip link set vcan9 up";
+    in_guest("frames_are_followed_by_their_echoes", &Guest::with(setup), || {
+        followed_until_transmitted("vcan9", "vcan9");
+    });
+}
+
 /// The arm has lost its power: what is in the kernel's queue goes out when it is back, unless the interface goes down.
 #[test]
 fn closing_the_port_takes_nothing_back_and_taking_the_interface_down_does() {

@@ -481,7 +481,15 @@ fn f29_a_device_has_one_program() {
     arm.record();
     let seen = |wanted| arm.trace().iter().filter(|r| r.request == wanted).count();
     let port = arm.address().rsplit(':').next().unwrap().to_owned();
-    for address in [arm.address(), format!("localhost:{port}"), format!("LOCALHOST:0{port}")] {
+    let spellings = [
+        arm.address(),
+        format!("localhost:{port}"),
+        format!("LOCALHOST:0{port}"),
+        format!("\"[::ffff:127.0.0.1]:{port}\""),
+        format!("\"[::FFFF:7f00:1]:{port}\""),
+        format!("0x7f000001:{port}"),
+    ];
+    for address in spellings {
         let second = home.dimos(&format!("run {RUN} --name second --set hardware.arm.address={address}"));
         second.with(3).says(&["in use by process", &first.pid().to_string(), "hint: "]);
     }

@@ -5,7 +5,9 @@
 #[path = "support/uml.rs"]
 mod uml;
 
+use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use dimos::hardware::arms::piper::GripperKind;
@@ -14,6 +16,7 @@ use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
+use dimos::joint::ControlMode;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use uml::{Guest, in_guest, sh};
 
@@ -120,6 +123,35 @@ fn an_interface_may_go_down_and_come_back() {
     });
 }
 
+/// The interface sends nothing for a while: at most two set points wait, and after `discard_pending` nothing new goes out
+/// before they are transmitted.
+#[test]
+fn at_most_two_set_points_wait_in_the_kernel() {
+    in_guest("at_most_two_set_points_wait_in_the_kernel", &Guest::with(uml::VXCAN), || {
+        let emulator = emulator("sim0", &SimOptions::default());
+        let mut arm = adapter("can0");
+        arm.connect().unwrap();
+        arm.activate().unwrap();
+        arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+        sh("tc qdisc add dev can0 root plug limit 100000; tc qdisc change dev can0 root plug block");
+        emulator.record();
+        let mut target = [0.1, 0.6, -0.7, 0.05, 0.4, -0.1];
+        let taken = (0..20).filter(|_| {
+            target[0] += 0.002;
+            arm.write_joint_positions(&target, 1.0).is_ok()
+        });
+        let taken = taken.count();
+        assert!((1..=2).contains(&taken), "{taken} set points wait");
+        arm.discard_pending();
+        assert!(arm.write_stop().is_err() && arm.is_connected(), "they must be out first");
+        sh("tc qdisc change dev can0 root plug release_indefinite");
+        until("a stop", || arm.write_stop().is_ok());
+        until("the stop at the arm", || emulator.trace().iter().filter(|(_, f)| f.id == 0x157).count() == taken + 1);
+        let ids: Vec<u16> = emulator.trace().iter().map(|(_, frame)| frame.id).collect();
+        assert!(ids.len() <= 12, "{ids:x?}");
+    });
+}
+
 #[test]
 fn two_arms_on_two_interfaces_do_not_hear_each_other() {
     in_guest("two_arms_on_two_interfaces_do_not_hear_each_other", &Guest::with(uml::VCAN), || {
@@ -145,15 +177,99 @@ fn two_arms_on_two_interfaces_do_not_hear_each_other() {
     });
 }
 
+/// Streams the arm's pose as a device thread does, until the arm is not as ordered any more: the mode, or the motors.
+fn stream_until_changed(arm: &mut PiperAdapter, reading: &mut JointReading) {
+    let pose = reading.position;
+    until("a sign of the change", || {
+        let _ = arm.read_joints(reading);
+        if arm.get_control_mode() != ControlMode::ServoPosition || !arm.read_enabled().unwrap_or(true) {
+            return true;
+        }
+        let _ = arm.write_joint_positions(&pose[..6], 1.0);
+        std::thread::sleep(Duration::from_millis(5));
+        false
+    });
+}
+
+/// The vendor's SDK beside the adapter on one interface: the adapter does not hear it, and sees in the arm's feedback what
+/// its calls change. They are not undone.
+fn interfere(test: &str, kinds: &[&str], pauses: &[u32], feedback_hz: f64) {
+    if !has_sdk() {
+        return;
+    }
+    let guest = Guest { limit: Duration::from_secs(180), ..Guest::with(uml::VXCAN) };
+    in_guest(test, &guest, || {
+        let emulator = emulator("sim0", &SimOptions { feedback_hz, ..SimOptions::default() });
+        let mut sdk = Command::new(".venv/bin/python")
+            .args(["tests/python/piper_sdk_interferes.py", "can0"])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let (mut calls, mut answers) = (sdk.stdin.take().unwrap(), BufReader::new(sdk.stdout.take().unwrap()).lines());
+        let mut answered = |word: &str| assert_eq!(answers.next().unwrap().unwrap(), word);
+        answered("ready");
+        let mut arm = adapter("can0");
+        arm.connect().unwrap();
+        let mut reading = JointReading::default();
+        for (kind, pause) in kinds.iter().flat_map(|kind| pauses.iter().map(move |pause| (kind, pause))) {
+            until("the arm", || arm.write_clear_errors().is_ok() && arm.write_enable(true).is_ok());
+            arm.set_control_mode(ControlMode::ServoPosition).unwrap();
+            arm.read_joints(&mut reading).unwrap();
+            arm.write_joint_positions(&reading.position[..6], 1.0).unwrap();
+            emulator.record();
+            writeln!(calls, "{kind} {pause}").unwrap();
+            stream_until_changed(&mut arm, &mut reading);
+            answered("done");
+            assert!(arm.write_joint_positions(&reading.position[..6], 1.0).is_err(), "{kind} {pause}");
+            let trace = emulator.trace();
+            // Of the frames that change a mode or switch motors, there are the SDK's only.
+            let orders = trace.iter().filter(|(_, f)| matches!(f.id, 0x150 | 0x151 | 0x471)).count();
+            assert_eq!(orders, if *kind == "pose" { 1 } else { 2 }, "{kind} {pause}: {trace:x?}");
+            println!("{kind}, {pause} ms apart: seen, left alone");
+            if *kind == "pose" {
+                let there = |joints: &[f64]| emulator.joints().1.iter().all(|v| v.abs() < 1e-3) && joints[1] > 0.0;
+                until("the SDK's pose", || there(&emulator.joints().0));
+            }
+        }
+        drop(calls);
+        sdk.wait().unwrap();
+    });
+}
+
+#[test]
+fn what_the_vendors_sdk_changes_of_the_mode_is_seen_and_left_alone() {
+    // At the full rate the SDK's Python takes most of the guest's one processor.
+    interfere(
+        "what_the_vendors_sdk_changes_of_the_mode_is_seen_and_left_alone",
+        &["pose", "guiding"],
+        &[0, 5, 200],
+        20.0,
+    );
+}
+
+#[test]
+fn what_the_vendors_sdk_changes_of_the_power_is_seen_and_left_alone() {
+    // The arm's motors tell that they are off with every fifth state: a shorter pause may hide in a stall of the guest.
+    interfere("what_the_vendors_sdk_changes_of_the_power_is_seen_and_left_alone", &["power"], &[200], 200.0);
+}
+
+fn has_sdk() -> bool {
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
+    let mut import = Command::new(&python);
+    let has = import.args(["-c", "import piper_sdk"]).stderr(Stdio::null()).status().is_ok_and(|s| s.success());
+    if !has {
+        assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "piper_sdk is missing (make test-tools)");
+        println!("SKIPPED: piper_sdk in .venv (make test-tools)");
+    }
+    has
+}
+
 /// The vendor's SDK opens its sockets without local loopback: on one interface its commands would reach nobody here.
 #[test]
 fn the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces() {
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
-    let mut import = std::process::Command::new(&python);
-    if !import.args(["-c", "import piper_sdk"]).stderr(std::process::Stdio::null()).status().is_ok_and(|s| s.success())
-    {
-        assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "piper_sdk is missing (make test-tools)");
-        return println!("SKIPPED: piper_sdk in .venv (make test-tools)");
+    if !has_sdk() {
+        return;
     }
     let name = "the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces";
     let guest = Guest { limit: Duration::from_secs(180), ..Guest::with(uml::VXCAN) };

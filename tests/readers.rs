@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::mpsc::channel;
 
 use dimos::arm::{ArmCommand, ArmState, Link, Pose, VelocitySource};
 use dimos::clock::{Mono, WallOffset};
 use dimos::joint::{ControlMode, joints_of, make_joints};
 use dimos::recording::log_writer::LogAttachment;
+use dimos::recording::notes::channel;
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
 use dimos::recording::replay::LogReader;
 use dimos::telemetry::describe::{ArmNames, Names, Severity};
@@ -31,6 +31,7 @@ fn record(path: &Path) {
         }],
         metadata: BTreeMap::new(),
         wall: WallOffset::of(Mono(5_000_000_000), WALL),
+        min_free: 0,
     };
     let (mut ring, consumer) = rtrb::RingBuffer::new(4096);
     let (notes, receiver) = channel();

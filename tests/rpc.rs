@@ -10,7 +10,7 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::time::Duration;
 
 use dimos::rpc::Code;
-use dimos::rpc::api::{MAX_CONNECTIONS, MAX_LINE, MAX_SUBSCRIPTIONS, Move, State, Status};
+use dimos::rpc::api::{MAX_CONNECTIONS, MAX_LINE, MAX_SUBSCRIPTIONS, Move, RESERVED_CONNECTIONS, State, Status};
 use dimos::rpc::client::{Client, ClientError};
 use dimos::rpc::place::{PlaceError, RunFolder};
 use dimos::rpc::server::Server;
@@ -256,24 +256,32 @@ fn a_client_that_never_reads_holds_up_nobody() {
 fn connections_and_subscriptions_are_bounded() {
     let folder = tempfile::tempdir().unwrap();
     let (server, _) = start(folder.path(), "test", FakeBackend::default());
+    let subscribe = r#"{"id":1,"method":"subscribe","params":{"stream":"events"}}"#;
+    // Who subscribes is not closed to make room.
     let mut taken: Vec<Raw> = (0..MAX_CONNECTIONS).map(|_| Raw::connect(&server)).collect();
     for raw in &mut taken {
-        assert_eq!(raw.ask(r#"{"id":1,"method":"state"}"#)["id"], json!(1));
+        assert_eq!(raw.ask(subscribe)["id"], json!(1));
     }
-    for _ in 0..1000 {
+    for _ in 0..300 {
         let mut refused = Raw::connect(&server);
-        assert_eq!(code(&refused.read()), "TOO_MANY_CONNECTIONS");
+        assert_eq!(code(&refused.ask(r#"{"id":1,"method":"state"}"#)), "TOO_MANY_CONNECTIONS");
         assert!(refused.is_closed());
     }
     let error = Client::connect("test", server.socket()).unwrap().call(State {}).unwrap_err();
     assert!(matches!(error, ClientError::Refused(e) if e.code == Code::TooManyConnections));
+    // What always gets through does, however many have come and said nothing.
+    let _silent: Vec<Raw> = (0..3 * RESERVED_CONNECTIONS).map(|_| Raw::connect(&server)).collect();
+    for method in ["stop", "cancel", "status", "shutdown"] {
+        let reply = Raw::connect(&server).ask(&format!(r#"{{"id":7,"method":"{method}"}}"#));
+        assert!(reply["result"].is_object(), "{reply}");
+    }
     taken.pop();
     eventually("a place that was given up is free", || {
         Client::connect("test", server.socket()).unwrap().call(State {}).is_ok()
     });
 
     let raw = taken.first_mut().unwrap();
-    for _ in 0..MAX_SUBSCRIPTIONS {
+    for _ in 1..MAX_SUBSCRIPTIONS {
         let reply = raw.ask(r#"{"id":1,"method":"subscribe","params":{"stream":"events"}}"#);
         assert!(reply["result"]["subscription"].is_u64(), "{reply}");
     }

@@ -15,8 +15,6 @@ use wire::judge::position;
 
 /// How far a first set point may be from where the arm is [rad]: what a moved joint is told by, too.
 const BESIDE: f64 = 0.02;
-/// A joint at rest is this close to its set point, in every emulator [rad].
-const ACCURACY: f64 = 0.005;
 
 fn arms() -> Vec<Arm> {
     let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC)];
@@ -177,7 +175,7 @@ fn a_joint_that_is_blocked_holds_the_arm_and_does_not_lunge_when_it_comes_free()
         if held_after.is_none_or(|after| after > Duration::from_millis(190 + 100 + 300)) {
             failures.push(format!("a blocked joint: held after {held_after:?}"));
         }
-        if lunged > ACCURACY + 0.05 {
+        if lunged > arm.accuracy() + 0.05 {
             failures.push(format!("it lunged by {lunged:.4} rad when it came free"));
         }
         failures
@@ -207,7 +205,7 @@ fn enabled_again_after_a_stop_an_arm_does_not_step() {
                 for (j, (a, b)) in before.iter().zip(now).enumerate() {
                     let most = bed.bounds.velocity[j] * PERIOD + arm.rounding;
                     let from_the_arm = here.get(j).map_or(f64::INFINITY, |q| (b - q).abs());
-                    if (a - b).abs() > most && from_the_arm > ACCURACY {
+                    if (a - b).abs() > most && from_the_arm > arm.accuracy().max(0.005) {
                         failures.push(format!(
                             "joint {}: a step of {:.4} rad, allowed {most:.4}",
                             j + 1,

@@ -107,7 +107,7 @@ fn begin(bed: &Bed, kind: Kind, time: Duration) -> dimos::clock::Mono {
 /// Whether the arm's states stop coming in such a stall for longer than they may.
 fn must_hold(arm: &Arm, kind: Kind, time: Duration) -> bool {
     let silent = matches!(kind, Kind::Controller | Kind::Wire(Stall::Both | Stall::FromArm | Stall::Drop));
-    silent && time.as_secs_f64() > arm.stale_after + 3.0 * PERIOD
+    silent && time.as_secs_f64() > arm.stale_after() + 3.0 * PERIOD
 }
 
 fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
@@ -175,7 +175,7 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
         }
         if held {
             // The arm's own lag, too.
-            let delay = bed.arm.time_limit.unwrap_or_default() + bed.arm.stale_after;
+            let delay = bed.arm.time_limit.unwrap_or_default() + bed.arm.stale_after();
             verdicts.push(bed.bounds.went(&from, &bed.truth(), delay, 0.1, began));
         } else if must_hold(&bed.arm, kind, time) {
             verdicts.push(Err(format!("it is {} after {time:?} of silence", bed.phase().0)));

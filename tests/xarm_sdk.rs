@@ -1,6 +1,10 @@
 //! The vendor's own client, in a process of its own, against our emulator at the arm's own ports: it connects,
 //! enables, moves, reads, sets velocities, uses the gripper and the force/torque sensor, sees errors and clears them.
 
+#[path = "support/program.rs"]
+#[allow(dead_code)]
+mod program;
+
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -114,4 +118,34 @@ fn an_old_firmware_satisfies_the_vendors_client_too() {
     let Some((_emulator, host)) = emulator(20, 6, options) else { return };
     let Some(child) = client("old", &host) else { return };
     ends_well(child);
+}
+
+#[test]
+fn the_vendors_client_takes_an_arm_over_from_a_run() {
+    for (i, spacing) in [0, 5, 200].into_iter().enumerate() {
+        let Some((emulator, host)) = emulator(30 + i as u8, 6, json!({})) else { return };
+        let home = program::Home::new();
+        let gripper = "--set hardware.arm.options.gripper=none";
+        let run = home.run(&format!("coordinator-xarm6 --no-record --set hardware.arm.address={host} {gripper}"));
+        program::eventually("ready", || home.status()["arms"][0]["phase"] == "ready");
+        let start = emulator.joints().0;
+        emulator.record();
+        let Some(child) = client(&format!("takeover-{spacing}"), &host) else { return };
+        ends_well(child);
+        program::eventually("the hold", || home.status()["arms"][0]["cause"]["name"] == "mode_changed");
+        run.end(rustix::process::Signal::INT);
+        // From the client's change of mode on, all orders are the client's; what was on its way is refused.
+        let trace = emulator.trace();
+        let begin = trace.iter().position(|r| r.register == 19).unwrap();
+        let orders = trace[begin..].iter().filter(|r| [11, 12, 16, 19, 21, 23, 30, 81].contains(&r.register));
+        let orders: Vec<_> = orders.map(|r| (r.register, r.payload[0])).collect();
+        assert!(matches!(orders[..], [(19, 0), (12, 0), (23, _)]), "{spacing} ms: {orders:?}");
+        let set_points: Vec<_> = trace[begin..].iter().filter(|r| r.register == 29).collect();
+        assert!(
+            set_points.len() <= 2 && set_points.iter().all(|r| r.status & 0x58 != 0),
+            "{spacing} ms: {set_points:?}"
+        );
+        let end = emulator.joints().0;
+        assert!((0..6).all(|j| (end[j] - start[j] - 0.4).abs() < 1e-3), "{spacing} ms: {start:?} to {end:?}");
+    }
 }

@@ -21,6 +21,7 @@ mod reference;
 mod registry;
 mod resolve;
 pub mod schema;
+pub mod size;
 mod summary;
 mod task_robots;
 mod tasks;

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::planner::{PlannerConfig, ViewConfig};
 use crate::blueprint::range::{self, tick_rate};
+use crate::blueprint::size::Size;
 use crate::yaml::{Keyed, Located, Raw};
 
 /// A blueprint: which arms there are, and what is done with them.
@@ -316,11 +317,14 @@ pub struct RecordingConfig {
     pub directory: Option<String>,
     /// How many logs are kept there, the newest ones; 0 = all.
     pub keep: u32,
+    /// Room that the disk of the log must have, such as `200 MB`, or in bytes; 0 = any. A run does not start with less,
+    /// and ends when the room falls below: its log is closed and stays whole.
+    pub min_free: Size,
 }
 
 impl Default for RecordingConfig {
     fn default() -> Self {
-        Self { enabled: true, directory: None, keep: 20 }
+        Self { enabled: true, directory: None, keep: 20, min_free: Size(200_000_000) }
     }
 }
 

@@ -20,8 +20,15 @@ pub struct Args {
 enum Action {
     /// Enable the motors and make the arm ready for motion, where it is
     Enable(Which),
-    /// Disable the motors; an arm that `list-adapters` does not say to hold falls, unless supported
-    Disable(Which),
+    /// Bring the arm to rest and disable the motors; an arm without brakes (`list-adapters`: HOLDS = no) drops unless
+    /// supported
+    Disable {
+        #[command(flatten)]
+        which: Which,
+        /// Switch the motors off at once, also while the arm moves
+        #[arg(long)]
+        now: bool,
+    },
     /// Clear a latched hold or a fault; moves nothing, enables nothing
     Reset(Which),
     /// Open or close the gripper
@@ -84,13 +91,13 @@ impl Opening {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let (Action::Enable(which) | Action::Disable(which) | Action::Reset(which) | Action::Gripper { which, .. }) =
+    let (Action::Enable(which) | Action::Disable { which, .. } | Action::Reset(which) | Action::Gripper { which, .. }) =
         &args.action;
     let mut client = which.target_run.connect()?;
     let arm = which.arm.clone();
     let reply = match &args.action {
         Action::Enable(_) => client.call(ArmEnable { arm })?,
-        Action::Disable(_) => client.call(ArmDisable { arm })?,
+        Action::Disable { now, .. } => client.call(ArmDisable { arm, now: *now })?,
         Action::Reset(_) => client.call(ArmReset { arm })?,
         Action::Gripper { opening, .. } => {
             let position = opening.of(&mut client, &arm)?;
@@ -107,6 +114,9 @@ pub fn run(args: &Args) -> Result {
         output::json(&reply);
     } else {
         output::line(format_args!("{}: {}", reply.arm, reply.phase));
+        if let Some(note) = &reply.note {
+            output::note(format_args!("{}: {note}", reply.arm));
+        }
         if matches!(args.action, Action::Reset(_)) {
             output::note(format_args!("next, when it may move again: dimos arm enable {}", reply.arm));
         }

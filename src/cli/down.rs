@@ -50,7 +50,7 @@ pub fn run(args: &Args) -> Result {
     }
     match noted() {
         Some(record) if record.fell() => {
-            let exit = if record.fate() == Fate::Crashed { Exit::Failed } else { Exit::Fault };
+            let exit = if let Fate::Ended(end) = record.fate() { Exit::of(end.exit) } else { Exit::Failed };
             Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it fell")) })
         }
         Some(RunRecord { log: Some(log), .. }) => {

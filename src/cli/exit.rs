@@ -17,6 +17,8 @@ pub enum Exit {
     Hardware = 3,
     /// A run ended by a fault.
     Fault = 4,
+    /// A run ended because its log did: no room on the disk, or the log was removed.
+    Log = 5,
     /// Ended by SIGINT, after the controlled stop.
     Interrupted = 130,
     /// Ended by SIGTERM, after the controlled stop.
@@ -26,7 +28,7 @@ pub enum Exit {
 impl Exit {
     /// The exit code of a number; one that is not in the contract (a crash) counts as failed.
     pub fn of(code: u8) -> Self {
-        let all = [Self::Ok, Self::Usage, Self::Hardware, Self::Fault, Self::Interrupted, Self::Terminated];
+        let all = [Self::Ok, Self::Usage, Self::Hardware, Self::Fault, Self::Log, Self::Interrupted, Self::Terminated];
         all.into_iter().find(|exit| *exit as u8 == code).unwrap_or(Self::Failed)
     }
 

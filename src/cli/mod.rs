@@ -23,6 +23,7 @@ pub mod logs;
 pub mod man;
 pub mod model;
 pub mod move_to;
+mod other_users;
 pub mod output;
 pub mod plan;
 pub mod preview;

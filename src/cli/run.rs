@@ -199,11 +199,14 @@ fn keep_up(
     say_goodbye(terminal, &report, &ending, &ended, json);
     let exit = match &ending {
         Ending::Fault(_) => Exit::Fault,
+        Ending::Log(_) => Exit::Log,
+        _ if ended.log_cut.is_some() => Exit::Log,
         Ending::Signal(signal) => Exit::by_signal(*signal),
         Ending::Duration | Ending::Asked => Exit::Ok,
     };
     if let Some(record) = record {
-        record.end(exit, why(&ending));
+        let why = ended.log_cut.clone().filter(|_| exit == Exit::Log).unwrap_or_else(|| why(&ending));
+        record.end(exit, why);
     }
     terminal.flush();
     Ok(exit)
@@ -230,6 +233,7 @@ pub(super) fn why(ending: &Ending) -> String {
         },
         Ending::Duration => "its time is over".to_owned(),
         Ending::Asked => "asked to end".to_owned(),
+        Ending::Log(what) => what.clone(),
         Ending::Fault(what) => format!("FAULT: {what}"),
     }
 }
@@ -242,11 +246,20 @@ fn say_goodbye(terminal: &Terminal, report: &StatusReport, ending: &Ending, ende
         why: String,
         troubles: &'a [String],
         log: Option<&'a PathBuf>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        log_cut: Option<&'a String>,
     }
     if json {
         let log = ended.log.as_ref();
         let (run, troubles) = (report.run.as_str(), ended.troubles.as_slice());
-        return terminal.json(&Line { event: "ended", run, why: why(ending), troubles, log });
+        return terminal.json(&Line {
+            event: "ended",
+            run,
+            why: why(ending),
+            troubles,
+            log,
+            log_cut: ended.log_cut.as_ref(),
+        });
     }
     for trouble in &ended.troubles {
         terminal.note(format_args!("warning: {trouble}"));
@@ -254,8 +267,9 @@ fn say_goodbye(terminal: &Terminal, report: &StatusReport, ending: &Ending, ende
     for arm in &report.arms {
         terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
     }
-    match &ended.log {
-        Some(log) => terminal.note(format_args!("run {} ended; its log: {}", report.run, log.display())),
-        None => terminal.note(format_args!("run {} ended; no log was written", report.run)),
+    match (&ended.log, &ended.log_cut) {
+        (Some(_), Some(cut)) => terminal.note(format_args!("run {} ended; its log is incomplete: {cut}", report.run)),
+        (Some(log), None) => terminal.note(format_args!("run {} ended; its log: {}", report.run, log.display())),
+        (None, _) => terminal.note(format_args!("run {} ended; no log was written", report.run)),
     }
 }

@@ -122,11 +122,11 @@ impl RunRecord {
         }
     }
 
-    /// Whether it came to an end that nobody wanted: it crashed, or a fault ended it.
+    /// Whether it came to an end that nobody wanted: it crashed, or a fault or the end of its log ended it.
     pub fn fell(&self) -> bool {
         match self.fate() {
             Fate::Lives => false,
-            Fate::Ended(end) => end.exit == Exit::Fault as u8,
+            Fate::Ended(end) => [Exit::Fault as u8, Exit::Log as u8].contains(&end.exit),
             Fate::Crashed => true,
         }
     }

@@ -229,6 +229,9 @@ fn print_arms(arms: &[ArmReport]) {
         if let Some(cause) = &arm.cause {
             output::line(format_args!("  {name} is {}: {}", arm.phase, cause.text));
         }
+        if arm.stop_pending {
+            output::line(format_args!("  {name}: a stop was not sent yet; it is delivered after the reconnect"));
+        }
         if let Some(error) = &arm.error {
             output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));
         }

@@ -3,21 +3,24 @@
 use std::collections::BTreeMap;
 
 use super::arguments::Target;
-use super::exit::{Exit, Failure, Result};
+use super::exit::{Exit, Failure};
+use super::other_users;
 use super::output::{self, Table, Tone, toned};
+use crate::rpc::Code;
 use crate::rpc::api::{Confirmation, Stop, StopReply};
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::place::{LiveRun, RunFolder};
+use crate::rpc::place::LiveRun;
 
 /// Arguments of `stop`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
+Stops every arm of every live run of this user, unless ARM or --run narrows it.
 The arms stay powered and held; no task moves them until `dimos arm reset ARM` and `dimos arm enable ARM`.
 Exit code 0 only when every arm confirmed. This is an operational stop and no safety function.")]
 pub struct Args {
-    /// Stop this arm only
+    /// Stop only the arm with this hardware_id, in every run that has it
     pub arm: Option<String>,
-    /// Stop all arms (the default), of all live runs where none is named
+    /// Stop all arms of all runs (the default)
     #[arg(long, conflicts_with = "arm")]
     pub all: bool,
     /// Which run
@@ -25,18 +28,16 @@ pub struct Args {
     pub target_run: Target,
 }
 
+type Result<T = Exit, E = Failure> = std::result::Result<T, E>;
+
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let runs = if args.all && args.target_run.run.is_none() {
-        args.target_run.named_or_all()?
-    } else {
-        vec![crate::rpc::client::find(&RunFolder::standard(), args.target_run.run.as_deref())?]
-    };
-    if runs.is_empty() {
-        return Err(ClientError::NoRun.into());
-    }
+    let runs = args.target_run.named_or_all()?;
     // One run that does not answer must not keep the others moving.
-    let replies: Vec<(&LiveRun, Result<StopReply>)> = runs.iter().map(|run| (run, stop(run, args))).collect();
+    let replies: Vec<(&LiveRun, Result<StopReply, ClientError>)> = std::thread::scope(|scope| {
+        let asked: Vec<_> = runs.iter().map(|run| (run, scope.spawn(|| stop(run, args)))).collect();
+        asked.into_iter().filter_map(|(run, answer)| Some((run, answer.join().ok()?))).collect()
+    });
     let done: BTreeMap<&str, &StopReply> =
         replies.iter().filter_map(|(run, r)| r.as_ref().ok().map(|r| (run.name.as_str(), r))).collect();
     if args.target_run.json {
@@ -44,10 +45,22 @@ pub fn run(args: &Args) -> Result {
     } else if !done.is_empty() {
         print(&done);
     }
+    if args.target_run.run.is_none() {
+        for other in other_users::runs() {
+            output::note(format_args!("not stopped: run {other}; only that user can stop it"));
+        }
+    }
+    if runs.is_empty() {
+        return Err(ClientError::NoRun.into());
+    }
     let confirmed = done.values().flat_map(|r| r.arms.values()).all(|c| *c == Confirmation::Confirmed);
-    let mut failures = replies.into_iter().filter_map(|(_, reply)| reply.err());
+    let stopped_any = !done.is_empty();
+    // A run without the arm is no failure as long as another one has it.
+    let is_elsewhere = |e: &ClientError| matches!(e, ClientError::Refused(e) if e.code == Code::UnknownArm);
+    let failures = replies.into_iter().filter_map(|(_, reply)| reply.err());
+    let mut failures = failures.filter(|e| !(stopped_any && is_elsewhere(e))).map(Failure::from);
     if let Some(first) = failures.next() {
-        failures.for_each(|failure| output::failure(&failure));
+        failures.filter(|failure| *failure != first).for_each(|failure| output::failure(&failure));
         return Err(first);
     }
     if !confirmed {
@@ -57,9 +70,8 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-fn stop(run: &LiveRun, args: &Args) -> Result<StopReply> {
-    let mut client = Client::connect(&run.name, &run.socket)?;
-    Ok(client.call(Stop { arm: args.arm.clone() })?)
+fn stop(run: &LiveRun, args: &Args) -> Result<StopReply, ClientError> {
+    Client::connect(&run.name, &run.socket)?.call(Stop { arm: args.arm.clone() })
 }
 
 fn print(done: &BTreeMap<&str, &StopReply>) {

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use super::exit::{Failure, Result};
 use crate::rpc::api::{Point, Trajectory};
+use crate::trajectory::MAX_DURATION;
 
 /// Largest file that is read [bytes].
 const MAX_FILE: u64 = 16 << 20;
@@ -73,6 +74,10 @@ fn csv(text: &str) -> std::result::Result<Trajectory, Mistake> {
         }
         if values.len() != header.width {
             let what = format!("{} values for {} columns", values.len(), header.width);
+            return Err(Mistake { line, column: 1, what });
+        }
+        if let Some(time) = values.first().filter(|time| **time > MAX_DURATION) {
+            let what = format!("{time} s, and a trajectory may take {} h at most", MAX_DURATION / 3600.0);
             return Err(Mistake { line, column: 1, what });
         }
         let pick = |columns: &[usize]| columns.iter().filter_map(|c| values.get(*c).copied()).collect::<Vec<_>>();

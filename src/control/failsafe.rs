@@ -43,6 +43,7 @@ pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
         Link::Up if !freshness.fresh => Some(Cause::Stale(freshness.age)),
         Link::Up if state.interference == Interference::Mode => Some(Cause::ModeChanged),
         Link::Up if state.interference == Interference::Power => Some(Cause::PowerChanged),
+        Link::Up if state.interference == Interference::Stop => Some(Cause::StoppedElsewhere),
         Link::Up if state.self_held => Some(Cause::HeartbeatLost),
         Link::Up => None,
     }

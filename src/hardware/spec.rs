@@ -147,6 +147,13 @@ pub trait ManipulatorAdapter: Send {
     /// The mode the device is in, verified where it can tell.
     fn get_control_mode(&self) -> ControlMode;
 
+    /// What another client of the device, or a person at its panel, changed since the last `activate` or
+    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: nothing, or the device itself is the cause
+    /// (`read_error`). An adapter never undoes such a change by itself. Must not allocate.
+    fn foreign_change(&self) -> Option<&'static str> {
+        None
+    }
+
     // --- State ---
 
     /// For a device that sends its state by itself: what becomes readable when something has arrived. The device

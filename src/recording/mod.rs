@@ -10,12 +10,15 @@
 mod arm_messages;
 pub mod cdr;
 mod entries;
+mod executes;
 pub mod files;
 pub mod log_writer;
 pub mod messages;
+pub mod notes;
 pub mod recorder;
 pub mod records;
 pub mod replay;
+pub mod space;
 mod tick_log;
 pub mod wire;
 mod worker;

@@ -7,16 +7,18 @@ use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::Receiver;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use thiserror::Error;
 
 use super::log_writer::LogAttachment;
+pub use super::notes::Note;
+use super::notes::Noted;
+use super::space::Megabytes;
 use super::worker::Worker;
-use crate::clock::{Clock, Mono, MonotonicClock, WallOffset};
-use crate::telemetry::describe::{Described, Names, Severity};
+use crate::clock::{Clock, MonotonicClock, WallOffset};
+use crate::telemetry::describe::{Described, Names};
 use crate::telemetry::{Event, Sample};
 
 /// How often the ring is emptied: half as often as the log is flushed, because each time costs a wake-up.
@@ -43,36 +45,8 @@ pub struct RecorderConfig {
     pub metadata: BTreeMap<String, String>,
     /// Offset between monotonic and Unix time.
     pub wall: WallOffset,
-}
-
-/// What other threads want in the log.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Note {
-    /// A request, sent before it is told to the tick.
-    Request {
-        /// The id that the tick answers with.
-        id: u64,
-        /// When it came.
-        stamp: Mono,
-        /// The request as it was told to the tick.
-        json: String,
-    },
-    /// A line of text.
-    Log {
-        /// How much it matters.
-        severity: Severity,
-        /// When.
-        stamp: Mono,
-        /// The line.
-        text: String,
-    },
-    /// What an arm says about its present error.
-    ArmText {
-        /// Index of the arm.
-        arm: u16,
-        /// The text.
-        text: String,
-    },
+    /// The log ends when less room than this is left on its disk [bytes].
+    pub min_free: u64,
 }
 
 /// What the recorder tells while it runs, on its own thread: be quick.
@@ -89,7 +63,7 @@ pub enum Notice<'a> {
     },
     /// The recorder fell behind: so many samples are missing in the log.
     Lost(u32),
-    /// The log could not be written and ends here. Said once; the run goes on.
+    /// The log ends here, before the run. Said once; events are still told.
     Stopped(&'a RecordError),
 }
 
@@ -105,12 +79,33 @@ pub enum RecordError {
         source: std::io::Error,
     },
     /// A write failed.
-    #[error("the log {path} ends here: {reason}\nhint: see whether the disk is full; the run goes on without a log")]
+    #[error("the log {path} ends here: {reason}\nhint: see whether the disk is full; --no-record runs without a log")]
     Write {
         /// The log file.
         path: PathBuf,
         /// Why.
         reason: String,
+    },
+    /// The disk is nearly full.
+    #[error(
+        "the log {path}: only {free} are free on its disk, and {min_free} must be\n\
+         hint: make room, name another file with --record FILE, or set recording.min_free; --no-record runs without a log"
+    )]
+    Room {
+        /// The log file.
+        path: PathBuf,
+        /// What is free.
+        free: Megabytes,
+        /// What must be.
+        min_free: Megabytes,
+    },
+    /// The file is not where it was.
+    #[error(
+        "the log {path} ends here: it was removed or replaced while it was written\nhint: keep logs out of folders that are cleaned up"
+    )]
+    Removed {
+        /// The log file.
+        path: PathBuf,
     },
     /// The thread cannot be started.
     #[error("the recorder thread cannot be started: {0}\nhint: see whether a limit on threads or memory is reached")]
@@ -152,7 +147,7 @@ impl Recorder {
     pub fn start(
         config: RecorderConfig,
         ring: rtrb::Consumer<Sample>,
-        notes: Receiver<Note>,
+        notes: Noted,
         on_notice: impl FnMut(Notice<'_>) + Send + 'static,
     ) -> Result<Self, RecordError> {
         let stats = Arc::new(RecorderStats::default());

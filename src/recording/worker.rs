@@ -6,20 +6,24 @@ use std::io::{Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
 use mcap::{McapError, McapResult};
 
+use super::executes::{Execute, Executes};
 use super::log_writer::LogWriter;
+use super::notes::Noted;
 use super::recorder::{Note, Notice, RecordError, RecorderConfig, RecorderStats};
+use super::space;
 use super::tick_log::TickLog;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::telemetry::describe::{Described, Names, describe};
-use crate::telemetry::{Sample, TickSample};
+use crate::telemetry::{Event, Outcome, Sample, TickSample};
 
 /// How often the disk is asked to keep what it was given, against a loss of power.
 const SYNC_EVERY: Duration = Duration::from_secs(1);
+/// How often it is looked whether the disk has room and the log is still there.
+const WATCH_EVERY: Duration = Duration::from_millis(500);
 
 /// Samples and notes in, log and notices out. A test steps it on a clock of its own.
 pub(super) struct Worker<W: Write + Seek, F> {
@@ -28,10 +32,14 @@ pub(super) struct Worker<W: Write + Seek, F> {
     /// The file once more, to be told to keep what it has.
     disk: Option<File>,
     synced: Mono,
+    min_free: u64,
+    watched: Mono,
     ticks: TickLog,
     names: Names,
     ring: rtrb::Consumer<Sample>,
-    notes: Receiver<Note>,
+    notes: Noted,
+    /// Trajectories that the tick has not answered yet.
+    executes: Executes,
     on_notice: F,
     stats: Arc<RecorderStats>,
     ended: Option<RecordError>,
@@ -43,7 +51,7 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         sink: Option<W>,
         disk: Option<File>,
         ring: rtrb::Consumer<Sample>,
-        notes: Receiver<Note>,
+        notes: Noted,
         on_notice: F,
         stats: Arc<RecorderStats>,
     ) -> Result<Self, RecordError> {
@@ -59,7 +67,22 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         };
         let path = config.path.clone().unwrap_or_default();
         let log = sink.map(begin).transpose().map_err(|e| write_error(&path, &e))?;
-        Ok(Self { path, log, disk, synced: Mono::ZERO, ticks, names, ring, notes, on_notice, stats, ended: None })
+        Ok(Self {
+            path,
+            log,
+            disk,
+            synced: Mono::ZERO,
+            min_free: config.min_free,
+            watched: Mono::ZERO,
+            ticks,
+            names,
+            ring,
+            notes,
+            executes: Executes::default(),
+            on_notice,
+            stats,
+            ended: None,
+        })
     }
 
     /// Takes everything there is and logs it.
@@ -67,13 +90,30 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         // Counted before the notes are taken: a request is noted before it is told to the tick, so the note of every
         // request that these samples answer is there, and stands before the answer in the log.
         let waiting = self.ring.slots();
-        let notes: Vec<Note> = self.notes.try_iter().collect();
+        let notes = self.notes.take();
+        let lost = self.notes.lost();
+        if lost > 0 {
+            self.stats.dropped.fetch_add(lost, Ordering::Relaxed);
+            (self.on_notice)(Notice::Lost(lost.min(u64::from(u32::MAX)) as u32));
+        }
         let samples: Vec<Sample> = self.ring.read_chunk(waiting).into_iter().flatten().collect();
         // Events are told before anything waits for the disk.
         let mut described = self.tell_events(&samples);
         if let Err(e) = self.write(notes, &samples, &mut described, now) {
-            self.stop_log(&e);
+            self.stop_log(write_error(&self.path, &e));
+        } else if now.since(self.watched) >= WATCH_EVERY {
+            self.watched = now;
+            self.watch();
         }
+    }
+
+    /// Ends the log while there is still room to close it, or when it is not there any more.
+    fn watch(&mut self) {
+        let Some((file, _)) = self.disk.as_ref().zip(self.log.as_ref()) else { return };
+        let Err(reason) = space::watch(&self.path, file, self.min_free) else { return };
+        let closed = self.log.take().map(|log| log.finish().map(drop)).transpose();
+        // What the room is too small for is the worse news.
+        self.stop_log(closed.map_or_else(|e| write_error(&self.path, &e), |_| reason));
     }
 
     fn tell_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
@@ -101,7 +141,12 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         for sample in samples {
             match sample {
                 Sample::Arm(arm) => self.ticks.arm(*arm),
-                Sample::Event(tick, _) => self.ticks.event(*tick, described.pop_front()),
+                Sample::Event(tick, event) => {
+                    if let Event::Request(id, outcome) = event {
+                        self.answered(*id, outcome)?;
+                    }
+                    self.ticks.event(*tick, described.pop_front());
+                }
                 Sample::Tick(tick) => self.close(tick)?,
             }
         }
@@ -118,12 +163,26 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         let Some(log) = &mut self.log else { return Ok(()) };
         match note {
             Note::Request { id, stamp, json } => self.ticks.request(log, id, stamp, &json),
+            Note::Execute { id, stamp, task, motion, trajectory } => {
+                match self.executes.asked(id, Execute { stamp, task, motion, trajectory }) {
+                    Some((id, execute)) => self.ticks.request(log, id, execute.stamp, &execute.whole()),
+                    None => Ok(()),
+                }
+            }
             Note::Log { severity, stamp, text } => self.ticks.line(log, severity, stamp, &text),
             Note::ArmText { arm, text } => {
                 self.ticks.arm_text(arm, text);
                 Ok(())
             }
         }
+    }
+
+    /// A request has its answer: one to follow a trajectory is logged now.
+    fn answered(&mut self, id: u64, outcome: &Outcome) -> McapResult<()> {
+        let Some((log, execute)) = self.log.as_mut().zip(self.executes.answered(id)) else { return Ok(()) };
+        let taken_on = matches!(outcome, Outcome::Accepted);
+        let json = if taken_on { execute.whole() } else { execute.refused() };
+        self.ticks.request(log, id, execute.stamp, &json)
     }
 
     fn close(&mut self, tick: &TickSample) -> McapResult<()> {
@@ -142,10 +201,9 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         result
     }
 
-    fn stop_log(&mut self, e: &McapError) {
+    fn stop_log(&mut self, error: RecordError) {
         self.log = None;
         self.stats.failed.store(true, Ordering::Relaxed);
-        let error = write_error(&self.path, e);
         (self.on_notice)(Notice::Stopped(&error));
         self.ended = Some(error);
     }
@@ -153,10 +211,18 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
     /// Takes what is left and closes the log.
     pub(super) fn finish(mut self, now: Mono) -> Result<(), RecordError> {
         self.step(now);
+        for (id, execute) in std::mem::take(&mut self.executes).into_unanswered() {
+            if let Some(log) = &mut self.log
+                && let Err(e) = self.ticks.request(log, id, execute.stamp, &execute.whole())
+            {
+                self.stop_log(write_error(&self.path, &e));
+            }
+        }
+        self.watch();
         let Some(log) = self.log.take() else { return self.ended.map_or(Ok(()), Err) };
         let closed = log.finish().map(drop).and_then(|()| Ok(self.disk.as_ref().map_or(Ok(()), File::sync_data)?));
         closed.map_err(|e| {
-            self.stop_log(&e);
+            self.stop_log(write_error(&self.path, &e));
             write_error(&self.path, &e)
         })
     }
@@ -171,11 +237,10 @@ fn write_error(path: &Path, e: &McapError) -> RecordError {
 mod tests {
     use super::*;
     use crate::clock::WallOffset;
-    use crate::telemetry::Event;
+    use crate::recording::notes::channel;
     use std::collections::BTreeMap;
     use std::io::{Cursor, Error, ErrorKind, SeekFrom};
     use std::sync::Mutex;
-    use std::sync::mpsc::channel;
 
     /// A disk with little room left.
     struct Full {
@@ -213,6 +278,7 @@ mod tests {
             attachments: Vec::new(),
             metadata: BTreeMap::new(),
             wall: WallOffset::of(Mono::ZERO, 0),
+            min_free: 0,
         };
         let told = Arc::new(Mutex::new(Vec::new()));
         let sink = told.clone();
@@ -234,7 +300,7 @@ mod tests {
         assert_eq!(producer.slots(), 64);
         assert!(stats.failed.load(Ordering::Relaxed));
         let message = "the log run.mcap ends here: No space left on device\n\
-                       hint: see whether the disk is full; the run goes on without a log";
+                       hint: see whether the disk is full; --no-record runs without a log";
         assert_eq!(*told.lock().unwrap(), [message, "degraded"]);
         assert_eq!(worker.finish(Mono(1)).unwrap_err().to_string(), message);
     }

@@ -278,7 +278,7 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
 }
 
 fn interference(name: &str) -> Result<Interference, String> {
-    let all = [Interference::None, Interference::Mode, Interference::Power];
+    let all = [Interference::None, Interference::Mode, Interference::Power, Interference::Stop];
     all.into_iter().find(|i| i.name() == name).ok_or_else(|| format!("{name:?} is no interference"))
 }
 

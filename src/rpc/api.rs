@@ -24,7 +24,9 @@ use super::streams::Streams;
 /// Longest request line, newline included [bytes].
 pub const MAX_LINE: usize = 256 * 1024;
 /// Most connections to one run.
-pub const MAX_CONNECTIONS: usize = 64;
+pub const MAX_CONNECTIONS: usize = 128;
+/// Connections beside those that may `stop`, `cancel`, ask for `status` and `shutdown`.
+pub const RESERVED_CONNECTIONS: usize = 8;
 /// Most subscriptions of one connection.
 pub const MAX_SUBSCRIPTIONS: usize = 16;
 /// Lowest `speed` of a move, as a fraction of the arm's limits.
@@ -35,8 +37,8 @@ pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
 
 /// What stands behind the server: the run itself.
 pub trait Backend: Send + Sync + 'static {
-    /// Answers one request. Called from the server's thread, so it may wait but must not block; when it takes
-    /// longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is dropped.
+    /// Answers one request. Called from the server's threads, several at once; it may wait but must not block, or a
+    /// stop would wait for it. When it takes longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is dropped.
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
     /// The arms that `subject` is about, by `hardware_id`; none where it names something that is not there. Who
     /// moves an arm needs its lease.
@@ -51,6 +53,8 @@ pub trait Backend: Send + Sync + 'static {
         let _ = (planner, line);
         Err(RpcError::new(Code::Unsupported, "this run takes no planner"))
     }
+    /// Called once on the thread that answers `stop`, `cancel`, `status` and `shutdown`, before it does.
+    fn prepare_urgent_thread(&self) {}
     /// What the run publishes.
     fn streams(&self) -> &Streams;
 }

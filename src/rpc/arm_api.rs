@@ -67,6 +67,9 @@ pub struct ArmEnable {
 pub struct ArmDisable {
     /// The arm's `hardware_id`.
     pub arm: String,
+    /// Switches the motors off at once, also while the arm moves. Without it the arm is brought to rest first.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub now: bool,
 }
 
 /// An arm after `arm_reset`, `arm_enable` or `arm_disable`.
@@ -76,6 +79,9 @@ pub struct ArmReply {
     pub arm: String,
     /// Its phase now.
     pub phase: String,
+    /// What else there is to say about it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub note: Option<String>,
 }
 
 /// Parameters of `lease`: takes the right to move one arm, or all, for this connection.

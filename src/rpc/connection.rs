@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 use serde_json::Value;
-use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncWriteExt, BufReader};
+use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
 use tokio::sync::mpsc;
@@ -25,8 +25,9 @@ use super::api::{
     Registered, Release, Reply, Request, read_params,
 };
 use super::error::{Code, RpcError};
-use super::lease::{Lessee, Subject};
+use super::lease::{Leases, Lessee, Subject};
 use super::planner_line::PlannerLine;
+use super::seats::Seat;
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
 use super::subscription::{Pace, Subscription};
@@ -39,15 +40,17 @@ const IN_FLIGHT: usize = 32;
 /// Time for the client to take the last replies, and for the rest of an oversize line to pass.
 const FAREWELL: Duration = Duration::from_secs(1);
 
-/// Serves one client until it closes its end, or sends a line that is too long.
-pub(super) async fn serve(stream: UnixStream, backend: Arc<dyn Backend>, lessee: Lessee) {
+/// Serves one client until it closes its end, sends a line that is too long, or must make room. `read` was read of it
+/// before.
+pub(super) async fn serve(stream: UnixStream, read: Vec<u8>, backend: Arc<dyn Backend>, lessee: Lessee, seat: Seat) {
     let (from_client, to_client) = stream.into_split();
     let (queue, waiting) = mpsc::channel(QUEUE);
     let mut writer = tokio::spawn(write(to_client, waiting));
-    let mut from_client = BufReader::new(from_client);
+    let mut from_client = BufReader::new(std::io::Cursor::new(read).chain(from_client));
     let connection = Connection {
         backend,
         lessee,
+        seat,
         queue,
         in_flight: VecDeque::new(),
         running: JoinSet::new(),
@@ -73,9 +76,11 @@ struct Connection {
     backend: Arc<dyn Backend>,
     /// What it holds of the leases; they end with the conversation.
     lessee: Lessee,
+    /// Its place among the connections.
+    seat: Seat,
     queue: mpsc::Sender<String>,
     /// Targets that the tick has not answered yet, the oldest first.
-    in_flight: VecDeque<(Value, Answer)>,
+    in_flight: VecDeque<InFlight>,
     /// The subscriptions' tasks; dropping the set ends them.
     running: JoinSet<()>,
     subscriptions: BTreeMap<u64, AbortHandle>,
@@ -95,6 +100,14 @@ impl Drop for Connection {
 /// The answer to a request, when it comes.
 type Answer = Pin<Box<dyn Future<Output = Result<Reply, RpcError>> + Send>>;
 
+/// A target that the tick has not answered yet.
+struct InFlight {
+    id: Value,
+    /// The arms whose leases it needs.
+    arms: Vec<String>,
+    answer: Answer,
+}
+
 /// The client is gone.
 struct Gone;
 
@@ -103,8 +116,16 @@ impl Connection {
         let mut line = Vec::new();
         loop {
             let longest = self.longest();
+            if self.in_flight.is_empty() {
+                self.seat.pin(!self.subscriptions.is_empty() || self.planner.is_some());
+                self.seat.rest();
+            }
             let read = tokio::select! {
                 biased;
+                reason = self.seat.must_leave() => {
+                    let _ = timeout(FAREWELL, self.reply::<Done>(&Value::Null, Err(reason))).await;
+                    return;
+                }
                 done = oldest(&mut self.in_flight), if !self.in_flight.is_empty() => {
                     if self.send_oldest(done).await.is_err() {
                         return;
@@ -115,7 +136,7 @@ impl Connection {
                 read = read_line(from, &mut line, longest), if self.in_flight.len() < IN_FLIGHT => read,
             };
             match read {
-                Line::Whole => {}
+                Line::Whole => self.seat.begin(),
                 Line::End => {
                     let _ = self.settle().await;
                     return;
@@ -179,8 +200,8 @@ impl Connection {
     }
 
     async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Gone> {
-        let request = match self.lessee.admit(request, &*self.backend).await {
-            Ok(request) => request,
+        let (request, arms) = match self.lessee.admit(request, &*self.backend).await {
+            Ok(admitted) => admitted,
             Err(refusal) => return self.reply::<Done>(&id, Err(refusal)).await,
         };
         let is_target =
@@ -189,26 +210,20 @@ impl Connection {
         if !is_target {
             self.settle().await?;
             let result = answer.await;
+            self.lessee.settle(&arms, is_taken_on(&result));
             return self.reply(&id, result).await;
         }
         // Polled once, it is on its way to the tick, whatever is read next.
         if let Poll::Ready(result) = poll_fn(|cx| Poll::Ready(answer.as_mut().poll(cx))).await {
             answer = Box::pin(ready(result));
         }
-        self.in_flight.push_back((id, answer));
+        self.in_flight.push_back(InFlight { id, arms, answer });
         Ok(())
     }
 
     fn call(&self, method: String, request: Request) -> Answer {
         let (backend, leases) = (self.backend.clone(), self.lessee.leases().clone());
-        Box::pin(async move {
-            let Ok(result) = timeout(CALL_LIMIT, backend.call(request)).await else {
-                let waited = CALL_LIMIT.as_secs();
-                let error = RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"));
-                return Err(error.hint("it may still take effect; ask for `status`"));
-            };
-            result.map(|reply| leases.complete(reply))
-        })
+        Box::pin(async move { answer(&method, backend.call(request), &leases).await })
     }
 
     /// Waits for the answers to all targets that are on their way.
@@ -222,7 +237,14 @@ impl Connection {
 
     async fn send_oldest(&mut self, result: Result<Reply, RpcError>) -> Result<(), Gone> {
         match self.in_flight.pop_front() {
-            Some((id, _)) => self.send(wire::reply(&id, result)).await,
+            Some(InFlight { id, arms, .. }) => {
+                let taken_on = is_taken_on(&result);
+                // While more targets are on their way, the last of them decides.
+                if taken_on || self.in_flight.is_empty() {
+                    self.lessee.settle(&arms, taken_on);
+                }
+                self.send(wire::reply(&id, result)).await
+            }
             None => Ok(()),
         }
     }
@@ -307,10 +329,29 @@ impl Connection {
     }
 }
 
+/// Whether a request takes effect, or may: what is not answered in time was not refused.
+fn is_taken_on(result: &Result<Reply, RpcError>) -> bool {
+    result.as_ref().map_or_else(|error| error.code == Code::NoAnswer, |_| true)
+}
+
+/// Waits for what the run answers, not for ever.
+pub(super) async fn answer(
+    method: &str,
+    call: impl Future<Output = Result<Reply, RpcError>>,
+    leases: &Leases,
+) -> Result<Reply, RpcError> {
+    let Ok(result) = timeout(CALL_LIMIT, call).await else {
+        let waited = CALL_LIMIT.as_secs();
+        let error = RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"));
+        return Err(error.hint("it may still take effect; ask for `status`"));
+    };
+    result.map(|reply| leases.complete(reply))
+}
+
 /// The answer to the oldest target that is on its way. Once it has come, the target must be taken out.
-async fn oldest(in_flight: &mut VecDeque<(Value, Answer)>) -> Result<Reply, RpcError> {
+async fn oldest(in_flight: &mut VecDeque<InFlight>) -> Result<Reply, RpcError> {
     match in_flight.front_mut() {
-        Some((_, answer)) => answer.await,
+        Some(InFlight { answer, .. }) => answer.await,
         None => std::future::pending().await,
     }
 }

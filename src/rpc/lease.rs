@@ -1,6 +1,6 @@
 //! One commander at a time: who may move an arm just now.
 //!
-//! A connection takes the lease of an arm with its first request that moves it, or with `lease`, and has it until
+//! A connection takes the lease of an arm with its first request that is taken on and moves it, or with `lease`, and has it until
 //! `release` or its own end. The rest of the program knows nothing of it: a stream of targets that ends with its
 //! commander goes stale like any other, and a trajectory that has begun goes on.
 
@@ -69,6 +69,8 @@ struct Holder {
     pid: Option<i32>,
     program: String,
     since: Instant,
+    /// A request under it was taken on, or it was asked for as such: it stays until it is released.
+    kept: bool,
 }
 
 impl Holder {
@@ -85,6 +87,11 @@ pub(super) struct Leases(Mutex<BTreeMap<String, Holder>>);
 impl Leases {
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Holder>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether a connection holds the lease of any arm.
+    pub fn holds(&self, connection: u64) -> bool {
+        self.lock().values().any(|holder| holder.connection == connection)
     }
 
     /// Adds to a reply what only the connections know: `status` tells who commands the arms.
@@ -127,30 +134,59 @@ impl Lessee {
 
     /// Lets a request through, or says who is in its way. The newest plan is named by its number from here on, so that
     /// the plan whose arms are leased is the one that is carried out.
-    pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<Request, RpcError> {
+    ///
+    /// Answers the arms whose leases it needs and has now; what came of it must be told to [`settle`](Self::settle).
+    pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<(Request, Vec<String>), RpcError> {
         match need(&request) {
             Need::Nothing => {}
-            Need::Lease(subject) => self.take(&backend.arms_of(subject))?,
+            Need::Lease(subject) => {
+                let arms = backend.arms_of(subject);
+                self.claim(&arms, false)?;
+                return Ok((request, arms));
+            }
             Need::Peace(subject) => self.check(&backend.arms_of(subject), &self.leases.lock())?,
             Need::Plan(plan) => {
                 let (plan, joints) = backend.plan_of(plan).await?;
-                self.take(&backend.arms_of(Subject::Joints(&joints)))?;
+                let arms = backend.arms_of(Subject::Joints(&joints));
+                self.claim(&arms, false)?;
                 let replan = matches!(&request, Request::ExecutePlan(execute) if execute.replan);
                 let presence = Some(Presence::of(&self.alive));
-                return Ok(Request::ExecutePlan(ExecutePlan { plan: Some(plan), replan, presence }));
+                return Ok((Request::ExecutePlan(ExecutePlan { plan: Some(plan), replan, presence }), arms));
             }
         }
-        Ok(request)
+        Ok((request, Vec::new()))
+    }
+
+    /// A request that needed the leases of these arms was taken on, or refused: then those that it took end.
+    pub fn settle(&self, arms: &[String], taken_on: bool) {
+        if arms.is_empty() {
+            return;
+        }
+        let mut held = self.leases.lock();
+        for arm in arms {
+            match held.get_mut(arm).filter(|holder| holder.connection == self.connection) {
+                Some(holder) if taken_on => holder.kept = true,
+                Some(Holder { kept: false, .. }) => drop(held.remove(arm)),
+                _ => {}
+            }
+        }
     }
 
     /// Takes the leases of arms: all of them, or none.
     pub fn take(&self, arms: &[String]) -> Result<(), RpcError> {
+        self.claim(arms, true)
+    }
+
+    fn claim(&self, arms: &[String], kept: bool) -> Result<(), RpcError> {
         let mut held = self.leases.lock();
         self.check(arms, &held)?;
         for arm in arms {
-            if !held.contains_key(arm) {
-                let (connection, pid, since) = (self.connection, self.pid, Instant::now());
-                held.insert(arm.clone(), Holder { connection, pid, program: program(pid), since });
+            match held.get_mut(arm) {
+                Some(holder) => holder.kept |= kept,
+                None => {
+                    let (connection, pid, since) = (self.connection, self.pid, Instant::now());
+                    held.insert(arm.clone(), Holder { connection, pid, program: program(pid), since, kept });
+                }
             }
         }
         Ok(())
@@ -226,6 +262,21 @@ mod tests {
         assert_eq!(one.release(&names(&["right", "third"])), names(&["right"]));
         drop(one);
         two.take(&names(&["left", "right"])).unwrap();
+    }
+
+    #[test]
+    fn a_refused_request_leaves_no_lease_behind() {
+        let leases = Arc::new(Leases::default());
+        let (one, arms) = (Lessee::new(leases.clone(), 1, None), names(&["left"]));
+        one.claim(&arms, false).unwrap();
+        assert!(leases.holds(1), "while it is asked");
+        one.settle(&arms, false);
+        assert!(!leases.holds(1));
+        one.claim(&arms, false).unwrap();
+        one.settle(&arms, true);
+        one.claim(&arms, false).unwrap();
+        one.settle(&arms, false);
+        assert!(leases.holds(1), "what it moves already it keeps");
     }
 
     #[test]

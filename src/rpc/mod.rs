@@ -27,9 +27,11 @@ mod planner_api;
 pub mod planner_end;
 pub mod planner_line;
 pub mod report;
+mod seats;
 pub mod server;
 pub mod streams;
 mod subscription;
+mod urgent;
 mod wire;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};

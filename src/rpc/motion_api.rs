@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
 use crate::joint::MAX_DOF;
+use crate::trajectory::MAX_DURATION;
 
 /// Parameters of `move`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -100,6 +101,10 @@ impl Execute {
         for (index, point) in self.trajectory.points.iter().enumerate() {
             let at = |field| format!("trajectory.points[{index}].{field}");
             finite(&at("time_from_start"), &[point.time_from_start])?;
+            if point.time_from_start > MAX_DURATION {
+                let (given, hours) = (point.time_from_start, MAX_DURATION / 3600.0);
+                return Err(format!("{} is {given} s, and may be {hours} h at most", at("time_from_start")));
+            }
             let given = [
                 ("positions", Some(&point.positions)),
                 ("velocities", point.velocities.as_ref()),

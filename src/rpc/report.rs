@@ -130,6 +130,9 @@ pub struct ArmReport {
     pub phase: String,
     /// Why it is held; absent when it is not.
     pub cause: Option<CauseReport>,
+    /// A stop was asked for while the arm could not be reached, and is delivered when it can.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub stop_pending: bool,
     /// Whether its motors are enabled.
     pub enabled: bool,
     /// The control mode it is in.

@@ -1,38 +1,52 @@
-//! The run's end of the socket: takes connections and hands each to a conversation of its own.
+//! The run's end of the socket: takes connections and answers them.
 //!
-//! One thread with one tokio runtime; nothing here is real-time, and nothing real-time waits for it.
+//! ```text
+//! socket ─▶ thread `rpc-stop`: stop, cancel, status, shutdown ──all else──▶ `rpc` ─▶ a thread per connection
+//! ```
+//!
+//! A connection that asks more than the requests that always get through has a thread of its own: what one client
+//! sends holds up nobody else, and the thread that stops arms is idle but for that. Nothing here is real-time, and
+//! nothing real-time waits for it.
 
 use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixListener as StdListener;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::{Semaphore, oneshot};
+use tokio::runtime::Runtime;
+use tokio::sync::watch;
 
-use super::api::{Backend, MAX_CONNECTIONS};
+use super::api::Backend;
 use super::connection;
 use super::error::{Code, RpcError};
 use super::lease::{Leases, Lessee};
 use super::place::Claim;
+use super::seats::Seats;
+use super::urgent::{self, Arrival};
 use super::wire;
 
 /// Longest time that a request may take.
 pub const CALL_LIMIT: Duration = Duration::from_secs(10);
 /// Time for the last replies to leave when the server ends.
 const LAST_WORDS: Duration = Duration::from_millis(50);
+/// How long the connections' threads get to end.
+const END_LIMIT: Duration = Duration::from_secs(1);
 /// Pause after the system refused a connection (no file descriptors left).
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// Stack of a connection's thread [bytes].
+const STACK: usize = 1 << 20;
 
 /// A running server. Ends, and removes its socket, when it is dropped.
 #[derive(Debug)]
 pub struct Server {
     claim: Claim,
-    stop: Option<oneshot::Sender<()>>,
-    thread: Option<JoinHandle<()>>,
+    end: watch::Sender<bool>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 impl Server {
@@ -42,19 +56,18 @@ impl Server {
         // The folder is closed to others, so nobody could connect before this.
         std::fs::set_permissions(claim.socket(), std::fs::Permissions::from_mode(0o600))?;
         listener.set_nonblocking(true)?;
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
-        let (stop, stopped) = oneshot::channel();
-        let thread = std::thread::Builder::new().name("rpc".into()).spawn(move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    () = accept(listener, backend) => {}
-                    _ = stopped => tokio::time::sleep(LAST_WORDS).await,
-                }
-            });
-            // A large file that is still being read does not keep the run from ending.
-            runtime.shutdown_background();
+        let runtime = runtime()?;
+        let (end, ended) = watch::channel(false);
+        let (arrivals, arrived) = channel();
+        let (first, others) = (backend.clone(), ended.clone());
+        let taking = std::thread::Builder::new().name("rpc-stop".into()).spawn(move || {
+            first.prepare_urgent_thread();
+            until_the_end(runtime, ended, accept(listener, first, arrivals));
         })?;
-        Ok(Self { claim, stop: Some(stop), thread: Some(thread) })
+        let mut server = Self { claim, end, threads: vec![taking] };
+        let serving = std::thread::Builder::new().name("rpc".into());
+        server.threads.push(serving.spawn(move || converse(&arrived, &backend, &others))?);
+        Ok(server)
     }
 
     /// Where it listens.
@@ -65,23 +78,37 @@ impl Server {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        if let Some(stop) = self.stop.take() {
-            let _ = stop.send(());
-        }
-        if let Some(thread) = self.thread.take() {
+        let _ = self.end.send(true);
+        for thread in self.threads.drain(..) {
             let _ = thread.join();
         }
     }
 }
 
-async fn accept(listener: StdListener, backend: Arc<dyn Backend>) {
+fn runtime() -> io::Result<Runtime> {
+    tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()
+}
+
+/// Runs a task until it is done or the server ends; then replies get a moment to leave.
+fn until_the_end(runtime: Runtime, mut ended: watch::Receiver<bool>, task: impl Future<Output = ()> + Send + 'static) {
+    runtime.block_on(async {
+        tokio::select! {
+            _ = tokio::spawn(task) => {}
+            _ = ended.wait_for(|ended| *ended) => tokio::time::sleep(LAST_WORDS).await,
+        }
+    });
+    // A large file that is still being read does not keep the run from ending.
+    runtime.shutdown_background();
+}
+
+/// Takes connections, and answers what always gets through.
+async fn accept(listener: StdListener, backend: Arc<dyn Backend>, others: Sender<Arrival>) {
     let listener = match UnixListener::from_std(listener) {
         Ok(listener) => listener,
         Err(e) => return tracing::error!("rpc: the socket cannot be served: {e}"),
     };
     let leases = Arc::new(Leases::default());
-    let mut connections = 0;
-    let room = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let seats = Seats::new(leases.clone());
     loop {
         let stream = match listener.accept().await {
             Ok((stream, _)) => stream,
@@ -95,20 +122,45 @@ async fn accept(listener: StdListener, backend: Arc<dyn Backend>) {
             refuse(&stream, RpcError::new(Code::Forbidden, "this run belongs to another user"));
             continue;
         }
-        let Ok(seat) = room.clone().try_acquire_owned() else {
-            let error = RpcError::new(Code::TooManyConnections, format!("all {MAX_CONNECTIONS} connections are taken"));
-            refuse(&stream, error.hint("close one, or ask several things over one connection"));
-            continue;
+        let seat = match seats.take() {
+            Ok(seat) => seat,
+            Err(error) => {
+                refuse(&stream, error);
+                continue;
+            }
         };
-        connections += 1;
         let pid = stream.peer_cred().ok().and_then(|peer| peer.pid());
-        let lessee = Lessee::new(leases.clone(), connections, pid);
-        let backend = backend.clone();
-        tokio::spawn(async move {
-            connection::serve(stream, backend, lessee).await;
-            drop(seat);
-        });
+        let lessee = Lessee::new(leases.clone(), seat.number(), pid);
+        tokio::spawn(urgent::serve(stream, backend.clone(), lessee, seat, others.clone()));
     }
+}
+
+/// Gives each connection that is handed on a thread, until the last one that could be has gone.
+fn converse(arrived: &Receiver<Arrival>, backend: &Arc<dyn Backend>, ended: &watch::Receiver<bool>) {
+    // Hangs up when the last thread that has its other end is gone.
+    let (alive, gone) = channel::<()>();
+    for arrival in arrived {
+        let (backend, ended, alive) = (backend.clone(), ended.clone(), alive.clone());
+        let thread = std::thread::Builder::new().name("rpc-client".into()).stack_size(STACK);
+        let started = thread.spawn(move || {
+            let Arrival { stream, read, lessee, seat } = arrival;
+            match runtime() {
+                Ok(runtime) => until_the_end(runtime, ended, async move {
+                    match UnixStream::from_std(stream) {
+                        Ok(stream) => connection::serve(stream, read, backend, lessee, seat).await,
+                        Err(e) => tracing::warn!("rpc: a connection was not taken: {e}"),
+                    }
+                }),
+                Err(e) => tracing::warn!("rpc: a connection was not taken: {e}"),
+            }
+            drop(alive);
+        });
+        if let Err(e) = started {
+            tracing::warn!("rpc: a connection was not taken: {e}");
+        }
+    }
+    drop(alive);
+    let _ = gone.recv_timeout(END_LIMIT);
 }
 
 fn is_owner_or_root(stream: &UnixStream) -> bool {

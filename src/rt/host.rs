@@ -16,6 +16,8 @@ pub const DEVICE_PRIORITY: i32 = 81;
 pub const TICK_PRIORITY: i32 = 80;
 /// FIFO priority of emulators: they stand for controllers, which do not wait for this host's other work.
 pub const EMULATOR_PRIORITY: i32 = 79;
+/// FIFO priority of the thread that takes an operator's stop: below all that moves arms, above everything else.
+pub const STOP_PRIORITY: i32 = 10;
 /// What the grant of real-time scheduling is called.
 pub const SCHEDULING: &str = "real-time scheduling";
 /// Stack of a timed thread [bytes].

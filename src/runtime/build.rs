@@ -29,7 +29,9 @@ use crate::planning::config::PlannerConfig;
 use crate::planning::setup::Setup;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
+use crate::recording::notes::{self, Notes};
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
+use crate::recording::space;
 use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
 use crate::rpc::streams::Streams;
@@ -54,6 +56,9 @@ impl Run {
         let (grants, latency) = host::prepare_process(options.hold_latency);
         let wall = WallOffset::take(&MonotonicClock);
         let log = log_path(blueprint, &options, &name, wall)?;
+        if let Some(log) = &log {
+            space::check(log, blueprint.recording.min_free.0).map_err(|e| split_hint(&e.to_string()))?;
+        }
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
         let robots = blueprint.planner.as_ref().map(robots).transpose()?;
@@ -62,7 +67,7 @@ impl Run {
             hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
         })?;
         let pulse = Arc::new(Pulse::default());
-        let (notes, noted) = channel();
+        let (notes, noted) = notes::channel();
 
         let device_notes = {
             let (notes, names) = (notes.clone(), names.clone());
@@ -113,6 +118,7 @@ impl Run {
             attachments: attachments(blueprint, &config),
             metadata: metadata(blueprint),
             wall,
+            min_free: blueprint.recording.min_free.0,
         };
         let parts = ServiceParts {
             run: name.clone(),
@@ -158,7 +164,10 @@ impl Run {
         };
         let publish = {
             let service = service.clone();
-            move |ticked| service.publish(ticked)
+            move |ticked| {
+                service.publish(ticked);
+                service.report_late_stops(wall);
+            }
         };
         let io = |what: &str, e: std::io::Error| StartError::other(format!("no {what} thread: {e}"), "see ulimit -u");
         let courier = Courier::start(dispatcher.clone(), reply_wake, reply_consumer, retired_consumer, publish)
@@ -415,7 +424,7 @@ fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
     ])
 }
 
-fn tell_device_note(notes: &Sender<Note>, names: &Names, arm: usize, note: device::Note) {
+fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: device::Note) {
     let id = names.arm(arm as u16);
     let (severity, text) = match note {
         device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),

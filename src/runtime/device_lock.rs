@@ -1,19 +1,25 @@
-//! One program per device: a name in the kernel by the device's canonical address, taken before a byte is sent. It
-//! belongs to the machine, not to a user or a folder, and dies with the process.
+//! One program per device: a name in the kernel for each address that the device's own resolves to, taken before a byte
+//! is sent. It belongs to the machine, not to a user or a folder, and dies with the process.
 
+use std::collections::BTreeSet;
 use std::io;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr as SocketIp, ToSocketAddrs};
 use std::os::fd::AsFd;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
+use std::sync::mpsc;
+use std::time::Duration;
 
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with, sockopt};
 
 /// Longest name of a socket in the kernel, without its leading zero [bytes].
 const MAX_NAME: usize = 107;
+/// How long the look-up of a host may take.
+const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);
 
 /// A device that is ours for as long as this lives.
 #[derive(Debug)]
-pub struct DeviceLock(#[expect(dead_code, reason = "the name is ours while the socket is open")] UnixListener);
+pub struct DeviceLock(#[expect(dead_code, reason = "the names are ours while the sockets are open")] Vec<UnixListener>);
 
 /// Why a device is not ours.
 #[derive(Debug, thiserror::Error)]
@@ -40,18 +46,22 @@ pub enum DeviceTaken {
     },
 }
 
-/// Takes the device at an address, which is given in full, or says who has it.
+/// Takes the device at an address, which is given in full, or says who has it. Looks names of hosts up.
 pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
-    let name = name(adapter, address);
-    let bound = SocketAddr::from_abstract_name(&name).and_then(|at| UnixListener::bind_addr(&at));
-    let (adapter, address) = (adapter.to_owned(), address.to_owned());
-    bound.map(DeviceLock).map_err(|error| match error.kind() {
-        io::ErrorKind::AddrInUse => {
-            let pid = holder(&name).map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
-            DeviceTaken::By { adapter, address, pid }
-        }
-        _ => DeviceTaken::Io { adapter, address, error },
-    })
+    let names = places(address).into_iter().map(|place| name(adapter, &place));
+    let mut taken = Vec::new();
+    for name in names {
+        let bound = SocketAddr::from_abstract_name(&name).and_then(|at| UnixListener::bind_addr(&at));
+        let (adapter, address) = (adapter.to_owned(), address.to_owned());
+        taken.push(bound.map_err(|error| match error.kind() {
+            io::ErrorKind::AddrInUse => {
+                let pid = holder(&name).map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
+                DeviceTaken::By { adapter, address, pid }
+            }
+            _ => DeviceTaken::Io { adapter, address, error },
+        })?);
+    }
+    Ok(DeviceLock(taken))
 }
 
 /// Who has a name: the kernel tells whoever connects. Waits for nobody.
@@ -62,10 +72,65 @@ fn holder(name: &str) -> Option<i32> {
     Some(sockopt::socket_peercred(&socket).ok()?.pid.as_raw_nonzero().get())
 }
 
-/// The same for every spelling of a device's address: case, a name for the loopback.
-fn name(adapter: &str, address: &str) -> String {
-    let address = address.trim().to_ascii_lowercase().replace("localhost", "127.0.0.1");
-    let name = format!("dimos/device/{adapter}/{address}");
+/// Where a device is, the same for every spelling of its address: the addresses that its host resolves to, each with
+/// the first port; the device file behind a link. At least one.
+fn places(address: &str) -> BTreeSet<String> {
+    let text = address.trim();
+    if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
+        // What stands behind an `@` is how to talk to it.
+        let path = path.split_once('@').map_or(path, |(path, _)| path);
+        let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
+        return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), real.display())]);
+    }
+    let text = text.to_ascii_lowercase();
+    let Some((host, port)) = host_and_port(text.strip_prefix("tcp:").unwrap_or(&text)) else {
+        return BTreeSet::from([text]);
+    };
+    let ips = match host.parse::<IpAddr>() {
+        Ok(ip) => vec![ip],
+        Err(_) => look_up(host, port),
+    };
+    if ips.is_empty() {
+        // It cannot be reached by a name that nobody knows either.
+        return BTreeSet::from([format!("{host}:{port}")]);
+    }
+    ips.into_iter().map(|ip| SocketIp::new(canonical(ip), port).to_string()).collect()
+}
+
+/// The host and the first port of `HOST:PORT` or `[HOST]:PORT`; what follows are more ports of the same device.
+fn host_and_port(text: &str) -> Option<(&str, u16)> {
+    let (host, ports) = match text.strip_prefix('[') {
+        Some(rest) => rest.split_once("]:")?,
+        None => text.split_once(':')?,
+    };
+    let port = ports.split(':').next()?.parse().ok()?;
+    Some((host, port))
+}
+
+/// One spelling of an address: IPv4 where it is one in other clothes, the loopback for "this host".
+fn canonical(ip: IpAddr) -> IpAddr {
+    match ip.to_canonical() {
+        IpAddr::V4(v4) if v4.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(v6) if v6.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        other => other,
+    }
+}
+
+/// All addresses of a host name; none where it is not known in time.
+fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
+    // The system's resolver knows no deadline, so it gets a thread of its own, left behind when it is late.
+    let (sender, found) = mpsc::channel();
+    let target = (host.to_owned(), port);
+    let asked = std::thread::Builder::new().name("resolve".into()).spawn(move || {
+        let found = target.to_socket_addrs().map(|all| all.map(|address| address.ip()).collect());
+        drop(sender.send(found.unwrap_or_default()));
+    });
+    asked.ok().and_then(|_| found.recv_timeout(LOOK_UP_LIMIT).ok()).unwrap_or_default()
+}
+
+/// The name in the kernel.
+fn name(adapter: &str, place: &str) -> String {
+    let name = format!("dimos/device/{adapter}/{place}");
     // Hosts may have names longer than that; they differ at their beginning, ports at their end.
     match name.char_indices().nth(MAX_NAME / 2) {
         Some((half, _)) if name.len() > MAX_NAME => {
@@ -98,9 +163,37 @@ mod tests {
 
     #[test]
     fn names_fit_and_differ_by_host_and_port() {
+        let all = |address: &str| places(address).iter().map(|place| name("a", place)).collect::<Vec<_>>();
         let long = |end: &str| name("adapter", &format!("{}{end}", "h".repeat(300)));
         assert!(long(":1").len() <= MAX_NAME && long("ä").len() <= MAX_NAME);
         assert_ne!(long(":1"), long(":2"));
-        assert_eq!(name("a", "Host:1"), name("a", " host:1"));
+        assert_eq!(all("Host.invalid:1"), all(" host.invalid:1"));
+    }
+
+    #[test]
+    fn every_spelling_of_an_address_is_the_same_device() {
+        let same = |spellings: &[&str]| {
+            let first = places(spellings[0]);
+            spellings.iter().for_each(|other| assert_eq!(places(other), first, "{other}"));
+            first
+        };
+        let v4 = same(&[
+            "127.0.0.65:502:30000",
+            "[::ffff:127.0.0.65]:502:30000",
+            "[::FFFF:7f00:41]:502",
+            "tcp:127.0.0.65:502",
+        ]);
+        assert_eq!(v4, BTreeSet::from(["127.0.0.65:502".to_owned()]));
+        same(&["[fe80::2]:502", "[FE80:0:0:0::2]:502:31000"]);
+        assert!(places("localhost:9").is_superset(&places("127.0.0.1:9")));
+        assert_eq!(places("0.0.0.0:9"), places("127.0.0.1:9"));
+        assert_ne!(places("127.0.0.1:9"), places("127.0.0.1:10"));
+        assert_eq!((places("can0").len(), places("CAN0").len()), (1, 1));
+        let folder = tempfile::tempdir().unwrap();
+        let (device, link) = (folder.path().join("ttyACM0"), folder.path().join("by-id"));
+        std::fs::write(&device, "").unwrap();
+        std::os::unix::fs::symlink(&device, &link).unwrap();
+        let at = |path: &std::path::Path, rate: &str| format!("slcan:{}{rate}", path.display());
+        same(&[&at(&device, "@1000000"), &at(&link, "@1000000"), &at(&link, "@500000")]);
     }
 }

@@ -3,7 +3,6 @@
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -11,15 +10,21 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
-use crate::clock::{Clock, MonotonicClock};
+use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::control::request::{Envelope, Motion, Request};
 use crate::control::tasks::cartesian::Goal;
-use crate::recording::recorder::Note;
+use crate::recording::notes::{Note, Notes};
 use crate::rt::wake::Wake;
 use crate::telemetry::Outcome;
+use crate::telemetry::describe::Severity;
+use crate::trajectory::JointTrajectory;
 
 /// Room for requests on their way to the tick.
 pub const REQUEST_RING: usize = 256;
+/// Part of it that is kept for what ends motion, however much else is asked.
+const RESERVED: usize = 32;
+/// How long the tick gets to answer.
+const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 /// How often finished motions are looked for when nothing else happens.
 const SWEEP: Duration = Duration::from_millis(100);
 
@@ -28,7 +33,7 @@ pub struct Dispatcher {
     requests: Mutex<rtrb::Producer<Envelope>>,
     waiting: Mutex<HashMap<u64, oneshot::Sender<Outcome>>>,
     next_id: AtomicU64,
-    notes: Sender<Note>,
+    notes: Notes,
 }
 
 /// Why a request got no outcome.
@@ -44,7 +49,7 @@ pub enum NotTold {
 
 impl Dispatcher {
     /// A dispatcher in front of a ring.
-    pub fn new(requests: rtrb::Producer<Envelope>, notes: Sender<Note>) -> Self {
+    pub fn new(requests: rtrb::Producer<Envelope>, notes: Notes) -> Self {
         Self { requests: Mutex::new(requests), waiting: Mutex::default(), next_id: AtomicU64::new(1), notes }
     }
 
@@ -55,15 +60,37 @@ impl Dispatcher {
 
     /// Sends a request; the answer comes with the tick that handles it. `log` is how the log tells it.
     pub fn send(&self, request: Request, log: Value) -> Result<oneshot::Receiver<Outcome>, NotTold> {
+        self.push(request, |id, stamp| Note::Request { id, stamp, json: log.to_string() })
+    }
+
+    /// Sends a motion along a trajectory to a task, and waits for its outcome.
+    pub async fn execute(
+        &self,
+        task: u16,
+        motion: Box<Motion>,
+        trajectory: Arc<JointTrajectory>,
+    ) -> Result<Outcome, NotTold> {
+        let number = motion.id;
+        let note = |id, stamp| Note::Execute { id, stamp, task, motion: number, trajectory };
+        answer(self.push(Request::Execute { task, motion }, note)?).await
+    }
+
+    fn push(
+        &self,
+        request: Request,
+        note: impl FnOnce(u64, Mono) -> Note,
+    ) -> Result<oneshot::Receiver<Outcome>, NotTold> {
+        let ends_motion = matches!(request, Request::Stop { .. } | Request::Cancel { .. } | Request::Shutdown);
         let id = self.number();
         let (sender, receiver) = oneshot::channel();
+        // Made before the lock: a stop waits for nobody's text.
+        let note = note(id, MonotonicClock.now());
         let mut ring = lock(&self.requests);
-        if ring.slots() == 0 {
+        if ring.slots() <= if ends_motion { 0 } else { RESERVED } {
             return Err(NotTold::Full);
         }
         lock(&self.waiting).insert(id, sender);
-        let note = Note::Request { id, stamp: MonotonicClock.now(), json: log.to_string() };
-        // Only a run that is ending has no recorder any more.
+        // The recorder counts what it has no room for; only a run that is ending has no recorder any more.
         let _ = self.notes.send(note);
         if ring.push(Envelope { id, request }).is_err() {
             lock(&self.waiting).remove(&id);
@@ -74,11 +101,12 @@ impl Dispatcher {
 
     /// Sends a request and waits for its outcome.
     pub async fn ask(&self, request: Request, log: Value) -> Result<Outcome, NotTold> {
-        let answer = self.send(request, log)?;
-        match tokio::time::timeout(Duration::from_secs(3), answer).await {
-            Ok(Ok(outcome)) => Ok(outcome),
-            _ => Err(NotTold::NoAnswer),
-        }
+        answer(self.send(request, log)?).await
+    }
+
+    /// Puts a line of text into the log.
+    pub fn log(&self, severity: Severity, text: String) {
+        let _ = self.notes.send(Note::Log { severity, stamp: MonotonicClock.now(), text });
     }
 
     fn answered(&self, id: u64, outcome: Outcome) {
@@ -86,6 +114,13 @@ impl Dispatcher {
             // Whoever asked may have gone.
             let _ = sender.send(outcome);
         }
+    }
+}
+
+async fn answer(answer: oneshot::Receiver<Outcome>) -> Result<Outcome, NotTold> {
+    match tokio::time::timeout(ANSWER_LIMIT, answer).await {
+        Ok(Ok(outcome)) => Ok(outcome),
+        _ => Err(NotTold::NoAnswer),
     }
 }
 

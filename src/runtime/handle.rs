@@ -103,9 +103,14 @@ impl Handle {
         self.call(ArmEnable { arm: arm.to_owned() })
     }
 
-    /// Disables an arm's motors. An arm without brakes falls.
+    /// Brings an arm to rest and disables its motors; refused while it still moves. An arm without brakes falls.
     pub fn disable(&self, arm: &str) -> Result<ArmReply, RpcError> {
-        self.call(ArmDisable { arm: arm.to_owned() })
+        self.call(ArmDisable { arm: arm.to_owned(), now: false })
+    }
+
+    /// Disables an arm's motors at once, also while it moves.
+    pub fn disable_now(&self, arm: &str) -> Result<ArmReply, RpcError> {
+        self.call(ArmDisable { arm: arm.to_owned(), now: true })
     }
 
     /// Commands the opening of a gripper [m].

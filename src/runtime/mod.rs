@@ -15,6 +15,7 @@ pub(crate) mod device_lock;
 mod dispatch;
 mod handle;
 mod in_process;
+mod late_stops;
 mod motion_requests;
 mod motions;
 mod plan_requests;
@@ -161,6 +162,8 @@ pub enum Ending {
     Duration,
     /// It was asked to, over rpc.
     Asked,
+    /// Its log ended, and why.
+    Log(String),
     /// Something broke.
     Fault(String),
 }
@@ -172,6 +175,8 @@ pub struct Ended {
     pub troubles: Vec<String>,
     /// The log, if one was written.
     pub log: Option<PathBuf>,
+    /// Why the log ended before the run, if it did.
+    pub log_cut: Option<String>,
 }
 
 /// A run that is up. Everything it can be asked is a method of its [`Handle`], and thereby of the run itself.
@@ -268,7 +273,7 @@ impl Run {
         ended.troubles.extend(self.arms.release());
         self.courier = None;
         if let Err(e) = recorder.finish() {
-            ended.troubles.push(e.to_string());
+            ended.log_cut = e.to_string().lines().next().map(str::to_owned);
         }
         ended
     }

@@ -10,7 +10,7 @@ use super::service::{Service, internal};
 use crate::control::config::TaskKind;
 use crate::control::limit::Bounds;
 use crate::control::point_to_point::{NoMotion, point_to_point};
-use crate::control::request::{Motion, Request};
+use crate::control::request::Motion;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::Outcome;
@@ -65,7 +65,7 @@ impl Service {
             NoMotion::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string()),
         })?;
         let duration = motion.duration();
-        let number = self.begin(task, joints, &motion, None).await?;
+        let number = self.begin(task, joints, motion, None).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,
             task: self.parts.names.task(task),
@@ -99,8 +99,8 @@ impl Service {
             Some(name) => self.task_index(name)?,
             None => self.trajectory_task(&joints)?,
         };
-        let number = self.begin(task, joints, &trajectory, plan).await?;
         let duration = trajectory.duration();
+        let number = self.begin(task, joints, trajectory, plan).await?;
         Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })
     }
 
@@ -109,11 +109,11 @@ impl Service {
         &self,
         task: u16,
         joints: Vec<u16>,
-        trajectory: &JointTrajectory,
+        trajectory: JointTrajectory,
         plan: Option<Carries>,
     ) -> Result<u64, RpcError> {
-        let spline = Spline::new(trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
-        self.check_rest(&joints, trajectory)?;
+        let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
+        self.check_rest(&joints, &trajectory)?;
         self.check_limits(&joints, &spline)?;
         let number = self.parts.dispatcher.number();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
@@ -128,9 +128,8 @@ impl Service {
             next: None,
         };
         lock(&self.motions).plan(number, planned);
-        let log = json!({"execute": {"task": task, "motion": number, "trajectory": trajectory}});
         let motion = Box::new(Motion { id: number, joints, spline });
-        let result = self.ask_logged(Request::Execute { task, motion }, log).await;
+        let result = self.outcome(self.parts.dispatcher.execute(task, motion, Arc::new(trajectory)).await);
         if result.is_err() {
             lock(&self.motions).forget(number);
         }

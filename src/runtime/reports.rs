@@ -85,6 +85,7 @@ impl Service {
             phase: view.phase.name().to_owned(),
             cause: (view.cause != Cause::None)
                 .then(|| CauseReport { name: view.cause.name().to_owned(), text: cause_text(view.cause) }),
+            stop_pending: self.late_stops.is_waiting(index),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
             error: (view.state.error != 0).then(|| DeviceError { code: view.state.error, text: health.error_text() }),

@@ -8,10 +8,9 @@ use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
-use serde_json::Value;
-
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, lock, log_of};
+use super::late_stops::LateStops;
 use super::motions::Motions;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
@@ -30,7 +29,7 @@ use crate::rpc::planner_line::PlannerLine;
 use crate::rpc::report::StatusReport;
 use crate::rpc::streams::Streams;
 use crate::rpc::{Code, RpcError, Subject};
-use crate::rt::host::Grant;
+use crate::rt::host::{self, Grant};
 use crate::rt::slot::SlotReader;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
@@ -38,7 +37,7 @@ use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 /// How long a device takes to refuse an opening of its gripper.
 const GRIPPER_REPLY: Duration = Duration::from_millis(20);
 /// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
-const STANDSTILL: f64 = 0.02;
+pub(super) const STANDSTILL: f64 = 0.02;
 
 /// What a service is made from.
 pub struct ServiceParts {
@@ -67,6 +66,7 @@ pub struct Service {
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
     pub(super) repeats: Repeats,
+    pub(super) late_stops: LateStops,
     /// Ticks done when the joint state was published last.
     pub(super) published: AtomicU64,
     /// The planner that is attached, or was.
@@ -88,6 +88,7 @@ impl Service {
             motions: Mutex::default(),
             recorder: OnceLock::new(),
             repeats: Repeats::default(),
+            late_stops: LateStops::default(),
             published: AtomicU64::new(0),
             attached: Mutex::default(),
             executed: Mutex::default(),
@@ -155,7 +156,11 @@ impl Service {
                 self.tell(tick, described, wall);
             }
             Notice::Lost(count) => tracing::warn!("the recorder fell behind: {count} samples are missing in the log"),
-            Notice::Stopped(error) => tracing::error!("{error}"),
+            Notice::Stopped(error) => {
+                tracing::error!("{error}");
+                let first = error.to_string().lines().next().unwrap_or_default().to_owned();
+                let _ = self.parts.endings.send(Ending::Log(first));
+            }
         }
     }
 
@@ -194,11 +199,12 @@ impl Service {
 
     pub(super) async fn ask(&self, request: Request) -> Result<Outcome, RpcError> {
         let log = log_of(&request);
-        self.ask_logged(request, log).await
+        self.outcome(self.parts.dispatcher.ask(request, log).await)
     }
 
-    pub(super) async fn ask_logged(&self, request: Request, log: Value) -> Result<Outcome, RpcError> {
-        let outcome = self.parts.dispatcher.ask(request, log).await.map_err(|e| match e {
+    /// What the tick answered, or its refusal.
+    pub(super) fn outcome(&self, answer: Result<Outcome, NotTold>) -> Result<Outcome, RpcError> {
+        let outcome = answer.map_err(|e| match e {
             NotTold::Full => RpcError::new(Code::NoAnswer, e.to_string()).hint("send fewer requests at once"),
             NotTold::NoAnswer => {
                 RpcError::new(Code::NoAnswer, e.to_string()).hint("`dimos status` shows whether the run is alive")
@@ -283,7 +289,7 @@ impl Service {
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
             Call::ArmEnable(a) => self.enable(a.arm).await,
-            Call::ArmDisable(a) => self.disable(a.arm).await,
+            Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
             Call::Gripper(g) => self.gripper(g).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
@@ -327,6 +333,11 @@ impl Backend for Service {
 
     fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
         self.register(planner, line)
+    }
+
+    fn prepare_urgent_thread(&self) {
+        // Where it is not granted, the thread competes like any other; it is idle otherwise, so its turn comes soon.
+        let _ = host::set_fifo(host::STOP_PRIORITY);
     }
 
     fn streams(&self) -> &Streams {

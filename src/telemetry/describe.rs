@@ -287,6 +287,7 @@ pub fn cause_text(cause: Cause) -> String {
             format!("joint {} moved by {} while the arm was being enabled", joint + 1, angle(by))
         }
         Cause::ModeChanged => "the panel, hand guiding or another program changed the control mode".into(),
+        Cause::StoppedElsewhere => "the panel or another program stopped the arm".into(),
         Cause::PowerChanged => "the panel or another program enabled the motors".into(),
         Cause::Shutdown => "the run is ending".into(),
     }

@@ -133,11 +133,18 @@ pub enum Cause {
     ModeChanged,
     /// The motors were enabled, and not by this run.
     PowerChanged,
+    /// The arm was stopped, paused or reset, and not by this run.
+    StoppedElsewhere,
     /// The run is ending.
     Shutdown,
 }
 
 impl Cause {
+    /// Whether a panel, a person or another program has the arm: it then gets neither set points nor a stop.
+    pub fn is_foreign(self) -> bool {
+        matches!(self, Self::ModeChanged | Self::PowerChanged | Self::StoppedElsewhere)
+    }
+
     /// The name used in rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
@@ -156,6 +163,7 @@ impl Cause {
             Self::MovedWhileActivating(..) => "moved_while_activating",
             Self::ModeChanged => "mode_changed",
             Self::PowerChanged => "power_changed",
+            Self::StoppedElsewhere => "stopped_elsewhere",
             Self::Shutdown => "shutdown",
         }
     }

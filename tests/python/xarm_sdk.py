@@ -150,7 +150,24 @@ def old(host):
         arm.disconnect()
 
 
+def takeover(host, pause):
+    arm = connect(host)
+    start = arm.get_servo_angle()[1][:6]
+    goal = [angle + 0.4 for angle in start]
+    ok(arm.set_mode(0), "set_mode")
+    time.sleep(pause)
+    ok(arm.set_state(0), "set_state")
+    time.sleep(pause)
+    ok(arm.set_servo_angle(angle=goal, speed=3, wait=True), "set_servo_angle")
+    time.sleep(1.0)
+    check(near(arm.get_servo_angle()[1], goal, 1e-3), f"it was taken to {arm.get_servo_angle()[1]}, not left at {goal}")
+    arm.disconnect()
+
+
 SCENARIOS = {
+    "takeover-0": lambda host: takeover(host, 0),
+    "takeover-5": lambda host: takeover(host, 0.005),
+    "takeover-200": lambda host: takeover(host, 0.2),
     "session": session,
     "errors": errors,
     "old": old,

@@ -91,9 +91,13 @@ impl Backend for FakeBackend {
                     let how = if self.unconfirmed { Confirmation::SentNotConfirmed } else { Confirmation::Confirmed };
                     Reply::Stop(StopReply { arms: [("arm".into(), how)].into() })
                 }
-                Request::ArmReset(a) => Reply::ArmReset(ArmReply { arm: a.arm, phase: "standby".into() }),
-                Request::ArmEnable(a) => Reply::ArmEnable(ArmReply { arm: a.arm, phase: "activating".into() }),
-                Request::ArmDisable(a) => Reply::ArmDisable(ArmReply { arm: a.arm, phase: "disabled".into() }),
+                Request::ArmReset(a) => Reply::ArmReset(ArmReply { arm: a.arm, phase: "standby".into(), note: None }),
+                Request::ArmEnable(a) => {
+                    Reply::ArmEnable(ArmReply { arm: a.arm, phase: "activating".into(), note: None })
+                }
+                Request::ArmDisable(a) => {
+                    Reply::ArmDisable(ArmReply { arm: a.arm, phase: "disabled".into(), note: None })
+                }
                 Request::Gripper(g) => {
                     let text = format!("{} has no gripper", g.arm);
                     return Err(RpcError::new(Code::NoGripper, text));

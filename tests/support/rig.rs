@@ -460,6 +460,18 @@ impl Rig {
                 let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
                 let drawn =
                     sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;
+                if (drawn || gap) && mode != ControlMode::Velocity {
+                    assert!(
+                        gap || (to - from).abs() <= limits.velocity_max[j] * dt * (1.0 + 1e-9),
+                        "{}",
+                        at("drawn too fast")
+                    );
+                    wire.velocity[j] = 0.0;
+                    if gap {
+                        assert_eq!(Some(to), arm.written.as_ref().map(|w| w[j]), "{}", at("in a gap"));
+                    }
+                    continue;
+                }
                 let velocity = match (mode == ControlMode::Velocity, switched) {
                     (true, _) => values[j],
                     (false, false) => (values[j] - wire.values[j]) / dt,
@@ -473,14 +485,6 @@ impl Rig {
                 let change = velocity - wire.velocity[j];
                 assert!(velocity.abs() <= limits.velocity_max[j] * (1.0 + 1e-9) + 1e-12, "{}", at("F08 velocity"));
                 let most = limits.acceleration_max[j] * dt * (1.0 + 1e-6) + 1e-8;
-                if (drawn || gap) && mode != ControlMode::Velocity {
-                    wire.velocity[j] = if drawn { 0.0 } else { velocity };
-                    if gap {
-                        assert_eq!(Some(to), arm.written.as_ref().map(|w| w[j]), "{}", at("in a gap"));
-                        wire.velocity[j] = 0.0;
-                    }
-                    continue;
-                }
                 assert!(change.abs() <= most, "{} joint {j} by {}", at("F08 acceleration"), change / dt);
                 wire.velocity[j] = velocity;
                 if mode != ControlMode::Velocity {

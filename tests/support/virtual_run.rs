@@ -3,7 +3,6 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
-use std::sync::mpsc::{Sender, channel};
 use std::time::Duration;
 
 use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
@@ -13,6 +12,7 @@ use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::joint::{ControlMode, JointLimits, make_joints};
 use dimos::recording::log_writer::LogAttachment;
+use dimos::recording::notes::{Notes, channel};
 use dimos::recording::recorder::{Note, Recorder, RecorderConfig};
 use dimos::runtime::log_of;
 use dimos::telemetry::describe::{ArmNames, Names};
@@ -63,7 +63,7 @@ pub struct VirtualRun {
     names: Names,
     now: Mono,
     ring: rtrb::Producer<Sample>,
-    notes: Sender<Note>,
+    notes: Notes,
     inbox: VecDeque<Envelope>,
     next_id: u64,
     recorder: Recorder,
@@ -90,6 +90,7 @@ impl VirtualRun {
             attachments: vec![attachment],
             metadata: BTreeMap::new(),
             wall: WallOffset::of(START.0, START.1),
+            min_free: 0,
         };
         let (ring, samples) = rtrb::RingBuffer::new(64 * 1024);
         let (notes, noted) = channel();

@@ -27,7 +27,7 @@ const HELLO: Patience = Patience { each: Duration::from_millis(250), times: 5 };
 const REPLY: Patience = Patience::once(Duration::from_millis(100));
 /// Longest wait for measurements, and for the reply to a set point. YOUR ARM: all tries together stay below `stale_after`,
 /// so that a single lost reply does not hold the arm.
-const CYCLE: Patience = Patience { each: Duration::from_millis(18), times: 3 };
+const CYCLE: Patience = Patience { each: Duration::from_millis(30), times: 3 };
 /// A reply answers further questions for one period of the controller.
 const STATE_AGE: Duration = Duration::from_micros((1e6 / NATIVE_RATE) as u64);
 

@@ -40,7 +40,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     native_rate: NATIVE_RATE,
     accuracy: 0.01,
     lag: 0.05,
-    stale_after: Duration::from_millis(60),
+    stale_after: Duration::from_millis(100),
     address: AddressForm {
         form: wire::FORM,
         required: true,

@@ -15,6 +15,20 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// connection [s].
 const STRIKES_AT: f64 = 1.0;
 
+/// Longest wait for room for a set point.
+const ROOM: Duration = Duration::from_secs(1);
+
+/// Writes again while two set points are unacknowledged, as the device thread does.
+pub fn when_there_is_room(mut write: impl FnMut() -> AdapterResult<()>) -> AdapterResult<()> {
+    let until = Instant::now() + ROOM;
+    loop {
+        match write() {
+            Err(AdapterError::Busy) if Instant::now() < until => std::thread::sleep(Duration::from_millis(1)),
+            result => return result,
+        }
+    }
+}
+
 /// What the checks are made on.
 #[derive(Debug, Clone)]
 pub struct Subject {
@@ -232,7 +246,16 @@ impl Context {
 
     /// Commands joint positions.
     pub fn command(&mut self, positions: &[f64], speed: f64) -> Result<(), String> {
-        self.adapter.write_joint_positions(positions, speed).map_err(|e| format!("write_joint_positions: {e}"))
+        let adapter = &mut self.adapter;
+        when_there_is_room(|| adapter.write_joint_positions(positions, speed))
+            .map_err(|e| format!("write_joint_positions: {e}"))
+    }
+
+    /// Commands velocities.
+    pub fn command_velocities(&mut self, velocities: &[f64]) -> Result<(), String> {
+        let adapter = &mut self.adapter;
+        when_there_is_room(|| adapter.write_joint_velocities(velocities))
+            .map_err(|e| format!("write_joint_velocities: {e}"))
     }
 
     /// Stops.

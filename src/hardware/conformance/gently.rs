@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use super::context::when_there_is_room;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
 use crate::joint::ControlMode;
@@ -270,7 +271,8 @@ impl Gently<'_> {
             let part = (streamed / time).min(1.0);
             if stream && look % LOOKS == 0 {
                 point = from + (to - from) * (0.5 - 0.5 * (part * std::f64::consts::PI).cos());
-                self.adapter.write_joint_positions(&self.target(joint, point), 1.0)?;
+                let target = self.target(joint, point);
+                when_there_is_room(|| self.adapter.write_joint_positions(&target, 1.0))?;
             }
             let (positions, reading, at) = self.look()?;
             let before = seen.moved;

@@ -97,7 +97,7 @@ fn stream_velocities(context: &mut Context) -> Result<(), String> {
     let mut half = None;
     let mut end = (start, Instant::now());
     for i in 0..40 {
-        context.adapter.write_joint_velocities(&wanted).map_err(|e| format!("write_joint_velocities: {e}"))?;
+        context.command_velocities(&wanted)?;
         std::thread::sleep(Duration::from_millis(10));
         let reading = context.joints()?;
         let positions = reading.position.get(..wanted.len()).unwrap_or_default().to_vec();

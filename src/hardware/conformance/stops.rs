@@ -97,7 +97,7 @@ fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
     let away = context.nearby(&start)?;
     let wanted: Vec<f64> = start.iter().zip(&away).map(|(a, b)| SPEED.copysign(b - a)).collect();
     for _ in 0..30 {
-        context.adapter.write_joint_velocities(&wanted).map_err(|e| format!("write_joint_velocities: {e}"))?;
+        context.command_velocities(&wanted)?;
         std::thread::sleep(Duration::from_millis(10));
     }
     let moving = farthest(&context.positions()?, &start);

@@ -338,7 +338,8 @@ impl Worker {
 
     fn finish(&mut self, adapter: &mut dyn ManipulatorAdapter, disable: bool) -> AdapterResult<()> {
         let mut result = Ok(());
-        if self.connected {
+        // An arm that another program has taken over is left to it.
+        if self.connected && self.state.interference != Interference::Mode {
             result = adapter.deactivate();
             if disable {
                 self.wait_for_standstill(adapter);
@@ -646,7 +647,16 @@ impl Worker {
         }
         self.state.mode = adapter.get_control_mode();
         self.compare_with_orders();
+        self.heed(adapter.foreign_change());
         Ok(())
+    }
+
+    /// What the adapter itself says was changed by another client of the device.
+    fn heed(&mut self, foreign: Option<&'static str>) {
+        let Some(what) = foreign.filter(|_| self.state.interference == Interference::None) else { return };
+        let mode = self.ordered_mode.is_some_and(|ordered| ordered != self.state.mode);
+        self.state.interference = if mode { Interference::Mode } else { Interference::Stop };
+        self.trouble(what);
     }
 
     /// Whether the arm is in the condition that this run ordered.

@@ -6,11 +6,11 @@ mod hostile;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
 
 use super::log_writer::LogAttachment;
 use super::messages::{ArmInput, JointState};
+use super::notes::{Notes, channel};
 use super::recorder::{Note, Notice, Recorder, RecorderConfig};
 use super::replay::{Entry, LogReader, Payload, ReplayError, Selection};
 use crate::arm::{ArmCommand, ArmState, Interference, Link, Pose, VelocitySource};
@@ -40,6 +40,7 @@ fn config(path: PathBuf) -> RecorderConfig {
         }],
         metadata: BTreeMap::from([("tick_rate".to_owned(), "100".to_owned())]),
         wall: WallOffset::of(Mono(1_000_000_000), WALL),
+        min_free: 0,
     }
 }
 
@@ -96,7 +97,7 @@ fn tick(tick: u64) -> [Sample; 3] {
 /// What the recorder told, as text.
 type Told = Arc<Mutex<Vec<String>>>;
 
-fn start(path: &Path, told: &Told) -> (Recorder, rtrb::Producer<Sample>, Sender<Note>) {
+fn start(path: &Path, told: &Told) -> (Recorder, rtrb::Producer<Sample>, Notes) {
     let (producer, consumer) = rtrb::RingBuffer::new(4096);
     let (notes, receiver) = channel();
     let told = told.clone();

@@ -32,8 +32,6 @@ pub struct Arm {
     pub rounding: f64,
     /// In velocity mode it stops by itself after this time without a set point [s]; `None`: it has no such mode.
     pub time_limit: Option<f64>,
-    /// Age limit of a state [s].
-    pub stale_after: f64,
 }
 
 /// The template arm over TCP.
@@ -43,7 +41,6 @@ pub const YOURARM: Arm = Arm {
     ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -4.4], [2.7, 0.4, 1.4, 2.5, 1.4, 4.4]],
     rounding: 1e-6,
     time_limit: Some(0.2),
-    stale_after: 0.03,
 };
 /// UFACTORY's arm: set points without waiting for replies, reports on ports of their own.
 pub const XARM: Arm = Arm {
@@ -52,7 +49,6 @@ pub const XARM: Arm = Arm {
     ends: [[-3.6, -0.6, -1.2, -3.6, 0.6, -3.6], [3.6, 0.6, -0.4, 3.6, 1.6, 3.6]],
     rounding: 1e-6,
     time_limit: Some(0.2),
-    stale_after: 0.03,
 };
 /// AgileX's arm on CAN.
 pub const PIPER: Arm = Arm {
@@ -61,7 +57,6 @@ pub const PIPER: Arm = Arm {
     ends: [[-2.5, 0.6, -1.6, -1.2, -0.8, -1.7], [2.5, 1.6, -0.6, 1.2, 0.8, 1.7]],
     rounding: 2e-5,
     time_limit: None,
-    stale_after: 0.03,
 };
 /// An arm behind another process; a simple one.
 pub const REMOTE: Arm = Arm {
@@ -70,7 +65,6 @@ pub const REMOTE: Arm = Arm {
     ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], [2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
     rounding: 1e-9,
     time_limit: Some(0.5),
-    stale_after: 0.1,
 };
 
 /// An arm on a serial line: the template of `dimos adapter new --transport serial`.
@@ -81,11 +75,20 @@ pub fn serial(row: &'static AdapterSpec) -> Arm {
         ends: [[-2.7, -0.8, 0.2, -2.5, 0.2, -2.7], [2.7, 0.4, 1.4, 2.5, 1.4, 2.7]],
         rounding: 1e-6,
         time_limit: Some(0.2),
-        stale_after: 0.03,
     }
 }
 
 impl Arm {
+    /// Age limit of a state [s].
+    pub fn stale_after(&self) -> f64 {
+        self.spec().stale_after.as_secs_f64()
+    }
+
+    /// How far a joint may rest from its set point [rad].
+    pub fn accuracy(&self) -> f64 {
+        self.spec().accuracy
+    }
+
     /// The end that is nearer to a pose, and the other.
     pub fn near_and_far(&self, pose: &[f64]) -> [[f64; 6]; 2] {
         let [a, b] = self.ends;
@@ -174,7 +177,7 @@ impl World {
             acceleration: limits.acceleration_max.clone(),
             period: PERIOD,
             rounding: arm.rounding,
-            stale_after: arm.stale_after,
+            stale_after: arm.stale_after(),
             time_limit: arm.time_limit,
         };
         Ok(Bed { run, gate: self.gate.clone(), arm, bounds, world: self, _folder: folder })
@@ -268,7 +271,21 @@ impl Bed {
             |to: &[f64]| self.run.move_arm("arm", to, 1.0).unwrap_or_else(|e| panic!("{}: {e}", self.arm.name)).motion;
         if furthest(&near, &self.measured()) > 0.2 {
             let motion = go(&near);
-            let there = self.run.wait(motion).unwrap();
+            let done = |bed: &Self| bed.run.motion(motion).is_ok_and(|m| m.done);
+            let began = Instant::now();
+            while !done(self) {
+                let report = self.run.motion(motion);
+                if began.elapsed() > PATIENCE {
+                    let last = self.gate.sent().last().map(|t| (super::now().since(t.at), t.what.clone()));
+                    panic!(
+                        "{}: it does not arrive: {report:?}, {last:?}, {:?}",
+                        self.arm.name,
+                        self.run.status().arms[0]
+                    );
+                }
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            let there = self.run.motion(motion).unwrap();
             assert_eq!(there.state, "COMPLETED", "{}: {:?}: {:?}", self.arm.name, there.error, self.phase());
             self.gate.forget();
         }

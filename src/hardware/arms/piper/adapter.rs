@@ -12,11 +12,12 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-use super::picture::{Counts, Picture};
+use super::hold;
+use super::picture::{Counts, Picture, STANDSTILL};
 use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
-use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
+use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
@@ -28,9 +29,8 @@ use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 /// How long clearing may take; drivers report every 25 ms.
 const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
-/// How long a stop waits for the joints to get slower, and what counts as standing and as slower [0.001 rad/s].
+/// How long a stop waits for the joints to get slower, and what counts as slower [0.001 rad/s].
 const STOP_TIMEOUT: Duration = Duration::from_millis(20);
-const STANDSTILL: i32 = 20;
 const SLOWER: i32 = 20;
 /// So far outside its limits a joint may be sent [rad]: the coordinator keeps to the limits, and an arm that lies
 /// beyond one must find back.
@@ -76,11 +76,6 @@ impl PiperAdapter {
             (ControlMode::ServoPosition, Follow::Direct) => protocol::Follow::Direct,
             _ => protocol::Follow::Smooth,
         }
-    }
-
-    /// Makes the place where the arm is its target.
-    fn hold(&mut self) -> AdapterResult<()> {
-        self.arm.send(&protocol::joint_targets(100, self.follow(), self.arm.picture.joints))
     }
 
     /// With how much torque the gripper closes at most [mNm].
@@ -154,21 +149,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     /// The data sheet's limits, narrowed by those that the controller has been given.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        let mut limits = limits();
-        let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
-        let all = positions.zip(&mut limits.velocity_max).zip(&self.arm.picture.limits);
-        for (((lower, upper), speed), own) in all {
-            let Some(own) = own else { continue };
-            let decidegrees = |value: i16| (f64::from(value) / 10.0).to_radians();
-            let (low, high) = (lower.max(decidegrees(own.lower)), upper.min(decidegrees(own.upper)));
-            if low < high {
-                (*lower, *upper) = (low, high);
-            }
-            if own.speed > 0 {
-                *speed = speed.min(f64::from(own.speed) * MILLI);
-            }
-        }
-        Ok(limits)
+        Ok(self.arm.limits())
     }
 
     // --- Mode ---
@@ -179,12 +160,14 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(AdapterError::Unsupported);
         }
         self.arm.known()?;
+        self.arm.ours()?;
         self.mode = mode;
         Ok(())
     }
 
+    /// The ordered mode, or another one when somebody else has changed it.
     fn get_control_mode(&self) -> ControlMode {
-        self.mode
+        self.arm.picture.guard.change.map_or(self.mode, |change| change.mode(self.mode))
     }
 
     // --- State ---
@@ -237,7 +220,8 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
-        Ok(self.arm.known()?.enabled())
+        let picture = self.arm.known()?;
+        Ok(picture.enabled() && !picture.guard.just_off(MonotonicClock.now()))
     }
 
     // --- Motion ---
@@ -254,19 +238,27 @@ impl ManipulatorAdapter for PiperAdapter {
             }
         }
         self.arm.may_move()?;
-        let joints: WireJoints = positions.map(millidegrees);
+        let mut joints: WireJoints = positions.map(millidegrees);
+        let here = self.arm.picture.joints.iter().zip(&self.arm.ranges);
+        for (target, (here, range)) in joints.iter_mut().zip(here) {
+            *target = hold::within(*target, *here, *range, self.arm.strict);
+        }
         match self.mode {
-            ControlMode::ServoPosition => self.arm.stream(&protocol::joint_targets(100, self.follow(), joints)),
-            _ => self.arm.send(&protocol::joint_targets(self.percent(velocity), self.follow(), joints)),
+            ControlMode::ServoPosition => self.arm.stream(self.follow(), joints),
+            _ => self.arm.write(self.percent(velocity), self.follow(), joints),
         }
     }
 
-    /// Holds the arm where it is. Confirmed when its feedback shows that every joint gets slower or stands.
+    /// Holds the arm: at what was last written, 0.02 rad from where it is at most. Confirmed when its feedback shows that
+    /// every joint gets slower or stands.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
+        if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
+            self.arm.settle()?;
+        }
         let before = self.arm.picture.motors.map(|motor| i32::from(motor.speed).abs());
         if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
-            self.hold()?;
+            self.arm.hold(self.follow())?;
         }
         let sent = MonotonicClock.now();
         let slower = |picture: &Picture| {
@@ -277,19 +269,25 @@ impl ManipulatorAdapter for PiperAdapter {
         Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
     }
 
-    /// Enabling holds the arm where it is: the target is set before the motors come on, and anew when they are on.
+    /// Enabling holds the arm where it is: the target is set before the motors come on, and again when they are on.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         if !enable {
             self.arm.drain()?;
+            self.arm.release();
             return self.arm.switch_motors(false);
         }
         self.arm.refresh()?;
         self.arm.in_order()?;
         self.arm.plausible()?;
-        self.hold()?;
+        let were_on = self.arm.picture.enabled();
+        self.arm.release();
+        self.arm.written = self.arm.written.filter(|_| were_on);
+        self.arm.take_up_hold(self.follow())?;
         self.arm.switch_motors(true)?;
         self.arm.refresh()?;
-        self.hold()
+        self.arm.written = self.arm.written.filter(|_| were_on);
+        self.arm.hold(self.follow())?;
+        self.arm.take_control()
     }
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
@@ -297,6 +295,7 @@ impl ManipulatorAdapter for PiperAdapter {
         if self.arm.picture.status.arm == ESTOP {
             return self.arm.in_order();
         }
+        self.arm.learn();
         self.arm.send(&[protocol::clear_errors()])?;
         if let Some(gripper) = self.arm.picture.gripper.filter(|_| self.arm.picture.gripper_errors().next().is_some()) {
             let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
@@ -305,10 +304,19 @@ impl ManipulatorAdapter for PiperAdapter {
         let asked = MonotonicClock.now();
         let cleared = |p: &Picture| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
         if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
+            if matches!(self.arm.picture.status.control, 0 | 1) {
+                self.arm.release();
+            }
             return Ok(());
         }
         let (code, text) = (self.arm.picture.error_code(), self.arm.picture.error_text());
         Err(AdapterError::Fault { code, text })
+    }
+
+    /// Set points that wait for the bus are taken back, where the bus lets them be; otherwise nothing new is sent before
+    /// they are out.
+    fn discard_pending(&mut self) {
+        self.arm.discard();
     }
 
     // --- Optional parts ---
@@ -329,6 +337,8 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.may_move()?;
         let ([x, y, z], [roll, pitch, yaw]) =
             (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
+        (self.arm.written, self.arm.control) = (None, None);
+        self.arm.picture.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
         self.arm.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
     }
 

@@ -1,9 +1,12 @@
 //! AgileX Piper: 6 joints and a gripper on a CAN bus. `docs/arms/piper.md` is for those who run one.
 
 pub mod adapter;
+mod belief;
 pub mod emulator;
 #[cfg(test)]
 mod golden;
+mod guard;
+mod hold;
 pub mod picture;
 pub mod protocol;
 mod session;
@@ -11,6 +14,10 @@ mod session;
 mod tests;
 #[cfg(test)]
 mod tests_faults;
+#[cfg(test)]
+mod tests_holds;
+#[cfg(test)]
+mod tests_others;
 mod wire;
 
 use std::time::Duration;

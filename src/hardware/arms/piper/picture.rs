@@ -5,6 +5,8 @@
 
 use std::time::Duration;
 
+use super::belief::Belief;
+use super::guard::Guard;
 use super::protocol::{
     DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
 };
@@ -16,6 +18,8 @@ const BURST: Duration = Duration::from_millis(4);
 const FAR: u32 = 360_000;
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
+/// A motor that says no more than this stands [0.001 rad/s].
+pub const STANDSTILL: i32 = 20;
 /// Room for the text of the firmware.
 const TEXT: usize = 128;
 
@@ -50,7 +54,7 @@ pub struct Counts {
     pub decoded: u64,
     /// Complete sets of joint positions.
     pub sets: u64,
-    /// Frames too short, and sets that no arm can mean.
+    /// Frames too short, and sets of positions that are not believed.
     pub damaged: u64,
     /// Frames of no interest.
     pub other: u64,
@@ -61,7 +65,7 @@ pub struct Counts {
 /// The arm's newest feedback. `Mono::ZERO` stands for never.
 #[derive(Debug, Clone)]
 pub struct Picture {
-    /// Joint positions [0.001°] and when their last frame arrived.
+    /// The newest believed joint positions [0.001°].
     pub joints: WireJoints,
     /// When `joints` was completed.
     pub joints_at: Mono,
@@ -87,8 +91,11 @@ pub struct Picture {
     pub limits: [Option<MotorLimits>; DOF],
     /// When somebody else last sent a command to an arm on this bus.
     pub commanded_at: Mono,
+    /// Changes that this run did not order.
+    pub guard: Guard,
     /// What was counted.
     pub counts: Counts,
+    belief: Belief,
     joint_parts: Triple,
     pose_parts: Triple,
     text: [u8; TEXT],
@@ -111,7 +118,9 @@ impl Default for Picture {
             gripper_used: false,
             limits: [None; DOF],
             commanded_at: Mono::ZERO,
+            guard: Guard::default(),
             counts: Counts::default(),
+            belief: Belief::default(),
             joint_parts: Triple::default(),
             pose_parts: Triple::default(),
             text: [0; TEXT],
@@ -131,9 +140,10 @@ impl Picture {
         match feedback {
             Feedback::Other => return self.counts.other += 1,
             Feedback::Damaged => return self.counts.damaged += 1,
-            Feedback::Leader => {
+            Feedback::Leader | Feedback::Command => {
                 self.commanded_at = now;
-                return self.counts.leader += 1;
+                self.guard.commanded();
+                return self.counts.leader += u64::from(feedback == Feedback::Leader);
             }
             _ => self.counts.decoded += 1,
         }
@@ -144,7 +154,10 @@ impl Picture {
                 }
             }
             Feedback::Pose(part, pair) => self.pose = self.pose_parts.take(part, pair, now).or(self.pose),
-            Feedback::Status(status) => (self.status, self.status_at) = (status, now),
+            Feedback::Status(status) => {
+                (self.status, self.status_at) = (status, now);
+                self.guard.status(&status, now);
+            }
             Feedback::Gripper(gripper) => self.gripper = Some(gripper),
             Feedback::Motor(joint, motor) => {
                 if let (Some(to), Some(at)) = (self.motors.get_mut(joint), self.motors_at.get_mut(joint)) {
@@ -154,6 +167,9 @@ impl Picture {
             Feedback::Driver(joint, driver) => {
                 if let (Some(to), Some(at)) = (self.drivers.get_mut(joint), self.drivers_at.get_mut(joint)) {
                     (*to, *at) = (driver, now);
+                    if !driver.enabled() {
+                        self.guard.motor_off(now);
+                    }
                 }
             }
             Feedback::Limits(joint, limits) => {
@@ -165,7 +181,7 @@ impl Picture {
                 room.iter_mut().zip(piece.iter().take(count)).for_each(|(to, from)| *to = *from);
                 self.text_length += count;
             }
-            Feedback::Other | Feedback::Damaged | Feedback::Leader => {}
+            Feedback::Other | Feedback::Damaged | Feedback::Leader | Feedback::Command => {}
         }
     }
 
@@ -173,11 +189,21 @@ impl Picture {
         let far = joints.iter().any(|value| value.unsigned_abs() > FAR);
         // A controller that has just started says zero before it has asked its joints.
         let elsewhere = self.joints_at != Mono::ZERO && self.joints.iter().any(|value| value.unsigned_abs() > NOT_ZERO);
-        if far || (elsewhere && joints == [0; DOF]) {
+        if far || (elsewhere && joints == [0; DOF]) || !self.belief.take(joints, now) {
             return self.counts.damaged += 1;
         }
         (self.joints, self.joints_at) = (joints, now);
         self.counts.sets += 1;
+    }
+
+    /// Whether joint positions were refused lately, so that the believed ones may be the wrong ones.
+    pub fn disputed(&self, now: Mono) -> bool {
+        self.belief.disputed(now)
+    }
+
+    /// Whether all motors say that they stand.
+    pub fn stands(&self) -> bool {
+        self.motors.iter().all(|motor| i32::from(motor.speed).abs() <= STANDSTILL)
     }
 
     /// Whether everything was heard of that the reads need.
@@ -316,13 +342,19 @@ mod tests {
         assert_eq!((picture.joints, picture.counts.sets), ([1; 6], 1));
         (0..3).for_each(|part| joints(&mut picture, part, -5, ms(30)));
         assert_eq!((picture.joints, picture.joints_at), ([-5; 6], ms(30)));
+        // What no arm can have reached in that time.
+        (0..3).for_each(|part| joints(&mut picture, part, 60_000, ms(35)));
+        assert_eq!((picture.joints, picture.counts.damaged), ([-5; 6], 1));
+        assert!(picture.disputed(ms(35)));
     }
 
     #[test]
     fn sudden_zeros_and_impossible_angles_are_not_believed() {
         let mut picture = Picture::default();
+        let mut at = 1;
         let mut set = |value: i32| {
-            (0..3).for_each(|part| joints(&mut picture, part, value, ms(1)));
+            at += 200;
+            (0..3).for_each(|part| joints(&mut picture, part, value, ms(at)));
             picture.joints[0]
         };
         assert_eq!(set(0), 0, "the first may be zero: activation looks again");

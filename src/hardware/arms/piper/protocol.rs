@@ -104,6 +104,10 @@ pub struct Status {
     pub control: u8,
     /// The arm's state; 0 = in order.
     pub arm: u8,
+    /// Its move mode: 0 MOVE P, 1 MOVE J …
+    pub mode: u8,
+    /// What it does of teaching by hand; 0 = nothing.
+    pub teaching: u8,
     /// Joints beyond their limits: bit 0 = joint 1.
     pub limits: u8,
     /// Joints that do not answer: bit 0 = joint 1.
@@ -187,6 +191,8 @@ pub enum Feedback {
     Firmware([u8; 8], usize),
     /// What an arm sends that leads others: its own joints as commands, or feedback under shifted identifiers.
     Leader,
+    /// Another command to the arm: a stop, a mode, a pose, its motors, its errors.
+    Command,
     /// A frame of the arm with too few bytes, or a number that no frame has.
     Damaged,
     /// Of no interest here.
@@ -199,6 +205,9 @@ pub fn decode(frame: &CanFrame) -> Feedback {
     if let 0x151 | 0x155..=0x157 | 0x159 | 0x3A0..=0x3AF = id {
         return Feedback::Leader;
     }
+    if let 0x150 | 0x152..=0x154 | 0x158 | 0x15A..=0x15F | 0x470 | 0x471 | 0x474 | 0x475 = id {
+        return Feedback::Command;
+    }
     if id == 0x4AF {
         return Feedback::Firmware(frame.data, usize::from(frame.len.min(8)));
     }
@@ -206,7 +215,9 @@ pub fn decode(frame: &CanFrame) -> Feedback {
     let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
     let from = |first: u16| usize::from(id.wrapping_sub(first));
     let feedback = match id {
-        0x2A1 => Feedback::Status(Status { control: a, arm: b, limits: g & 0x3F, silent: h & 0x3F }),
+        0x2A1 => {
+            Feedback::Status(Status { control: a, arm: b, mode: c, teaching: d, limits: g & 0x3F, silent: h & 0x3F })
+        }
         0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
         0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
         0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], status: g }),
@@ -286,6 +297,19 @@ pub fn control_text(control: u8) -> &'static str {
         6 => "a leader arm",
         7 => "a program of its own",
         _ => "something that the sheet does not list",
+    }
+}
+
+/// The name of a move mode (0x2A1, byte 2).
+pub fn mode_text(mode: u8) -> &'static str {
+    match mode {
+        0 => "MOVE P",
+        1 => "MOVE J",
+        2 => "MOVE L",
+        3 => "MOVE C",
+        4 => "MIT",
+        5 => "CPV",
+        _ => "a mode that the sheet does not list",
     }
 }
 

@@ -20,7 +20,7 @@ fn commands_are_the_golden_bytes() {
 #[test]
 fn feedback_is_read_from_the_golden_bytes() {
     let read = |text| decode(&frame(text));
-    let status = Status { control: 1, arm: 4, limits: 0b10, silent: 0b100000 };
+    let status = Status { control: 1, arm: 4, mode: 1, teaching: 0, limits: 0b10, silent: 0b100000 };
     assert_eq!(read(golden::STATUS), Feedback::Status(status));
     for part in 0..3 {
         let two = |all: [i32; 6]| [all[2 * part], all[2 * part + 1]];
@@ -39,7 +39,12 @@ fn feedback_is_read_from_the_golden_bytes() {
     for leader in ["151#01", "155#", "157#0000000000000000", "159#00", "3A5#0000000000000000"] {
         assert_eq!(read(leader), Feedback::Leader);
     }
-    for other in [golden::ACK_ENABLE, golden::ACCELERATION_3, "000#", "150#02", "2A0#00", "2A9#00", "7FF#FFFF"] {
+    for command in ["150#02", golden::MOVE_POSE[1], golden::ENABLE, golden::CLEAR, "15A#00", "470#FC", "474#01"] {
+        assert_eq!(read(command), Feedback::Command);
+    }
+    for other in
+        [golden::ACK_ENABLE, golden::ACCELERATION_3, golden::ASK_LIMITS, "000#", "2A0#00", "2A9#00", "7FF#FFFF"]
+    {
         assert_eq!(read(other), Feedback::Other);
     }
 }

@@ -3,13 +3,15 @@
 
 use std::time::Duration;
 
+use super::hold::{self, WireRanges};
 use super::limits;
 use super::picture::Picture;
-use super::protocol::{self, DOF, radians};
+use super::protocol::{self, DOF, Follow, MoveMode, Status, WireJoints, radians};
 use super::wire::Wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::{CanAddress, CanFrame};
+use crate::joint::JointLimits;
 
 /// Longest waits for the first whole state, and then for what was asked.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
@@ -39,6 +41,14 @@ pub struct Session {
     pub wire: Option<Wire>,
     /// What is known of the arm.
     pub picture: Picture,
+    /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
+    pub written: Option<WireJoints>,
+    /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
+    pub control: Option<(u8, Follow)>,
+    /// Its joint limits [0.001°].
+    pub ranges: WireRanges,
+    /// The controller refuses targets outside its limits.
+    pub strict: bool,
     /// When what had arrived was last taken up.
     drained_at: Mono,
 }
@@ -46,12 +56,25 @@ pub struct Session {
 impl Session {
     /// A session with the arm on the bus at `address`. Does not connect.
     pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
-        Self { hardware_id, address, wire: None, picture: Picture::of_arm(gripper_used), drained_at: Mono::ZERO }
+        let picture = Picture::of_arm(gripper_used);
+        let ranges = [(0, 0); DOF];
+        Self {
+            hardware_id,
+            address,
+            wire: None,
+            picture,
+            written: None,
+            control: None,
+            ranges,
+            strict: false,
+            drained_at: Mono::ZERO,
+        }
     }
 
     /// Opens the port and waits for a whole state. Only asks.
     pub fn connect(&mut self) -> AdapterResult<()> {
         self.picture = Picture::of_arm(self.picture.gripper_used);
+        (self.written, self.control, self.strict) = (None, None, false);
         self.wire = Some(Wire::open(&self.address)?);
         let introduced = self.introduce();
         if introduced.is_err() {
@@ -78,9 +101,35 @@ impl Session {
         self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
     }
 
-    /// Sends a set point of a stream, which may get lost: the next one replaces it.
-    pub fn stream(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
-        self.wire.as_mut().ok_or(AdapterError::NotConnected)?.stream(frames)
+    /// Sends a joint target, with its control frame, and remembers it.
+    pub fn write(&mut self, speed: u8, follow: Follow, target: WireJoints) -> AdapterResult<()> {
+        let frames = protocol::joint_targets(speed, follow, target);
+        self.picture.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
+        self.send(&frames)?;
+        (self.written, self.control) = (Some(target), Some((speed, follow)));
+        Ok(())
+    }
+
+    /// Sends a set point. The control frame is left out where the arm reports that it is in the mode: another program that
+    /// has just changed it would have that undone before it shows.
+    pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
+        const SPEED: u8 = 100;
+        let Status { control, mode, .. } = self.picture.status;
+        if self.control != Some((SPEED, follow)) || (control, mode) != (1, MoveMode::Joint as u8) {
+            return self.write(SPEED, follow, target);
+        }
+        let [_, targets @ ..] = protocol::joint_targets(SPEED, follow, target);
+        self.send(&targets)?;
+        self.written = Some(target);
+        Ok(())
+    }
+
+    /// Takes back what has not left this computer; see [`Wire::discard`]. Where that fails, the connection ends.
+    pub fn discard(&mut self) {
+        let discarded = self.wire.as_mut().map(Wire::discard);
+        if let Some(Err(_)) = discarded {
+            self.wire = None;
+        }
     }
 
     /// Takes up feedback until `done` says so; `false` when the time is over.
@@ -159,7 +208,28 @@ impl Session {
             self.send(&questions)?;
             self.watch(ANSWER_TIMEOUT / 2, answered)?; // what stays unanswered is known from the data sheet
         }
+        let limits = self.limits();
+        self.ranges = hold::ranges(&limits.position_lower, &limits.position_upper);
         Ok(())
+    }
+
+    /// The data sheet's limits, narrowed by those that the controller has been given.
+    pub fn limits(&self) -> JointLimits {
+        let mut limits = limits();
+        let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
+        let all = positions.zip(&mut limits.velocity_max).zip(&self.picture.limits);
+        for (((lower, upper), speed), own) in all {
+            let Some(own) = own else { continue };
+            let decidegrees = |value: i16| (f64::from(value) / 10.0).to_radians();
+            let (low, high) = (lower.max(decidegrees(own.lower)), upper.min(decidegrees(own.upper)));
+            if low < high {
+                (*lower, *upper) = (low, high);
+            }
+            if own.speed > 0 {
+                *speed = speed.min(f64::from(own.speed) * 1e-3);
+            }
+        }
+        limits
     }
 
     /// Why there is no whole state.
@@ -222,15 +292,47 @@ impl Session {
         }
     }
 
+    /// An error when somebody else has changed the arm's mode or power, which is left as it is.
+    pub fn ours(&self) -> AdapterResult<()> {
+        let what = match (self.picture.guard.change, self.picture.guard.lost_power()) {
+            (Some(change), _) => change.text(),
+            (None, true) => "its motors were switched off".to_owned(),
+            (None, false) => return Ok(()),
+        };
+        Err(self.refuse(format!(
+            "{what}, which this run did not order: the arm is left alone\nhint: end that, then enable the arm again"
+        )))
+    }
+
+    /// Ends the watch for changes that this run did not order, and forgets what was written before one.
+    pub fn release(&mut self) {
+        self.written = self.written();
+        self.control = None;
+        self.picture.guard.release();
+    }
+
+    /// What was written, if the arm has followed it since.
+    pub fn written(&self) -> Option<WireJoints> {
+        self.written.filter(|_| self.ours().is_ok())
+    }
+
     /// An error unless the arm may be told to move.
     pub fn may_move(&mut self) -> AdapterResult<()> {
         self.whole()?;
         self.in_order()?;
+        self.ours()?;
         if self.picture.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
     }
 
     /// An error when the measured pose cannot be true: holding there would be a jump.
-    pub fn plausible(&self) -> AdapterResult<()> {
+    pub fn plausible(&mut self) -> AdapterResult<()> {
+        if !self.settle()? {
+            return Err(self.refuse(
+                "its measured positions contradict each other: not enabled\nhint: look for interference on the bus \
+                 (shield, terminators), or a second arm on it"
+                    .into(),
+            ));
+        }
         if self.picture.joints == [0; DOF] {
             return Err(self.refuse(
                 "every joint reads exactly 0, as from a controller that has not measured yet: not enabled\nhint: if \

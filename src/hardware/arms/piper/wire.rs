@@ -17,16 +17,16 @@ const FILTERS: &[CanFilter] = &[
     CanFilter { id: 0x2A0, mask: 0x7F0 },
     CanFilter { id: 0x250, mask: 0x7F0 },
     CanFilter { id: 0x260, mask: 0x7F0 },
-    CanFilter { id: 0x473, mask: 0x7FF },
     CanFilter { id: 0x4AF, mask: 0x7FF },
     CanFilter { id: 0x150, mask: 0x7F0 },
     CanFilter { id: 0x3A0, mask: 0x7F0 },
+    // Commands for the motors: those of other programs, and this one's until they are transmitted.
+    CanFilter { id: 0x470, mask: 0x7FC },
+    CanFilter { id: 0x474, mask: 0x7FE },
 ];
-/// Frames that may wait for the bus: the next command is not sent behind them. A healthy bus takes a burst in 1 ms, and
-/// what waits when the arm loses its power reaches it when the power returns.
+/// Frames that may wait for the bus: two set points of four frames. A healthy bus takes one in 1 ms, and what waits when
+/// the arm loses its power reaches it when the power returns.
 const MAY_WAIT: usize = 8;
-/// So many set points in a row that the bus does not take are more than a hiccup.
-const TOO_MANY: u32 = 3;
 /// Most events fetched in one go: a second's.
 const BATCH: usize = 4096;
 
@@ -35,8 +35,8 @@ pub struct Wire {
     port: Box<dyn CanPort>,
     /// The arm and its bus, for messages.
     peer: String,
-    /// Commands in a row that were not taken whole.
-    refused: u32,
+    /// What waited when it was to be discarded must have gone before anything new is sent.
+    discarding: bool,
     /// What was counted.
     pub counts: WireCounts,
 }
@@ -56,27 +56,24 @@ impl Wire {
     /// Opens a port at `address`.
     pub fn open(address: &CanAddress) -> AdapterResult<Self> {
         let port = can::open("piper", address, FILTERS)?;
-        Ok(Self { port, peer: format!("piper at {address}"), refused: 0, counts: WireCounts::default() })
+        Ok(Self { port, peer: format!("piper at {address}"), discarding: false, counts: WireCounts::default() })
     }
 
     /// Sends a command: an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
-        if self.offer(frames)? { Ok(()) } else { Err(self.no_room()) }
-    }
-
-    /// Sends a set point of a stream. One that the bus has no room for is dropped and counted: the next one replaces it.
-    /// Three in a row are an error.
-    pub fn stream(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
-        if self.offer(frames)? || self.refused < TOO_MANY { Ok(()) } else { Err(self.no_room()) }
-    }
-
-    /// Whether the bus has taken all of a command.
-    fn offer(&mut self, frames: &[CanFrame]) -> AdapterResult<bool> {
-        let taken = if self.port.waiting() > MAY_WAIT { 0 } else { self.port.send(frames)? };
-        let whole = taken == frames.len();
-        self.refused = if whole { 0 } else { self.refused.saturating_add(1) };
+        let waiting = self.port.waiting();
+        self.discarding &= waiting > 0;
+        let room = !self.discarding && waiting + frames.len() <= MAY_WAIT;
+        let taken = if room { self.port.send(frames)? } else { 0 };
         self.counts.not_taken += (frames.len() - taken) as u64;
-        Ok(whole)
+        if taken == frames.len() { Ok(()) } else { Err(self.no_room()) }
+    }
+
+    /// Takes back what has not left this computer. What cannot be taken back goes out before anything else: until then
+    /// nothing is sent.
+    pub fn discard(&mut self) -> AdapterResult<()> {
+        self.discarding = self.port.discard()? > 0;
+        Ok(())
     }
 
     fn no_room(&self) -> AdapterError {
@@ -129,5 +126,50 @@ impl Wire {
     /// Readable when something has arrived.
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.port.fd()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::protocol::{Follow, joint_targets};
+    use super::*;
+    use crate::hardware::transport::can::Bus;
+
+    fn burst(n: i32) -> [CanFrame; 4] {
+        joint_targets(100, Follow::Smooth, [n; 6])
+    }
+
+    /// The frames that another node has heard.
+    fn heard(arm: &mut impl CanPort) -> Vec<CanFrame> {
+        let frames = std::iter::from_fn(|| arm.receive().unwrap());
+        frames.filter_map(|event| if let CanEvent::Frame(frame) = event { Some(frame) } else { None }).collect()
+    }
+
+    #[test]
+    fn at_most_two_set_points_wait_and_they_can_be_taken_back() {
+        let bus = Bus::new();
+        let mut arm = bus.attach().unwrap();
+        let mut wire = Wire::open(&bus.address()).unwrap();
+        bus.withhold(100);
+        let sent: Vec<bool> = (0..5).map(|n| wire.send(&burst(n)).is_ok()).collect();
+        assert_eq!(sent, [true, true, false, false, false]);
+        wire.discard().unwrap();
+        assert_eq!(wire.send(&burst(7)), Ok(()), "there is room again");
+        assert_eq!((bus.acknowledge(), heard(&mut arm)), (4, burst(7).to_vec()), "and nothing from before goes out");
+    }
+
+    #[test]
+    fn what_cannot_be_taken_back_goes_out_before_anything_new() {
+        let bus = Bus::new();
+        let mut arm = bus.attach().unwrap();
+        let mut wire = Wire::open(&bus.address()).unwrap();
+        bus.keep_waiting(true);
+        bus.withhold(100);
+        wire.send(&burst(0)).unwrap();
+        wire.discard().unwrap();
+        let error = wire.send(&burst(1)).unwrap_err().to_string();
+        assert!(error.contains("takes no frames"), "{error}");
+        assert_eq!((bus.acknowledge(), heard(&mut arm)), (4, burst(0).to_vec()));
+        assert_eq!((wire.send(&burst(2)), heard(&mut arm)), (Ok(()), burst(2).to_vec()));
     }
 }

@@ -7,12 +7,13 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use super::address::Address;
-use super::connect::{connect, takes_duration};
+use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
+use super::measured::measured;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
 use super::session::Session;
-use super::{HOLDS_WHEN_DISABLED, MODES, Options, fit, model_of};
+use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, fit, model_of};
 use crate::arm::Pose;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
@@ -80,6 +81,12 @@ impl XArmAdapter {
         self.session.as_mut().ok_or(AdapterError::NotConnected)
     }
 
+    /// The modes of this very arm.
+    fn modes(&self) -> &'static [ControlMode] {
+        let old = self.session.as_ref().is_some_and(|session| !ends_velocities(session.device.firmware));
+        if old { MODES_WITHOUT_VELOCITY } else { MODES }
+    }
+
     /// Our joint values as those of the wire.
     fn joints(&self, values: &[f64]) -> AdapterResult<WireJoints> {
         let dof = self.model.axes();
@@ -121,6 +128,19 @@ impl ManipulatorAdapter for XArmAdapter {
         (self.session, self.target) = (None, None);
     }
 
+    fn discard_pending(&mut self) {
+        self.target = None;
+        self.session.take().into_iter().for_each(Session::abort);
+    }
+
+    /// Stops nothing where another client has taken the arm over: it is not this run's motion.
+    fn deactivate(&mut self) -> AdapterResult<()> {
+        match self.session.as_ref().and_then(Session::foreign_change) {
+            Some(_) => Ok(()),
+            None => self.write_stop().map(drop),
+        }
+    }
+
     fn is_connected(&self) -> bool {
         self.session.is_some()
     }
@@ -143,7 +163,7 @@ impl ManipulatorAdapter for XArmAdapter {
             firmware_version: device.map(|device| device.firmware.to_string()),
             serial_number: device.map(|device| device.serial.clone()),
             native_rate: self.session.as_ref().map_or(super::NATIVE_RATE, Session::rate),
-            modes: MODES,
+            modes: self.modes(),
             holds_when_disabled: HOLDS_WHEN_DISABLED,
             whole_state_at_once: true,
         }
@@ -160,6 +180,13 @@ impl ManipulatorAdapter for XArmAdapter {
     // --- Mode ---
 
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        if mode == ControlMode::Velocity && !self.modes().contains(&mode) {
+            let firmware = self.session.as_ref().map(|session| session.device.firmware.to_string()).unwrap_or_default();
+            return Err(AdapterError::Rejected(format!(
+                "velocity mode needs firmware 1.8.0 or newer, which ends a velocity when no other follows; this \
+                 controller has {firmware}\nhint: update the controller's firmware, or use position tasks"
+            )));
+        }
         let mode = match mode {
             ControlMode::Position => PLANNED,
             ControlMode::ServoPosition => SERVO,
@@ -181,6 +208,10 @@ impl ManipulatorAdapter for XArmAdapter {
             5 => ControlMode::CartesianVelocity,
             _ => ControlMode::Cartesian,
         }
+    }
+
+    fn foreign_change(&self) -> Option<&'static str> {
+        self.session.as_ref().and_then(Session::foreign_change)
     }
 
     // --- State ---
@@ -220,7 +251,7 @@ impl ManipulatorAdapter for XArmAdapter {
             position: self.only(&motion.position),
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
-            valid: None,
+            valid: measured(motion, self.model, session.condition().tool),
         };
         Ok(())
     }
@@ -258,10 +289,11 @@ impl ManipulatorAdapter for XArmAdapter {
 
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         let joints = self.joints(velocities)?;
-        self.with(|session| {
-            let duration = takes_duration(session.device.firmware).then_some(VELOCITY_TIMEOUT);
-            session.stream(JOINT_VELOCITY, &Command::Velocity { joints, duration })
-        })
+        if !self.modes().contains(&ControlMode::Velocity) {
+            return Err(AdapterError::Unsupported);
+        }
+        let command = Command::Velocity { joints, duration: Some(VELOCITY_TIMEOUT) };
+        self.with(|session| session.stream(JOINT_VELOCITY, &command))
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
@@ -269,9 +301,22 @@ impl ManipulatorAdapter for XArmAdapter {
         self.with(Session::stop)
     }
 
+    /// Switched on, the arm is ready in the mode it is in, or in servo mode.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         self.target = None;
-        self.with(|session| session.enable(enable))
+        let modes = self.modes();
+        self.with(|session| {
+            if !enable {
+                return session.enable(false);
+            }
+            let velocity = modes.contains(&ControlMode::Velocity);
+            let mode = match session.motion().0.mode {
+                PLANNED => PLANNED,
+                JOINT_VELOCITY if velocity => JOINT_VELOCITY,
+                _ => SERVO,
+            };
+            session.activate(mode, false)
+        })
     }
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {

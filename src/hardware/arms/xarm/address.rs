@@ -29,6 +29,11 @@ impl Address {
         Ok(Self { control: Endpoint::parse(control, CONTROL_PORT)?, reports })
     }
 
+    /// The second control port, one above the first: newer boxes have it for the devices behind them.
+    pub fn second(&self) -> Endpoint {
+        Endpoint { host: self.control.host.clone(), port: self.control.port.saturating_add(1) }
+    }
+
     /// The report port so many after the first.
     pub fn report(&self, offset: u16) -> Endpoint {
         Endpoint { host: self.control.host.clone(), port: self.reports.saturating_add(offset) }
@@ -64,6 +69,7 @@ mod tests {
         for bad in ["", ":502", "host:0", "host:1:0", "host:1:65533", "host:1:2:3", "host:1:", "host::2", "300.1.1.1"] {
             assert!(full(bad).is_err(), "{bad:?}");
         }
-        assert_eq!(Address::parse("arm:1:2").unwrap().report(3).port, 5);
+        let address = Address::parse("arm:1:2").unwrap();
+        assert_eq!((address.report(3).port, address.second().port), (5, 2));
     }
 }

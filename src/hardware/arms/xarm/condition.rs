@@ -27,10 +27,14 @@ pub struct Condition {
     pub warning: u8,
     /// Motors that are on, one bit per joint.
     pub enabled: u8,
+    /// Where the tool is from the flange: x, y, z [mm].
+    pub tool: [f64; 3],
     /// Error codes of the joints' servos.
     servos: [u8; 7],
     /// Something has changed; register 15 must say what.
     pub changed: bool,
+    /// When something was seen that only an answer to a later question explains.
+    doubted: Mono,
     servos_changed: bool,
     /// When it was asked, while the answer is outstanding.
     asked: Option<Mono>,
@@ -43,6 +47,11 @@ impl Condition {
         self.enabled & all == all
     }
 
+    /// Whether the motors of the first `axes` joints are off.
+    pub fn none_enabled(&self, axes: usize) -> bool {
+        u16::from(self.enabled) & ((1 << axes) - 1) == 0
+    }
+
     /// Looks at the state byte of a response.
     pub fn hint(&mut self, status: Status) {
         self.changed |= status.error() != (self.error != 0);
@@ -50,8 +59,13 @@ impl Condition {
 
     /// Looks at a report.
     pub fn report(&mut self, health: Health) {
-        self.enabled = health.enabled;
+        (self.enabled, self.tool) = (health.enabled, health.tool);
         self.changed |= health.error != self.error || health.warning != self.warning;
+    }
+
+    /// Something happened just now: what was asked before does not explain it.
+    pub fn doubt(&mut self, now: Mono) {
+        (self.changed, self.doubted) = (true, now);
     }
 
     /// Takes the answer to a question of [`Condition::due`].
@@ -60,7 +74,8 @@ impl Condition {
             (15, [error, warning, ..]) => {
                 self.servos_changed = SERVO_ERRORS.contains(error) && *error != self.error;
                 (self.error, self.warning) = (*error, *warning);
-                (self.changed, self.asked) = (false, None);
+                self.changed &= self.asked.is_some_and(|asked| asked <= self.doubted);
+                self.asked = None;
                 if POWER_CUT.contains(error) {
                     self.enabled = 0;
                 }

@@ -6,10 +6,10 @@ use std::time::Duration;
 use super::Options;
 use super::address::Address;
 use super::condition::Condition;
-use super::control::{Control, Purpose, REPLY_TIMEOUT};
+use super::control::{Control, Purpose};
 use super::gripper::Gripper;
 use super::model::{Identity, Model};
-use super::protocol::commands::Command;
+use super::protocol::commands::{Command, QUICK, SLOW};
 use super::protocol::frame::{Response, WATCHED};
 use super::protocol::gripper::{BAUD_INDEX, BAUD_REGISTER, GripperKind, Rtu, decode_position};
 use super::protocol::identity::{Firmware, decode_serial, decode_version};
@@ -21,11 +21,15 @@ use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
 /// Longest time for all of it.
-const ALL: Duration = Duration::from_millis(2500);
+const ALL: Duration = Duration::from_millis(3000);
 /// Longest wait for the connection, for the introduction, and for the first report of a kind.
 const CONNECT: Duration = Duration::from_millis(1200);
 const VERSION: Duration = Duration::from_millis(1000);
 const FIRST_REPORT: Duration = Duration::from_millis(1000);
+/// Longest wait for the second control port, which older boxes refuse.
+const SECOND: Duration = Duration::from_millis(300);
+/// Longest wait for the gripper's first answer over it.
+const FIRST_TELEGRAM: Duration = Duration::from_millis(1200);
 
 /// What is left of a time limit, at most `most`.
 fn left(until: Mono, most: Duration) -> Duration {
@@ -46,26 +50,37 @@ pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterRes
     if firmware.at_least(1, 8, 6) {
         control.speak(WATCHED);
     }
-    let serial = ask(&mut control, &Command::Serials, left(until, REPLY_TIMEOUT))?;
+    let serial = ask(&mut control, &Command::Serials, left(until, QUICK))?;
     let serial = decode_serial(serial.data()).unwrap_or_else(|| identity.serial.clone());
 
-    let full = firmware.at_least(2, 1, 0);
-    let (kind, decode): (_, fn(&[u8]) -> _) =
-        if full { (Kind::Full, Motion::decode_full) } else { (Kind::Real, Motion::decode_real) };
-    let mut motion = Stream::connect(address, kind, decode, left(until, CONNECT))?;
+    let (motion, first) = reports(address, firmware, until)?;
     let mut normal = Stream::connect(address, Kind::Normal, Health::decode, left(until, CONNECT))?;
-    let first = motion.wait(left(until, FIRST_REPORT)).map_err(no_report)?;
     let mut condition = Condition::default();
     condition.report(normal.wait(left(until, FIRST_REPORT)).map_err(no_report)?);
     // Register 70 turns the torques of every report but the full one into currents.
-    let currents = !full && ask(&mut control, &Command::ReportsCurrents, REPLY_TIMEOUT)?.data().first() == Some(&1);
-    condition.take(&ask(&mut control, &Command::GetError, REPLY_TIMEOUT)?);
-    let pulses = find_gripper(&mut control, options.gripper, address)?;
+    let full = motion.kind() == Kind::Full;
+    let currents = !full && ask(&mut control, &Command::ReportsCurrents, QUICK)?.data().first() == Some(&1);
+    condition.take(&ask(&mut control, &Command::GetError, QUICK)?);
+    let (bus, pulses) = find_gripper(&mut control, options.gripper, address, until)?;
 
     let limits = identity.limits().unwrap_or_else(|| model.limits());
     let device = Device { model, firmware, serial, limits, torques: !currents };
     let gripper = Gripper::new(options.gripper, pulses);
-    Ok(Session::new(device, control, motion, first, normal, condition, gripper))
+    Ok(Session::new(device, control, bus, motion, first, normal, condition, gripper))
+}
+
+/// Connects to the joints' reports: those of port 30000 where there are any, else those of port 30003, which every
+/// firmware has.
+fn reports(address: &Address, firmware: Firmware, until: Mono) -> AdapterResult<(Stream<Motion>, Motion)> {
+    let begin = |kind, decode: fn(&[u8]) -> _| -> AdapterResult<_> {
+        let mut stream = Stream::connect(address, kind, decode, left(until, FIRST_REPORT))?;
+        let first = stream.wait(left(until, FIRST_REPORT)).map_err(no_report)?;
+        Ok((stream, first))
+    };
+    if !firmware.at_least(2, 1, 0) {
+        return begin(Kind::Real, Motion::decode_real);
+    }
+    begin(Kind::Full, Motion::decode_full).or_else(|error| begin(Kind::Real, Motion::decode_real).map_err(|_| error))
 }
 
 fn ask(control: &mut Control, command: &Command, timeout: Duration) -> AdapterResult<Response> {
@@ -119,14 +134,20 @@ fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()
     )))
 }
 
-/// Looks whether the gripper of the blueprint answers; where it is [pulses].
-fn find_gripper(control: &mut Control, kind: GripperKind, address: &Address) -> AdapterResult<Option<i32>> {
+/// Looks whether the gripper of the blueprint answers: over which connection, where `control` is not to be used, and
+/// where it is [pulses].
+fn find_gripper(
+    control: &mut Control,
+    kind: GripperKind,
+    address: &Address,
+    until: Mono,
+) -> AdapterResult<(Option<Control>, Option<i32>)> {
     if kind == GripperKind::None {
-        return Ok(None);
+        return Ok((None, None));
     }
     let rejected =
         |what: &str, hint: &str| Err(AdapterError::Rejected(format!("xarm at {address}: {what}\nhint: {hint}")));
-    let baud = ask(control, &Command::ReadToolBoard(BAUD_REGISTER), REPLY_TIMEOUT)?;
+    let baud = ask(control, &Command::ReadToolBoard(BAUD_REGISTER), left(until, SLOW))?;
     match baud.data() {
         [_, a, b, c, d, ..] | [a, b, c, d] if i32::from_be_bytes([*a, *b, *c, *d]) == BAUD_INDEX => {}
         _ => {
@@ -137,9 +158,18 @@ fn find_gripper(control: &mut Control, kind: GripperKind, address: &Address) -> 
         }
     }
     let telegram = Rtu::read_position();
-    let answer = ask(control, &Command::Tool(telegram), REPLY_TIMEOUT)?;
+    // What listens there may be something else altogether.
+    let second = || {
+        let mut bus = Control::new(TcpLink::connect("xarm", &address.second(), left(until, SECOND))?);
+        let answer = ask(&mut bus, &Command::Tool(telegram), left(until, FIRST_TELEGRAM))?;
+        AdapterResult::Ok((Some(bus), answer))
+    };
+    let (bus, answer) = match second() {
+        Ok(found) => found,
+        Err(_) => (None, ask(control, &Command::Tool(telegram), left(until, SLOW))?),
+    };
     match telegram.answered(answer.data()).and_then(decode_position) {
-        Some(pulses) => Ok(Some(pulses)),
+        Some(pulses) => Ok((bus, Some(pulses))),
         None => rejected(
             "no gripper answers at the tool flange",
             "is it fitted? Without one set the arm's options to {gripper: none}",
@@ -152,7 +182,8 @@ pub fn takes_detection(firmware: Firmware) -> bool {
     firmware.at_least(1, 10, 0)
 }
 
-/// Whether joint velocities can have a time after which they end.
-pub fn takes_duration(firmware: Firmware) -> bool {
+/// Whether joint velocities have a time after which the controller ends them. Without it a velocity lasts until the next
+/// command, also when no command can come any more: such an arm has no velocity mode here.
+pub fn ends_velocities(firmware: Firmware) -> bool {
     firmware.at_least(1, 8, 0)
 }

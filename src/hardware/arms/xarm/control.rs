@@ -1,19 +1,20 @@
 //! The control connection. Requests go out without waiting for the responses to earlier ones: a set point must not
 //! wait for the answer to the set point before. Each response is matched to its request by number, whenever it comes.
 
+use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
-use super::protocol::commands::Command;
+use super::protocol::commands::{Command, QUICK};
 use super::protocol::frame::{self, Arrived, MAX_REQUEST, PRIVATE, Response, Status};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
-/// Most requests without response. At 250 set points a second the controller is then a quarter of a second behind.
+/// Most requests without response.
 const WINDOW: usize = 64;
-/// A response that takes longer is late: nobody waits for it any more. The controller answers within a few ms.
-pub const REPLY_TIMEOUT: Duration = Duration::from_millis(200);
-/// A controller that answers nothing for so long, while it is asked, is gone.
+/// Most set points without response: what a stalled connection still delivers when it is back.
+const IN_FLIGHT: usize = 2;
+/// A controller that answers nothing for so long, while it is asked what it answers quickly, is gone.
 const GONE: Duration = Duration::from_millis(1000);
 
 /// Who wants the response.
@@ -48,7 +49,15 @@ struct Pending {
     register: u8,
     purpose: Purpose,
     sent: Mono,
+    timeout: Duration,
     overdue: bool,
+}
+
+impl Pending {
+    /// Whether the controller may take its time over it. It answers in order: what was asked later waits as well.
+    fn is_slow(&self) -> bool {
+        self.timeout > QUICK && !self.overdue
+    }
 }
 
 /// The connection to the control port.
@@ -59,8 +68,14 @@ pub struct Control {
     pending: [Option<Pending>; WINDOW],
     last_sent: Mono,
     last_response: Mono,
-    /// A motion command that was refused, until somebody hears of it.
-    refusal: Option<Status>,
+    /// When the newest of the requests that were answered was sent.
+    answered_up_to: Mono,
+    /// When the last slow request was settled.
+    unblocked: Mono,
+    /// When the newest request was sent whose response says that the arm is not ready.
+    not_ready: Option<Mono>,
+    /// A motion command that was refused, and when it was sent, until the session takes it.
+    refusal: Option<(Status, Mono)>,
     counts: Counts,
 }
 
@@ -75,6 +90,9 @@ impl Control {
             pending: [None; WINDOW],
             last_sent: now,
             last_response: now,
+            answered_up_to: Mono::ZERO,
+            unblocked: Mono::ZERO,
+            not_ready: None,
             refusal: None,
             counts: Counts::default(),
         }
@@ -95,14 +113,50 @@ impl Control {
         self.counts
     }
 
-    /// The refusal of an earlier motion command, told once.
-    pub fn take_refusal(&mut self) -> Option<Status> {
+    /// Becomes readable when a response has come.
+    pub fn fd(&self) -> BorrowedFd<'_> {
+        self.link.as_fd()
+    }
+
+    /// The device and its address, for messages.
+    pub fn peer(&self) -> &str {
+        self.link.peer()
+    }
+
+    /// Closes the connection and discards what has not left this computer.
+    pub fn abort(self) {
+        self.link.abort();
+    }
+
+    /// The refusal of an earlier motion command, and when that was sent; once.
+    pub fn take_refusal(&mut self) -> Option<(Status, Mono)> {
         self.refusal.take()
     }
 
-    /// Sends a request and returns at once. The response shows up in [`Control::next`].
-    pub fn post(&mut self, command: &Command, purpose: Purpose) -> AdapterResult<()> {
+    /// Whether the response to a request that was sent after `since` says that the arm is not ready.
+    pub fn not_ready_after(&self, since: Mono) -> bool {
+        self.not_ready.is_some_and(|sent| sent > since)
+    }
+
+    /// Whether a request is under way over which the controller may take its time.
+    pub fn waits(&self) -> bool {
+        self.pending.iter().flatten().any(Pending::is_slow)
+    }
+
+    /// Set points on their way: without response, and nothing that was sent later has one. A connection that stands
+    /// still keeps this count, however long it does.
+    fn in_flight(&self) -> usize {
+        let on_their_way = |p: &&Pending| p.purpose == Purpose::Motion && p.sent > self.answered_up_to;
+        self.pending.iter().flatten().filter(on_their_way).count()
+    }
+
+    /// Sends a request and returns its number at once. The response shows up in [`Control::next`]. `Busy` for a set
+    /// point while two are on their way.
+    pub fn post(&mut self, command: &Command, purpose: Purpose) -> AdapterResult<u16> {
         let now = MonotonicClock.now();
+        if purpose == Purpose::Motion && self.in_flight() >= IN_FLIGHT {
+            return Err(AdapterError::Busy);
+        }
         if purpose == Purpose::Answer {
             self.make_room();
         }
@@ -114,11 +168,13 @@ impl Control {
         };
         self.transaction = self.transaction % u16::MAX + 1;
         let (transaction, register) = (self.transaction, command.register());
-        *slot = Some(Pending { transaction, register, purpose, sent: now, overdue: false });
+        let timeout = command.timeout();
+        *slot = Some(Pending { transaction, register, purpose, sent: now, timeout, overdue: false });
         self.last_sent = now;
         self.counts.sent += 1;
         let mut frame = [0; MAX_REQUEST];
-        self.link.send(command.encode(transaction, self.protocol, &mut frame))
+        self.link.send(command.encode(transaction, self.protocol, &mut frame))?;
+        Ok(transaction)
     }
 
     /// What somebody waits for goes out, however far behind the controller is: it may be a stop. The response to the
@@ -158,8 +214,8 @@ impl Control {
         timeout: Duration,
         mut other: impl FnMut(Purpose, &Response),
     ) -> AdapterResult<Response> {
-        self.post(command, Purpose::Answer)?;
-        let (transaction, deadline) = (self.transaction, MonotonicClock.now().after(timeout));
+        let transaction = self.post(command, Purpose::Answer)?;
+        let deadline = MonotonicClock.now().after(timeout);
         loop {
             let (protocol, pending) = (self.protocol, &self.pending);
             let asked = |transaction, register| find(pending, transaction, register).is_some();
@@ -189,9 +245,16 @@ impl Control {
         let at = find(&self.pending, response.transaction, response.register)?;
         let pending = self.pending.get_mut(at)?.take()?;
         self.last_response = MonotonicClock.now();
+        self.answered_up_to = self.answered_up_to.max(pending.sent);
+        if pending.is_slow() {
+            self.unblocked = self.last_response;
+        }
+        if response.status.not_ready() {
+            self.not_ready = self.not_ready.max(Some(pending.sent));
+        }
         if pending.purpose == Purpose::Motion {
             let refused = response.status.error() || response.status.not_ready() || response.status.invalid();
-            self.refusal = refused.then_some(response.status).or(self.refusal);
+            self.refusal = refused.then_some((response.status, pending.sent)).or(self.refusal);
         }
         if pending.overdue {
             self.counts.late += 1;
@@ -200,22 +263,30 @@ impl Control {
         Some(pending.purpose)
     }
 
-    /// Gives up waiting for what is overdue; an error when the controller has answered nothing for too long.
+    /// Gives up waiting for what is overdue; an error when the controller has answered nothing for too long. Time in
+    /// which it was busy with something slow does not count for what was asked later.
     fn expire(&mut self) -> AdapterResult<()> {
         let (now, last_response) = (MonotonicClock.now(), self.last_response);
+        let slow = self.pending.iter().flatten().filter(|p| p.is_slow()).map(|p| p.sent).min();
+        let mut over = false;
         for slot in &mut self.pending {
-            let Some(pending) = slot else { continue };
-            let age = now.since(pending.sent);
-            if age > REPLY_TIMEOUT && !pending.overdue {
+            let Some(pending) = slot.as_mut().filter(|p| slow.is_none_or(|slow| p.sent <= slow)) else { continue };
+            let age = now.since(pending.sent.max(self.unblocked));
+            if age > pending.timeout && !pending.overdue {
+                over |= pending.is_slow();
                 pending.overdue = true;
                 self.counts.overdue += 1;
             }
-            if age > GONE && last_response < pending.sent {
+            let gone = age > GONE.max(pending.timeout);
+            if gone && last_response < pending.sent {
                 return Err(AdapterError::Io(format!("{} answers nothing any more", self.link.peer())));
             }
-            if age > GONE {
+            if gone {
                 *slot = None; // lost, while others were answered
             }
+        }
+        if over {
+            self.unblocked = now;
         }
         Ok(())
     }
@@ -253,7 +324,8 @@ mod tests {
         });
         let endpoint = Endpoint { host: "127.0.0.1".into(), port };
         let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
-        (0..3).for_each(|_| control.post(&Command::GetState, Purpose::Health).unwrap());
+        let numbers = [(); 3].map(|()| control.post(&Command::GetState, Purpose::Health).unwrap());
+        assert_eq!(numbers, [1, 2, 3]);
         let next = |control: &mut Control| {
             let end = std::time::Instant::now() + Duration::from_secs(10);
             while std::time::Instant::now() < end {
@@ -270,7 +342,7 @@ mod tests {
         assert_eq!(next(&mut control).data(), [11]);
         let second = |control: &Control| control.pending.iter().flatten().map(|p| p.transaction).collect::<Vec<_>>();
         assert_eq!(second(&control), [2]);
-        std::thread::sleep(REPLY_TIMEOUT + Duration::from_millis(10));
+        std::thread::sleep(QUICK + Duration::from_millis(10));
         assert_eq!(control.next().unwrap().map(|_| ()), None);
         assert_eq!(control.counts(), Counts { sent: 3, late: 0, overdue: 1, stray: 1 });
         go.send(()).unwrap();
@@ -295,8 +367,8 @@ mod tests {
         });
         let endpoint = Endpoint { host: "127.0.0.1".into(), port };
         let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
-        (0..WINDOW).for_each(|_| control.post(&Command::GetState, Purpose::Motion).unwrap());
-        let full = control.post(&Command::GetState, Purpose::Motion).unwrap_err();
+        assert!((0..WINDOW).all(|_| control.post(&Command::GetState, Purpose::Health).is_ok()));
+        let full = control.post(&Command::GetState, Purpose::Health).unwrap_err();
         assert!(full.to_string().contains("does not keep up"), "{full}");
         let answer =
             control.ask(&Command::SetState(super::super::protocol::commands::STOP), Duration::from_secs(5), |_, _| ());

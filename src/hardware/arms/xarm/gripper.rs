@@ -1,5 +1,8 @@
-//! The gripper, one telegram at a time: each costs some milliseconds on the tool's bus, so nobody ever waits for one.
-//! Commands are kept until their turn, the position is asked for now and then and answered from memory.
+//! The gripper, one telegram at a time: each costs 10 to 100 ms on the tool's bus, so no caller waits for one.
+//! Commands are kept until their turn; the position is read now and then and answered from memory.
+//!
+//! Telegrams go over the second control port. A box without one has them on the same connection as the set points, which
+//! would wait behind each telegram: there a gripper at rest is not asked while set points are streamed.
 
 use std::time::Duration;
 
@@ -15,7 +18,10 @@ const POLL_SILENT: Duration = Duration::from_millis(1000);
 /// For how long it is asked again and again after a stop, to see whether it still moves.
 const WATCH: Duration = Duration::from_millis(500);
 /// A telegram whose answer takes longer is lost.
-const TIMEOUT: Duration = Duration::from_millis(300);
+const TIMEOUT: Duration = Duration::from_secs(2);
+/// After so many equal positions, a few pulses apart at most, a gripper is at rest.
+const RESTS_AFTER: u32 = 10;
+const SAME_PULSES: u32 = 2;
 /// So many lost telegrams in a row mean that there is no gripper.
 const SILENT_AFTER: u32 = 3;
 /// After so many positions the error is asked for.
@@ -45,6 +51,8 @@ pub struct Gripper {
     pulses: Option<i32>,
     error: u16,
     failures: u32,
+    /// Equal positions in a row.
+    same: u32,
     next_poll: Mono,
     watched_until: Mono,
     polls: u32,
@@ -62,6 +70,7 @@ impl Gripper {
             pulses,
             error: 0,
             failures: 0,
+            same: RESTS_AFTER,
             next_poll: Mono::ZERO,
             watched_until: Mono::ZERO,
             polls: 0,
@@ -101,9 +110,22 @@ impl Gripper {
         self.clear |= self.error != 0;
     }
 
-    /// The next telegram, if one is due.
-    pub fn due(&mut self, now: Mono) -> Option<Rtu> {
-        if self.kind == GripperKind::None {
+    /// The connection over which it was asked is gone.
+    pub fn unplugged(&mut self) {
+        if self.under_way.is_some() {
+            self.failed();
+        }
+    }
+
+    /// Whether there is nothing to send it and nothing to expect of it.
+    fn rests(&self, now: Mono) -> bool {
+        let asked = self.clear || self.wanted.is_some() || now < self.watched_until;
+        !asked && self.pulses.is_some() && self.same >= RESTS_AFTER
+    }
+
+    /// The next telegram, if one is due. `quiet`: a telegram would delay set points, so one that can wait does.
+    pub fn due(&mut self, now: Mono, quiet: bool) -> Option<Rtu> {
+        if self.kind == GripperKind::None || (quiet && (self.rests(now) || self.failures >= SILENT_AFTER)) {
             return None;
         }
         if let Some((_, _, sent)) = self.under_way {
@@ -153,6 +175,7 @@ impl Gripper {
             Step::Mode if self.kind == GripperKind::Xarm => self.wake = Some(Step::Speed),
             Step::Mode | Step::Speed => self.wake = None,
             Step::Go(pulses) => {
+                self.same = 0;
                 self.wanted = self.wanted.filter(|wanted| *wanted != pulses);
                 self.polls = ERROR_EVERY - 1; // whether it took it shows in its error
                 self.next_poll = Mono::ZERO;
@@ -163,7 +186,12 @@ impl Gripper {
                     (self.wanted, self.wake) = (None, Some(Step::Enable));
                 }
             }
-            Step::Position => self.pulses = decode_position(data).or(self.pulses),
+            Step::Position => {
+                let pulses = decode_position(data).or(self.pulses);
+                let same = pulses.zip(self.pulses).is_some_and(|(a, b)| a.abs_diff(b) <= SAME_PULSES);
+                self.same = if same { self.same.saturating_add(1) } else { 0 };
+                self.pulses = pulses;
+            }
         }
     }
 

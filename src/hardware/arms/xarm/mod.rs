@@ -1,8 +1,9 @@
 //! UFACTORY's arms behind a control box on TCP: xArm 5, 6 and 7, Lite 6, 850. `docs/arms/xarm.md` is for users.
 //!
 //! ```text
-//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched whenever they come
+//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched whenever they come; port 503: the gripper
 //!   (SI)       (state)  ◀── stream    ports 30000 or 30003: joints; 30001: motors, error
+//!                 ├── orders: motors, mode, stop; foreign: what other clients change
 //!                 └── mode, condition, gripper: small machines that never wait
 //! ```
 
@@ -13,16 +14,23 @@ mod connect;
 mod control;
 pub mod emulator;
 pub mod errors;
+mod foreign;
 #[cfg(test)]
 mod golden;
 mod gripper;
+mod measured;
 mod mode;
 pub mod model;
+mod orders;
 pub mod protocol;
 mod session;
 mod stream;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_foreign;
+#[cfg(test)]
+mod tests_slow;
 
 use std::time::Duration;
 
@@ -38,6 +46,9 @@ use protocol::gripper::GripperKind;
 
 /// The modes of the arm.
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
+
+/// Those of firmware before 1.8.0, which does not end a velocity by itself.
+const MODES_WITHOUT_VELOCITY: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition];
 
 /// How often a controller with firmware 2.1.0 or newer reports [Hz]. Older ones do 100 times a second.
 const NATIVE_RATE: f64 = 250.0;

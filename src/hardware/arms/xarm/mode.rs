@@ -8,8 +8,8 @@ use super::protocol::commands::{Command, READY, STOP};
 use super::protocol::report::Motion;
 use crate::clock::Mono;
 
-/// How long a step may take to show in the reports.
-const STEP_LIMIT: Duration = Duration::from_millis(300);
+/// How long a step may take to show in the reports: the reply timeout of what it sends.
+const STEP_LIMIT: Duration = Duration::from_secs(2);
 /// Rest between the steps of a second attempt, as the vendor advises.
 const REST: Duration = Duration::from_millis(100);
 /// Attempts before it is given up.
@@ -42,6 +42,8 @@ pub enum Next {
     Wait,
     /// The arm is ready in its mode.
     Done,
+    /// Another client brings the arm into a mode.
+    TakenOver,
     /// The arm does not get there; what it did not do.
     GiveUp(&'static str),
 }
@@ -51,6 +53,8 @@ pub enum Next {
 pub struct ModeChange {
     /// The mode it is to be in.
     pub target: u8,
+    /// The mode that it was in.
+    from: Option<u8>,
     detect: bool,
     step: Step,
     since: Mono,
@@ -60,7 +64,7 @@ pub struct ModeChange {
 impl ModeChange {
     /// Towards a mode. `detect`: the firmware takes the parameter about collision detection.
     pub fn new(target: u8, detect: bool, now: Mono) -> Self {
-        Self { target, detect, step: Step::Begin, since: now, attempt: 1 }
+        Self { target, from: None, detect, step: Step::Begin, since: now, attempt: 1 }
     }
 
     /// The next step, from what the newest report says.
@@ -70,6 +74,10 @@ impl ModeChange {
             return Next::Wait;
         }
         let there = motion.mode == self.target;
+        // The way leads from the mode it was in to the target, or silently to 0. Any other is not ours to undo.
+        if !there && motion.mode != 0 && motion.mode != *self.from.get_or_insert(motion.mode) {
+            return Next::TakenOver;
+        }
         match self.step {
             Step::Begin if there && is_ready(motion.state) => return Next::Done,
             Step::Begin if !is_stopped(motion.state) => return self.send(Step::Stopping, Command::SetState(STOP), now),
@@ -123,6 +131,14 @@ mod tests {
         assert_eq!(change.advance(&reported(5, 4), now), Next::Send(Command::SetState(READY)));
         assert_eq!(change.advance(&reported(2, 4), now), Next::Done);
         assert_eq!(ModeChange::new(4, true, now).advance(&reported(1, 4), now), Next::Done, "nothing to change");
+    }
+
+    #[test]
+    fn a_mode_of_another_client_is_left_alone() {
+        let now = Mono(1);
+        let mut change = ModeChange::new(4, true, now);
+        assert_eq!(change.advance(&reported(2, 1), now), Next::Send(Command::SetState(STOP)));
+        assert_eq!(change.advance(&reported(2, 2), now), Next::TakenOver);
     }
 
     #[test]

@@ -124,6 +124,16 @@ impl Model {
         if self == Self::Lite6 { 500.0 } else { 1000.0 }
     }
 
+    /// Where the flange is when all joints are at zero: x, z [mm]; it points down, and y is 0.
+    pub fn zero_pose(self) -> (f64, f64) {
+        match self {
+            Self::Xarm5 | Self::Xarm6 => (207.0, 112.0),
+            Self::Xarm7 => (206.0, 120.5),
+            Self::Lite6 => (87.0, 154.2),
+            Self::Xarm850 => (150.0, 238.0),
+        }
+    }
+
     /// Joint limits of the usual arm of this model: the narrower ones where series differ. Arms of another kind, such as
     /// a mirrored one, have others: [`Identity::limits`].
     pub fn limits(self) -> JointLimits {

@@ -7,19 +7,18 @@ use std::time::Duration;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::condition::Condition;
-use super::connect::takes_detection;
-use super::control::{Control, Counts, Purpose, REPLY_TIMEOUT};
+use super::control::{Control, Counts, Purpose};
 use super::errors::warning_text;
 use super::gripper::Gripper;
-use super::mode::{ModeChange, Next, is_ready};
+use super::mode::{ModeChange, is_ready};
 use super::model::{Model, VELOCITY};
-use super::protocol::commands::{Command, STOP};
+use super::protocol::commands::{Command, QUICK, SLOW};
 use super::protocol::frame::{Response, Status};
 use super::protocol::identity::Firmware;
 use super::protocol::report::{Health, Motion};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult, Stop};
+use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
 use crate::joint::JointLimits;
 
@@ -30,11 +29,8 @@ pub const SILENCE: Duration = Duration::from_millis(500);
 const ON_THE_WAY: Duration = Duration::from_millis(20);
 /// Which motors are on is told five times a second, and by nothing else: after so much silence that is not known.
 const CONDITION_SILENCE: Duration = Duration::from_millis(1000);
-/// How long one call may work on a change of mode. It goes on with the next call.
-const MODE_SLICE: Duration = Duration::from_millis(15);
-/// How long an activation may take for the motors, and for the mode.
-const MOTORS_LIMIT: Duration = Duration::from_millis(900);
-const ACTIVATION_LIMIT: Duration = Duration::from_millis(1200);
+/// Set points were streamed lately: a gripper that shares their connection is left alone as far as it can be.
+const STREAMING: Duration = Duration::from_secs(2);
 /// Joint positions that jump further than the arm can move, and this much [rad], are believed only when the next
 /// report agrees.
 const JUMP: f64 = 0.1;
@@ -54,9 +50,11 @@ pub struct Device {
 }
 
 /// What responses and reports are told to, besides the joints.
-struct Known {
-    condition: Condition,
-    gripper: Gripper,
+pub(super) struct Known {
+    pub(super) condition: Condition,
+    pub(super) gripper: Gripper,
+    /// The newest answer to a request that a caller waits for.
+    pub(super) answer: Option<Response>,
 }
 
 impl Known {
@@ -65,33 +63,49 @@ impl Known {
         match purpose {
             Purpose::Health => self.condition.take(response),
             Purpose::Gripper => self.gripper.take(response),
-            Purpose::Motion | Purpose::Answer => {}
+            Purpose::Answer => self.answer = Some(*response),
+            Purpose::Motion => {}
         }
     }
+}
+
+/// What this run ordered last: an arm that is ready for motion in a mode.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Ready {
+    pub(super) mode: u8,
+    pub(super) since: Mono,
 }
 
 /// A connected arm.
 pub struct Session {
     /// What it is.
     pub device: Device,
-    control: Control,
+    pub(super) control: Control,
+    /// The second control connection, for the gripper; without one its telegrams share `control`.
+    bus: Option<Control>,
     reports: Stream<Motion>,
     normal: Stream<Health>,
-    known: Known,
-    motion: Motion,
+    pub(super) known: Known,
+    pub(super) motion: Motion,
     /// When the newest positions were measured, and when they came.
     stamp: Mono,
-    fresh_at: Mono,
+    pub(super) fresh_at: Mono,
     device_time: DeviceTime,
     suspect: bool,
-    /// The arm has stopped, by us or by somebody else: only an activation makes it ready again.
-    halted: bool,
+    /// `None`: the arm was stopped, by this run or by another client: only an activation makes it ready again.
+    pub(super) ready: Option<Ready>,
+    /// The mode that was ordered when another client changed the mode, the state or the motors.
+    pub(super) foreign: Option<u8>,
+    /// When a set point was refused: no more are sent before a report tells why.
+    refused_at: Option<Mono>,
+    /// When the last set point was sent.
+    streamed_at: Mono,
     /// A change of mode under way: it goes on with every report, whoever asks.
-    change: Option<ModeChange>,
-    /// The mode that the last change did not reach, and why, until somebody hears of it.
-    failed: Option<(u8, &'static str)>,
+    pub(super) change: Option<ModeChange>,
+    /// The mode that the last change did not reach, and why, until a caller takes it.
+    pub(super) failed: Option<(u8, &'static str)>,
     /// When the force/torque sensor was switched on: before that its place in the reports holds zeros.
-    wrench_since: Option<Mono>,
+    pub(super) wrench_since: Option<Mono>,
     updated: Mono,
 }
 
@@ -100,6 +114,7 @@ impl Session {
     pub fn new(
         device: Device,
         control: Control,
+        bus: Option<Control>,
         reports: Stream<Motion>,
         first: Motion,
         normal: Stream<Health>,
@@ -112,15 +127,19 @@ impl Session {
         Self {
             device,
             control,
+            bus,
             reports,
             normal,
-            known: Known { condition, gripper },
+            known: Known { condition, gripper, answer: None },
             motion: first,
             stamp,
             fresh_at: arrived,
             device_time,
             suspect: false,
-            halted: true,
+            ready: None,
+            foreign: None,
+            refused_at: None,
+            streamed_at: Mono::ZERO,
             change: None,
             failed: None,
             wrench_since: None,
@@ -169,6 +188,12 @@ impl Session {
         self.known.condition.all_enabled(self.device.model.axes())
     }
 
+    /// Closes the connections and discards what has not left this computer.
+    pub fn abort(self) {
+        self.control.abort();
+        self.bus.into_iter().for_each(Control::abort);
+    }
+
     /// Takes up all that has arrived, without waiting, and asks what is due. Does nothing within `age` of the last time.
     pub fn update(&mut self, age: Duration) -> AdapterResult<()> {
         let now = MonotonicClock.now();
@@ -176,6 +201,25 @@ impl Session {
             return Ok(());
         }
         self.updated = now;
+        self.take_up()?;
+        if MonotonicClock.now().since(self.fresh_at) > SILENCE {
+            return Err(AdapterError::Io(format!("{} sent nothing new for {SILENCE:?}", self.reports.peer())));
+        }
+        if MonotonicClock.now().since(self.normal.arrived) > CONDITION_SILENCE {
+            return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_SILENCE:?}", self.normal.peer())));
+        }
+        self.advance_change()?;
+        // What is asked behind something slow waits for it, and so would the next set point.
+        if !self.control.waits()
+            && let Some(question) = self.known.condition.due(now, self.control.last_sent())
+        {
+            self.control.post(&question, Purpose::Health)?;
+        }
+        self.ask_gripper(now)
+    }
+
+    /// Takes up all that has arrived, without waiting.
+    fn take_up(&mut self) -> AdapterResult<()> {
         if let Some(motion) = self.reports.newest()? {
             self.take(motion);
         }
@@ -185,20 +229,35 @@ impl Session {
         while let Some((purpose, response)) = self.control.next()? {
             self.known.take(purpose, &response);
         }
-        if MonotonicClock.now().since(self.fresh_at) > SILENCE {
-            return Err(AdapterError::Io(format!("{} sent nothing new for {SILENCE:?}", self.reports.peer())));
-        }
-        if MonotonicClock.now().since(self.normal.arrived) > CONDITION_SILENCE {
-            return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_SILENCE:?}", self.normal.peer())));
-        }
-        self.advance_change()?;
-        if let Some(question) = self.known.condition.due(now, self.control.last_sent()) {
-            self.control.post(&question, Purpose::Health)?;
-        }
-        if let Some(telegram) = self.known.gripper.due(now) {
-            self.control.post(&Command::Tool(telegram), Purpose::Gripper)?;
+        if self.ready.is_some_and(|ready| self.control.not_ready_after(ready.since)) {
+            self.changed_by_another_client();
         }
         Ok(())
+    }
+
+    /// Sends the gripper its next telegram and takes up its answers. A box may close the second connection: then the
+    /// gripper has the first one, like that of an older box.
+    fn ask_gripper(&mut self, now: Mono) -> AdapterResult<()> {
+        let Known { gripper, .. } = &mut self.known;
+        if let Some(bus) = &mut self.bus {
+            let mut talk = || -> AdapterResult<()> {
+                while let Some((_, response)) = bus.next()? {
+                    gripper.take(&response);
+                }
+                let telegram = gripper.due(now, false);
+                telegram.map_or(Ok(()), |telegram| bus.post(&Command::Tool(telegram), Purpose::Gripper).map(drop))
+            };
+            if talk().is_err() {
+                self.bus = None;
+                gripper.unplugged();
+            }
+            return Ok(());
+        }
+        let streams = now.since(self.streamed_at) < STREAMING;
+        match gripper.due(now, streams) {
+            Some(telegram) => self.control.post(&Command::Tool(telegram), Purpose::Gripper).map(drop),
+            None => Ok(()),
+        }
     }
 
     fn take(&mut self, motion: Motion) {
@@ -218,25 +277,71 @@ impl Session {
             None => arrived,
         };
         self.fresh_at = arrived;
-        if !is_ready(motion.state) && self.change.is_none() && !self.halted {
-            self.halted = true;
-            self.known.condition.changed = true;
-        }
         self.motion = motion;
+        if self.ready.is_some_and(|ready| !is_ready(motion.state) || motion.mode != ready.mode) {
+            self.changed_by_another_client();
+        }
     }
 
-    /// Waits for the next report, a few ms at most.
+    /// The arm is not as this run ordered: nothing is commanded any more, and nothing is undone. Register 15 tells
+    /// whether the device itself is the cause.
+    pub(super) fn changed_by_another_client(&mut self) {
+        self.foreign = self.ready.take().map(|ready| ready.mode);
+        self.known.condition.doubt(MonotonicClock.now());
+    }
+
+    /// Waits for the next report or response, a few ms at most.
     fn pause(&self) {
         let timeout = Timespec { tv_sec: 0, tv_nsec: 5_000_000 };
-        let _ = poll(&mut [PollFd::from_borrowed_fd(self.fd(), PollFlags::IN)], Some(&timeout));
+        let fds = [self.fd(), self.control.fd()];
+        let _ = poll(&mut fds.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)), Some(&timeout));
     }
 
-    /// Asks and waits for the answer.
-    fn ask(&mut self, command: &Command) -> AdapterResult<Response> {
-        let known = &mut self.known;
-        let response = self.control.ask(command, REPLY_TIMEOUT, |purpose, response| known.take(purpose, response))?;
-        self.known.condition.hint(response.status);
-        Ok(response)
+    /// Takes up what arrives until `done` has what it looks for; `None` when it has not within `limit`.
+    pub(super) fn wait<T>(
+        &mut self,
+        limit: Duration,
+        mut done: impl FnMut(&mut Self) -> AdapterResult<Option<T>>,
+    ) -> AdapterResult<Option<T>> {
+        let until = MonotonicClock.now().after(limit);
+        loop {
+            self.update(Duration::ZERO)?;
+            if let Some(found) = done(self)? {
+                return Ok(Some(found));
+            }
+            if MonotonicClock.now() >= until {
+                return Ok(None);
+            }
+            self.pause();
+        }
+    }
+
+    /// Sends a request whose answer a caller waits for.
+    pub(super) fn request(&mut self, command: &Command) -> AdapterResult<u16> {
+        self.known.answer = None; // numbers come again
+        self.control.post(command, Purpose::Answer)
+    }
+
+    /// The answer to the request with this number, once it is there.
+    pub(super) fn answer(&self, number: u16) -> Option<Response> {
+        self.known.answer.filter(|answer| answer.transaction == number)
+    }
+
+    /// Asks and waits for the answer. Reports are taken up meanwhile where it may take long.
+    pub(super) fn ask(&mut self, command: &Command) -> AdapterResult<Response> {
+        // A quick answer comes after that to something slow that was asked before.
+        let limit = if self.control.waits() { command.timeout().max(SLOW) } else { command.timeout() };
+        if limit <= QUICK {
+            let known = &mut self.known;
+            let response = self.control.ask(command, limit, |purpose, response| known.take(purpose, response))?;
+            self.known.condition.hint(response.status);
+            return Ok(response);
+        }
+        let number = self.request(command)?;
+        self.wait(limit, |session| Ok(session.answer(number)))?.ok_or_else(|| {
+            let (peer, register) = (self.control.peer(), command.register());
+            AdapterError::Timeout(format!("{peer} did not answer register {register} within {limit:?}"))
+        })
     }
 
     /// Asks for the error, and answers it as such when there is one.
@@ -247,173 +352,21 @@ impl Session {
     }
 
     /// The known error, as such.
-    fn fault(&self) -> AdapterResult<()> {
+    pub(super) fn fault(&self) -> AdapterResult<()> {
         match self.known.condition.error {
             0 => Ok(()),
             code => Err(AdapterError::Fault { code: code.into(), text: self.known.condition.text() }),
         }
     }
 
-    // --- Motors, mode, stop ---
-
-    /// Switches all motors on or off, and sees it.
-    pub fn enable(&mut self, on: bool) -> AdapterResult<()> {
-        if on {
-            self.check_error()?;
-        }
-        self.change = None;
-        self.halted = true; // the controller forgets that it was ready
-        let answer = self.ask(&Command::Enable(on))?;
-        // An error stands against enabling; that the motors go off shows in the reports, error or not.
-        if on && answer.status.error() {
-            self.check_error()?;
-        }
-        let until = MonotonicClock.now().after(MOTORS_LIMIT);
-        let axes = self.device.model.axes();
-        let none = |condition: &Condition| (0..axes).all(|i| condition.enabled & (1 << i) == 0);
-        while if on { !self.enabled() } else { !none(&self.known.condition) } {
-            if MonotonicClock.now() >= until {
-                let word = if on { "on" } else { "off" };
-                return Err(AdapterError::Timeout(format!("the motors do not go {word} within {MOTORS_LIMIT:?}")));
-            }
-            self.pause();
-            self.update(Duration::ZERO)?;
-            if on {
-                self.fault()?;
-            }
-        }
-        Ok(())
-    }
-
-    /// Makes the arm ready for motion in a mode: warning cleared, motors on, where it is.
-    pub fn activate(&mut self, mode: u8, force_torque: bool) -> AdapterResult<()> {
-        self.update(Duration::ZERO)?;
-        self.check_error()?;
-        if self.known.condition.warning != 0 {
-            self.ask(&Command::ClearWarning)?;
-        }
-        if self.moves() {
-            return Err(AdapterError::Rejected("the arm is moving: somebody else commands it".into()));
-        }
-        if !self.enabled() {
-            self.enable(true)?;
-        }
-        if force_torque {
-            let status = self.ask(&Command::EnableForceTorque(true))?.status;
-            self.wrench_since = (!status.error() && !status.invalid()).then(|| MonotonicClock.now());
-        }
-        self.control.take_refusal();
-        self.begin_change(mode);
-        if !self.finish_change(ACTIVATION_LIMIT)? {
-            self.change = None;
-            return Err(AdapterError::Timeout(format!("the arm is not ready within {ACTIVATION_LIMIT:?}")));
-        }
-        self.halted = false;
-        Ok(())
-    }
-
-    /// Brings the arm into a mode. `Rejected` while it moves, and while the change is under way: ask again.
-    pub fn set_mode(&mut self, mode: u8) -> AdapterResult<()> {
-        self.update(Duration::ZERO)?;
-        self.fault()?;
-        if self.change.is_none() {
-            // A change that came to nothing between two calls has stopped the arm: first why, then that.
-            self.reached()?;
-            let _ = self.heed_refusal(); // of a set point; but it may tell that the arm was stopped
-            self.may_be_commanded()?;
-        }
-        if self.change.is_none_or(|change| change.target != mode) {
-            if self.moves() {
-                return Err(AdapterError::Rejected("the arm is moving".into()));
-            }
-            self.begin_change(mode);
-        }
-        match self.finish_change(MODE_SLICE)? {
-            true => Ok(()),
-            false => Err(AdapterError::Rejected("the change of mode is under way".into())),
-        }
-    }
-
-    fn begin_change(&mut self, mode: u8) {
-        let detect = takes_detection(self.device.firmware);
-        self.change = Some(ModeChange::new(mode, detect, MonotonicClock.now()));
-        self.failed = None;
-    }
-
-    /// Waits for the end of the change of mode; `false` when it is still under way after `limit`.
-    fn finish_change(&mut self, limit: Duration) -> AdapterResult<bool> {
-        let until = MonotonicClock.now().after(limit);
-        self.update(Duration::ZERO)?;
-        while self.change.is_some() {
-            if MonotonicClock.now() >= until {
-                return Ok(false);
-            }
-            self.pause();
-            self.update(Duration::ZERO)?;
-        }
-        self.fault()?;
-        self.reached().map(|()| true)
-    }
-
-    /// An error, told once, when the last change did not reach its mode.
-    fn reached(&mut self) -> AdapterResult<()> {
-        let Some((mode, why)) = self.failed.take() else { return Ok(()) };
-        Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}")))
-    }
-
-    /// Goes on with the change of mode, as far as the newest report allows.
-    fn advance_change(&mut self) -> AdapterResult<()> {
-        let Some(mut change) = self.change.take() else { return Ok(()) };
-        if self.known.condition.error != 0 {
-            self.halted = true;
-            return Ok(());
-        }
-        let next = change.advance(&self.motion, MonotonicClock.now());
-        match next {
-            Next::Send(command) => {
-                self.control.post(&command, Purpose::Health)?;
-                self.change = Some(change);
-            }
-            Next::Wait => self.change = Some(change),
-            Next::Done => {}
-            Next::GiveUp(why) => (self.failed, self.halted) = (Some((change.target, why)), true),
-        }
-        Ok(())
-    }
-
-    /// Whether the arm moves, by its own account.
-    fn moves(&self) -> bool {
-        let still = |velocity: [f64; 7]| velocity.iter().all(|v| v.abs() < 0.01);
-        self.motion.state == 1 && !self.motion.velocity.is_some_and(still)
-    }
-
-    /// Stops all motion of the joints. The arm stays stopped until it is activated. The gripper knows no stop: it can be
-    /// held where it is.
-    pub fn stop(&mut self) -> AdapterResult<Stop> {
-        (self.change, self.halted) = (None, true);
-        self.known.gripper.stopped(MonotonicClock.now());
-        self.ask(&Command::SetState(STOP))?;
-        let state = self.ask(&Command::GetState)?.data().first().copied();
-        Ok(if matches!(state, Some(4..=6)) { Stop::Confirmed } else { Stop::Sent })
-    }
-
-    /// Clears error and warning, of the gripper too.
-    pub fn clear_errors(&mut self) -> AdapterResult<()> {
-        self.update(Duration::ZERO)?;
-        (self.change, self.halted) = (None, true);
-        self.known.gripper.clear_error();
-        self.ask(&Command::ClearError)?;
-        self.ask(&Command::ClearWarning)?;
-        self.check_error()
-    }
-
     // --- Motion ---
 
-    fn may_be_commanded(&self) -> AdapterResult<()> {
+    pub(super) fn may_be_commanded(&self) -> AdapterResult<()> {
         if !self.enabled() {
             Err(AdapterError::Rejected("the motors are disabled".into()))
-        } else if self.halted || !is_ready(self.motion.state) {
-            Err(AdapterError::Rejected("the arm was stopped: enable it again".into()))
+        } else if self.ready.is_none() || !is_ready(self.motion.state) {
+            let why = self.foreign_change().unwrap_or("the arm was stopped");
+            Err(AdapterError::Rejected(format!("{why}: enable it again")))
         } else {
             Ok(())
         }
@@ -421,27 +374,37 @@ impl Session {
 
     fn may_move(&mut self, mode: u8) -> AdapterResult<()> {
         self.fault()?;
+        if self.change.is_some() {
+            return Err(AdapterError::Rejected("the change of mode is under way".into()));
+        }
         self.may_be_commanded()?;
-        if self.motion.mode != mode || self.change.is_some() {
+        if self.motion.mode != mode {
             return Err(AdapterError::Rejected(format!("the arm is in mode {}, not {mode}", self.motion.mode)));
         }
         Ok(())
     }
 
-    /// Sends a command of a stream (a set point, velocities) and does not wait for its response. When an earlier one
-    /// was refused, that is the answer.
+    /// Sends a command of a stream (a set point, velocities) and does not wait for its response. Not when the newest
+    /// report or response says that the arm is not as it was ordered to be, and not while two are on their way (`Busy`).
     pub fn stream(&mut self, mode: u8, command: &Command) -> AdapterResult<()> {
+        self.take_up()?;
+        self.heed_refusal()?;
         self.may_move(mode)?;
+        if self.refused_at.is_some_and(|refused| self.fresh_at <= refused) {
+            return Err(AdapterError::Busy);
+        }
         self.control.post(command, Purpose::Motion)?;
-        self.heed_refusal()
+        self.streamed_at = self.control.last_sent();
+        Ok(())
     }
 
-    /// Tells of a set point that was refused. An arm that is not ready was stopped by somebody: the response may say so
-    /// before the report does.
-    fn heed_refusal(&mut self) -> AdapterResult<()> {
-        let Some(status) = self.control.take_refusal() else { return Ok(()) };
-        self.halted |= status.not_ready();
-        self.known.condition.changed |= status.not_ready();
+    /// Reports a set point that was refused. The response may say that the arm is not ready before the report does.
+    pub(super) fn heed_refusal(&mut self) -> AdapterResult<()> {
+        let Some((status, sent)) = self.control.take_refusal() else { return Ok(()) };
+        if self.ready.is_none_or(|ready| sent < ready.since) && self.foreign.is_none() {
+            return Ok(()); // of a set point before a stop or a change of mode that this run ordered
+        }
+        self.refused_at = Some(MonotonicClock.now());
         Err(self.refused(status))
     }
 
@@ -463,13 +426,18 @@ impl Session {
             self.known.condition.warning = 0;
             return Err(AdapterError::Rejected(format!("xarm refuses the move: {} ({code})", warning_text(code))));
         }
-        self.halted |= status.not_ready();
+        if status.not_ready() && self.ready.is_some() {
+            self.changed_by_another_client();
+        }
         if status.not_ready() || status.invalid() { Err(self.refused(status)) } else { Ok(()) }
     }
 
     fn refused(&self, status: Status) -> AdapterError {
         if let Err(fault) = self.fault() {
             return fault;
+        }
+        if let Some(what) = self.foreign_change() {
+            return AdapterError::Rejected(format!("{what}: enable it again"));
         }
         let why = match status {
             status if status.error() => "it is in error",

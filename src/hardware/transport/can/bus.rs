@@ -39,6 +39,8 @@ struct State {
     refuse: usize,
     /// Nobody acknowledges; so many frames may wait.
     withheld: Option<usize>,
+    /// Ports cannot take back what waits.
+    kept: bool,
     /// Frames that wait for an acknowledgement.
     queue: VecDeque<(u64, CanFrame)>,
 }
@@ -135,6 +137,12 @@ impl Bus {
         let mut state = lock(&self.hub);
         state.queue.reserve(limit);
         state.withheld = Some(limit);
+    }
+
+    /// Whether ports can take back what waits for an acknowledgement. They can, unless told otherwise; those on an
+    /// interface of the system cannot.
+    pub fn keep_waiting(&self, keep: bool) {
+        lock(&self.hub).kept = keep;
     }
 
     /// The other nodes are back: they hear what has waited, in order, and then whatever comes. Answers how many frames
@@ -247,6 +255,16 @@ impl CanPort for BusPort {
 
     fn waiting(&self) -> usize {
         lock(&self.hub).queue.iter().filter(|(from, _)| *from == self.number).count()
+    }
+
+    fn discard(&mut self) -> AdapterResult<usize> {
+        let mut state = self.state()?;
+        let (kept, number) = (state.kept, self.number);
+        if !kept {
+            state.queue.retain(|(from, _)| *from != number);
+        }
+        drop(state);
+        Ok(self.waiting())
     }
 }
 

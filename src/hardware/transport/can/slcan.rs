@@ -2,17 +2,21 @@
 //! identifier, the number of bytes and the bytes in hexadecimal digits, ended by a carriage return.
 //!
 //! Such an adapter tells of no trouble on the bus: that nobody acknowledges shows only in that nobody answers. What it
-//! replies to commands (a carriage return, or a bell for "no") is not read, since many models do not reply.
+//! replies to commands (a carriage return, or a bell for "no") is not read, since many models do not reply; the `z` that
+//! some reply to a frame is counted, and bounds what waits.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::time::{Duration, Instant};
 
+use rustix::event::PollFlags;
 use rustix::io::Errno;
+use rustix::termios::{QueueSelector, tcflush};
 
 use super::address::SLCAN_RATES;
 use super::{CanEvent, CanFilter, CanFrame, CanPort};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::incoming::{Incoming, Scan};
-use crate::hardware::transport::serial::{broken, open_line, read_line};
+use crate::hardware::transport::serial::{broken, open_line, read_line, wait};
 
 /// Rate of the serial line [bit/s]: adapters on USB take any and ignore it.
 const BAUD: u32 = 115_200;
@@ -20,12 +24,32 @@ const BAUD: u32 = 115_200;
 pub(super) const LONGEST: usize = 32;
 /// A frame's line without its data: `tIIIL`.
 const HEAD: usize = 5;
+/// Replies that are passed over at most before a frame is looked for again.
+const REPLIES: usize = 64;
+/// A reply that has not come after this time was lost.
+const REPLY_LOST: Duration = Duration::from_millis(200);
+/// So many frames wait at least when the kernel has no room for more.
+const BACKLOG: usize = 16;
 const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
 
 /// A port on a serial CAN adapter.
 pub struct SlcanPort {
     line: Lines<OwnedFd>,
     filters: Vec<CanFilter>,
+    /// What opens the channel.
+    opening: [u8; 8],
+    /// Frames that were written and have no reply yet, whether the adapter replies to frames at all, and when the last
+    /// one was written.
+    unanswered: usize,
+    replies: bool,
+    written_at: Instant,
+}
+
+/// What an adapter says.
+enum Said {
+    Frame(CanFrame),
+    /// A frame was taken.
+    Taken,
 }
 
 /// Opens the serial CAN adapter at `path` and its channel with `bit_rate` [bit/s], one of [`SLCAN_RATES`].
@@ -35,26 +59,68 @@ pub fn open(device: &str, path: &str, bit_rate: u32, filters: &[CanFilter]) -> A
     let code = code.ok_or_else(|| failed(&format!("slcan has no bit rate {bit_rate}")))?;
     let mut line = Lines::new(open_line(device, path, BAUD)?, format!("{device} at {path}"));
     // The first carriage return ends whatever another program left unfinished. Only a closed channel takes a rate.
-    if !line.put(format!("\rC\rS{code}\rO\r").as_bytes())? {
+    let opening = [b'\r', b'C', b'\r', b'S', b'0' + code as u8, b'\r', b'O', b'\r'];
+    if !line.put(&opening)? {
         return Err(failed("it takes no bytes"));
     }
-    Ok(SlcanPort { line, filters: filters.to_vec() })
+    let (filters, written_at) = (filters.to_vec(), Instant::now());
+    Ok(SlcanPort { line, filters, opening, unanswered: 0, replies: false, written_at })
 }
 
 impl CanPort for SlcanPort {
     fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
-        self.line.put_frames(frames)
+        let taken = self.line.put_frames(frames)?;
+        self.unanswered += taken;
+        self.written_at = Instant::now();
+        Ok(taken)
     }
 
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
         let filters = &self.filters;
-        let wanted = |line: &[u8]| decode(line).filter(|frame| CanFilter::any(filters, frame.id));
-        let frame = self.line.next(wanted, read_line)?;
-        Ok(frame.map(CanEvent::Frame))
+        let wanted = |line: &[u8]| match line {
+            [b'z' | b'Z'] => Some(Said::Taken),
+            line => decode(line).filter(|frame| CanFilter::any(filters, frame.id)).map(Said::Frame),
+        };
+        for _ in 0..REPLIES {
+            match self.line.next(wanted, read_line)? {
+                None => break,
+                Some(Said::Taken) => (self.replies, self.unanswered) = (true, self.unanswered.saturating_sub(1)),
+                Some(Said::Frame(frame)) => {
+                    // An adapter that hands on frames has long looked at what was written to it: the reply was lost.
+                    if self.unanswered > 0 && self.written_at.elapsed() > REPLY_LOST {
+                        self.unanswered = 0;
+                    }
+                    return Ok(Some(CanEvent::Frame(frame)));
+                }
+            }
+        }
+        Ok(None)
     }
 
     fn fd(&self) -> BorrowedFd<'_> {
         self.line.fd.as_fd()
+    }
+
+    /// Frames without a reply, of an adapter that replies. Of another one: the kernel says when some 256 bytes wait for it.
+    fn waiting(&self) -> usize {
+        let room = || wait(&self.line.fd, PollFlags::OUT, Duration::ZERO).unwrap_or(false);
+        if self.replies {
+            self.unanswered
+        } else if room() {
+            0
+        } else {
+            BACKLOG
+        }
+    }
+
+    /// Throws away what the serial line has not sent, and what the adapter has not: it forgets that with its channel
+    /// closed.
+    fn discard(&mut self) -> AdapterResult<usize> {
+        tcflush(&self.line.fd, QueueSelector::OFlush).map_err(|e| broken(&self.line.peer, e))?;
+        self.line.rest.1 = 0;
+        self.unanswered = 0;
+        let opened = self.line.put(&self.opening)?;
+        Ok(if opened { 0 } else { BACKLOG })
     }
 }
 

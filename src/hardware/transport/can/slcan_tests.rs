@@ -220,3 +220,40 @@ fn an_unplugged_adapter_is_an_io_error() {
     let error = open("arm", "/dev/ttyACM77", 1_000_000, &[]).err().unwrap().to_string();
     assert!(error.contains("there is no such device\nhint: "), "{error}");
 }
+
+#[test]
+fn what_the_adapter_has_not_read_is_taken_back() {
+    let pty = Pty::open().unwrap();
+    let mut port = open("arm", pty.path(), 500_000, &[]).unwrap();
+    assert_eq!(heard(&pty, "O\r"), "\rC\rS6\rO\r");
+    let frames = golden().map(|(frame, _)| frame);
+    assert_eq!(port.send(&frames), Ok(4));
+    assert_eq!(port.discard(), Ok(0));
+    assert_eq!(port.send(&frames[3..]), Ok(1));
+    // A channel that is closed and opened again empties the adapter, too.
+    assert_eq!(heard(&pty, "t47120702\r"), "\rC\rS6\rO\rt47120702\r");
+}
+
+#[test]
+fn frames_without_a_reply_are_counted_where_the_adapter_replies() {
+    let pty = Pty::open().unwrap();
+    let mut port = open("arm", pty.path(), 1_000_000, &[]).unwrap();
+    let frames = golden().map(|(frame, _)| frame);
+    port.send(&frames).unwrap();
+    assert_eq!(port.waiting(), 0, "nothing is known of an adapter that has not replied yet");
+    pty.write(b"z\r").unwrap();
+    let start = Instant::now();
+    while port.waiting() != 3 {
+        assert!(start.elapsed() < WAIT && port.receive() == Ok(None));
+    }
+    port.send(&frames[..2]).unwrap();
+    assert_eq!(port.waiting(), 5);
+    pty.write(b"z\rz\rt0001F0\rZ\r").unwrap();
+    assert_eq!(events(&mut port, 1), [CanFrame::new(0, &[0xF0])]);
+    assert_eq!(port.waiting(), 2);
+    // A reply was lost: an adapter that hands on frames later on has taken everything.
+    std::thread::sleep(Duration::from_millis(250));
+    pty.write(b"t0001F0\r").unwrap();
+    assert_eq!(events(&mut port, 1).len(), 1);
+    assert_eq!(port.waiting(), 0);
+}

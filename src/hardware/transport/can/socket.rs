@@ -1,17 +1,24 @@
 //! A CAN interface of the system, over a raw socket of Linux's SocketCAN.
 //!
-//! Two things bound what can go wrong while nobody acknowledges (the arm has lost its power): the socket may have
-//! [`SEND_QUEUE`] frames in the kernel's queues at a time, and [`CanPort::waiting`] tells how many there are. Closing
-//! the socket does not take them back: the kernel sends them when somebody acknowledges again. What takes them back is
-//! the interface going down (`ip link set can0 down`, a privilege), or a controller in one-shot mode.
+//! Two things bound what can go wrong while no node acknowledges (the arm has lost its power): the socket may have
+//! [`SEND_QUEUE`] frames in the kernel's queues at a time, and [`CanPort::waiting`] tells how many have not been
+//! transmitted. Closing the socket does not take them back: the kernel sends them when a node acknowledges again. What
+//! takes them back is the interface going down (`ip link set can0 down`, a privilege), or a controller in one-shot mode.
+//!
+//! The memory that the kernel charges the socket for a frame shows only what waits in the interface's queue: since Linux
+//! 5.10 it is released when the driver takes the frame, and drivers have room for 10 and more. So the socket also hears
+//! its own frames (`CAN_RAW_RECV_OWN_MSGS`, marked `MSG_CONFIRM`): drivers of real controllers echo a frame when it was
+//! transmitted. Interfaces without such a driver (vcan, vxcan, serial lines) echo it at once, and there the memory shows
+//! what waits.
 
-use std::io::{Error, ErrorKind};
+use std::io::{Error, ErrorKind, IoSliceMut};
 use std::os::fd::{AsFd, BorrowedFd};
 
-use libc::{ENETDOWN, ENOBUFS, ENODEV, can_frame};
-use rustix::net::sockopt;
+use libc::{ENETDOWN, ENOBUFS, ENODEV};
+use rustix::net::{RecvAncillaryBuffer, RecvFlags, recvmsg, sockopt};
 use socketcan::{CanDataFrame, CanSocket, EmbeddedFrame, Socket, SocketOptions, StandardId};
 
+use super::in_flight::InFlight;
 use super::{CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 
@@ -35,6 +42,18 @@ pub struct SocketPort {
     broken: Option<AdapterError>,
     /// Frames that the socket had no room for, as counted by the kernel.
     lost: u32,
+    /// What others send that the device wants, and what is followed until it is transmitted; everything is wanted where
+    /// there are none, and nothing is followed.
+    filters: Vec<CanFilter>,
+    in_flight: InFlight,
+}
+
+/// A frame as the kernel hands it over (`struct can_frame`), and whether this socket has sent it.
+struct Raw {
+    id: u32,
+    len: u8,
+    data: [u8; 8],
+    own: bool,
 }
 
 /// Opens a port on the CAN interface `name`.
@@ -51,7 +70,7 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
         socket.set_error_filter_accept_all()?;
         // Programs on this computer hear each other, so that an emulator can stand in for an arm.
         socket.set_loopback(true)?;
-        socket.set_recv_own_msgs(false)?;
+        socket.set_recv_own_msgs(!filters.is_empty())?;
         socket.set_nonblocking(true)?;
         // The kernel doubles both figures, to account for its own overhead.
         sockopt::set_socket_send_buffer_size(&socket, SEND_QUEUE * FRAME_MEMORY / 2)?;
@@ -71,7 +90,8 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
              wiring, the terminators and the bit rate; then ip link set {name} down; ip link set {name} up (as root)"
         )));
     }
-    Ok(SocketPort { socket, peer: format!("{device} at {name}"), broken: None, lost: 0 })
+    let (peer, filters) = (format!("{device} at {name}"), filters.to_vec());
+    Ok(SocketPort { socket, peer, broken: None, lost: 0, filters, in_flight: InFlight::new() })
 }
 
 /// Why an interface cannot be opened, with the remedy.
@@ -128,6 +148,18 @@ impl SocketPort {
         error
     }
 
+    /// The next frame in the socket's buffer.
+    fn read(&self) -> std::io::Result<Raw> {
+        /// Identifier (4 bytes), length (1), padding (3), data (8).
+        const SIZE: usize = 16;
+        let mut room = [0; SIZE];
+        let mut control = RecvAncillaryBuffer::default();
+        let got = recvmsg(&self.socket, &mut [IoSliceMut::new(&mut room)], &mut control, RecvFlags::empty())?;
+        let own = got.flags.bits() & libc::MSG_CONFIRM as u32 != 0;
+        let [a, b, c, d, len, _, _, _, data @ ..] = room;
+        Ok(Raw { id: u32::from_ne_bytes([a, b, c, d]), len: len.min(8), data, own })
+    }
+
     /// The kernel's figures about the socket: its send memory [bytes], and how many frames it had no room for.
     fn figures(&self) -> Option<(usize, u32)> {
         let mut bytes = [0; 9 * 4];
@@ -149,7 +181,13 @@ impl CanPort for SocketPort {
             let Some(data) = made else {
                 return Err(AdapterError::Protocol(format!("{:#x} is no CAN identifier of 11 bits", frame.id)));
             };
+            if self.in_flight.len() >= SEND_QUEUE {
+                return Ok(taken);
+            }
             match self.socket.write_frame(&data) {
+                Ok(()) if !self.filters.is_empty() && CanFilter::any(&self.filters, frame.id) => {
+                    self.in_flight.handed_over(CanFrame::new(frame.id, frame.bytes()));
+                }
                 Ok(()) => {}
                 // The socket's own bound, and that of the interface.
                 Err(e) if e.kind() == ErrorKind::WouldBlock || e.raw_os_error() == Some(ENOBUFS) => return Ok(taken),
@@ -161,22 +199,36 @@ impl CanPort for SocketPort {
 
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
         self.usable()?;
-        match self.socket.read_raw_frame() {
-            Ok(frame) if frame.can_id & libc::CAN_ERR_FLAG != 0 => Ok(Some(CanEvent::Trouble(trouble(&frame)))),
-            Ok(frame) => {
-                let bytes = frame.data.get(..usize::from(frame.can_dlc)).unwrap_or(&frame.data);
-                Ok(Some(CanEvent::Frame(CanFrame::new((frame.can_id & libc::CAN_SFF_MASK) as u16, bytes))))
+        // What it has sent itself is passed over: no more than can be in flight.
+        for _ in 0..=SEND_QUEUE {
+            match self.read() {
+                Ok(frame) if frame.id & libc::CAN_ERR_FLAG != 0 => {
+                    return Ok(Some(CanEvent::Trouble(trouble(frame.id, frame.data))));
+                }
+                Ok(frame) => {
+                    let bytes = frame.data.get(..usize::from(frame.len)).unwrap_or(&frame.data);
+                    let heard = CanFrame::new((frame.id & libc::CAN_SFF_MASK) as u16, bytes);
+                    if !frame.own {
+                        return Ok(Some(CanEvent::Frame(heard)));
+                    }
+                    self.in_flight.confirmed(&heard);
+                }
+                Err(e) if e.kind() == ErrorKind::WouldBlock => {
+                    // Now that everything is fetched: was that everything?
+                    let lost = self.figures().map_or(self.lost, |(_, lost)| lost);
+                    let fresh = lost != self.lost;
+                    self.lost = lost;
+                    if fresh {
+                        // Echoes may be among the lost; a bus that fills the buffer has taken what was sent before.
+                        self.in_flight.clear();
+                    }
+                    return Ok(fresh.then_some(CanEvent::Trouble(CanTrouble::Overflow)));
+                }
+                Err(e) if e.kind() == ErrorKind::Interrupted => return Ok(None),
+                Err(e) => return Err(self.break_down(&e)),
             }
-            Err(e) if e.kind() == ErrorKind::WouldBlock => {
-                // Now that everything is fetched: was that everything?
-                let lost = self.figures().map_or(self.lost, |(_, lost)| lost);
-                let fresh = lost != self.lost;
-                self.lost = lost;
-                Ok(fresh.then_some(CanEvent::Trouble(CanTrouble::Overflow)))
-            }
-            Err(e) if e.kind() == ErrorKind::Interrupted => Ok(None),
-            Err(e) => Err(self.break_down(&e)),
         }
+        Ok(None)
     }
 
     fn fd(&self) -> BorrowedFd<'_> {
@@ -184,14 +236,15 @@ impl CanPort for SocketPort {
     }
 
     fn waiting(&self) -> usize {
-        self.figures().map_or(0, |(memory, _)| memory.div_ceil(FRAME_MEMORY))
+        let queued = self.figures().map_or(0, |(memory, _)| memory.div_ceil(FRAME_MEMORY));
+        queued.max(self.in_flight.len())
     }
 }
 
 /// What an error frame says. Where it says several things, the worst.
-fn trouble(frame: &can_frame) -> CanTrouble {
-    let class = frame.can_id & libc::CAN_ERR_MASK;
-    let [_, controller, _, location, ..] = frame.data;
+fn trouble(id: u32, data: [u8; 8]) -> CanTrouble {
+    let class = id & libc::CAN_ERR_MASK;
+    let [_, controller, _, location, ..] = data;
     let controller = |bits: libc::c_int| class & libc::CAN_ERR_CRTL != 0 && libc::c_int::from(controller) & bits != 0;
     let no_ack = class & libc::CAN_ERR_PROT != 0 && location == LOCATION_ACK;
     match class {
@@ -214,7 +267,8 @@ mod tests {
     fn error_frames_are_told_apart() {
         let told = |class: u32, data: [u8; 8]| {
             let made = socketcan::CanErrorFrame::new_error(class, &data).unwrap();
-            trouble(made.as_ref())
+            let frame: &libc::can_frame = made.as_ref();
+            trouble(frame.can_id, frame.data)
         };
         assert_eq!(told(0x40, [0; 8]), CanTrouble::BusOff);
         assert_eq!(told(0x20, [0; 8]), CanTrouble::NoAcknowledge);

@@ -23,7 +23,7 @@ use crate::hardware::sim::arm::check_pose;
 use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
 use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::CanFrame;
-use crate::joint::Joints;
+use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 use server::Server;
 
@@ -52,7 +52,8 @@ const ANYWHERE: usize = PLAYABLE.len() - 3;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
+    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an arm may rest that
+    /// nobody holds; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
     pub initial_positions: Vec<f64>,
     /// How often it sends its state, 20 to 200 [Hz]: an arm's 200, or less for a client that cannot keep up.
     #[serde(deserialize_with = "rate")]
@@ -79,13 +80,22 @@ impl SimOptions {
     /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
     pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), Misfit> {
         check_script("the piper emulator", &self.faults, playable)
-            .and_then(|()| check_pose(&self.initial_positions, &limits()))
+            .and_then(|()| check_pose(&self.initial_positions, &stops()))
             .map_err(|misfit| misfit.within("sim"))?;
         match self.firmware.len() {
             8 => Ok(()),
             _ => Err(Misfit::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
         }
     }
+}
+
+/// Where the joints meet their mechanical stops: 0.05 rad outside the limits.
+fn stops() -> JointLimits {
+    const BEYOND: f64 = 0.05;
+    let mut stops = limits();
+    stops.position_lower.iter_mut().for_each(|lower| *lower -= BEYOND);
+    stops.position_upper.iter_mut().for_each(|upper| *upper += BEYOND);
+    stops
 }
 
 fn rate<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
@@ -129,6 +139,17 @@ impl PiperEmulator {
     /// Whether the motors are on.
     pub fn enabled(&self) -> bool {
         self.server.with(|controller, _| controller.enabled())
+    }
+
+    /// Whether it refuses targets outside its limits (it does, unless told otherwise) or takes them.
+    pub fn refuse_outside(&self, refuse: bool) {
+        self.server.with(|controller, _| controller.lenient = !refuse);
+    }
+
+    /// Does as a frame says that a program sends which other programs on this computer do not hear, as the vendor's SDK
+    /// does (it switches local loopback off).
+    pub fn obey_unheard(&self, frame: &CanFrame) {
+        self.server.with(|controller, now| controller.handle(frame, now, &mut Vec::new()));
     }
 
     /// How often a client has let the motors lose their power by a reset (0x150).

@@ -8,11 +8,11 @@ use nalgebra::Isometry3;
 
 use super::super::model::{Identity, Model, VELOCITY};
 use super::super::protocol::gripper::GripperKind;
-use super::SimOptions;
 use super::kinematics::{Chain, to_wire};
 use super::report::Snapshot;
 use super::tool::Tool;
 use super::wire::Request;
+use super::{SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript};
 use crate::hardware::sim::plant::{Drive, Plant, Tracking};
@@ -55,6 +55,8 @@ pub struct Received {
     pub payload: Vec<u8>,
     /// The state byte of the response.
     pub status: u8,
+    /// Whether it came over the second control port.
+    pub second: bool,
 }
 
 impl Received {
@@ -117,6 +119,9 @@ pub struct Controller {
     pub keeps_mode: bool,
     /// It sends no reports of how it is; all others go on.
     pub condition_muted: bool,
+    /// What becomes of the full reports.
+    pub withhold: Withhold,
+    slow: Vec<SlowReply>,
     estop_open: bool,
     estop_until: Option<Mono>,
     pub(super) script: FaultScript,
@@ -165,6 +170,8 @@ impl Controller {
             settings: Settings { sensitivity: [3, 3], ..Settings::default() },
             keeps_mode: false,
             condition_muted: false,
+            withhold: Withhold::No,
+            slow: options.slow_replies.clone(),
             estop_open: false,
             estop_until: None,
             script: FaultScript::new(&options.faults),
@@ -334,13 +341,14 @@ impl Controller {
         if self.script.take(FaultKind::Nan, t).is_some() {
             snapshot.position = [f32::NAN; 7];
         } else if self.script.take(FaultKind::ZeroState, t).is_some() {
-            (snapshot.position, snapshot.velocity) = ([0.0; 7], [0.0; 7]);
+            // A controller that has not measured yet has no pose either.
+            (snapshot.position, snapshot.velocity, snapshot.pose) = ([0.0; 7], [0.0; 7], [0.0; 6]);
         }
         snapshot
     }
 
     /// Does what a request asks and writes the response into `out`; what becomes of it on its way.
-    pub fn handle(&mut self, request: &Request<'_>, now: Mono, out: &mut Vec<u8>) -> Delivery {
+    pub fn handle(&mut self, request: &Request<'_>, second: bool, now: Mono, out: &mut Vec<u8>) -> Delivery {
         self.first_contact.get_or_insert(now);
         self.advance(now);
         let t = self.script_time(now);
@@ -348,9 +356,21 @@ impl Controller {
         let status = self.respond(request, now, t, out);
         if let Some(trace) = self.trace.as_mut().filter(|trace| trace.len() < TRACE) {
             let (protocol, register, payload) = (request.protocol, request.register, request.payload.to_vec());
-            trace.push(Received { at: now, protocol, register, payload, status });
+            trace.push(Received { at: now, protocol, register, payload, status, second });
         }
         self.delivery(now)
+    }
+
+    /// How long the reply to a register takes.
+    pub fn reply_time(&self, register: u8) -> Duration {
+        let slow = self.slow.iter().find(|slow| slow.register == register);
+        slow.map_or(Duration::ZERO, |slow| Duration::from_secs_f64(slow.delay))
+    }
+
+    /// Lets the replies to a register take time from now on.
+    pub fn slow_down(&mut self, slow: SlowReply) {
+        self.slow.retain(|other| other.register != slow.register);
+        self.slow.push(slow);
     }
 
     pub(super) fn script_time(&self, now: Mono) -> f64 {

@@ -156,6 +156,8 @@ mod tests {
             let pose = Chain::of(model).forward(&[0.0; 7]);
             let off = (pose.translation.vector - Vector3::from(expected)).norm();
             assert!(off < 1e-9, "{model:?}: {:?}", pose.translation);
+            let (x, z) = model.zero_pose();
+            assert!((x / 1000.0 - expected[0]).abs() + (z / 1000.0 - expected[2]).abs() < 1e-9, "{model:?}");
             let out = pose.rotation * Vector3::z();
             assert!((out + Vector3::z()).norm() < 1e-9, "{model:?}: the hand points down, not {out}");
         }

@@ -75,14 +75,37 @@ pub struct SimOptions {
     pub initial_positions: Vec<f64>,
     /// Firmware version of the controller. Before 2.1.0 there is no report with velocities.
     pub firmware: String,
+    /// Whether it serves the second control port (503), which newer boxes have for the gripper's bus.
+    pub port_503: bool,
+    /// Registers whose replies take time, as those of a real box do.
+    pub slow_replies: Vec<SlowReply>,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
 
 impl Default for SimOptions {
     fn default() -> Self {
-        Self { initial_positions: Vec::new(), firmware: "2.5.1".into(), faults: Vec::new() }
+        Self {
+            initial_positions: Vec::new(),
+            firmware: "2.5.1".into(),
+            port_503: true,
+            slow_replies: Vec::new(),
+            faults: Vec::new(),
+        }
     }
+}
+
+/// A register whose replies take time. What was asked happens at once; requests that come later over the same
+/// connection wait, as the controller replies in order.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct SlowReply {
+    /// The register: 11 enable, 12 state, 16 clear the error, 19 mode, 124 RS485 of the gripper.
+    #[schemars(range(min = 1, max = 254))]
+    pub register: u8,
+    /// How long its replies take [s].
+    #[schemars(range(min = 0, max = 3600))]
+    pub delay: f64,
 }
 
 impl SimOptions {
@@ -91,6 +114,9 @@ impl SimOptions {
         check_script("the xarm emulator", &self.faults, PLAYABLE)
             .and_then(|()| check_pose(&self.initial_positions, limits))
             .map_err(|misfit| misfit.within("sim"))?;
+        if let Some(i) = self.slow_replies.iter().position(|slow| !(0.0..=3600.0).contains(&slow.delay)) {
+            return Err(Misfit::new(format!("sim.slow_replies.{i}.delay"), "a delay is between 0 and 3600 s"));
+        }
         self.firmware().map(drop)
     }
 
@@ -125,7 +151,7 @@ impl XArmEmulator {
     ) -> AdapterResult<Self> {
         options.check(&model.limits())?;
         let firmware = options.firmware()?;
-        let ports = Ports::bind(ip, in_process)?;
+        let ports = Ports::bind(ip, in_process, options.port_503)?;
         let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now());
         let server = Server::start(controller, ports, firmware >= [2, 1, 0])
             .map_err(|e| AdapterError::Io(format!("{WHO}: cannot serve: {e}")))?;
@@ -153,6 +179,16 @@ impl XArmEmulator {
     /// Lets port 30001 fall silent while its connections stay open and all other ports go on, or report again.
     pub fn mute_condition(&self, mute: bool) {
         self.server.with(|controller, _| controller.condition_muted = mute);
+    }
+
+    /// Lets the replies to a register take so long [s] from now on.
+    pub fn slow_down(&self, register: u8, delay: f64) {
+        self.server.with(|controller, _| controller.slow_down(SlowReply { register, delay }));
+    }
+
+    /// Lets port 30000 close its connections, or keep them without a word, in the place of its reports.
+    pub fn withhold_full_reports(&self, withhold: Withhold) {
+        self.server.with(|controller, _| controller.withhold = withhold);
     }
 
     /// True joint positions [rad] and velocities [rad/s] now.
@@ -203,40 +239,57 @@ impl Emulator for XArmEmulator {
     }
 }
 
+/// What becomes of the reports of port 30000.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Withhold {
+    /// They are sent.
+    #[default]
+    No,
+    /// Connections end at once.
+    Close,
+    /// Connections stay, and nothing is sent.
+    Silence,
+}
+
 /// The sockets that wait for clients.
 struct Ports {
     ip: IpAddr,
     control: TcpListener,
+    /// The second control port, one above the first.
+    second: Option<TcpListener>,
     /// In the order of their ports.
     reports: Vec<TcpListener>,
 }
 
 impl Ports {
     /// Listens at the arm's own ports, or at free ones.
-    fn bind(ip: IpAddr, in_process: bool) -> AdapterResult<Self> {
+    fn bind(ip: IpAddr, in_process: bool, second: bool) -> AdapterResult<Self> {
         if !in_process {
-            return Self::at(ip, CONTROL_PORT, REPORT_PORT);
+            return Self::at(ip, CONTROL_PORT, REPORT_PORT, second);
         }
         let free = |_| {
-            let control = TcpListener::bind((ip, 0)).ok()?;
-            let reports = Self::block(ip, 0).ok()?;
-            Some(Self { ip, control, reports })
+            let mut control = Self::block(ip, 0, 1 + u16::from(second)).ok()?.into_iter();
+            let reports = Self::block(ip, 0, REPORT_PORTS).ok()?;
+            Some(Self { ip, control: control.next()?, second: control.next(), reports })
         };
         (0..ATTEMPTS).find_map(free).ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))
     }
 
     /// Listens at these ports.
-    fn at(ip: IpAddr, control: u16, reports: u16) -> AdapterResult<Self> {
+    fn at(ip: IpAddr, control: u16, reports: u16, second: bool) -> AdapterResult<Self> {
         let failed = |port: u16| move |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, port), &e);
+        let above = control.saturating_add(1);
+        let second = second.then(|| TcpListener::bind((ip, above)).map_err(failed(above))).transpose()?;
         let control = TcpListener::bind((ip, control)).map_err(failed(control))?;
-        Ok(Self { ip, control, reports: Self::block(ip, reports).map_err(failed(reports))? })
+        Ok(Self { ip, control, second, reports: Self::block(ip, reports, REPORT_PORTS).map_err(failed(reports))? })
     }
 
-    fn block(ip: IpAddr, first: u16) -> io::Result<Vec<TcpListener>> {
+    /// Listens at so many ports in a row.
+    fn block(ip: IpAddr, first: u16, count: u16) -> io::Result<Vec<TcpListener>> {
         let listener = TcpListener::bind((ip, first))?;
         let first = listener.local_addr()?.port();
         let mut all = vec![listener];
-        for offset in 1..REPORT_PORTS {
+        for offset in 1..count {
             let port = first.checked_add(offset).ok_or(io::ErrorKind::AddrNotAvailable)?;
             all.push(TcpListener::bind((ip, port))?);
         }

@@ -10,10 +10,10 @@ use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::Ports;
 use super::controller::{Controller, Delivery};
 use super::report::Kind;
 use super::wire;
+use super::{Ports, Withhold};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::transport::tcp::Scan;
@@ -28,6 +28,8 @@ const CLIENTS: usize = 16;
 struct Shared {
     ip: IpAddr,
     control: u16,
+    /// Whether there is a second control port, one above the first.
+    second: bool,
     reports: u16,
     /// Whether there is a report at the first report port.
     full: bool,
@@ -117,6 +119,7 @@ impl Server {
         let shared = Arc::new(Shared {
             ip: ports.ip,
             control: ports.control.local_addr()?.port(),
+            second: ports.second.is_some(),
             reports: first,
             full,
             controller: Mutex::new(controller),
@@ -200,7 +203,8 @@ impl Floor {
                 }
                 None => {
                     // After a loss of power, on the same ports.
-                    ports = Ports::at(self.shared.ip, self.shared.control, self.shared.reports).ok();
+                    ports =
+                        Ports::at(self.shared.ip, self.shared.control, self.shared.reports, self.shared.second).ok();
                     if ports.is_none() {
                         std::thread::sleep(Duration::from_millis(20));
                     }
@@ -215,7 +219,7 @@ impl Floor {
         let due = self.readers.iter().map(|reader| reader.due).min();
         let left = due.map_or(Duration::from_secs(1), |due| due.saturating_duration_since(Instant::now()));
         let timeout = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
-        let listeners = || [&ports.control].into_iter().chain(&ports.reports);
+        let listeners = || ports.reports.iter().chain([&ports.control]).chain(&ports.second);
         let mut fds: Vec<_> = listeners().map(|l| PollFd::new(l, PollFlags::IN)).collect();
         fds.push(PollFd::from_borrowed_fd(self.shared.wake.as_fd(), PollFlags::IN));
         if !poll(&mut fds, Some(&timeout)).is_ok_and(|n| n > 0) {
@@ -226,27 +230,31 @@ impl Floor {
             self.shared.wake.lower();
         }
         for (i, (listener, _)) in listeners().zip(&ready).enumerate().filter(|(_, (_, ready))| **ready) {
-            self.accept(listener, i.checked_sub(1).and_then(|i| Kind::ALL.get(i)).copied());
+            self.accept(listener, Kind::ALL.get(i).copied(), i > Kind::ALL.len());
         }
     }
 
-    fn accept(&mut self, listener: &TcpListener, reports: Option<Kind>) {
+    fn accept(&mut self, listener: &TcpListener, reports: Option<Kind>, second: bool) {
         let Ok((stream, _)) = listener.accept() else {
             std::thread::sleep(Duration::from_millis(10)); // out of descriptors, say: do not spin
             return;
         };
         let _ = stream.set_nodelay(true);
         match reports {
-            Some(Kind::Full) if !self.shared.full => {}
+            Some(Kind::Full) if !self.shared.full || self.withheld() == Withhold::Close => {}
             Some(kind) if stream.set_nonblocking(true).is_ok() => {
                 self.readers.push(Reader { kind, stream, due: Instant::now(), last: Vec::new() });
             }
             Some(_) => {}
-            None => self.begin_session(stream),
+            None => self.begin_session(stream, second),
         }
     }
 
-    fn begin_session(&mut self, stream: TcpStream) {
+    fn withheld(&self) -> Withhold {
+        lock(&self.shared.controller).withhold
+    }
+
+    fn begin_session(&mut self, stream: TcpStream, second: bool) {
         self.sessions.retain(|session| !session.is_finished());
         let Ok(copy) = stream.try_clone() else { return };
         let mut line = lock(&self.shared.line);
@@ -261,7 +269,7 @@ impl Floor {
             host::enter_realtime(host::EMULATOR_PRIORITY);
             let peer = stream.peer_addr().ok();
             diary::note(Happening::Came);
-            serve(&shared, stream);
+            serve(&shared, stream, second);
             diary::note(Happening::Gone);
             lock(&shared.line).clients.retain(|client| client.peer_addr().ok() != peer);
         });
@@ -279,8 +287,10 @@ impl Floor {
             let period = Duration::from_micros(reader.kind.period_us());
             reader.due = if now > reader.due + period { now + period } else { reader.due + period };
             let mut controller = lock(&shared.controller);
-            if reader.kind == Kind::Normal && controller.condition_muted {
-                return true;
+            match reader.kind {
+                Kind::Normal if controller.condition_muted => return true,
+                Kind::Full if controller.withhold != Withhold::No => return controller.withhold == Withhold::Silence,
+                _ => {}
             }
             let mono = MonotonicClock.now();
             let snapshot = controller.snapshot(mono);
@@ -303,7 +313,7 @@ impl Floor {
 }
 
 /// Serves a control connection until it ends.
-fn serve(shared: &Shared, mut stream: TcpStream) {
+fn serve(shared: &Shared, mut stream: TcpStream, second: bool) {
     let mut buffer = [0; 4096];
     let mut filled = 0;
     let mut reply = Vec::with_capacity(256);
@@ -319,7 +329,11 @@ fn serve(shared: &Shared, mut stream: TcpStream) {
             };
             used += length;
             let Some(request) = request else { continue };
-            let delivery = lock(&shared.controller).handle(&request, MonotonicClock.now(), &mut reply);
+            let mut controller = lock(&shared.controller);
+            let delivery = controller.handle(&request, second, MonotonicClock.now(), &mut reply);
+            let ready_at = Instant::now() + controller.reply_time(request.register);
+            drop(controller);
+            shared.wait(|_| ready_at);
             if shared.deliver(delivery, &mut reply) && stream.write_all(&reply).is_err() {
                 return;
             }

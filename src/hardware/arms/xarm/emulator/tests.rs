@@ -17,7 +17,7 @@ fn answer(controller: &mut Controller, request: &[u8], at: f64) -> Vec<u8> {
     assert_eq!(wire::scan(&request[..request.len() - 1]), Scan::More);
     assert_eq!(wire::scan(request), Scan::Take(request.len(), ()));
     let mut out = Vec::new();
-    controller.handle(&wire::parts(request).unwrap(), Mono(1).after(Duration::from_secs_f64(at)), &mut out);
+    controller.handle(&wire::parts(request).unwrap(), false, Mono(1).after(Duration::from_secs_f64(at)), &mut out);
     out
 }
 

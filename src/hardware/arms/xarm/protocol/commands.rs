@@ -1,5 +1,7 @@
 //! What the controller can be asked, as far as the adapter needs it.
 
+use std::time::Duration;
+
 use super::frame::{MAX_REQUEST, Writer};
 use super::gripper::Rtu;
 
@@ -10,6 +12,13 @@ pub type WireJoints = [f64; 7];
 const ALL_JOINTS: u8 = 8;
 /// The number of the tool flange among the devices behind the controller.
 const TOOL: u8 = 0x09;
+
+/// Reply timeouts. Set points and questions are answered within a few ms; what resets the controller or goes to a device
+/// behind it takes longer (the vendor's client waits 2 s), and motors that are switched on longest (5 s).
+pub const QUICK: Duration = Duration::from_millis(200);
+/// See [`QUICK`].
+pub const SLOW: Duration = Duration::from_secs(2);
+const MOTORS: Duration = Duration::from_secs(5);
 
 /// `set_state`: ready for motion.
 pub const READY: u8 = 0;
@@ -103,6 +112,16 @@ impl Command {
             Self::Tool(_) => 124,
             Self::ReadToolBoard(_) => 128,
             Self::EnableForceTorque(_) => 201,
+        }
+    }
+
+    /// How long its reply may take.
+    pub fn timeout(&self) -> Duration {
+        match self {
+            Self::Enable(_) => MOTORS,
+            Self::SetState(_) | Self::SetMode { .. } | Self::ClearError | Self::ClearWarning => SLOW,
+            Self::Tool(_) | Self::ReadToolBoard(_) | Self::EnableForceTorque(_) => SLOW,
+            _ => QUICK,
         }
     }
 

@@ -61,10 +61,11 @@ impl GripperKind {
     /// The pulses of an opening [m].
     pub fn pulses(self, opening: f64) -> i32 {
         let millimetres = opening * 1000.0;
-        match self {
-            Self::XarmG2 => ((((millimetres - 16.0) / 110.0).asin().to_degrees() + 8.33) * 18.28).round() as i32,
-            _ => (millimetres * 10.0).round() as i32,
-        }
+        let pulses = match self {
+            Self::XarmG2 => (((millimetres - 16.0) / 110.0).asin().to_degrees() + 8.33) * 18.28,
+            _ => millimetres * 10.0,
+        };
+        (pulses.round() as i32).max(0) // closed is 0; rounding alone would make it −1 for a G2
     }
 
     /// The opening [m] of pulses.

@@ -108,7 +108,7 @@ impl Motion {
 }
 
 /// How the controller is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Health {
     /// Motors that are on, one bit per joint.
     pub enabled: u8,
@@ -116,6 +116,8 @@ pub struct Health {
     pub error: u8,
     /// The warning; 0 = none.
     pub warning: u8,
+    /// Where the tool is from the flange: x, y, z [mm].
+    pub tool: [f64; 3],
 }
 
 impl Health {
@@ -125,7 +127,8 @@ impl Health {
         // What the vendor's own client asks of a report before it believes it.
         let [collision, teach] = take::bytes(packet, 131)?;
         let [state_mode] = take::bytes(packet, 4)?;
-        (collision <= 5 && teach <= 5 && state_mode & 0x0F <= 9).then_some(Self { enabled, error, warning })
+        let tool = take::floats(packet, 91)?;
+        (collision <= 5 && teach <= 5 && state_mode & 0x0F <= 9).then_some(Self { enabled, error, warning, tool })
     }
 }
 

@@ -1,0 +1,104 @@
+//! Which measured joint positions are believed: those that the arm can have reached since the last believed ones.
+//!
+//! Controllers of this make are known to report a wrong angle now and then. A set that jumps is not believed; three in
+//! a row that agree with each other are: then the arm was moved, or its zero points were, while nothing was heard.
+
+use super::SPEED;
+use super::protocol::{WireJoints, millidegrees};
+use crate::clock::Mono;
+
+/// Steps beyond what the arm's speed explains, at half as much again, are not believed from here on [rad].
+const STEP: f64 = 0.02;
+const HASTE: f64 = 1.5;
+/// Period of the arm [s]: sets that this computer fetched together were not measured together.
+const PERIOD: f64 = 0.005;
+/// Consecutive refused sets that agree with each other until they are believed.
+const AGREEING: u32 = 3;
+/// Consecutive undisputed sets that end a dispute, and for how long one lasts at most [s].
+const UNDISPUTED: u32 = 5;
+const DISPUTE: f64 = 0.1;
+
+/// The believed joint positions and what speaks against them.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Belief {
+    /// The believed positions [0.001°].
+    pub joints: WireJoints,
+    /// When they arrived; `Mono::ZERO`: there are none.
+    pub at: Mono,
+    /// The last refused set, when it arrived, and how many in a row agree with it.
+    refused: WireJoints,
+    refused_at: Mono,
+    agreeing: u32,
+    /// Consecutive believed sets.
+    undisputed: u32,
+}
+
+impl Belief {
+    /// Takes a set that arrived at `now`. `true`: it is believed.
+    pub fn take(&mut self, joints: WireJoints, now: Mono) -> bool {
+        if self.at == Mono::ZERO || reachable(&joints, &self.joints, now.seconds_since(self.at)) {
+            self.undisputed = self.undisputed.saturating_add(1);
+            self.agreeing = 0;
+            (self.joints, self.at) = (joints, now);
+            return true;
+        }
+        let agrees = self.agreeing > 0 && reachable(&joints, &self.refused, now.seconds_since(self.refused_at));
+        self.agreeing = if agrees { self.agreeing + 1 } else { 1 };
+        (self.refused, self.refused_at, self.undisputed) = (joints, now, 0);
+        if self.agreeing < AGREEING {
+            return false;
+        }
+        self.agreeing = 0;
+        (self.joints, self.at) = (joints, now);
+        true
+    }
+
+    /// Whether sets were refused lately, so that the believed ones may be the wrong ones.
+    pub fn disputed(&self, now: Mono) -> bool {
+        let lately = self.refused_at != Mono::ZERO && now.seconds_since(self.refused_at) < DISPUTE;
+        lately && self.undisputed < UNDISPUTED
+    }
+}
+
+/// Whether an arm at `from` can be at `to` after `dt` [s].
+fn reachable(to: &WireJoints, from: &WireJoints, dt: f64) -> bool {
+    let reach = millidegrees(HASTE * SPEED * dt.clamp(PERIOD, 60.0) + STEP);
+    to.iter().zip(from).all(|(to, from)| to.saturating_sub(*from).saturating_abs() <= reach)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn ms(n: u64) -> Mono {
+        Mono(1_000_000_000 + n * 1_000_000)
+    }
+
+    #[test]
+    fn what_the_arm_cannot_have_reached_is_not_believed() {
+        let mut belief = Belief::default();
+        assert!(belief.take([10_000; 6], ms(0)) && belief.take([12_000; 6], ms(5)), "0.035 rad in 5 ms");
+        assert!(!belief.disputed(ms(5)));
+        assert!(!belief.take([15_000; 6], ms(10)), "0.052 rad in 5 ms");
+        assert!(belief.disputed(ms(10)));
+        assert_eq!((belief.joints, belief.at), ([12_000; 6], ms(5)));
+        assert!(belief.take([15_000; 6], ms(15)), "but in 10 ms");
+        // One joint is enough, and time alone makes longer ways possible, without bound.
+        assert!(!belief.take([15_000, 15_000, 15_000, 75_000, 15_000, 15_000], ms(20)));
+        assert!(belief.take([75_000; 6], ms(300)));
+    }
+
+    #[test]
+    fn three_in_a_row_that_agree_are_believed() {
+        let mut belief = Belief::default();
+        belief.take([0; 6], ms(0));
+        let far = [90_000; 6];
+        let took = [far, far, [0; 6], far, [-90_000; 6], far, far, far].map(|joints| belief.take(joints, ms(5)));
+        assert_eq!(took, [false, false, true, false, false, false, false, true]);
+        assert_eq!(belief.joints, far);
+        assert!(belief.disputed(ms(5)), "whichever of them is wrong");
+        (0..5).for_each(|i| assert!(belief.take(far, ms(10 + i))));
+        assert!(!belief.disputed(ms(15)));
+        assert!(!belief.take([0; 6], ms(20)) && belief.disputed(ms(20)) && !belief.disputed(ms(120)));
+    }
+}

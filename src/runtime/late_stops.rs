@@ -1,0 +1,81 @@
+//! Stops that could not be sent because an arm could not be reached: whoever asked was told so, and hears when the
+//! device thread delivers them after all.
+
+use std::collections::BTreeMap;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::dispatch::lock;
+use super::service::Service;
+use crate::clock::WallOffset;
+use crate::rpc::api::Confirmation;
+use crate::telemetry::Phase;
+use crate::telemetry::describe::{Described, Severity};
+
+/// The stops of a run that were not sent.
+#[derive(Debug, Default)]
+pub(super) struct LateStops {
+    /// Whether there are any: this is looked at with every tick.
+    any: AtomicBool,
+    /// By arm: the number of the last stop that had been sent.
+    sent_before: Mutex<BTreeMap<usize, u32>>,
+}
+
+impl LateStops {
+    fn add(&self, arm: usize, sent: u32) {
+        lock(&self.sent_before).insert(arm, sent);
+        self.any.store(true, Ordering::Release);
+    }
+
+    /// Whether an arm's stop still waits for its connection.
+    pub fn is_waiting(&self, arm: usize) -> bool {
+        self.any.load(Ordering::Acquire) && lock(&self.sent_before).contains_key(&arm)
+    }
+}
+
+impl Service {
+    /// An operator was told that an arm's stop was not sent.
+    pub(super) fn stop_not_sent(&self, arm: usize) {
+        if let Some(device) = self.parts.devices.get(arm) {
+            self.late_stops.add(arm, device.health().stop_sent.load(Ordering::Acquire));
+        }
+    }
+
+    /// Reports the stops that were delivered since this was called last.
+    pub fn report_late_stops(&self, wall: WallOffset) {
+        if !self.late_stops.any.load(Ordering::Acquire) {
+            return;
+        }
+        let mut waiting = lock(&self.late_stops.sent_before);
+        waiting.retain(|&arm, before| {
+            let Some(device) = self.parts.devices.get(arm) else { return false };
+            let sent = device.health().stop_sent.load(Ordering::Acquire);
+            if sent != *before {
+                let confirmed = device.health().stop_confirmed.load(Ordering::Relaxed) == sent;
+                self.report_late_stop(arm, confirmed, wall);
+            }
+            // An arm that was reset is not to be stopped any more.
+            sent == *before && self.phase(arm) == Phase::Held
+        });
+        self.late_stops.any.store(!waiting.is_empty(), Ordering::Release);
+    }
+
+    fn report_late_stop(&self, arm: usize, confirmed: bool, wall: WallOffset) {
+        let arm = self.parts.names.arm(arm as u16);
+        let how = if confirmed { Confirmation::Confirmed } else { Confirmation::SentNotConfirmed };
+        let described = Described {
+            kind: "stop",
+            severity: Severity::Warn,
+            status: "delivered",
+            text: format!("the stop of {arm} was delivered after the reconnect: {}", how.text()),
+            arm: Some(arm),
+            request: None,
+            task: None,
+            joint: None,
+            values: Vec::new(),
+        };
+        self.parts.dispatcher.log(described.severity, described.text.clone());
+        let tick = self.parts.pulse.ticks.load(Ordering::Relaxed);
+        self.tell(tick, &described, wall);
+    }
+}
