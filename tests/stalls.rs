@@ -123,6 +123,7 @@ fn bounds() -> Bounds {
         period: PERIOD,
         rounding: YOURARM.rounding,
         stale_after: YOURARM.stale_after(),
+        stopped_within: None,
         time_limit: YOURARM.time_limit,
     }
 }

@@ -11,6 +11,7 @@ use super::compare::{Comparison, Difference};
 use super::inputs::{Assembler, Topic};
 use super::recorded::{Recorded, RecordedError};
 use crate::arm::ArmState;
+use crate::control::config::CONTROL_VERSION;
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Envelope;
 use crate::recording::records::{RawRecord, RecordReader, unpack_chunk};
@@ -52,6 +53,14 @@ pub struct Verification {
 /// Runs a log once more and compares.
 pub fn verify(path: &Path) -> Result<Verification, RecordedError> {
     let recorded = Recorded::open(path)?;
+    if recorded.config.version != CONTROL_VERSION {
+        let what = format!(
+            "it was recorded with version {} of the tick's rules, this program has version {CONTROL_VERSION}: the same \
+             inputs give other commands (verify it with the program that recorded it)",
+            recorded.config.version
+        );
+        return Err(RecordedError::Unfit { path: path.to_owned(), what });
+    }
     let mut records = RecordReader::open(path)?;
     let mut run = Rerun::new(&recorded);
     let end = loop {

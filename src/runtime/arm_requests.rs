@@ -12,6 +12,7 @@ use crate::hardware::device::{Answer, Device};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
+use crate::telemetry::describe::cause_text;
 use crate::telemetry::{Outcome, Phase};
 
 /// How long a stopped arm gets to come to rest and confirm.
@@ -23,7 +24,7 @@ const SETTLING_LIMIT: Duration = Duration::from_secs(1);
 /// How long a request to disable waits at most: clients wait 10 s for an answer, and the device needs some of that.
 const BRAKING_LIMIT: Duration = Duration::from_secs(7);
 /// How long an order to a device may take.
-const ORDER_LIMIT: Duration = Duration::from_secs(5);
+const ORDER_LIMIT: Duration = Duration::from_secs(8);
 /// How long an enabled arm gets to be ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
 
@@ -78,7 +79,8 @@ impl Service {
         let arm = self.arm_index(&id)?;
         let device = self.device(arm)?;
         let view = self.arm_view(arm as usize);
-        if view.is_some_and(|v| v.phase == Phase::Held) {
+        let cause = view.filter(|v| v.phase == Phase::Held).map(|v| cause_text(v.cause));
+        if cause.is_some() {
             let cleared = order(device.clear_errors()).await;
             match cleared {
                 Ok(()) | Err(AdapterError::NotConnected) => {}
@@ -88,7 +90,10 @@ impl Service {
             tokio::time::sleep(self.period() * 2).await;
         }
         self.ask(Request::Reset { arm }).await?;
-        self.phase_reply(id, arm).await
+        let mut reply = self.phase_of(id, arm).await;
+        // What was wrong is read once more before the arm is enabled.
+        reply.note = cause.map(|cause| format!("was held: {cause}"));
+        Ok(Reply::ArmReset(reply))
     }
 
     pub(super) async fn enable(&self, id: String) -> Result<Reply, RpcError> {

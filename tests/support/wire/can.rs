@@ -27,8 +27,9 @@ pub struct CanProxy {
 impl CanProxy {
     /// In front of the arm on the bus at `upstream`.
     ///
-    /// In a stall of both ways nobody acknowledges what the run sends, as where the arm's plug is out: it waits in the
-    /// queue of the computer's own controller. In the other stalls it waits behind the bus, as in a gateway.
+    /// In a stall on the way to the arm nobody acknowledges what the run sends, as where the arm's plug is out: it waits in
+    /// the queue of the computer's own controller, and nothing comes back. In the other stalls frames wait behind the bus,
+    /// as in a gateway.
     pub fn start(upstream: &str, gate: &Gate) -> Self {
         let address = CanAddress::parse(upstream).unwrap();
         // A run locks its arm by the bus's number, and buses of other tests have numbers, too.
@@ -60,7 +61,7 @@ fn carry(bus: &Bus, mut near: Box<dyn CanPort>, mut far: Box<dyn CanPort>, gate:
     let mut held: [VecDeque<CanFrame>; 2] = Default::default();
     let (mut withheld, mut next_frame) = (false, Instant::now());
     while !closing.load(Ordering::Relaxed) {
-        let cut = matches!(gate.kind(), Some(Stall::Both));
+        let cut = matches!(gate.kind(), Some(Stall::Both | Stall::ToArm));
         match (cut, withheld) {
             (true, false) => bus.withhold(SEND_QUEUE),
             (false, true) => drop(bus.acknowledge()),
@@ -79,14 +80,10 @@ fn carry(bus: &Bus, mut near: Box<dyn CanPort>, mut far: Box<dyn CanPort>, gate:
         let trickles = Instant::now() >= next_frame;
         for (way, held) in [Way::ToArm, Way::FromArm].into_iter().zip(&mut held) {
             let most = match gate.passage(way).0 {
-                Passage::Pass => usize::MAX,
+                Passage::Pass if !cut => usize::MAX,
+                Passage::Keep if !cut => 0,
                 // What an arm says while its plug is out is lost.
-                Passage::Keep if cut && way == Way::FromArm => {
-                    held.clear();
-                    0
-                }
-                Passage::Keep => 0,
-                Passage::Lose => {
+                Passage::Pass | Passage::Keep | Passage::Lose => {
                     held.clear();
                     0
                 }

@@ -17,6 +17,8 @@ pub struct Bounds {
     pub rounding: f64,
     /// Age limit of a state [s].
     pub stale_after: f64,
+    /// It is stopped by a set point this close to where it is [rad], whatever it was told before.
+    pub stopped_within: Option<f64>,
     /// In velocity mode the arm stands after this time without a set point [s].
     pub time_limit: Option<f64>,
 }
@@ -91,10 +93,23 @@ impl Worst {
 }
 
 impl Bounds {
+    /// The position set points that follow one another. One that stops the arm where it is begins anew.
+    fn positions<'a>(&self, told: &'a [Told]) -> Vec<Vec<(Mono, &'a Vec<f64>)>> {
+        let stops = |one: &Told| match (position(&one.what), &one.truth, self.stopped_within) {
+            (Some(told), Some(truth), Some(most)) => told.iter().zip(truth).all(|(a, b)| (a - b).abs() <= most),
+            _ => false,
+        };
+        let mut all = Vec::new();
+        for part in told.chunk_by(|_, next| !stops(next)) {
+            all.extend(chains(part, position));
+        }
+        all
+    }
+
     /// Neighbouring set points: at most two periods at top speed apart; in velocity mode, at most acceleration.
     pub fn neighbours(&self, told: &[Told], since: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
-        for chain in chains(told, position) {
+        for chain in self.positions(told) {
             for pair in chain.windows(2) {
                 for (j, (a, b)) in pair[0].1.iter().zip(pair[1].1).enumerate() {
                     let most = self.velocity[j] * self.period * 2.0 + self.rounding;
@@ -121,7 +136,7 @@ impl Bounds {
     /// The way within any 50 ms: at top speed, and two periods.
     pub fn windows(&self, delivered: &[Told], since: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
-        for chain in chains(delivered, position) {
+        for chain in self.positions(delivered) {
             let steps: Vec<(Mono, Vec<f64>)> = chain
                 .windows(2)
                 .map(|pair| (pair[1].0, pair[0].1.iter().zip(pair[1].1).map(|(a, b)| (b - a).abs()).collect()))
@@ -148,14 +163,24 @@ impl Bounds {
     /// Where set points go after a stall that the arm is held for.
     pub fn travel(&self, delivered: &[Told], began: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
-        let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| position(&t.what));
-        let Some(last) = last else { return Ok(()) };
+        let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| Some((t.at, position(&t.what)?)));
+        let Some((at, last)) = last else { return Ok(()) };
+        // Counted from where the set points were when the stall began, after the last of them.
+        let delay = self.stale_after + began.seconds_since(at).min(self.period);
         for one in delivered.iter().filter(|t| t.at >= began) {
             for (j, (a, b)) in last.iter().zip(position(&one.what).unwrap_or(last)).enumerate() {
-                worst.look(j, one.at, (b - a).abs(), self.stopping(j, self.stale_after) + self.rounding);
+                worst.look(j, one.at, (b - a).abs(), self.stopping(j, delay) + self.rounding);
             }
         }
         worst.verdict("the way after a stall", "rad", began)
+    }
+
+    /// How long after a moment set points still moved [s].
+    pub fn moved_for(&self, sent: &[Told], began: Mono) -> f64 {
+        let points: Vec<(Mono, &Vec<f64>)> = sent.iter().filter_map(|t| Some((t.at, position(&t.what)?))).collect();
+        let moves = |pair: &[(Mono, &Vec<f64>)]| pair[0].1.iter().zip(pair[1].1).any(|(a, b)| (a - b).abs() > 1e-4);
+        let last = points.windows(2).rev().find(|pair| moves(pair));
+        last.map_or(0.0, |pair| pair[1].0.seconds_since(began))
     }
 
     /// How far the arm itself went.

@@ -77,7 +77,7 @@ pub struct Told {
     /// Counts the connections of the run to the arm.
     pub connection: usize,
     pub what: What,
-    /// Where the joints truly were at that moment [rad], when it was delivered.
+    /// Where the joints truly were at that moment [rad].
     pub truth: Option<Vec<f64>>,
 }
 
@@ -163,8 +163,10 @@ impl Gate {
     }
 
     fn note_sent(&self, connection: usize, what: impl Iterator<Item = What>) {
-        let at = now();
-        lock(&self.log).sent.extend(what.map(|what| Told { at, connection, what, truth: None }));
+        for what in what {
+            let truth = Some((self.truth)());
+            lock(&self.log).sent.push(Told { at: now(), connection, what, truth });
+        }
     }
 
     fn note_delivered(&self, connection: usize, what: impl Iterator<Item = What>) {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use dimos::rt::host;
 
-/// A thread that notices when it gets no processor, at the priority of emulators.
+/// A thread that notices when it gets no processor.
 pub struct Watch {
     longest: Arc<AtomicU64>,
     closing: Arc<AtomicBool>,
@@ -15,11 +15,14 @@ pub struct Watch {
 }
 
 impl Watch {
-    pub fn start() -> Self {
+    /// At the priority of emulators, or of any program.
+    pub fn start(realtime: bool) -> Self {
         let (longest, closing) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
         let (max, end) = (longest.clone(), closing.clone());
         let thread = std::thread::spawn(move || {
-            host::enter_realtime(host::EMULATOR_PRIORITY);
+            if realtime {
+                host::enter_realtime(host::EMULATOR_PRIORITY);
+            }
             while !end.load(Ordering::Relaxed) {
                 let began = Instant::now();
                 std::thread::sleep(Duration::from_millis(1));
