@@ -96,6 +96,38 @@ fn the_small_motion_stays_small_and_leaves_the_arm_as_it_was() {
     assert!(!emulator.enabled());
 }
 
+/// What is measured is what was emulated: the median of the joints, which does not depend on a moment in which this
+/// machine was busy.
+#[test]
+fn the_lag_of_an_arm_is_measured() {
+    let (emulator, address) = arm(&SimOptions { lag: 0.037, ..SimOptions::default() });
+    let home = Home::new();
+    let line = format!("adapter test yourarm --address {address} --only row --lag");
+    home.dimos(&line).with(2).says(&["--lag moves the arm", "hint: add --allow-motion"]);
+    assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
+    let report = home.dimos(&format!("{line} --allow-motion --yes --json --report r.md")).with(0).json();
+    let lag = &report["lag"];
+    let median = lag["median"].as_f64().unwrap();
+    assert!((median - 0.037).abs() < 0.002, "{lag:#}");
+    assert!(lag["largest"].as_f64().unwrap() >= median && lag["row"] == 0.03, "{lag:#}");
+    assert_eq!(lag["joints"].as_array().unwrap().len(), 6);
+    let text = std::fs::read_to_string(home.path().join("r.md")).unwrap();
+    assert!(text.contains(" ms (row: 30 ms; set hardware.arm.lag: 0.0"), "{text}");
+    let streamed = |request: &Request| match request {
+        Request::ServoJoints(target) => target.iter().zip(START).all(|(a, b)| (a - b).abs() < 2.01),
+        other => !other.moves(),
+    };
+    assert!(requests(&emulator).iter().all(streamed));
+    assert!(!emulator.enabled());
+}
+
+/// An arm in memory is not asked for: there is nothing to be hurt.
+#[test]
+fn the_lag_of_a_mock_is_measured_without_a_question() {
+    let ended = Home::new().dimos("adapter test mock --dof 1 --only row --lag").with(0);
+    assert!(ended.out.contains(" ms (row: 20 ms; set hardware.arm.lag: 0.0"), "{}", ended.out);
+}
+
 #[test]
 fn nobody_to_ask_no_motion() {
     let (emulator, address) = arm(&SimOptions::default());
@@ -233,7 +265,8 @@ fn an_error_in_motion_ends_it() {
 
 #[test]
 fn a_pose_too_near_a_limit_is_refused() {
-    let near = SimOptions { initial_positions: vec![0.0, 0.0, 149.0_f64.to_radians(), 0.0, 0.0, 0.0], faults: vec![] };
+    let pose = vec![0.0, 0.0, 149.0_f64.to_radians(), 0.0, 0.0, 0.0];
+    let near = SimOptions { initial_positions: pose, ..SimOptions::default() };
     let (emulator, address) = arm(&near);
     let home = Home::new();
     let line = format!("adapter test yourarm --address {address} --only row --allow-motion --yes");

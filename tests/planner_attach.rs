@@ -110,7 +110,7 @@ fn every_verb_goes_on_addressing_one_run() {
     holder.call(Lease { arm: Some("arm".into()) }).unwrap();
     home.dimos("plan arm 0.5 -0.3 0.6 0 0.8 0").with(0);
     home.dimos("execute").with(1).says(&["LEASE_HELD", "arm is commanded by "]);
-    holder.call(dimos::rpc::api::ExecutePlan { plan: None }).unwrap();
+    holder.call(dimos::rpc::api::ExecutePlan::default()).unwrap();
     eventually("it arrives", || home.status()["planner"]["state"] == "COMPLETED");
     is_at(&home, &[0.5, -0.3, 0.6, 0.0, 0.8, 0.0]);
     drop(holder);
@@ -397,4 +397,20 @@ fn what_registers_is_not_trusted() {
     planner.hear();
     drop(planner);
     asked.wait().with(1).says(&["NO_PLANNER"]);
+}
+
+#[test]
+fn a_motion_of_an_attached_planner_obeys_a_world_that_changes() {
+    let (home, _run, _planner) = up();
+    let moving = home.start("move arm 1.4 -0.3 0.6 0 0.8 0 --speed 0.2 --replan");
+    eventually("it moves", || home.positions("arm")[0] > 0.1);
+    home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
+    moving.wait().with(0).says(&["in its way after", "obstacle \"late\"", "it goes on as motion"]);
+    is_at(&home, &[1.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    home.dimos("world remove late").with(0);
+    let moving = home.start("move arm --named home --speed 0.2");
+    eventually("it moves back", || home.positions("arm")[0] < 1.3);
+    home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
+    moving.wait().with(1).says(&["ABORTED", "obstacle \"late\"", "the arm rests before it"]);
+    assert!(home.positions("arm")[0] > 1.0);
 }

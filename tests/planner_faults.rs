@@ -85,7 +85,7 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
     // The next request has a thread of its own, beside the one that hangs.
     let (plan, state, error) = planned(&run, Plan { timeout: Some(20.0), ..to(2.0, 0) });
     assert_eq!(state, "PLANNED", "{error}");
-    let begun = run.call(ExecutePlan { plan: Some(plan) }).unwrap();
+    let begun = run.call(ExecutePlan { plan: Some(plan), ..Default::default() }).unwrap();
     assert_eq!(run.wait(begun.motion).unwrap().state, "COMPLETED");
     // One that hangs does not keep the run from ending.
     run.call(to(0.5, HANGS)).unwrap();

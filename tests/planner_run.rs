@@ -7,7 +7,7 @@ mod program;
 
 use std::time::Instant;
 
-use dimos::rpc::api::{ArmEnable, ArmReset, Lease, Plan, PlanGoal, Planning, Status};
+use dimos::rpc::api::{ArmEnable, ArmReset, ExecutePlan, Lease, Motion, Plan, PlanGoal, Planning, Status};
 use program::{Home, Started, eventually};
 use rustix::process::Signal;
 
@@ -212,6 +212,27 @@ fn a_planned_motion_is_cancelled_and_stopped_like_any_other() {
     client.call(ArmEnable { arm: "arm".into() }).unwrap();
     home.dimos("execute").with(0);
     is_at(&home, "arm", &HOME);
+}
+
+#[test]
+fn nothing_is_planned_again_for_a_client_that_has_gone() {
+    let (home, _run) = up();
+    home.dimos("plan arm 1.4 -0.3 0.6 0 0.8 0 --speed 0.2").with(0);
+    let mut client = home.client();
+    let execute = ExecutePlan { plan: None, replan: true, presence: None };
+    let begun = client.call(execute).unwrap();
+    eventually("it moves", || home.positions("arm")[0] > 0.1);
+    drop(client);
+    eventually("its lease is free", || home.status()["arms"][0]["commander"].is_null());
+    home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
+    let mut client = home.client();
+    let mut report = client.call(Motion { motion: begun.motion }).unwrap();
+    eventually("the motion ends", || {
+        report = client.call(Motion { motion: begun.motion }).unwrap();
+        report.done
+    });
+    let error = report.error.unwrap_or_default();
+    assert!(report.next.is_none() && error.contains("who asked for it has gone"), "{error}");
 }
 
 #[test]

@@ -132,7 +132,7 @@ fn check_shows_what_files_add_to_a_robot() {
     let limits = |i| ["lower", "upper", "velocity", "acceleration", "jerk"].map(|key| joint(i, key).as_f64());
     assert_eq!(limits(0), [Some(0.0), Some(0.5), Some(0.2), Some(0.5), Some(4.0)]);
     assert_eq!(limits(1), [None, None, Some(2.0), Some(1.0), Some(8.0)]);
-    assert_eq!(limits(2), [Some(-1.2), Some(1.2), Some(2.0), Some(4.0), None]);
+    assert_eq!(limits(2), [Some(-1.2), Some(1.2), Some(2.0), Some(4.0), Some(100.0)], "the arm's own jerk");
     assert_eq!(robot["always_touching"].as_array().unwrap().len(), 0);
 }
 

@@ -126,6 +126,28 @@ fn connections_that_are_in_use_stay_when_others_make_room() {
     assert!(first.message.contains("make room"), "{first:?}");
 }
 
+#[test]
+fn a_connection_that_was_silent_goes_on_where_it_was() {
+    let (home, run) = up("--no-record");
+    let threads = || {
+        let all = std::fs::read_dir(format!("/proc/{}/task", run.pid())).unwrap();
+        let names = all.filter_map(|task| std::fs::read_to_string(task.unwrap().path().join("comm")).ok());
+        names.filter(|name| name.trim() == "rpc-client").count()
+    };
+    let mut client = home.client();
+    client.call(dimos::rpc::api::Lease::default()).unwrap();
+    let us = Some(Some(std::process::id() as i32));
+    for _ in 0..3 {
+        client.call(State {}).unwrap();
+        eventually("its thread is not needed any more", || threads() == 0);
+        // What it is asked now is answered by the thread that takes stops; the lease is still its own.
+        assert_eq!(client.call(Status {}).unwrap().arms[0].commander.as_ref().map(|c| c.pid), us);
+        assert_eq!(client.call(Stop { arm: None }).unwrap().arms["arm"], Confirmation::Confirmed);
+        assert_eq!(threads(), 0);
+        make_ready(&mut client);
+    }
+}
+
 /// Everything that clients do to a run beside a stop, until it is dropped.
 struct Flood {
     stop: Arc<AtomicBool>,
@@ -403,7 +425,7 @@ tasks:
 }
 
 /// An arm that says that it moves, whatever it is told.
-static RUNAWAY: LazyLock<MockAdapter> = LazyLock::new(|| MockAdapter::new(7));
+static RUNAWAY: LazyLock<MockAdapter> = LazyLock::new(|| MockAdapter::new(7).positions(&[0.1; 7]));
 
 #[test]
 fn an_arm_that_does_not_come_to_rest_keeps_its_motors_unless_now_is_said() {

@@ -8,9 +8,12 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::range::{non_negative, positive};
+use crate::blueprint::range::{maybe_positive, non_negative, positive};
 use crate::collision::body::MeshMode;
 use crate::yaml::{Keyed, Located, Text};
+
+/// Distance that plans keep when the blueprint does not say [m].
+const PADDING: f64 = 0.003;
 
 /// Motion planning.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
@@ -20,6 +23,11 @@ pub struct PlannerConfig {
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub planning_timeout: f64,
+    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Given up near a start or goal
+    /// that is closer itself, which every plan tells.
+    #[serde(deserialize_with = "non_negative")]
+    #[schemars(range(min = 0.0))]
+    pub padding: f64,
     /// The robots that are planned for.
     pub robots: Vec<Located<RobotConfig>>,
     /// Obstacles that are there from the start, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0, 0]}}`.
@@ -30,7 +38,13 @@ pub struct PlannerConfig {
 
 impl Default for PlannerConfig {
     fn default() -> Self {
-        Self { planning_timeout: 10.0, robots: Vec::new(), world: Keyed::default(), visualization: None }
+        Self {
+            planning_timeout: 10.0,
+            padding: PADDING,
+            robots: Vec::new(),
+            world: Keyed::default(),
+            visualization: None,
+        }
     }
 }
 
@@ -71,6 +85,10 @@ pub struct RobotConfig {
     /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
     #[serde(default)]
     pub joint_name_mapping: Keyed<Located<String>>,
+    /// The joint of the model that the arm's gripper moves: `{joint: finger, closed: 0, open: 0.04}`. Without it a gripper is
+    /// planned for at its widest opening.
+    #[serde(default)]
+    pub gripper_joint: Option<Located<GripperJointEntry>>,
     /// The trajectory task that executes the robot's motions.
     #[serde(default)]
     pub coordinator_task_name: Option<Located<String>>,
@@ -92,9 +110,25 @@ pub struct RobotConfig {
     #[serde(default = "max_acceleration", deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_acceleration: f64,
+    /// Highest joint jerk, on top of the model's and the arm's own limits [rad/s³].
+    #[serde(default, deserialize_with = "maybe_positive")]
+    #[schemars(extend("exclusiveMinimum" = 0.0))]
+    pub max_jerk: Option<f64>,
     /// Poses with a name: one position for each of `joint_names` [rad].
     #[serde(default)]
     pub named_poses: Keyed<Located<Vec<f64>>>,
+}
+
+/// The joint of a model that a gripper moves. Joints that follow it by `mimic` move with it.
+#[derive(Debug, Clone, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct GripperJointEntry {
+    /// Its name in the model.
+    pub joint: Located<String>,
+    /// Its position when the gripper is closed [rad or m].
+    pub closed: f64,
+    /// Its position when the gripper is open [rad or m]; between the two it follows the opening in proportion.
+    pub open: f64,
 }
 
 /// The joints of a robot that are planned for.

@@ -11,7 +11,7 @@ use crate::blueprint::planner::{
 };
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
-use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
@@ -20,6 +20,7 @@ pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Describ
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
+        padding: typed.padding,
         robots: robots.map(|(robot, described)| self::robot(checker, robot, described)).collect(),
         objects: typed.world.0.iter().map(|(name, entry)| object(checker, &name.value, entry)).collect(),
     }
@@ -60,10 +61,17 @@ fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Describ
         end_effector_link: typed.end_effector_link.value.clone(),
         coordinator_joints: joints.iter().map(ours).collect(),
         joints,
+        joint_prefix: typed.joint_prefix.as_ref().map_or_else(String::new, |prefix| prefix.value.clone()),
+        gripper_joint: typed.gripper_joint.as_ref().map(|gripper| GripperJoint {
+            joint: gripper.joint.value.clone(),
+            closed: gripper.closed,
+            open: gripper.open,
+        }),
         task: typed.coordinator_task_name.as_ref().map(|name| name.value.clone()),
         exclusions: typed.collision_exclusion_pairs.clone(),
         max_velocity: typed.max_velocity,
         max_acceleration: typed.max_acceleration,
+        max_jerk: typed.max_jerk,
         named_poses: typed
             .named_poses
             .0

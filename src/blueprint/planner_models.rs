@@ -43,6 +43,7 @@ pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, described: &[Descr
             shapes(checker, robot, model);
             meshes(checker, robot, model);
             named_poses(checker, robot, described, model);
+            gripper_joint(checker, robot, described, model);
         }
     }
     for ((_, entry), object) in typed.world.0.iter().zip(&config.objects) {
@@ -195,6 +196,38 @@ fn link(checker: &mut Checker<'_>, at: NodeId, name: &str, model: &RobotModel) {
         let links = model.links.iter().map(|link| link.name.as_str());
         checker.error(at, diag.maybe_hint(did_you_mean(name, links, "its links")));
     }
+}
+
+/// The joint that the gripper moves: one that is not planned and has a position of its own, within its limits.
+fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Described, model: &RobotModel) {
+    let Some(gripper) = &robot.gripper_joint else { return };
+    let name = &gripper.joint;
+    let planned = described.joints.iter().flatten().any(|joint| joint.value == name.value);
+    let diag = match model.joint_index(name).and_then(|index| model.joints.get(index)) {
+        None => {
+            let names = model.joints.iter().map(|joint| joint.name.as_str());
+            Diag::error(format!("the model has no joint {}", quote(name))).maybe_hint(did_you_mean(
+                name,
+                names,
+                "its joints",
+            ))
+        }
+        Some(_) if planned => Diag::error(format!("the joint {} is planned for", quote(name)))
+            .hint("name the joint that the gripper moves, which is none of `joint_names`"),
+        Some(joint) if !joint.is_independent() => {
+            let why = if joint.is_movable() { "follows another joint" } else { "is fixed" };
+            Diag::error(format!("the joint {} {why}", quote(name))).hint("name the joint that the others follow")
+        }
+        Some(joint) => {
+            let limits = joint.limits;
+            let outside = |q: &f64| !(limits.lower - 1e-9..=limits.upper + 1e-9).contains(q);
+            let Some(at) = [gripper.closed, gripper.open].into_iter().find(outside) else { return };
+            let (lower, upper, unit) = (limits.lower, limits.upper, joint.kind.unit());
+            Diag::error(format!("{} at {at} {unit} is outside the model's limits", quote(name)))
+                .hint(format!("it goes from {lower:.4} to {upper:.4} {unit}"))
+        }
+    };
+    checker.error(name.at, diag);
 }
 
 fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {

@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::blueprint::json_schema::full_schema;
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
-use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
+use crate::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, CountedJoints, HardwareEntry, RecordingConfig, RpcConfig, TaskEntry,
 };
@@ -50,7 +50,7 @@ const fn section(title: &'static str, first: &'static str, pointer: &'static str
 const ARMS: &str = "A list of arms, merged by `hardware_id` when blueprints are included.";
 const TASKS: &str = "A list of tasks, merged by `name` when blueprints are included.";
 
-const SECTIONS: [Section; 18] = [
+const SECTIONS: [Section; 19] = [
     section("Top level", "", "", keys::<BlueprintFile>),
     section("`coordinator`", "", "/$defs/CoordinatorConfig", keys::<CoordinatorConfig>),
     section("`hardware[]`", ARMS, "/$defs/HardwareEntry", keys::<HardwareEntry>),
@@ -63,6 +63,7 @@ const SECTIONS: [Section; 18] = [
     section("`params` of `cartesian_ik` and `eef_twist`", "", "/$defs/CartesianParams", keys::<CartesianParams>),
     section("`planner`", "", "/$defs/PlannerConfig", keys::<PlannerConfig>),
     section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotConfig", keys::<RobotConfig>),
+    section("`planner.robots[].gripper_joint`", "", "/$defs/GripperJointEntry", keys::<GripperJointEntry>),
     section("`planner.robots[].base_pose`", "", "/$defs/PoseEntry", keys::<PoseEntry>),
     section("`planner.world`", "A group of obstacles by name.", "/$defs/ObjectEntry", keys::<ObjectEntry>),
     section("`view`", "", "/$defs/ViewConfig", keys::<ViewConfig>),

@@ -23,6 +23,9 @@ pub struct Args {
     /// The trajectory task to use; without it the one whose joints cover the file's
     #[arg(long, requires = "file")]
     pub task: Option<String>,
+    /// Plan again and go on when the motion has to end before something that got in its way
+    #[arg(long, conflicts_with_all = ["file", "no_wait"])]
+    pub replan: bool,
     /// Return when the motion has begun
     #[arg(long)]
     pub no_wait: bool,
@@ -47,7 +50,7 @@ pub fn run(args: &Args) -> Result {
             begun
         }
         None => {
-            let begun = client.call(ExecutePlan { plan: args.plan })?;
+            let begun = client.call(ExecutePlan { plan: args.plan, replan: args.replan, presence: None })?;
             let (motion, task) = (begun.motion, &begun.task);
             output::note(format_args!(
                 "motion {motion} on {task}: {:.2} s, planned, collision-checked",

@@ -31,8 +31,15 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
     }
     bar.set_prefix(task.to_owned());
     let mut cancelled: Option<Instant> = None;
+    let mut motion = motion;
     let report = loop {
         let report = client.call(Motion { motion })?;
+        if let Some(next) = report.next.filter(|_| report.done) {
+            let why = report.error.unwrap_or_default();
+            bar.suspend(|| output::note(format_args!("motion {motion}: {why}; it goes on as motion {next}")));
+            motion = next;
+            continue;
+        }
         bar.set_position((report.progress.clamp(0.0, 1.0) * 1000.0) as u64);
         bar.set_message(format!("{:.1} s left", report.remaining.max(0.0)));
         if report.done {

@@ -198,4 +198,13 @@ pub fn show(planned: &Planned) {
         (Some(clearance), None) => output::line(format_args!("  clearance {} mm", fixed(clearance * 1e3, 1))),
         _ => {}
     }
+    for given_up in &s.padding_given_up {
+        let where_ = match given_up.near.as_str() {
+            "everywhere" => "in every pose".to_owned(),
+            near => format!("near the {near}"),
+        };
+        let (link, other, distance) = (&given_up.link, &given_up.other, fixed(given_up.distance * 1e3, 1));
+        let padding = fixed(s.padding * 1e3, 1);
+        output::line(format_args!("  less than {padding} mm {where_}: {link} is {distance} mm from {other} there"));
+    }
 }

@@ -24,6 +24,9 @@ pub struct Args {
     /// Move straight in joint space although the run has a planner: not collision-checked
     #[arg(long, conflicts_with_all = ["pose", "named", "several"])]
     pub direct: bool,
+    /// Plan again and go on when the motion has to end before something that got in its way
+    #[arg(long, conflicts_with_all = ["direct", "no_wait"])]
+    pub replan: bool,
     /// Return when the motion has begun
     #[arg(long)]
     pub no_wait: bool,
@@ -56,7 +59,7 @@ fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result
     if !args.target_run.json {
         show(&planned);
     }
-    let begun = client.call(ExecutePlan { plan: Some(planned.plan) })?;
+    let begun = client.call(ExecutePlan { plan: Some(planned.plan), replan: args.replan, presence: None })?;
     output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
     let reply = serde_json::to_value(&begun).unwrap_or_default();
     Ok((begun.motion, begun.task, reply))

@@ -41,6 +41,10 @@ pub struct ExactChecker {
     pub(super) witness: Option<usize>,
     pub(super) pieces: Pieces,
     pub(super) looks: u64,
+    /// Distance that each pair keeps [m], beside `pairs`: closer counts as touching.
+    pub(super) pads: Vec<f64>,
+    /// Pairs of things that never move relative to the world.
+    still: Vec<Pair>,
 }
 
 impl ExactChecker {
@@ -64,7 +68,10 @@ impl ExactChecker {
         pairs.sort_by_key(order);
         let link_pairs = pairs.iter().map(link_pair).collect();
         let pieces = Pieces::new(scene.dof(), pairs.len());
+        let pads = vec![0.0; pairs.len()];
         let mut made = Self {
+            pads,
+            still,
             frames,
             pairs,
             link_pairs,
@@ -76,7 +83,7 @@ impl ExactChecker {
             scene: scene.clone(),
         };
         made.place(&vec![0.0; scene.dof()]);
-        made.always = still.into_iter().find(|pair| made.gap(*pair, 0.0) == Gap::Touch);
+        made.always = made.still.iter().copied().find(|pair| made.gap_of(*pair, 0.0, 0.0) == Gap::Touch);
         made
     }
 
@@ -91,11 +98,15 @@ impl ExactChecker {
         self.scene.forward(q, &mut self.frames);
     }
 
-    /// How far two things are apart where they stand now.
-    pub(super) fn gap(&self, pair: Pair, margin: f64) -> Gap {
+    /// How far the two of a pair, by index, are apart where they stand now, beyond the distance that they keep.
+    pub(super) fn gap(&self, pair: usize, margin: f64) -> Gap {
+        self.gap_of(self.pairs[pair], self.pads[pair], margin)
+    }
+
+    fn gap_of(&self, pair: Pair, pad: f64, margin: f64) -> Gap {
         match pair {
-            Pair::Links(a, b) => self.gap_of_links(a, b, margin),
-            Pair::Obstacle(link, obstacle) => self.gap_to_obstacle(link, obstacle, margin),
+            Pair::Links(a, b) => self.gap_of_links(a, b, pad, margin),
+            Pair::Obstacle(link, obstacle) => self.gap_to_obstacle(link, obstacle, pad, margin),
         }
     }
 
@@ -103,10 +114,10 @@ impl ExactChecker {
         self.frames[link.frame].transform_point3(link.ball.0)
     }
 
-    fn gap_to_obstacle(&self, link: usize, obstacle: usize, margin: f64) -> Gap {
+    fn gap_to_obstacle(&self, link: usize, obstacle: usize, pad: f64, margin: f64) -> Gap {
         let (link, standing) = (&self.scene.links[link], &self.scene.obstacles[obstacle]);
         let (guard, half) = &standing.guard;
-        let extra = standing.solid.radius + margin;
+        let extra = standing.solid.radius + pad + margin;
         let reach = link.ball.1 + extra;
         if outside(self.center(link), guard, *half) > reach * reach {
             return Gap::Far;
@@ -114,7 +125,7 @@ impl ExactChecker {
         let frame = &self.frames[link.frame];
         let mut worst = Gap::Far;
         for solid in &link.solids {
-            let radii = solid.radius + standing.solid.radius;
+            let radii = solid.radius + standing.solid.radius + pad;
             if let Core::Point = solid.core {
                 // The obstacle's box first: it is all there is to know about most obstacles, and about all that are far.
                 let center = frame.transform_point3(solid.frame.translation);
@@ -138,10 +149,10 @@ impl ExactChecker {
         worst
     }
 
-    fn gap_of_links(&self, a: usize, b: usize, margin: f64) -> Gap {
+    fn gap_of_links(&self, a: usize, b: usize, pad: f64, margin: f64) -> Gap {
         let (first, second) = (&self.scene.links[a], &self.scene.links[b]);
         let (center, radius) = (self.center(second), second.ball.1);
-        let reach = first.ball.1 + radius + margin;
+        let reach = first.ball.1 + radius + pad + margin;
         if self.center(first).distance_squared(center) > reach * reach {
             return Gap::Far;
         }
@@ -150,7 +161,7 @@ impl ExactChecker {
         for one in &first.solids {
             let placed = one.place(f);
             if let Placed::Point(p) = placed {
-                let reach = one.radius + radius + margin;
+                let reach = one.radius + radius + pad + margin;
                 if p.distance_squared(center) > reach * reach {
                     continue;
                 }
@@ -158,14 +169,15 @@ impl ExactChecker {
             for two in &second.solids {
                 if let (Placed::Point(p), Core::Point) = (placed, &two.core) {
                     let squared = p.distance_squared(g.transform_point3(two.frame.translation));
-                    let (radii, reach) = (one.radius + two.radius, one.radius + two.radius + margin);
+                    let radii = one.radius + two.radius + pad;
+                    let reach = radii + margin;
                     if squared <= radii * radii {
                         return Gap::Touch;
                     }
                     worst = if squared <= reach * reach { Gap::Close } else { worst };
                     continue;
                 }
-                match tell(&placed, &two.place(g), one.radius + two.radius, margin) {
+                match tell(&placed, &two.place(g), one.radius + two.radius + pad, margin) {
                     Gap::Touch => return Gap::Touch,
                     Gap::Close => worst = Gap::Close,
                     Gap::Far => {}
@@ -175,7 +187,7 @@ impl ExactChecker {
         worst
     }
 
-    fn contact(&self, pair: Pair) -> Option<Contact> {
+    pub(super) fn contact(&self, pair: Pair) -> Option<Contact> {
         let scene = &*self.scene;
         let (l, name) = match pair {
             Pair::Links(a, b) => (a, &scene.links[b].name),
@@ -293,7 +305,7 @@ impl CollisionChecker for ExactChecker {
             return self.always;
         }
         self.place(q);
-        let touches = |i: &usize| self.gap(self.pairs[*i], 0.0) == Gap::Touch;
+        let touches = |i: &usize| self.gap(*i, 0.0) == Gap::Touch;
         let found = self.witness.filter(touches).or_else(|| (0..self.pairs.len()).find(touches));
         self.witness = found.or(self.witness);
         found.map(|i| self.pairs[i])
@@ -316,9 +328,10 @@ impl CollisionChecker for ExactChecker {
 
     fn contacts(&mut self, q: &[f64]) -> Vec<Contact> {
         self.place(q);
-        let scene = self.scene.clone();
-        let touching = scene.all_pairs().filter(|pair| self.gap(*pair, 0.0) == Gap::Touch);
-        let mut contacts: Vec<Contact> = touching.filter_map(|pair| self.contact(pair)).collect();
+        let moving = self.pairs.iter().zip(&self.pads).map(|(pair, pad)| (*pair, *pad));
+        let all = moving.chain(self.still.iter().map(|pair| (*pair, 0.0)));
+        let touching = all.filter(|(pair, pad)| self.gap_of(*pair, *pad, 0.0) == Gap::Touch);
+        let mut contacts: Vec<Contact> = touching.filter_map(|(pair, _)| self.contact(pair)).collect();
         contacts.sort_by(|a, b| a.distance.total_cmp(&b.distance));
         contacts
     }

@@ -13,6 +13,7 @@ pub mod checker;
 pub mod cloud;
 pub mod exact;
 mod motion;
+mod padding;
 pub mod pairs;
 pub mod ply;
 pub mod report;

@@ -90,14 +90,14 @@ impl ExactChecker {
                 }
                 self.place(&p.q);
                 if let Some(witness) = self.witness
-                    && self.gap(self.pairs[witness], 0.0) == Gap::Touch
+                    && self.gap(witness, 0.0) == Gap::Touch
                 {
                     return false;
                 }
                 let first = p.pairs_next.len() as u32;
                 for k in piece.first..piece.last {
                     let pair = p.pairs_now[k as usize];
-                    match self.gap(self.pairs[pair as usize], 0.5 * size * p.reach[pair as usize]) {
+                    match self.gap(pair as usize, 0.5 * size * p.reach[pair as usize]) {
                         Gap::Far => {}
                         Gap::Close => p.pairs_next.push(pair),
                         Gap::Touch => {

@@ -16,6 +16,8 @@ use super::world::{Robot, World};
 pub struct LinkShape {
     /// Its name; with its robot's before it where that has one.
     pub name: String,
+    /// Index of the robot that it belongs to, or that holds it.
+    pub(super) robot: usize,
     /// Index of the frame that carries it.
     pub(super) frame: usize,
     /// Its solids in that frame, padding included in their radii.
@@ -171,7 +173,7 @@ impl Scene {
         add_levers(kinematics, own.first_joint, kinematics.levers(body, reach), &mut levers);
         let name = full_name(&robot.name, name);
         let frame = own.first_frame + body;
-        self.links.push(LinkShape { name, frame, solids, ball, moves: body != 0, levers });
+        self.links.push(LinkShape { name, robot: r, frame, solids, ball, moves: body != 0, levers });
         origins.push(Origin { robot: r, link, body, reach, held });
     }
 

@@ -14,6 +14,8 @@ use crate::robot::Source;
 pub struct PlannerConfig {
     /// The longest time that one request may search.
     pub timeout: Duration,
+    /// Distance that plans keep from obstacles and other arms [m].
+    pub padding: f64,
     /// The robots that are planned for.
     pub robots: Vec<RobotConfig>,
     /// What is in the world from the start.
@@ -49,6 +51,10 @@ pub struct RobotConfig {
     pub joints: Vec<String>,
     /// The coordinator's names of the same joints.
     pub coordinator_joints: Vec<String>,
+    /// What comes before a joint's name in the model to make the coordinator's name of one that is not planned.
+    pub joint_prefix: String,
+    /// The joint of the model that the arm's gripper moves.
+    pub gripper_joint: Option<GripperJoint>,
     /// The trajectory task that executes its motions.
     pub task: Option<String>,
     /// Pairs of links that may touch.
@@ -57,8 +63,21 @@ pub struct RobotConfig {
     pub max_velocity: f64,
     /// Highest joint acceleration, on top of the model's limits [rad/s²].
     pub max_acceleration: f64,
+    /// Highest joint jerk, on top of the model's and the arm's limits [rad/s³].
+    pub max_jerk: Option<f64>,
     /// Poses with a name: a position for each of `joints` [rad].
     pub named_poses: BTreeMap<String, Vec<f64>>,
+}
+
+/// The joint of a model that a gripper moves; others follow it by `mimic`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GripperJoint {
+    /// Its name in the model.
+    pub joint: String,
+    /// Its position when the gripper is closed [rad or m].
+    pub closed: f64,
+    /// Its position when the gripper is open [rad or m].
+    pub open: f64,
 }
 
 impl RobotConfig {
@@ -84,6 +103,8 @@ pub struct JointBounds {
     pub velocity: f64,
     /// Highest acceleration [rad/s²].
     pub acceleration: f64,
+    /// Highest jerk [rad/s³].
+    pub jerk: f64,
 }
 
 /// An object in the world.

@@ -10,6 +10,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::ahead::{Blocked, look_ahead};
+use super::idle::Measured;
 use super::review::review;
 use super::setup::Setup;
 use super::solve::{Failure, Found, Request, solve};
@@ -63,6 +65,7 @@ impl Job {
 
 struct Order {
     id: u64,
+    setup: Arc<Setup>,
     request: Arc<Request>,
     world: World,
     stop: Stop,
@@ -78,7 +81,10 @@ struct Shared {
 /// A planner that is running. Ends with its last owner.
 pub struct Desk {
     setup: Arc<Setup>,
-    world: Mutex<World>,
+    /// The same with the joints that are not planned where they were measured last.
+    now: Mutex<Arc<Setup>>,
+    /// The world and how often it was changed.
+    world: Mutex<(World, u64)>,
     shared: Arc<Shared>,
     solver: Solver,
     timeout: Duration,
@@ -117,10 +123,11 @@ impl Desk {
 
     /// Starts the thread with what answers each request.
     pub fn with(setup: Setup, timeout: Duration, solver: Solver) -> std::io::Result<Self> {
-        let world = Mutex::new(setup.world.clone());
+        let world = Mutex::new((setup.world.clone(), 1));
         let (setup, shared) = (Arc::new(setup), Arc::new(Shared::default()));
-        let worker = Mutex::new(Worker::start(&setup, &shared, &solver, 0)?);
-        Ok(Self { setup, world, shared, solver, timeout, worker })
+        let worker = Mutex::new(Worker::start(&shared, &solver, 0)?);
+        let now = Mutex::new(setup.clone());
+        Ok(Self { setup, now, world, shared, solver, timeout, worker })
     }
 
     /// The robots.
@@ -128,9 +135,30 @@ impl Desk {
         &self.setup
     }
 
-    /// Looks at the world or changes it. Requests that are being planned keep the world that they began with.
+    /// The robots with the joints that are not planned where they were measured last.
+    pub fn now(&self) -> Arc<Setup> {
+        lock(&self.now).clone()
+    }
+
+    /// Takes note of where the joints that are not planned are.
+    pub fn measured(&self, measured: &Measured) {
+        let mut now = lock(&self.now);
+        if let Some(changed) = now.with_idle_joints(measured) {
+            *now = Arc::new(changed);
+            lock(&self.world).1 += 1;
+        }
+    }
+
+    /// Changes the world. Requests that are being planned keep the world that they began with.
     pub fn world<T>(&self, act: impl FnOnce(&mut World) -> T) -> T {
-        act(&mut lock(&self.world))
+        let mut world = lock(&self.world);
+        world.1 += 1;
+        act(&mut world.0)
+    }
+
+    /// How often the world was changed.
+    pub fn version(&self) -> u64 {
+        lock(&self.world).1
     }
 
     /// Begins a request with this number. It ends by itself after `timeout`, or the planner's own.
@@ -151,7 +179,7 @@ impl Desk {
         if jobs.len() > KEPT {
             jobs.pop_front();
         }
-        let order = Order { id, request, world: lock(&self.world).clone(), stop };
+        let order = Order { id, setup: self.now(), request, world: lock(&self.world).0.clone(), stop };
         // The thread ends with this sender only.
         let _ = orders.send(order);
         Ok(())
@@ -187,7 +215,7 @@ impl Desk {
         job.progress = Progress::Failed(failure, since.elapsed());
         let mut worker = lock(&self.worker);
         let hanging = worker.hanging + 1;
-        let fresh = (hanging < MAX_HANGING).then(|| Worker::start(&self.setup, &self.shared, &self.solver, hanging));
+        let fresh = (hanging < MAX_HANGING).then(|| Worker::start(&self.shared, &self.solver, hanging));
         *worker = match fresh {
             Some(Ok(fresh)) => fresh,
             _ => Worker { orders: None, thread: None, hanging },
@@ -202,8 +230,21 @@ impl Desk {
         positions: Vec<Vec<f64>>,
         stop: Stop,
     ) -> impl FnOnce() -> Result<(), Failure> + Send + use<> {
-        let (setup, world) = (self.setup.clone(), lock(&self.world).clone());
+        let (setup, world) = (self.now(), lock(&self.world).0.clone());
         move || review(&setup, &world, &found, &positions, &stop)
+    }
+
+    /// Looks at the rest of a motion under way, from `elapsed` [s] on, in the world as it is now: work for another
+    /// thread, which may take until `stop`.
+    pub fn look_ahead(
+        &self,
+        found: Arc<Found>,
+        positions: Vec<Vec<f64>>,
+        elapsed: f64,
+        stop: Stop,
+    ) -> impl FnOnce() -> Result<Option<Blocked>, Failure> + Send + use<> {
+        let (setup, world) = (self.now(), lock(&self.world).0.clone());
+        move || look_ahead(&setup, &world, &found, &positions, elapsed, &stop)
     }
 
     /// A request by its number.
@@ -221,13 +262,13 @@ impl Desk {
 }
 
 impl Worker {
-    fn start(setup: &Arc<Setup>, shared: &Arc<Shared>, solver: &Solver, hanging: usize) -> std::io::Result<Self> {
+    fn start(shared: &Arc<Shared>, solver: &Solver, hanging: usize) -> std::io::Result<Self> {
         let (orders, receiver) = channel();
-        let (setup, shared, solver) = (setup.clone(), shared.clone(), solver.clone());
+        let (shared, solver) = (shared.clone(), solver.clone());
         let thread = std::thread::Builder::new()
             .name("planner".into())
             .stack_size(STACK)
-            .spawn(move || work(&solver, &setup, &shared, &receiver))?;
+            .spawn(move || work(&solver, &shared, &receiver))?;
         Ok(Self { orders: Some(orders), thread: Some(thread), hanging })
     }
 }
@@ -249,10 +290,11 @@ impl Drop for Desk {
     }
 }
 
-fn work(solver: &Solver, setup: &Setup, shared: &Shared, orders: &Receiver<Order>) {
+fn work(solver: &Solver, shared: &Shared, orders: &Receiver<Order>) {
     while let Ok(order) = orders.recv() {
         let began = Instant::now();
-        let outcome = catch_unwind(AssertUnwindSafe(|| solver(setup, &order.world, &order.request, &order.stop)));
+        let outcome =
+            catch_unwind(AssertUnwindSafe(|| solver(&order.setup, &order.world, &order.request, &order.stop)));
         let took = began.elapsed();
         let progress = match outcome {
             Ok(Ok(found)) => Progress::Found(Arc::new(found), took),
@@ -306,9 +348,13 @@ mod tests {
             exclusions: Vec::new(),
             max_velocity: 1.0,
             max_acceleration: 2.0,
+            max_jerk: None,
+            joint_prefix: String::new(),
+            gripper_joint: None,
             named_poses: BTreeMap::new(),
         };
-        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), robots: vec![robot], objects }).unwrap()
+        Setup::load(&PlannerConfig { timeout: Duration::from_secs(60), padding: 0.003, robots: vec![robot], objects })
+            .unwrap()
     }
 
     /// Walls that no search gets around in the time of these tests.

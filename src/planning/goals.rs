@@ -2,6 +2,7 @@
 
 use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
+use super::padded::Place;
 use super::path::Path;
 use super::setup::PlannedRobot;
 use super::solve::{Failure, Goal, Stage, late};
@@ -30,13 +31,14 @@ pub(super) fn configurations(
     // One list of configurations per robot; a combination of one from each is a goal of all.
     let mut all: Path = vec![Vec::new()];
     let mut first = 0;
-    let checker = &mut stage.checker;
     let alone = stage.robots.len() == 1;
-    let mut free = |q: &[f64]| !alone || checker.is_free(q);
     for (robot, index) in stage.robots.iter().zip(&stage.indices) {
         let own = stage.start.get(first..first + robot.joints.len()).unwrap_or_default().to_vec();
         first += robot.joints.len();
         let goal = wanted.iter().find(|(wanted, _)| wanted == index).map(|(_, goal)| goal);
+        let checker = &mut stage.checker;
+        let mut free =
+            |q: &[f64], padded: bool| !alone || if padded { checker.is_free(q) } else { checker.touches_nothing(q) };
         let several = match goal {
             Some(Goal::Joints(values)) => {
                 // Where the model lets a joint turn without end, but the arm does not, whole turns are the same goal.
@@ -70,13 +72,16 @@ fn reached(
     target: &DAffine3,
     near: &[f64],
     settings: &IkSettings,
-    free: &mut impl FnMut(&[f64]) -> bool,
+    free: &mut impl FnMut(&[f64], bool) -> bool,
     stop: &Stop,
 ) -> Result<Path, Failure> {
     let in_root = robot.body.base.inverse() * *target;
     let mut ik = Ik::new(&robot.body.kinematics, robot.end_effector);
-    if let Ok(several) = ik.solve(&in_root, near, settings, free, stop) {
-        return Ok(several);
+    // Those that keep the padding, else those that touch nothing.
+    for padded in [true, false] {
+        if let Ok(several) = ik.solve(&in_root, near, settings, |q| free(q, padded), stop) {
+            return Ok(several);
+        }
     }
     ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
         if stop.is_cancelled() {
@@ -97,7 +102,13 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     if let Some(contact) = contacts.first() {
         return Err(Failure::new(format!("the start collides: {contact}")));
     }
-    let line = straight_line(&kinematics, robot.end_effector, &start, &in_root, &LineSettings::default(), |a, b| {
+    // Where it ends is known once it has been followed.
+    let settings = LineSettings::default();
+    let ahead = straight_line(&kinematics, robot.end_effector, &start, &in_root, &settings, |_, _| true);
+    if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= WHOLE) {
+        checker.give_up(Place::Goal, goal);
+    }
+    let line = straight_line(&kinematics, robot.end_effector, &start, &in_root, &settings, |a, b| {
         checker.motion_is_free(a, b, stop)
     });
     if line.fraction >= WHOLE {

@@ -5,12 +5,14 @@ use crate::collision::{CollisionChecker, Stop};
 
 /// Looks along one piece of the way out.
 const LOOKS: u32 = 8;
+/// How deep a start may touch [m].
+pub(super) const CONTACT: f64 = 0.003;
 /// How much deeper than at the start anything may go [m].
 const DEEPER: f64 = 1e-4;
 
 /// The start of a path that touches, and how far the path goes until nothing does.
-#[derive(Debug, Clone)]
-pub(super) struct Leaving {
+#[derive(Debug, Clone, PartialEq)]
+pub struct Leaving {
     start: Vec<f64>,
     depth: f64,
     reach: f64,
@@ -20,7 +22,10 @@ impl Leaving {
     /// That of a path; none where its start is free.
     pub fn of<C: CollisionChecker>(checker: &mut C, path: &Path) -> Option<Self> {
         let start = path.first()?.clone();
-        let depth = checker.contacts(&start).first().map(|contact| -contact.distance)?;
+        let depth = checker.contacts(&start).first().map(|contact| -contact.distance).filter(|depth| *depth >= 0.0)?;
+        if depth > CONTACT + DEEPER {
+            return None;
+        }
         let free = path.iter().position(|q| checker.is_free(q))?;
         let reach = length(path.get(..=free)?);
         Some(Self { start, depth, reach })

@@ -7,14 +7,17 @@
 //!                                 JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
 //! ```
 
+pub mod ahead;
 pub mod blend;
 pub mod cartesian;
 pub mod config;
 pub mod desk;
 mod goals;
+pub mod idle;
 pub mod ik;
-mod leaving;
+pub mod leaving;
 pub mod nearest;
+pub mod padded;
 pub mod path;
 pub mod planner;
 pub mod review;

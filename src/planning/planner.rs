@@ -6,6 +6,7 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
+use super::leaving::CONTACT;
 use super::path::{Path, between, distance, length, unwind};
 use super::rrt_connect::{Ended, RrtSettings, SearchCount, search};
 use super::sampler::Sampler;
@@ -33,7 +34,7 @@ impl Default for PlanSettings {
             search: RrtSettings::default(),
             shortcut: ShortcutSettings::default(),
             limit_tolerance: 0.02,
-            contact_tolerance: 0.003,
+            contact_tolerance: CONTACT,
         }
     }
 }

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use glamx::DVec3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use super::idle::{Measured, idle};
 use super::timing::DEFAULT_ACCELERATION;
 use crate::collision::always::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
@@ -39,6 +40,8 @@ pub struct PlannedRobot {
     pub end_effector: usize,
     /// Limits of the planned joints.
     pub limits: Vec<Limits>,
+    /// Where the joints that are not planned are, among positions of all joints of the model [rad or m].
+    pub rest: Vec<f64>,
     /// As it stands in the world, with all its planned joints.
     pub body: Robot,
 }
@@ -50,6 +53,8 @@ pub struct Setup {
     pub robots: Vec<PlannedRobot>,
     /// The world as it is at the start. Its robots are those above, in the same order.
     pub world: World,
+    /// Distance that plans keep from obstacles and other arms [m].
+    pub padding: f64,
     /// Pairs of links that touch in every pose, with their robot's name; they are not checked.
     pub always_touching: Vec<(String, [String; 2])>,
 }
@@ -68,7 +73,7 @@ impl Setup {
             let added = obstacle(object).and_then(|o| world.add(o).map_err(|e| e.to_string()));
             added.map_err(|e| format!("object {:?} of the world: {e}", object.name))?;
         }
-        let mut setup = Self { robots, world, always_touching: Vec::new() };
+        let mut setup = Self { robots, world, padding: config.padding, always_touching: Vec::new() };
         setup.leave_out_what_always_touches();
         Ok(setup)
     }
@@ -145,6 +150,8 @@ impl PlannedRobot {
                 let own = joint.limits.acceleration.unwrap_or(DEFAULT_ACCELERATION.max(config.max_acceleration));
                 joint.limits.velocity = joint.limits.velocity.min(config.max_velocity);
                 joint.limits.acceleration = Some(own.min(config.max_acceleration));
+                let jerks = [joint.limits.jerk, config.max_jerk].into_iter().flatten();
+                joint.limits.jerk = jerks.reduce(f64::min);
             }
         }
         let link = |name: &str| {
@@ -155,7 +162,9 @@ impl PlannedRobot {
         let (base, end_effector) = (link(&config.base_link)?, link(&config.end_effector_link)?);
         let shape = |link: &str| config.shapes.get(link).copied().unwrap_or_default();
         let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
-        let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
+        let idle = idle(config, &model, &joints, &Measured::default());
+        let posed = model.positions(&idle);
+        let kinematics = Kinematics::new(&model, &joints, &posed).map_err(|e| e.to_string())?;
         let limits = kinematics.limits().to_vec();
         let rest = model.positions(&HashMap::new());
         let base_in_model = model.link_poses(&rest).get(base).copied().unwrap_or_default();
@@ -180,7 +189,7 @@ impl PlannedRobot {
         for (name, pose) in semantics.poses_of(&config.joints).into_iter().filter(|(_, pose)| outside(pose).is_none()) {
             config.named_poses.entry(name.to_owned()).or_insert(pose);
         }
-        Ok(Self { config, model, joints, end_effector, limits, body })
+        Ok(Self { config, model, joints, end_effector, limits, rest: posed, body })
     }
 
     fn narrow(&mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<(), String> {
@@ -199,8 +208,9 @@ impl PlannedRobot {
             joint.limits.upper = own.upper.min(upper);
             joint.limits.velocity = own.velocity.min(b.velocity);
             joint.limits.acceleration = Some(own.acceleration.map_or(b.acceleration, |a| a.min(b.acceleration)));
+            joint.limits.jerk = Some(own.jerk.map_or(b.jerk, |jerk| jerk.min(b.jerk)));
         }
-        let kinematics = Kinematics::new(&model, &self.joints, &[]).map_err(|e| e.to_string())?;
+        let kinematics = Kinematics::new(&model, &self.joints, &self.rest).map_err(|e| e.to_string())?;
         self.limits = kinematics.limits().to_vec();
         self.model = Arc::new(model);
         self.body = Robot { model: self.model.clone(), kinematics: Arc::new(kinematics), ..self.body.clone() };
@@ -209,7 +219,9 @@ impl PlannedRobot {
 
     /// The robot as it stands in the world while it does not move: no joint of it is planned.
     pub fn standing(&self, positions: &[f64]) -> Result<Robot, String> {
-        let named = self.config.joints.iter().cloned().zip(positions.iter().copied()).collect();
+        let mut named: HashMap<String, f64> =
+            self.model.joints.iter().zip(&self.rest).map(|(joint, q)| (joint.name.clone(), *q)).collect();
+        named.extend(self.config.joints.iter().cloned().zip(positions.iter().copied()));
         let rest = self.model.positions(&named);
         let kinematics = Kinematics::new(&self.model, &[], &rest).map_err(|e| e.to_string())?;
         Ok(Robot { kinematics: Arc::new(kinematics), ..self.body.clone() })

@@ -7,12 +7,13 @@ use nalgebra::{Isometry3, Vector3};
 
 use super::goals;
 use super::leaving::{Leaving, passes};
-use super::path::{Path, between, distance, length};
+use super::padded::{GivenUp, Padded, Place};
+use super::path::{Path, between, distance, length, unwind};
 use super::planner::{PlanError, PlanSettings, plan};
 use super::setup::{PlannedRobot, Setup};
 use super::timing::{TimingSettings, bounds, time};
 use crate::collision::world::World;
-use crate::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
+use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};
@@ -21,6 +22,11 @@ use crate::trajectory::{JointTrajectory, TrajectoryPoint};
 const CLEARANCE_STEP: f64 = 0.05;
 /// A path shorter than this is none: the robots are there already [rad].
 const THERE: f64 = 1e-6;
+/// Configurations as close as this are the same [rad].
+const SAME: f64 = 1e-3;
+/// Searched with as much more padding [m]: between the points of its trajectory a motion is not exactly what was proved,
+/// and must still keep the padding when it is looked at again.
+const SPARE: f64 = 2e-4;
 /// How long the motion of robots takes that are there already [s].
 const MOMENT: f64 = 0.1;
 
@@ -62,6 +68,12 @@ pub struct Found {
     /// Smallest distance on the path [m], and between which two; none where there is nothing to be near to, or where
     /// time was up before it was known.
     pub clearance: Option<(f64, [String; 2])>,
+    /// The way out of its start, where that touches something.
+    pub leaving: Option<Leaving>,
+    /// Distance that it keeps [m].
+    pub padding: f64,
+    /// Where it does not.
+    pub given_up: Vec<GivenUp>,
     /// Of a straight line, the part that can be done.
     pub fraction: Option<f64>,
     /// What took how long [s].
@@ -103,14 +115,15 @@ pub(super) struct Stage<'a> {
     /// Where they are [rad].
     pub start: Vec<f64>,
     /// Knows all robots and obstacles.
-    pub checker: ExactChecker,
+    pub checker: Padded,
 }
 
 /// Plans a motion. The same setup, world and request give the same motion, as long as time does not run out.
 pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Result<Found, Failure> {
     let mut times = BTreeMap::new();
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
-    let mut stage = stage(setup, world, &moving, &request.positions)?;
+    let mut stage = stage(setup, world, &moving, &request.positions, setup.padding + SPARE)?;
+    stage.checker.give_up(Place::Start, &stage.start);
     let began = Instant::now();
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
@@ -127,6 +140,11 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
         }
         wanted => {
             let goals = goals::configurations(&mut stage, wanted, request.seed, stop)?;
+            for goal in &goals {
+                let mut goal = goal.clone();
+                unwind(&mut goal, &stage.start, stage.checker.turns());
+                stage.checker.give_up(Place::Goal, &goal);
+            }
             lap(&mut times, "ik", began);
             let settings = PlanSettings { seed: request.seed, ..PlanSettings::default() };
             let start = stage.start.clone();
@@ -144,15 +162,22 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
     let looking = lap(&mut times, "timing", timing);
     let clearance = clearance(&mut stage.checker, &path, stop);
     lap(&mut times, "clearance", looking);
-    Ok(Found { robots: stage.indices, path, trajectory, clearance, fraction, times })
+    let leaving = Leaving::of(&mut stage.checker, &path);
+    // Of several goals one was reached.
+    let reached = |center: &[f64]| path.last().is_some_and(|end| distance(end, center) < SAME);
+    let at_end = |given_up: &&GivenUp| given_up.place != Place::Goal || reached(&given_up.center);
+    let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
+    let (robots, padding) = (stage.indices, setup.padding);
+    Ok(Found { robots, path, trajectory, clearance, leaving, padding, given_up, fraction, times })
 }
 
-/// The world of one request: robots that move, by index, and all others where they are [rad].
+/// The world of one request: robots that move, by index, and all others where they are [rad]; `padding` is kept [m].
 pub(super) fn stage<'a>(
     setup: &'a Setup,
     world: &World,
     moving: &[usize],
     positions: &[Vec<f64>],
+    padding: f64,
 ) -> Result<Stage<'a>, Failure> {
     let (mut robots, mut indices, mut bodies) = (Vec::new(), Vec::new(), Vec::new());
     let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
@@ -170,7 +195,7 @@ pub(super) fn stage<'a>(
         limits.extend_from_slice(&robot.limits);
         start.extend_from_slice(at);
     }
-    let checker = ExactChecker::new(world.with_robots(bodies).snapshot(), Resolution::default());
+    let checker = Padded::new(world.with_robots(bodies).snapshot(), padding);
     Ok(Stage { robots, indices, joints, limits, start, checker })
 }
 
@@ -241,7 +266,7 @@ pub(super) fn late(stop: &Stop) -> Option<Failure> {
 }
 
 /// The smallest distance on a path, and between which two. A figure for people: without it where time is up.
-fn clearance(checker: &mut ExactChecker, path: &Path, stop: &Stop) -> Option<(f64, [String; 2])> {
+fn clearance(checker: &mut Padded, path: &Path, stop: &Stop) -> Option<(f64, [String; 2])> {
     let mut least: Option<(f64, [String; 2])> = None;
     let mut q = path.first()?.clone();
     for pair in path.windows(2) {

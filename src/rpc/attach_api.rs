@@ -57,6 +57,8 @@ pub struct CommandLimits {
     pub velocity: f64,
     /// Highest acceleration [rad/s²].
     pub acceleration: f64,
+    /// Highest jerk [rad/s³].
+    pub jerk: f64,
 }
 
 /// What a run asks its planner: `data` of a message of the stream `planner_requests`.
@@ -82,6 +84,9 @@ pub struct Moment {
     /// Where joints are [rad]: where they are commanded to be, where positions are commanded. Without those whose arm has
     /// not been heard of for 1 s.
     pub positions: BTreeMap<String, f64>,
+    /// How far the grippers of arms are open, 0–1, by each of their arm's joints.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub grippers: BTreeMap<String, f64>,
 }
 
 /// Parameters of `planner_answer`: one of `result` and `error`.
@@ -96,6 +101,36 @@ pub struct PlannerAnswer {
     /// Why it is refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<RpcError>,
+}
+
+/// Name of what a run asks its planner after every change of the world, for each planned motion under way.
+pub const RECHECK: &str = "recheck";
+
+/// Parameters of `recheck`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recheck {
+    /// The plan that is being carried out.
+    pub plan: u64,
+    /// How far its motion is [s].
+    pub elapsed: f64,
+}
+
+/// Reply to `recheck`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct RecheckReply {
+    /// What is in the way of the rest of the motion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub blocked: Option<BlockedReport>,
+}
+
+/// What is in the way of a motion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BlockedReport {
+    /// Up to here the motion keeps its distance [s since its start].
+    pub free_until: f64,
+    /// What is in the way, with names and distances.
+    pub what: String,
 }
 
 /// A plan that is still free, for the coordinator to execute.

@@ -18,7 +18,7 @@ use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, JoinSet};
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 
 use super::api::{
     Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, Method, PlannerAnswer, RegisterPlanner,
@@ -31,18 +31,24 @@ use super::seats::Seat;
 use super::server::CALL_LIMIT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
 use super::subscription::{Pace, Subscription};
+use super::urgent::Arrival;
 use super::wire;
 
 /// Lines that wait for a client to read them.
 const QUEUE: usize = 64;
 /// Targets of one client that may wait for the tick at once.
 const IN_FLIGHT: usize = 32;
+/// A connection that says nothing for so long is given back.
+const SILENT_FOR: Duration = Duration::from_millis(250);
 /// Time for the client to take the last replies, and for the rest of an oversize line to pass.
 const FAREWELL: Duration = Duration::from_secs(1);
 
-/// Serves one client until it closes its end, sends a line that is too long, or must make room. `read` was read of it
-/// before.
-pub(super) async fn serve(stream: UnixStream, read: Vec<u8>, backend: Arc<dyn Backend>, lessee: Lessee, seat: Seat) {
+/// Serves one client until it closes its end, sends a line that is too long, or must make room. Gives back a connection
+/// that says nothing for a while: its next request may be one of those that always get through.
+pub(super) async fn serve(arrival: Arrival, backend: Arc<dyn Backend>) -> Option<Arrival> {
+    let Arrival { stream, read, lessee, seat } = arrival;
+    let stream =
+        UnixStream::from_std(stream).inspect_err(|e| tracing::warn!("rpc: a connection was not taken: {e}")).ok()?;
     let (from_client, to_client) = stream.into_split();
     let (queue, waiting) = mpsc::channel(QUEUE);
     let mut writer = tokio::spawn(write(to_client, waiting));
@@ -58,18 +64,32 @@ pub(super) async fn serve(stream: UnixStream, read: Vec<u8>, backend: Arc<dyn Ba
         next: 1,
         planner: None,
     };
-    connection.converse(&mut from_client).await;
-    if timeout(FAREWELL, &mut writer).await.is_err() {
-        writer.abort();
-    }
+    let Some((lessee, seat)) = connection.converse(&mut from_client).await else {
+        if timeout(FAREWELL, &mut writer).await.is_err() {
+            writer.abort();
+        }
+        return None;
+    };
+    let written = tokio::select! {
+        // A client that does not read its last replies is not read from either.
+        written = &mut writer => written.ok().flatten()?,
+        _ = seat.must_leave() => {
+            writer.abort();
+            return None;
+        }
+    };
+    let (_, from_client) = from_client.into_inner().into_inner();
+    let stream = from_client.reunite(written).ok()?.into_std().ok()?;
+    Some(Arrival { stream, read: Vec::new(), lessee, seat })
 }
 
-async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) {
+/// Gives its half back when nothing more is to be written.
+async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) -> Option<OwnedWriteHalf> {
     while let Some(line) = waiting.recv().await {
-        if to.write_all(line.as_bytes()).await.is_err() {
-            return; // The client is gone; dropping the queue tells the rest of the conversation.
-        }
+        // The client is gone; dropping the queue tells the rest of the conversation.
+        to.write_all(line.as_bytes()).await.ok()?;
     }
+    Some(to)
 }
 
 struct Connection {
@@ -86,14 +106,15 @@ struct Connection {
     subscriptions: BTreeMap<u64, AbortHandle>,
     next: u64,
     /// The line to the planner that registered here.
-    planner: Option<Arc<PlannerLine>>,
+    planner: Option<PlannerHere>,
 }
 
-impl Drop for Connection {
+/// A planner's line, closed with its connection.
+struct PlannerHere(Arc<PlannerLine>);
+
+impl Drop for PlannerHere {
     fn drop(&mut self) {
-        if let Some(planner) = &self.planner {
-            planner.close();
-        }
+        self.0.close();
     }
 }
 
@@ -112,7 +133,8 @@ struct InFlight {
 struct Gone;
 
 impl Connection {
-    async fn converse(mut self, from: &mut (impl AsyncBufRead + Unpin)) {
+    /// Answers requests until the connection ends (`None`), or says nothing for a while.
+    async fn converse(mut self, from: &mut (impl AsyncBufRead + Unpin)) -> Option<(Lessee, Seat)> {
         let mut line = Vec::new();
         loop {
             let longest = self.longest();
@@ -124,36 +146,45 @@ impl Connection {
                 biased;
                 reason = self.seat.must_leave() => {
                     let _ = timeout(FAREWELL, self.reply::<Done>(&Value::Null, Err(reason))).await;
-                    return;
+                    return None;
                 }
                 done = oldest(&mut self.in_flight), if !self.in_flight.is_empty() => {
                     if self.send_oldest(done).await.is_err() {
-                        return;
+                        return None;
                     }
                     continue;
                 }
+                // Before the line, so that nothing is read that would be lost; a partial line belongs here.
+                () = sleep(SILENT_FOR), if line.is_empty() && self.is_plain() => Line::Nothing,
                 // Begins again where it was when an answer came first: what it read so far is in `line`.
                 read = read_line(from, &mut line, longest), if self.in_flight.len() < IN_FLIGHT => read,
             };
             match read {
                 Line::Whole => self.seat.begin(),
+                Line::Nothing if line.is_empty() => return Some((self.lessee, self.seat)),
+                Line::Nothing => continue,
                 Line::End => {
                     let _ = self.settle().await;
-                    return;
+                    return None;
                 }
                 Line::TooLong => {
                     let error = RpcError::new(Code::TooLarge, format!("the line is longer than {longest} bytes"));
                     let error = error.hint("send less at once; the connection is closed now");
                     let _ = self.reply::<Done>(&Value::Null, Err(error)).await;
                     let _ = timeout(FAREWELL, skip_line(from)).await;
-                    return;
+                    return None;
                 }
             }
             if !line.trim_ascii().is_empty() && self.answer(&line).await.is_err() {
-                return;
+                return None;
             }
             line.clear();
         }
+    }
+
+    /// Whether it asks and is answered, and nothing else goes on here.
+    fn is_plain(&self) -> bool {
+        self.in_flight.is_empty() && self.next == 1 && self.planner.is_none()
     }
 
     async fn answer(&mut self, line: &[u8]) -> Result<(), Gone> {
@@ -264,13 +295,13 @@ impl Connection {
         let planner: RegisterPlanner = read_params(params)?;
         let line = Arc::new(PlannerLine::new(self.queue.clone(), self.lessee.pid()));
         let registered = self.backend.register_planner(planner, line.clone())?;
-        self.planner = Some(line);
+        self.planner = Some(PlannerHere(line));
         Ok(registered)
     }
 
     fn planner_answer(&self, params: Value) -> Result<Done, RpcError> {
         match &self.planner {
-            Some(planner) => planner.answered(read_params(params)?),
+            Some(PlannerHere(planner)) => planner.answered(read_params(params)?),
             None => return Err(RpcError::new(Code::InvalidParams, "this connection registered no planner")),
         }
         Ok(Done {})
@@ -358,6 +389,8 @@ async fn oldest(in_flight: &mut VecDeque<InFlight>) -> Result<Reply, RpcError> {
 
 enum Line {
     Whole,
+    /// Not even a part of one, for a while.
+    Nothing,
     End,
     TooLong,
 }

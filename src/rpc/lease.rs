@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use super::api::{Backend, ExecutePlan, Reply, Request};
+use super::api::{Backend, ExecutePlan, Presence, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
 
@@ -112,12 +112,14 @@ pub(super) struct Lessee {
     leases: Arc<Leases>,
     connection: u64,
     pid: Option<i32>,
+    /// Dropped with the connection.
+    alive: Arc<()>,
 }
 
 impl Lessee {
     /// `connection` is a number given once; `pid` is the process at its other end.
     pub fn new(leases: Arc<Leases>, connection: u64, pid: Option<i32>) -> Self {
-        Self { leases, connection, pid }
+        Self { leases, connection, pid, alive: Arc::default() }
     }
 
     /// The process at the connection's other end, where the system tells.
@@ -147,7 +149,9 @@ impl Lessee {
                 let (plan, joints) = backend.plan_of(plan).await?;
                 let arms = backend.arms_of(Subject::Joints(&joints));
                 self.claim(&arms, false)?;
-                return Ok((Request::ExecutePlan(ExecutePlan { plan: Some(plan) }), arms));
+                let replan = matches!(&request, Request::ExecutePlan(execute) if execute.replan);
+                let presence = Some(Presence::of(&self.alive));
+                return Ok((Request::ExecutePlan(ExecutePlan { plan: Some(plan), replan, presence }), arms));
             }
         }
         Ok((request, Vec::new()))

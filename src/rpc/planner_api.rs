@@ -2,6 +2,7 @@
 //! begins, `planning` tells how it goes.
 
 use std::collections::BTreeMap;
+use std::sync::{Arc, Weak};
 
 use serde::{Deserialize, Serialize};
 
@@ -168,6 +169,12 @@ pub struct PlanSummary {
     /// The two that come closest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closest: Option<[String; 2]>,
+    /// Distance that it keeps from obstacles and other arms [m].
+    #[serde(default)]
+    pub padding: f64,
+    /// Pairs that do not keep it, and where.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub padding_given_up: Vec<PaddingGivenUp>,
     /// Of a straight line, the part that can be done (0–1].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fraction: Option<f64>,
@@ -175,6 +182,19 @@ pub struct PlanSummary {
     pub seed: u64,
     /// Time for inverse kinematics, search, shortcuts, timing, checking [s].
     pub times: BTreeMap<String, f64>,
+}
+
+/// A pair that does not keep the padding, near the start or the goal, where it is closer itself.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PaddingGivenUp {
+    /// `start`, `goal`, or `everywhere`: the two are closer in every pose.
+    pub near: String,
+    /// The link.
+    pub link: String,
+    /// The obstacle, or the link of another arm.
+    pub other: String,
+    /// Their distance there [m]; negative: they touch.
+    pub distance: f64,
 }
 
 /// Parameters of `preview`.
@@ -200,13 +220,43 @@ pub struct PreviewReply {
 }
 
 /// Parameters of `execute_plan`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
     /// The plan's number; without it the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
+    /// Whether a motion that must end before something that gets in its way is planned again from there and goes on.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub replan: bool,
+    /// The connection that asks for it, where there is one: with its end nothing is planned again.
+    #[serde(skip)]
+    pub presence: Option<Presence>,
 }
+
+/// Whether a connection still lives.
+#[derive(Debug, Clone)]
+pub struct Presence(Weak<()>);
+
+impl Presence {
+    /// That of a connection which keeps `alive` to its end.
+    pub fn of(alive: &Arc<()>) -> Self {
+        Self(Arc::downgrade(alive))
+    }
+
+    /// Whether the connection has ended.
+    pub fn is_over(&self) -> bool {
+        self.0.strong_count() == 0
+    }
+}
+
+impl PartialEq for Presence {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.ptr_eq(&other.0)
+    }
+}
+
+impl Eq for Presence {}
 
 /// Parameters of `planner`: none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

@@ -306,6 +306,12 @@ pub struct MotionReport {
     pub remaining: f64,
     /// Why it ended elsewhere than it should, in a sentence.
     pub error: Option<String>,
+    /// Whether it had to end before something in its way, and is being planned again; until then it is not done.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub replanning: bool,
+    /// The motion that goes on in its place, around what was in its way.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<u64>,
     /// When done: how far off each joint ended.
     pub deviation: Option<Vec<Deviation>>,
 }

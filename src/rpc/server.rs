@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! socket ─▶ thread `rpc-stop`: stop, cancel, status, shutdown ──all else──▶ `rpc` ─▶ a thread per connection
+//!                    ▲──────────── connections that say nothing for a while ───────────────────┘
 //! ```
 //!
 //! A connection that asks more than the requests that always get through has a thread of its own: what one client
@@ -19,6 +20,7 @@ use std::time::Duration;
 
 use tokio::net::{UnixListener, UnixStream};
 use tokio::runtime::Runtime;
+use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::watch;
 
 use super::api::Backend;
@@ -59,14 +61,15 @@ impl Server {
         let runtime = runtime()?;
         let (end, ended) = watch::channel(false);
         let (arrivals, arrived) = channel();
+        let (back, silent) = unbounded_channel();
         let (first, others) = (backend.clone(), ended.clone());
         let taking = std::thread::Builder::new().name("rpc-stop".into()).spawn(move || {
             first.prepare_urgent_thread();
-            until_the_end(runtime, ended, accept(listener, first, arrivals));
+            until_the_end(runtime, ended, accept(listener, first, arrivals, silent));
         })?;
         let mut server = Self { claim, end, threads: vec![taking] };
         let serving = std::thread::Builder::new().name("rpc".into());
-        server.threads.push(serving.spawn(move || converse(&arrived, &backend, &others))?);
+        server.threads.push(serving.spawn(move || converse(&arrived, &back, &backend, &others))?);
         Ok(server)
     }
 
@@ -102,7 +105,12 @@ fn until_the_end(runtime: Runtime, mut ended: watch::Receiver<bool>, task: impl 
 }
 
 /// Takes connections, and answers what always gets through.
-async fn accept(listener: StdListener, backend: Arc<dyn Backend>, others: Sender<Arrival>) {
+async fn accept(
+    listener: StdListener,
+    backend: Arc<dyn Backend>,
+    others: Sender<Arrival>,
+    mut silent: UnboundedReceiver<Arrival>,
+) {
     let listener = match UnixListener::from_std(listener) {
         Ok(listener) => listener,
         Err(e) => return tracing::error!("rpc: the socket cannot be served: {e}"),
@@ -110,7 +118,14 @@ async fn accept(listener: StdListener, backend: Arc<dyn Backend>, others: Sender
     let leases = Arc::new(Leases::default());
     let seats = Seats::new(leases.clone());
     loop {
-        let stream = match listener.accept().await {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            Some(arrival) = silent.recv() => {
+                tokio::spawn(urgent::serve(arrival, backend.clone(), others.clone()));
+                continue;
+            }
+        };
+        let stream = match accepted {
             Ok((stream, _)) => stream,
             Err(e) => {
                 tracing::warn!("rpc: a connection was not taken: {e}");
@@ -131,24 +146,30 @@ async fn accept(listener: StdListener, backend: Arc<dyn Backend>, others: Sender
         };
         let pid = stream.peer_cred().ok().and_then(|peer| peer.pid());
         let lessee = Lessee::new(leases.clone(), seat.number(), pid);
-        tokio::spawn(urgent::serve(stream, backend.clone(), lessee, seat, others.clone()));
+        let Ok(stream) = stream.into_std() else { continue };
+        let arrival = Arrival { stream, read: Vec::new(), lessee, seat };
+        tokio::spawn(urgent::serve(arrival, backend.clone(), others.clone()));
     }
 }
 
 /// Gives each connection that is handed on a thread, until the last one that could be has gone.
-fn converse(arrived: &Receiver<Arrival>, backend: &Arc<dyn Backend>, ended: &watch::Receiver<bool>) {
+fn converse(
+    arrived: &Receiver<Arrival>,
+    back: &UnboundedSender<Arrival>,
+    backend: &Arc<dyn Backend>,
+    ended: &watch::Receiver<bool>,
+) {
     // Hangs up when the last thread that has its other end is gone.
     let (alive, gone) = channel::<()>();
     for arrival in arrived {
-        let (backend, ended, alive) = (backend.clone(), ended.clone(), alive.clone());
+        let (backend, back, ended, alive) = (backend.clone(), back.clone(), ended.clone(), alive.clone());
         let thread = std::thread::Builder::new().name("rpc-client".into()).stack_size(STACK);
         let started = thread.spawn(move || {
-            let Arrival { stream, read, lessee, seat } = arrival;
             match runtime() {
                 Ok(runtime) => until_the_end(runtime, ended, async move {
-                    match UnixStream::from_std(stream) {
-                        Ok(stream) => connection::serve(stream, read, backend, lessee, seat).await,
-                        Err(e) => tracing::warn!("rpc: a connection was not taken: {e}"),
+                    if let Some(silent) = connection::serve(arrival, backend).await {
+                        // Only a server that is ending takes none any more.
+                        let _ = back.send(silent);
                     }
                 }),
                 Err(e) => tracing::warn!("rpc: a connection was not taken: {e}"),

@@ -28,7 +28,7 @@ const WRITE_LIMIT: Duration = Duration::from_secs(1);
 /// `status` is answered here so often per connection: a client that asks again and again is one like all others.
 const STATUS_LIMIT: u32 = 8;
 
-/// A connection that asks more than urgent requests.
+/// A connection on its way from one thread to another.
 pub(super) struct Arrival {
     /// Its socket.
     pub stream: std::os::unix::net::UnixStream,
@@ -40,15 +40,10 @@ pub(super) struct Arrival {
     pub seat: Seat,
 }
 
-/// Serves a new connection until it ends or asks something else; then it is handed on.
-pub(super) async fn serve(
-    mut stream: UnixStream,
-    backend: Arc<dyn Backend>,
-    lessee: Lessee,
-    seat: Seat,
-    others: Sender<Arrival>,
-) {
-    let mut read = Vec::new();
+/// Serves a connection until it ends or asks something else; then it is handed on.
+pub(super) async fn serve(arrival: Arrival, backend: Arc<dyn Backend>, others: Sender<Arrival>) {
+    let Arrival { stream, mut read, lessee, seat } = arrival;
+    let Ok(mut stream) = UnixStream::from_std(stream) else { return };
     let mut statuses = 0;
     loop {
         while let Some(line) = next_line(&mut read) {

@@ -120,7 +120,7 @@ impl Run {
             wall,
             min_free: blueprint.recording.min_free.0,
         };
-        let service = Arc::new(Service::new(ServiceParts {
+        let parts = ServiceParts {
             run: name.clone(),
             blueprint: blueprint.clone(),
             config: config.clone(),
@@ -137,7 +137,8 @@ impl Run {
             log: log.clone(),
             endings: endings.clone(),
             planner,
-        }));
+        };
+        let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
         let notice = {
             let (service, wall) = (service.clone(), wall);
             move |notice: Notice<'_>| service.notice(notice, wall)

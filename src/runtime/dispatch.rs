@@ -14,6 +14,7 @@ use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::control::request::{Envelope, Motion, Request};
 use crate::control::tasks::cartesian::Goal;
 use crate::recording::notes::{Note, Notes};
+use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::telemetry::Outcome;
 use crate::telemetry::describe::Severity;
@@ -165,6 +166,8 @@ impl Courier {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopping, waiting) = (stop.clone(), wake.clone());
         let thread = std::thread::Builder::new().name("courier".into()).spawn(move || {
+            // It tells operators that their stop was taken; where this is not granted it competes like any other thread.
+            let _ = host::set_fifo(host::STOP_PRIORITY);
             while !stopping.load(Ordering::Acquire) {
                 let woken = waiting.wait(SWEEP);
                 while let Ok((id, outcome)) = replies.pop() {

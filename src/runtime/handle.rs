@@ -60,11 +60,15 @@ impl Handle {
     }
 
     /// Waits for the end of a motion. Its `state` is `COMPLETED` when the arm has arrived; else `error` says why not.
+    /// Where it was planned again around something, that of the motion that went on.
     pub fn wait(&self, motion: u64) -> Result<MotionReport, RpcError> {
+        let mut motion = motion;
         loop {
             let report = self.motion(motion)?;
-            if report.done {
-                return Ok(report);
+            match report.next {
+                Some(next) if report.done => motion = next,
+                _ if report.done => return Ok(report),
+                _ => {}
             }
             if self.service.is_closed() {
                 return Err(RpcError::new(Code::ShuttingDown, format!("the run ends during motion {motion}")));

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde_json::json;
 
 use super::dispatch::lock;
-use super::motions::Planned;
+use super::motions::{Carried, Planned};
 use super::service::{Service, internal};
 use crate::control::config::TaskKind;
 use crate::control::limit::Bounds;
@@ -20,6 +20,9 @@ use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 const SLACK: f64 = 1.001;
 /// A trajectory begins and ends at rest: slower than this [rad/s].
 const REST: f64 = 1e-3;
+
+/// The plan that a motion carries out, and whether it is planned again: see [`Carried::replan`].
+pub(super) type Carries = (u64, Option<Option<api::Presence>>);
 
 impl Service {
     /// A trajectory task that covers these joints.
@@ -62,7 +65,7 @@ impl Service {
             NoMotion::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string()),
         })?;
         let duration = motion.duration();
-        let number = self.begin(task, joints, motion).await?;
+        let number = self.begin(task, joints, motion, None).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,
             task: self.parts.names.task(task),
@@ -74,6 +77,15 @@ impl Service {
     }
 
     pub(super) async fn execute(&self, call: api::Execute) -> Result<Reply, RpcError> {
+        self.execute_as(call, None).await.map(Reply::Execute)
+    }
+
+    /// Follows a trajectory, as the motion of a plan where it comes from one.
+    pub(super) async fn execute_as(
+        &self,
+        call: api::Execute,
+        plan: Option<Carries>,
+    ) -> Result<api::ExecuteReply, RpcError> {
         let trajectory = trajectory_of(call.trajectory);
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|a| &a.joints).collect();
         let mut joints = Vec::new();
@@ -88,8 +100,8 @@ impl Service {
             None => self.trajectory_task(&joints)?,
         };
         let duration = trajectory.duration();
-        let number = self.begin(task, joints, trajectory).await?;
-        Ok(Reply::Execute(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration }))
+        let number = self.begin(task, joints, trajectory, plan).await?;
+        Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })
     }
 
     /// Hands a trajectory to its task. Everything about it is checked before anything moves.
@@ -98,13 +110,23 @@ impl Service {
         task: u16,
         joints: Vec<u16>,
         trajectory: JointTrajectory,
+        plan: Option<Carries>,
     ) -> Result<u64, RpcError> {
         let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_rest(&joints, &trajectory)?;
         self.check_limits(&joints, &spline)?;
         let number = self.parts.dispatcher.number();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
-        let planned = Planned { task, joints: joints.clone(), goal, duration: spline.duration() };
+        let plan = plan.map(|(plan, replan)| Carried { plan, spline: Arc::new(spline.clone()), replan });
+        let planned = Planned {
+            task,
+            joints: joints.clone(),
+            goal,
+            duration: spline.duration(),
+            plan,
+            blocked: None,
+            next: None,
+        };
         lock(&self.motions).plan(number, planned);
         let motion = Box::new(Motion { id: number, joints, spline });
         let result = self.outcome(self.parts.dispatcher.execute(task, motion, Arc::new(trajectory)).await);

@@ -8,6 +8,7 @@ use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_inde
 use super::service::internal;
 use crate::collision::Stop;
 use crate::planning::desk::{Job, NotBegun, Progress};
+use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
 use crate::planning::setup::{PlannedRobot, Setup};
 use crate::planning::solve::{Found, Goal, Request};
@@ -19,6 +20,7 @@ const REVIEW_LIMIT: Duration = Duration::from_secs(2);
 
 impl PlannerPort {
     pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
+        self.measured(moment);
         let setup = self.desk.setup();
         let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
         let positions = all_positions(setup, moment)?;
@@ -36,7 +38,7 @@ impl PlannerPort {
 
     pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
         let (job, found) = found(self, plan)?;
-        let setup = self.desk.setup();
+        let setup = self.desk.now();
         let mut end_effectors = BTreeMap::new();
         let mut first = 0;
         for &index in &found.robots {
@@ -64,7 +66,10 @@ impl PlannerPort {
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
         let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
         let task = task.map(|task| (*task).clone());
+        self.measured(moment);
+        let version = self.desk.version();
         self.still_free(&job, &found, moment).await?;
+        self.remember(job.id, found.clone(), version);
         Ok(ReleasedPlan { plan: job.id, trajectory: travelling(&found), task })
     }
 
@@ -114,7 +119,7 @@ impl PlannerPort {
 }
 
 /// Where every robot is [rad], in the setup's order.
-fn all_positions(setup: &Setup, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
+pub(super) fn all_positions(setup: &Setup, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
     let configs = setup.robots.iter().map(|robot| &robot.config);
     configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
 }
@@ -204,10 +209,18 @@ fn summary(job: &Job, found: &Found) -> PlanSummary {
         duration: found.trajectory.duration(),
         clearance: found.clearance.as_ref().map(|(distance, _)| *distance),
         closest: found.clearance.as_ref().map(|(_, pair)| pair.clone()),
+        padding: found.padding,
+        padding_given_up: found.given_up.iter().map(given_up).collect(),
         fraction: found.fraction,
         seed: job.request.seed,
         times: found.times.clone(),
     }
+}
+
+fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
+    let GivenUp { place, link, other, distance, .. } = given_up;
+    let (near, link, other) = (place.name().to_owned(), link.clone(), other.clone());
+    api::PaddingGivenUp { near, link, other, distance: *distance }
 }
 
 /// The trajectory as rpc has it.

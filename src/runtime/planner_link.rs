@@ -12,8 +12,10 @@ use super::planner_port::PlannerPort;
 use super::service::{Service, internal};
 use crate::control::config::{CoordinatorConfig, TaskKind};
 use crate::control::limit::Bounds;
+use crate::joint::DEFAULT_JERK;
 use crate::rpc::api::{
-    self, CommandLimits, Moment, PlannerReport, RegisterPlanner, Registered, ReleasedPlan, Reply, Request as Call,
+    self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered,
+    ReleasedPlan, Reply, Request as Call,
 };
 use crate::rpc::planner_line::{PlannerLine, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
@@ -37,7 +39,7 @@ pub(super) struct Attached {
 }
 
 /// Where a run's planner is.
-enum Planner<'a> {
+pub(super) enum Planner<'a> {
     Own(&'a PlannerPort),
     Attached(Arc<Attached>),
 }
@@ -53,11 +55,29 @@ impl Planner<'_> {
         }
     }
 
+    /// What is in the way of a planned motion under way.
+    pub(super) async fn recheck(
+        &self,
+        call: &Recheck,
+        moment: Moment,
+        limit: Duration,
+    ) -> Result<RecheckReply, RpcError> {
+        match self {
+            Self::Own(port) => port.recheck(call, &moment).await,
+            Self::Attached(planner) => {
+                let params = serde_json::to_value(call).unwrap_or_default();
+                let reply = planner.line.ask(RECHECK, params, moment, limit).await?;
+                let unlike = |e: serde_json::Error| RpcError::new(Code::Internal, format!("reply to {RECHECK}: {e}"));
+                serde_json::from_value(reply).map_err(unlike)
+            }
+        }
+    }
+
     async fn release(&self, plan: Option<u64>, moment: Moment) -> Result<ReleasedPlan, RpcError> {
         match self {
             Self::Own(port) => port.release(plan, &moment).await,
             Self::Attached(planner) => {
-                let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan }).written();
+                let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan, ..Default::default() }).written();
                 let released = planner.line.ask(method, params, moment, LONG).await?;
                 serde_json::from_value(released)
                     .map_err(|e| RpcError::new(Code::Internal, format!("the planner released no plan: {e}")))
@@ -86,27 +106,46 @@ impl Service {
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(execute.plan, self.moment(0)).await?;
-                self.execute_released(released).await
+                let replan = execute.replan.then_some(execute.presence);
+                self.execute_released(&planner, released, replan).await
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
-            Call::Plan(_) => planner.answer(call, self.moment(self.parts.dispatcher.number()), limit).await,
-            Call::Attach(_) | Call::Detach(_) => planner.answer(call, self.moment(0), limit).await,
+            Call::Plan(ref plan) => {
+                let (number, plan) = (self.parts.dispatcher.number(), plan.clone());
+                let begun = planner.answer(call, self.moment(number), limit).await?;
+                self.remember_request(number, plan);
+                Ok(begun)
+            }
+            Call::WorldAdd(_) | Call::WorldMove(_) | Call::WorldRemove(_) | Call::Attach(_) | Call::Detach(_) => {
+                let moment =
+                    if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
+                let changed = planner.answer(call, moment, limit).await;
+                // Also where it was refused, or not answered in time: it may have happened all the same.
+                self.recheck(&planner).await;
+                changed
+            }
             _ => planner.answer(call, Moment::default(), limit).await,
         }
     }
 
-    async fn execute_released(&self, released: ReleasedPlan) -> Result<Reply, RpcError> {
+    async fn execute_released(
+        &self,
+        planner: &Planner<'_>,
+        released: ReleasedPlan,
+        replan: Option<Option<api::Presence>>,
+    ) -> Result<Reply, RpcError> {
         let ReleasedPlan { plan, trajectory, task } = released;
         // What comes from another process is checked like what comes from any client.
         let execute = api::Execute { trajectory, task };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
-        match self.execute(execute).await? {
-            Reply::Execute(begun) => {
-                *lock(&self.executed) = Some((plan, begun.motion));
-                Ok(Reply::ExecutePlan(begun))
-            }
-            other => Ok(other),
+        let begun = self.execute_as(execute, Some((plan, replan))).await?;
+        *lock(&self.executed) = Some((plan, begun.motion));
+        // The world may have changed since the plan was found free.
+        let under_way = lock(&self.motions).under_way().into_iter().find(|motion| motion.number == begun.motion);
+        if let Some(motion) = under_way {
+            self.recheck_motion(planner, &motion).await;
         }
+        Ok(Reply::ExecutePlan(begun))
     }
 
     /// Ends planning, where something is being planned.
@@ -230,8 +269,8 @@ impl Service {
     }
 
     /// What a planner needs to know of this run now.
-    fn moment(&self, plan: u64) -> Moment {
-        let (now, mut positions) = (self.now(), BTreeMap::new());
+    pub(super) fn moment(&self, plan: u64) -> Moment {
+        let (now, mut positions, mut grippers) = (self.now(), BTreeMap::new(), BTreeMap::new());
         for (index, arm) in self.parts.names.arms.iter().enumerate() {
             let fresh = |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= FRESH;
             let Some(view) = self.arm_view(index).filter(fresh) else { continue };
@@ -239,8 +278,15 @@ impl Service {
             let values = if commanded { view.command.values } else { view.state.position };
             let known = arm.joints.iter().cloned().zip(values).filter(|(_, value)| value.is_finite());
             positions.extend(known);
+            let range = self.parts.connected.get(index).and_then(|connected| connected.gripper_range);
+            if let (Some(opening), Some((closed, open))) = (view.state.gripper, range)
+                && open > closed
+            {
+                let part = ((opening - closed) / (open - closed)).clamp(0.0, 1.0);
+                grippers.extend(arm.joints.iter().map(|joint| (joint.clone(), part)));
+            }
         }
-        Moment { plan, positions }
+        Moment { plan, positions, grippers }
     }
 }
 
@@ -249,11 +295,13 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
     let mut all = BTreeMap::new();
     for (arm, named) in config.arms.iter().zip(&names.arms) {
         let l = &arm.limits;
-        let bounds = l.position_lower.iter().zip(&l.position_upper).zip(&l.velocity_max).zip(&l.acceleration_max);
-        for (joint, (((lower, upper), velocity), acceleration)) in named.joints.iter().zip(bounds) {
-            let b = Bounds::inside(*lower, *upper, *velocity, *acceleration);
-            let limits =
-                CommandLimits { position: [b.lower, b.upper], velocity: b.velocity, acceleration: b.acceleration };
+        for (j, joint) in named.joints.iter().enumerate() {
+            let of = |limits: &[f64]| limits.get(j).copied();
+            let (Some(lower), Some(upper)) = (of(&l.position_lower), of(&l.position_upper)) else { continue };
+            let (Some(velocity), Some(acceleration)) = (of(&l.velocity_max), of(&l.acceleration_max)) else { continue };
+            let b = Bounds::inside(lower, upper, velocity, acceleration);
+            let jerk = of(&l.jerk_max).unwrap_or(DEFAULT_JERK);
+            let limits = CommandLimits { position: [b.lower, b.upper], velocity, acceleration, jerk };
             all.insert(joint.clone(), limits);
         }
     }
@@ -263,6 +311,10 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
 /// A planner in a process of its own: answers what a run asks, as it travels.
 pub(super) async fn answer_travelling(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
     let encoded = |e: serde_json::Error| RpcError::new(Code::Internal, e.to_string());
+    if asked.method == RECHECK {
+        let call = serde_json::from_value(asked.params).map_err(encoded)?;
+        return serde_json::to_value(port.recheck(&call, &asked.moment).await?).map_err(encoded);
+    }
     match Call::read(&asked.method, asked.params)? {
         Call::ExecutePlan(execute) => {
             let released = port.release(execute.plan, &asked.moment).await?;

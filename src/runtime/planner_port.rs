@@ -8,10 +8,12 @@ use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
 use super::dispatch::lock;
 use super::plan_requests::job;
+use super::recheck::Released;
 use super::service::internal;
 use super::world_requests::typed;
 use crate::planning::config::{JointBounds, PlannerConfig};
 use crate::planning::desk::{Desk, Solver};
+use crate::planning::idle::Measured;
 use crate::planning::setup::Setup;
 use crate::planning::solve::solve;
 use crate::rpc::api::{CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject};
@@ -23,6 +25,8 @@ pub struct PlannerPort {
     pub(super) desk: Desk,
     /// The objects of the world, as they were given.
     pub(super) objects: Mutex<BTreeMap<String, WorldObject>>,
+    /// The plans that were handed over, by number.
+    pub(super) released: Mutex<BTreeMap<u64, Released>>,
 }
 
 impl PlannerPort {
@@ -38,12 +42,19 @@ impl PlannerPort {
             position: l.position,
             velocity: l.velocity,
             acceleration: l.acceleration,
+            jerk: l.jerk,
         };
         let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
         let desk = Desk::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
         let desk = desk.map_err(|e| format!("no planner thread: {e}"))?;
-        Ok(Self { desk, objects: Mutex::new(objects) })
+        Ok(Self { desk, objects: Mutex::new(objects), released: Mutex::default() })
+    }
+
+    /// Takes note of where the joints are that are not planned.
+    pub(super) fn measured(&self, moment: &Moment) {
+        let (positions, grippers) = (moment.positions.clone(), moment.grippers.clone());
+        self.desk.measured(&Measured { positions, grippers });
     }
 
     /// Answers one of the planner's methods, but for `execute_plan`: see [`release`](Self::release).

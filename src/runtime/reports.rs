@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
 use super::dispatch::lock;
-use super::motions::End;
+use super::motions::{End, Next};
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
 use crate::blueprint::OnExit;
@@ -201,7 +201,16 @@ impl Service {
         };
         report.state = end.state.name().to_owned();
         report.done = true;
-        report.error = self.reason(&end.reason);
+        // That it was cancelled or held is how it ended; what was in its way is why.
+        let was_stopped = matches!(end.reason, Reason::Cancelled | Reason::ArmHeld(..));
+        let blocked = planned.blocked.clone().filter(|_| was_stopped);
+        report.error = blocked.or_else(|| self.reason(&end.reason));
+        match &planned.next {
+            Some(Next::Planning) => (report.replanning, report.done) = (true, false),
+            Some(Next::Motion(next)) => report.next = Some(*next),
+            Some(Next::None(why)) => report.error = report.error.map(|error| format!("{error}; no way around: {why}")),
+            None => {}
+        }
         if end.state == TaskState::Completed {
             (report.progress, report.remaining) = (1.0, 0.0);
         }

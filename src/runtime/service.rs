@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::Sender;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use super::Ending;
@@ -73,12 +73,15 @@ pub struct Service {
     pub(super) attached: Mutex<Option<Arc<Attached>>>,
     /// The plan that was carried out last, and its motion.
     pub(super) executed: Mutex<Option<(u64, u64)>>,
+    /// What plans were asked for, by their number.
+    pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
+    pub(super) me: Weak<Self>,
     closed: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
 
 impl Service {
-    pub fn new(parts: ServiceParts) -> Self {
+    pub fn new(parts: ServiceParts, me: Weak<Self>) -> Self {
         Self {
             parts,
             started: Instant::now(),
@@ -89,6 +92,8 @@ impl Service {
             published: AtomicU64::new(0),
             attached: Mutex::default(),
             executed: Mutex::default(),
+            plan_requests: Mutex::default(),
+            me,
             closed: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
@@ -227,6 +232,7 @@ impl Service {
         let mut tasks = BTreeMap::new();
         for (i, config) in self.parts.config.tasks.iter().enumerate() {
             if task.is_none_or(|t| t as usize == i) && moves(&config.joints) {
+                lock(&self.motions).end_replanning(i as u16);
                 let outcome = self.ask(Request::Cancel { task: Some(i as u16) }).await?;
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }

@@ -18,7 +18,8 @@ use crate::rpc::{Code, RpcError};
 
 impl PlannerPort {
     pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<Done, RpcError> {
-        let setup = self.desk.setup();
+        self.measured(moment);
+        let setup = &*self.desk.now();
         let index = robot_index(setup, &call.robot)?;
         let robot = setup.robots.get(index).ok_or_else(internal)?;
         let mut object = named(self, &call.name)?;
@@ -56,7 +57,8 @@ impl PlannerPort {
         let Some([robot, link]) = object.held_by.take() else {
             return Err(wrong(format!("nobody holds {name}")));
         };
-        let setup = self.desk.setup();
+        self.measured(moment);
+        let setup = &*self.desk.now();
         let robot = setup.robots.get(robot_index(setup, &robot)?).ok_or_else(internal)?;
         let at = link_pose(robot, &link, moment)? * isometry(&object.pose);
         let let_go = |world: &mut World| {

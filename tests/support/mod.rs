@@ -52,6 +52,8 @@ impl FakeBackend {
             elapsed: 0.4,
             remaining: 0.1,
             error: (state == "ABORTED").then(|| "arm_joint1 was 0.2000 rad off the path".into()),
+            replanning: false,
+            next: None,
             deviation: done.then(|| vec![joint("arm_joint1", 0.3, 0.3004), joint("arm_joint2", -0.2, -0.1)]),
         }
     }

@@ -37,6 +37,8 @@ const LOOK: Duration = Duration::from_millis(1);
 pub struct AcmeAdapter {
     address: CanAddress,
     port: Option<Box<dyn CanPort>>,
+    /// What waits on the bus must be out before anything new is sent.
+    discarding: bool,
     identity: Option<Identity>,
     /// What has arrived of the current round of frames; a bit per pair says which of them.
     round: State,
@@ -62,6 +64,7 @@ impl AcmeAdapter {
         Ok(Self {
             address: config.parse_address(CanAddress::parse)?,
             port: None,
+            discarding: false,
             identity: None,
             round: State::default(),
             arrived: (0, 0),
@@ -132,7 +135,12 @@ impl AcmeAdapter {
 
     /// Hands frames to the bus.
     fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
-        let sent = self.port()?.send(frames).inspect_err(|_| self.disconnect())?;
+        let waiting = self.port()?.waiting();
+        self.discarding &= waiting > 0;
+        let sent = match self.discarding {
+            true => 0,
+            false => self.port()?.send(frames).inspect_err(|_| self.disconnect())?,
+        };
         if sent < frames.len() {
             let what = format!("the bus of acme at {} takes no more frames: nobody acknowledges them", self.address);
             return Err(AdapterError::Io(what));
@@ -227,7 +235,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     }
 
     fn disconnect(&mut self) {
-        self.port = None;
+        (self.port, self.discarding) = (None, false);
         self.identity = None;
         self.arrived = (0, 0);
         self.state_at = Mono::ZERO;
@@ -333,6 +341,10 @@ impl ManipulatorAdapter for AcmeAdapter {
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         let targets = protocol::encode_targets(&to_wire(positions)?);
         self.may_move()?;
+        // At most two set points wait for the bus.
+        if self.port()?.waiting() > PAIRS {
+            return Err(AdapterError::Busy);
+        }
         if self.state.status.mode == Mode::Planned {
             let speed = (velocity * 100.0).clamp(1.0, 100.0) as u8;
             self.send(&[Control::Mode(Mode::Planned, speed).encode()])?;
@@ -359,6 +371,14 @@ impl ManipulatorAdapter for AcmeAdapter {
         match (cleared, self.state.status.error) {
             (Err(AdapterError::Timeout(_)), error) if error != 0 => Err(fault(error, protocol::error_text(error))),
             (cleared, _) => cleared,
+        }
+    }
+
+    /// Called when the states are stale. What an interface of the system does not give back goes out before anything new.
+    fn discard_pending(&mut self) {
+        match self.port.as_mut().map(|port| port.discard()) {
+            Some(Ok(waiting)) => self.discarding = waiting > 0,
+            _ => self.disconnect(),
         }
     }
 

@@ -38,12 +38,15 @@ const IDENTITY: u16 = 0x2D0;
 const CONTROL: u16 = 0x150;
 const TARGETS: u16 = 0x160;
 
-/// What the adapter wants to hear: everything that the arm sends.
+/// What the adapter wants to hear: everything that the arm sends; and its own commands, which are so followed until they
+/// are transmitted.
 pub const FILTERS: &[CanFilter] = &[
     CanFilter { id: POSITIONS, mask: 0x7F0 },
     CanFilter { id: VELOCITIES, mask: 0x7F0 },
     CanFilter { id: STATUS, mask: 0x7FF },
     CanFilter { id: IDENTITY, mask: 0x7FF },
+    CanFilter { id: CONTROL, mask: 0x7FF },
+    CanFilter { id: TARGETS, mask: 0x7F0 },
 ];
 
 /// One value per joint, in wire units.

@@ -5,6 +5,7 @@ use serde::Serialize;
 use super::super::output::{self, Table, Tone, fixed, toned};
 use crate::hardware::conformance::figures::{Figures, Spread};
 use crate::hardware::conformance::gently::Motion;
+use crate::hardware::conformance::lag::Lag;
 use crate::hardware::conformance::{Made, Needs, Outcome};
 use crate::joint::JointLimits;
 
@@ -31,6 +32,8 @@ pub struct Report {
     pub checks: Vec<Row>,
     /// The small slow motion.
     pub motion: Option<Motion>,
+    /// The lag, where it was measured.
+    pub lag: Option<Lag>,
     /// Whether nothing failed.
     pub passed: bool,
 }
@@ -137,6 +140,7 @@ impl Report {
             None => "; nothing was moved",
             Some(_) if odd => "; the motion was ODD and was stopped",
             Some(motion) if motion.interrupted => "; the motion was interrupted",
+            Some(_) if self.lag.as_ref().is_some_and(|lag| !lag.complete()) => "; the lag was not measured",
             Some(_) => "; each joint moved as it was told",
         };
         let (passed, failed, skipped) = (self.count("passed"), self.count("failed"), self.count("skipped"));
@@ -212,9 +216,14 @@ impl Report {
         self.parts().into_iter().for_each(Part::print);
     }
 
+    /// What came of the motion.
+    fn moved_parts(&self) -> impl Iterator<Item = Part> {
+        self.motion.iter().map(motion_part).chain(self.lag.iter().map(lag_part))
+    }
+
     /// Prints the rest: the motion, if there was one, and the verdict.
     pub fn conclude(&self) {
-        self.motion.iter().map(motion_part).for_each(Part::print);
+        self.moved_parts().for_each(Part::print);
         output::line("");
         output::line(self.verdict());
     }
@@ -225,7 +234,7 @@ impl Report {
         for (what, fact) in self.facts() {
             text += &format!("- {what}: {}\n", escaped(&fact));
         }
-        for part in self.parts().into_iter().chain(self.motion.iter().map(motion_part)) {
+        for part in self.parts().into_iter().chain(self.moved_parts()) {
             text += &format!("\n## {}\n\n", part.title);
             let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
             text += &line(part.headings.iter().map(|h| h.trim_start_matches('>').to_owned()).collect());
@@ -261,6 +270,25 @@ fn state_part(figures: &Figures) -> Part {
         None => one("age when read", "it gives no time".to_owned()),
     });
     Part { title: "state", headings: vec!["", ">MEDIAN", ">99 %", ">MOST"], rows, notes: Vec::new() }
+}
+
+fn lag_part(lag: &Lag) -> Part {
+    let ms = |seconds: f64| format!("{:.0} ms", 1e3 * seconds);
+    let rows = lag.joints.iter().enumerate().map(|(i, joint)| {
+        let text = joint.map_or_else(|| "not measured".to_owned(), |lag| fixed(1e3 * lag, 1));
+        vec![(i + 1).to_string(), text]
+    });
+    let (row, mut notes) = (ms(lag.row), Vec::new());
+    if let (Some(largest), Some(median)) = (lag.largest, lag.median) {
+        notes.push(format!("lag {} (row: {row}; set hardware.arm.lag: {largest:.3})", ms(largest)));
+        notes.push(format!("the largest of all joints; the median is {}", ms(median)));
+    }
+    if !lag.complete() {
+        let why = "not measured: over 500 ms, or other programs took the processor; try again without them";
+        notes.push(why.to_owned());
+    }
+    let title = "lag: from a set point to the measured motion";
+    Part { title, headings: vec![">JOINT", ">LAG ms"], rows: rows.collect(), notes }
 }
 
 fn motion_part(motion: &Motion) -> Part {

@@ -14,9 +14,11 @@ use super::super::follow::Signals;
 use super::super::output;
 use super::choice::{Choice, failure, not_started};
 use super::report::{Arm, Limits, Report, Row};
+use crate::hardware::conformance::lag::Lag;
 use crate::hardware::conformance::{Check, Made, Subject, checks, figures, gently, run_all};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry, SIM};
 use crate::hardware::spec::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
+use crate::joint::ControlMode;
 use crate::runtime::device_lock::{self, DeviceLock};
 
 /// For how long the state is watched.
@@ -27,6 +29,7 @@ const WATCH: Duration = Duration::from_secs(2);
 #[command(after_help = "\
 Without --allow-motion nothing is enabled and nothing moves. With it, and only when no check failed, after a question,
 each joint goes 2° to either side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
+With --lag this motion is streamed as set points, and the lag is measured: the time from a set point to the motion that follows it.
 Stay within reach of the arm's own E-stop button.
 
 Exit codes: 0 all passed, 1 something failed, 2 usage, 3 the arm cannot be reached.")]
@@ -39,6 +42,9 @@ pub struct Args {
     /// Move each joint a little, slowly
     #[arg(long)]
     pub allow_motion: bool,
+    /// Measure the lag by a small slow motion of each joint; a real arm needs --allow-motion too
+    #[arg(long)]
+    pub lag: bool,
     /// Do not ask before the motion
     #[arg(long, requires = "allow_motion")]
     pub yes: bool,
@@ -74,6 +80,9 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     // A terminal that is closed must stop the arm too.
     let signals = Signals::watch_with_hangup();
     let bench = args.bench(&row)?;
+    if args.lag && bench.subject.real && !args.allow_motion {
+        return Err(Failure::usage("--lag moves the arm").hint("add --allow-motion"));
+    }
     let mut adapter = (row.create)(&bench.subject.config).map_err(|e| failure(Exit::Usage, &e))?;
     let unreachable = |e: AdapterError| {
         let failure = failure(Exit::Hardware, &e);
@@ -98,18 +107,21 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         checks,
         passed: false,
         motion: None,
+        lag: None,
     };
     if !args.json {
         report.print(); // before the motion: whoever is asked about that knows what was found
     }
     let moved = match report.count("failed") {
-        _ if !args.allow_motion || signals.last().is_some() => Ok(None),
-        0 => args.motion(&mut *adapter, &info, &bench, &signals).map(Some),
+        _ if !(args.allow_motion || args.lag) || signals.last().is_some() => Ok((None, None)),
+        0 => args.motion(&mut *adapter, &info, &bench, &signals).map(|(motion, lag)| (Some(motion), lag)),
         1 => Err(Failure::new(Exit::Failed, "not moved: 1 check failed")),
         failed => Err(Failure::new(Exit::Failed, format!("not moved: {failed} checks failed"))),
     };
-    report.motion = moved.as_ref().ok().cloned().flatten();
-    report.passed = report.count("failed") == 0 && report.motion.as_ref().is_none_or(|motion| motion.odd.is_none());
+    (report.motion, report.lag) = moved.as_ref().ok().cloned().unwrap_or_default();
+    report.passed = report.count("failed") == 0
+        && report.motion.as_ref().is_none_or(|motion| motion.odd.is_none())
+        && report.lag.as_ref().is_none_or(Lag::complete);
     args.publish(&report)?;
     moved?;
     match signals.last() {
@@ -199,14 +211,19 @@ impl Args {
         bar
     }
 
-    /// The small slow motion.
+    /// The small slow motion, and the lag where it is measured.
     fn motion(
         &self,
         adapter: &mut dyn ManipulatorAdapter,
         info: &ManipulatorInfo,
         bench: &Bench,
         signals: &Signals,
-    ) -> Result<gently::Motion> {
+    ) -> Result<(gently::Motion, Option<Lag>)> {
+        if self.lag && !info.modes.contains(&ControlMode::ServoPosition) {
+            let modes = info.modes.iter().map(|mode| mode.name()).collect::<Vec<_>>().join(", ");
+            let what = format!("not moved: no lag to measure, {} has no servo_position mode", info.model);
+            return Err(Failure::new(Exit::Failed, what).hint(format!("its modes: {modes}")));
+        }
         connect_to_move(adapter)?;
         adapter.disconnect();
         let (model, dof) = (&info.model, info.dof);
@@ -224,13 +241,22 @@ impl Args {
         // Once more: much can happen while a question waits for its answer.
         connect_to_move(adapter)?;
         let quiet = self.json;
-        let motion = gently::move_gently(adapter, &|| signals.last().is_some(), &mut |what| {
-            if !quiet {
-                output::note(what);
-            }
-        });
+        let (interrupted, mut tell) = (
+            || signals.last().is_some(),
+            |what: &str| {
+                if !quiet {
+                    output::note(what);
+                }
+            },
+        );
+        let (motion, lag) = if self.lag {
+            let (motion, lag) = gently::measure_lag(adapter, bench.subject.row.lag, &interrupted, &mut tell);
+            (motion, Some(lag))
+        } else {
+            (gently::move_gently(adapter, &interrupted, &mut tell), None)
+        };
         adapter.disconnect();
-        Ok(motion)
+        Ok((motion, lag))
     }
 
     /// Printed first: a file that cannot be written must not cost what was found.

@@ -1,10 +1,13 @@
 //! What `dimos check` says of the planner's robots. Their descriptions and shapes are read as a run reads them.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use crate::blueprint::Blueprint;
+use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
+use crate::planning::config::JointBounds;
 use crate::planning::setup::{PlannedRobot, Setup};
 
 /// A robot that is planned for.
@@ -15,6 +18,8 @@ pub(super) struct Robot {
     end_effector_link: String,
     joints: Vec<Joint>,
     named_poses: Vec<String>,
+    /// Gripper joints of which nothing says where they are: they are planned for wide open.
+    taken_as_open: Vec<String>,
     /// Pairs of links that touch in every pose.
     always_touching: Vec<[String; 2]>,
 }
@@ -37,8 +42,20 @@ pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
     let Some(planner) = blueprint.planner.as_ref().filter(|_| blueprint.awaited_assets().is_empty()) else {
         return Ok(Vec::new());
     };
-    let setup = Setup::load(planner)?;
+    // As a run narrows them to the velocities, accelerations and jerks of its arms.
+    let setup = Setup::load(planner)?.within(&commanded(&Summary::of(blueprint)))?;
     Ok(setup.robots.iter().map(|planned| robot(planned, &setup)).collect())
+}
+
+/// How fast the joints of a blueprint's arms are commanded, as far as that is known without the arms.
+fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
+    let bounds = |joint: &JointSummary| {
+        // Ranges are shown as the model has them, beside those of the arm.
+        let position = [f64::NEG_INFINITY, f64::INFINITY];
+        let velocity = joint.velocity.map_or(f64::INFINITY, |limit| limit.value);
+        JointBounds { position, velocity, acceleration: joint.acceleration.value, jerk: joint.jerk.value }
+    };
+    summary.arms.iter().flat_map(|arm| &arm.joints).map(|joint| (joint.name.clone(), bounds(joint))).collect()
 }
 
 fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {
@@ -60,6 +77,7 @@ fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {
         end_effector_link: config.end_effector_link.clone(),
         joints: joints.collect(),
         named_poses: config.named_poses.keys().cloned().collect(),
+        taken_as_open: planned.taken_as_open().into_iter().map(|(name, _)| name).collect(),
         always_touching: touching.map(|(_, pair)| pair.clone()).collect(),
     }
 }
@@ -85,6 +103,10 @@ pub(super) fn print(robot: &Robot) {
     table.print();
     if !robot.named_poses.is_empty() {
         output::line(format_args!("  named poses: {}", robot.named_poses.join(", ")));
+    }
+    for joint in &robot.taken_as_open {
+        output::line(format_args!("  {joint} is planned for wide open: nothing says where it is"));
+        output::line("  hint: gripper_joint: {joint: …, closed: …, open: …} lets it follow the gripper");
     }
     for [a, b] in &robot.always_touching {
         output::line(format_args!(

@@ -9,6 +9,7 @@ use std::time::Duration;
 use serde::Serialize;
 
 use super::context::when_there_is_room;
+use super::lag::{Lag, Trace};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
 use crate::joint::ControlMode;
@@ -46,6 +47,11 @@ const PERIOD: Duration = Duration::from_micros(2500);
 /// Looks from one set point of a stream to the next. Looking only when one has just been sent would always see the
 /// joint in the same part of its step.
 const LOOKS: u32 = 4;
+/// Shortest time of a wave, and of one with which the lag is measured [s]: slow enough for the joint to stay near its
+/// set points in spite of a long lag.
+const SHORTEST: (f64, f64) = (0.3, 0.8);
+/// Attempts to measure the lag of a joint while this program runs unevenly.
+const ATTEMPTS: u32 = 3;
 /// Set points go on by no more than this time at once [s].
 const LONGEST_STEP: f64 = 0.01;
 /// What the integral of a joint's velocity may be, as a fraction of its way: less where this program had to wait for a
@@ -147,16 +153,22 @@ pub fn move_gently(
     interrupted: &dyn Fn() -> bool,
     tell: &mut dyn FnMut(&str),
 ) -> Motion {
-    let mut gently = Gently { adapter, interrupted, tell, start: Vec::new(), motion: Motion::default() };
-    let was_on = gently.adapter.read_enabled().unwrap_or(true);
-    match catch_unwind(AssertUnwindSafe(|| gently.all())) {
-        Ok(Ok(())) => {}
-        Ok(Err(End::Odd(what))) => gently.motion.odd = Some(what),
-        Ok(Err(End::Interrupted)) => gently.motion.interrupted = true,
-        Err(_) => gently.motion.odd = Some("the adapter panicked".to_owned()),
-    }
-    gently.leave(was_on);
-    gently.motion
+    Gently { adapter, interrupted, tell, start: Vec::new(), motion: Motion::default(), trace: None }.run(Gently::all)
+}
+
+/// Moves each joint of a connected arm a little by streamed set points, as [`move_gently`] does but slower, and measures
+/// its lag. `row` is the row's [s].
+pub fn measure_lag(
+    adapter: &mut dyn ManipulatorAdapter,
+    row: f64,
+    interrupted: &dyn Fn() -> bool,
+    tell: &mut dyn FnMut(&str),
+) -> (Motion, Lag) {
+    let mut joints = Vec::new();
+    let trace = Some(Trace::default());
+    let gently = Gently { adapter, interrupted, tell, start: Vec::new(), motion: Motion::default(), trace };
+    let motion = gently.run(|it| it.lags(&mut joints));
+    (motion, Lag::of(joints, row))
 }
 
 struct Gently<'a> {
@@ -166,6 +178,8 @@ struct Gently<'a> {
     /// Where the arm stood [rad].
     start: Vec<f64>,
     motion: Motion,
+    /// What a joint was sent and did, where its lag is measured.
+    trace: Option<Trace>,
 }
 
 /// What is seen of one way: the joint's offset from the start, the most that others moved [rad], and the integral of
@@ -178,7 +192,45 @@ struct Seen {
 }
 
 impl Gently<'_> {
-    fn all(&mut self) -> Result<(), End> {
+    /// Makes `motions`, and leaves the arm as it was found.
+    fn run(mut self, motions: impl FnOnce(&mut Self) -> Result<(), End>) -> Motion {
+        let was_on = self.adapter.read_enabled().unwrap_or(true);
+        match catch_unwind(AssertUnwindSafe(|| motions(&mut self))) {
+            Ok(Ok(())) => {}
+            Ok(Err(End::Odd(what))) => self.motion.odd = Some(what),
+            Ok(Err(End::Interrupted)) => self.motion.interrupted = true,
+            Err(_) => self.motion.odd = Some("the adapter panicked".to_owned()),
+        }
+        self.leave(was_on);
+        self.motion
+    }
+
+    /// Measures the lag of each joint [s].
+    fn lags(&mut self, joints: &mut Vec<Option<f64>>) -> Result<(), End> {
+        self.motors_on()?;
+        let mode = ControlMode::ServoPosition;
+        self.set_mode(mode)?;
+        for joint in 0..self.start.len() {
+            (self.tell)(&format!("lag of joint {}: first +, then −", joint + 1));
+            let mut lag = None;
+            for attempt in 0..ATTEMPTS {
+                if attempt > 0 {
+                    self.motion.ways.pop();
+                }
+                self.trace = Some(Trace::default());
+                self.there_and_back(joint, mode)?;
+                lag = self.trace.as_ref().and_then(Trace::lag);
+                if lag.is_some() {
+                    break;
+                }
+            }
+            joints.push(lag);
+        }
+        Ok(())
+    }
+
+    /// Enables the motors, and watches that the arm holds its pose.
+    fn motors_on(&mut self) -> Result<(), End> {
         self.start = self.look()?.0;
         (self.tell)("the motors come on");
         self.adapter.activate()?;
@@ -194,6 +246,11 @@ impl Gently<'_> {
             self.pause()?;
         }
         self.start = self.look()?.0;
+        Ok(())
+    }
+
+    fn all(&mut self) -> Result<(), End> {
+        self.motors_on()?;
         let modes = self.adapter.get_info().modes;
         for mode in [ControlMode::Position, ControlMode::ServoPosition] {
             if modes.contains(&mode) {
@@ -253,7 +310,8 @@ impl Gently<'_> {
         let limits = self.adapter.get_limits()?;
         let top = limits.velocity_max.get(joint).copied().unwrap_or(1.0);
         // The fastest moment of a half cosine wave is at SPEED.
-        let time = (std::f64::consts::FRAC_PI_2 * (to - from).abs() / (SPEED * top)).max(0.3);
+        let shortest = if self.trace.is_some() { SHORTEST.1 } else { SHORTEST.0 };
+        let time = (std::f64::consts::FRAC_PI_2 * (to - from).abs() / (SPEED * top)).max(shortest);
         let stream = mode == ControlMode::ServoPosition;
         if !stream {
             self.adapter.write_joint_positions(&self.target(joint, to), SPEED)?;
@@ -262,6 +320,7 @@ impl Gently<'_> {
         let (mut seen, mut last) = (Seen::default(), None);
         let (mut streamed, mut before_this) = (0.0, began);
         let (mut still, mut point) = (0, if stream { from } else { to });
+        self.trace.iter_mut().for_each(Trace::begin_wave);
         for look in 0_u32.. {
             let now = MonotonicClock.now();
             let past = now.seconds_since(began);
@@ -269,14 +328,25 @@ impl Gently<'_> {
             streamed += now.seconds_since(before_this).min(LONGEST_STEP);
             before_this = now;
             let part = (streamed / time).min(1.0);
-            if stream && look % LOOKS == 0 {
+            let due = stream && look % LOOKS == 0;
+            // In turn before and after a look: always before it, the first look after each would see the joint in the
+            // same early part of its step, and the lag would come out short by half the time between looks.
+            let afterwards = self.trace.is_some() && look / LOOKS % 2 == 1;
+            if due {
                 point = from + (to - from) * (0.5 - 0.5 * (part * std::f64::consts::PI).cos());
-                let target = self.target(joint, point);
-                when_there_is_room(|| self.adapter.write_joint_positions(&target, 1.0))?;
+            }
+            if due && !afterwards {
+                self.stream(joint, point)?;
             }
             let (positions, reading, at) = self.look()?;
+            if due && afterwards {
+                self.stream(joint, point)?;
+            }
             let before = seen.moved;
             seen = self.judge(joint, from, to, &positions, seen)?;
+            if let Some(trace) = &mut self.trace {
+                trace.saw(now, at, seen.moved);
+            }
             if stream && (seen.moved - point).abs() > BEHIND {
                 let behind = (seen.moved - point).abs().to_degrees();
                 return Err(End::Odd(format!("joint {} is {behind:.2}° from its set point", joint + 1)));
@@ -297,6 +367,20 @@ impl Gently<'_> {
             self.pause()?;
         }
         Ok(seen)
+    }
+
+    /// Writes a set point of one joint, as an offset from the start [rad].
+    fn stream(&mut self, joint: usize, point: f64) -> Result<(), End> {
+        let target = self.target(joint, point);
+        let mut at = Mono::ZERO;
+        when_there_is_room(|| {
+            at = MonotonicClock.now();
+            self.adapter.write_joint_positions(&target, 1.0)
+        })?;
+        if let Some(trace) = &mut self.trace {
+            trace.wrote(at, point);
+        }
+        Ok(())
     }
 
     /// Whether what is seen is what was asked for.

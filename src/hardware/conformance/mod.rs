@@ -10,6 +10,7 @@ mod faults;
 pub mod figures;
 pub mod gently;
 mod identity;
+pub mod lag;
 mod lifecycle;
 mod motion;
 mod pushed;

@@ -9,12 +9,14 @@ use serde::{Deserialize, Serialize};
 use crate::clock::Mono;
 use crate::hardware::fit::Misfit;
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript, check_kind, check_script};
-use crate::hardware::sim::plant::{Drive, Plant, Tracking};
+use crate::hardware::sim::plant::{Drive, Plant};
 use crate::hardware::spec::AdapterResult;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
-/// How far joints are behind their set points [s].
+/// Default of [`SimOptions::lag`] [s].
 const LAG: f64 = 0.01;
+/// Longest lag that an emulator can have [s].
+const LONGEST_LAG: f64 = 0.5;
 /// Positions this close to a limit count as inside: numbers on the wire are rounded [rad].
 const ROUNDING: f64 = 2e-5;
 /// Error code of the open E-stop line.
@@ -39,20 +41,30 @@ pub const PLAYABLE: &[FaultKind] = &[
 ];
 
 /// What an emulator does: the `sim` part of an arm's options.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
     /// Joint positions at power-up [rad], one per joint; a pose of the arm's own when empty.
     pub initial_positions: Vec<f64>,
+    /// How far joints are behind their servo set points, 0 to 0.5 [s].
+    #[schemars(range(min = 0, max = 0.5))]
+    pub lag: f64,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
 
+impl Default for SimOptions {
+    fn default() -> Self {
+        Self { initial_positions: Vec::new(), lag: LAG, faults: Vec::new() }
+    }
+}
+
 impl SimOptions {
-    /// Refuses a pose outside `limits`, and faults that are not among `playable`. `name` is the arm's.
+    /// Refuses a pose outside `limits`, a lag that no emulator has, and faults that are not among `playable`. `name` is the arm's.
     pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), Misfit> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))
+            .and_then(|()| check_lag(self.lag))
             .map_err(|misfit| misfit.within("sim"))
     }
 }
@@ -71,6 +83,15 @@ pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), Misfit>
             let what = format!("{needed}: joint {} goes from {lower:.4} to {upper:.4}, not to {value}", joint + 1);
             Err(Misfit::new(format!("initial_positions.{joint}"), what))
         }
+    }
+}
+
+/// Refuses a `lag` [s] that is not 0 to 0.5 s.
+pub fn check_lag(lag: f64) -> Result<(), Misfit> {
+    if (0.0..=LONGEST_LAG).contains(&lag) {
+        Ok(())
+    } else {
+        Err(Misfit::new("lag", format!("lag must be 0 to {LONGEST_LAG} s, not {lag} s")))
     }
 }
 
@@ -169,7 +190,7 @@ impl SimArm {
         Ok(Self {
             name,
             playable,
-            plant: Plant::new(limits, initial, Tracking::Lag(LAG), 0.0),
+            plant: Plant::lagging(limits, initial, options.lag),
             limits: limits.clone(),
             mode: ControlMode::Position,
             error: 0,

@@ -3,6 +3,7 @@
 
 pub mod arm;
 pub mod can_server;
+pub mod delay;
 pub mod diary;
 pub mod faults;
 pub mod gripper;

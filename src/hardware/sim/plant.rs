@@ -3,6 +3,7 @@
 //! Time is passed in ([`Plant::advance`]) and integrated in steps of one length, so the same inputs give the same
 //! motion however often somebody looks. Nothing here allocates after construction.
 
+use crate::hardware::sim::delay::DelayLine;
 use crate::joint::{JointLimits, Joints, MAX_DOF};
 
 /// The step of integration [s].
@@ -18,6 +19,8 @@ const FRICTION: f64 = 0.5;
 /// How much more than the acceleration limit the drives can do when they follow set points: one that could do no more
 /// than it is asked would never make up for starting late.
 const HEADROOM: f64 = 2.0;
+/// The part of a lag that is first-order at most [s]; the rest is dead time.
+const FIRST_ORDER: f64 = 0.02;
 /// Below these a joint that follows a target has arrived [rad, rad/s].
 const ARRIVED: (f64, f64) = (1e-7, 1e-4);
 
@@ -71,6 +74,8 @@ pub struct Plant {
     dof: usize,
     drive: Drive,
     tracking: Tracking,
+    /// Servo set points that have not taken effect.
+    delayed: DelayLine,
     /// Fraction of the top speed in drive `Position` (0–1].
     speed: f64,
     /// Speed at which joints fall to their lower limits when disabled [rad/s]; 0 = brakes hold.
@@ -105,6 +110,7 @@ impl Plant {
             dof,
             drive: Drive::Disabled,
             tracking,
+            delayed: DelayLine::new(0.0),
             speed: 1.0,
             fall,
             sag: 0.0,
@@ -112,6 +118,15 @@ impl Plant {
             interval: 0.0,
             ahead: 0.0,
         }
+    }
+
+    /// Joints as those of [`Plant::new`] with brakes, which move `lag` [s] after their servo set points: 20 ms of it
+    /// first-order, the rest dead time. First-order alone would be less than its time constant behind where the set
+    /// points accelerate, and would not reach the ends of short motions.
+    pub fn lagging(limits: &JointLimits, initial: &[f64], lag: f64) -> Self {
+        let first_order = lag.min(FIRST_ORDER);
+        let plant = Self::new(limits, initial, Tracking::Lag(first_order), 0.0);
+        Self { delayed: DelayLine::new(lag - first_order), ..plant }
     }
 
     /// Joint positions [rad].
@@ -153,12 +168,14 @@ impl Plant {
     /// Switches the motors on, holding where the arm is, or off.
     pub fn enable(&mut self, on: bool) {
         if on != self.enabled() {
+            self.delayed.clear();
             self.drive = if on { Drive::Stop } else { Drive::Disabled };
         }
     }
 
     /// Decelerates to standstill and holds. Nothing when disabled.
     pub fn stop(&mut self) {
+        self.delayed.clear();
         if self.enabled() {
             self.drive = Drive::Stop;
         }
@@ -167,11 +184,21 @@ impl Plant {
     /// Moves to `target` [rad] at a fraction of the top speed (0–1].
     pub fn move_to(&mut self, target: &[f64], speed: f64) {
         self.speed = if speed.is_finite() { speed.clamp(0.01, 1.0) } else { 0.01 };
+        self.delayed.clear();
         self.drive_to(Drive::Position, target);
     }
 
-    /// Follows a set point [rad].
+    /// Follows a set point [rad], after the dead time.
     pub fn servo(&mut self, target: &[f64]) {
+        if !self.enabled() {
+            return;
+        }
+        if let Some(target) = self.delayed.push(target) {
+            self.follow_set_point(&target);
+        }
+    }
+
+    fn follow_set_point(&mut self, target: &[f64]) {
         let following = self.drive == Drive::Servo;
         let before = self.joints.map(|joint| joint.target);
         if !self.drive_to(Drive::Servo, target) {
@@ -196,6 +223,7 @@ impl Plant {
 
     /// Keeps a velocity [rad/s].
     pub fn velocity(&mut self, target: &[f64]) {
+        self.delayed.clear();
         self.drive_to(Drive::Velocity, target);
     }
 
@@ -222,7 +250,17 @@ impl Plant {
 
     /// Lets `dt` [s] pass.
     pub fn advance(&mut self, dt: f64) {
-        self.ahead -= if dt.is_finite() { dt.max(0.0) } else { 0.0 };
+        let mut left = if dt.is_finite() { dt.max(0.0) } else { 0.0 };
+        while let Some((wait, target)) = self.delayed.pass(left) {
+            self.integrate(wait);
+            self.follow_set_point(&target);
+            left -= wait;
+        }
+        self.integrate(left);
+    }
+
+    fn integrate(&mut self, dt: f64) {
+        self.ahead -= dt;
         // The margin keeps a sum of rounded times from being a step too many.
         while self.ahead < -1e-6 * STEP {
             if self.at_rest() {

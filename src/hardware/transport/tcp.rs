@@ -133,6 +133,12 @@ impl TcpLink {
         self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))
     }
 
+    /// Sends `bytes` as far as there is room for them, without waiting. For a last word before [`TcpLink::abort`].
+    pub fn send_now(&mut self, bytes: &[u8]) {
+        let flags = rustix::net::SendFlags::DONTWAIT | rustix::net::SendFlags::NOSIGNAL;
+        let _ = rustix::net::send(&self.stream, bytes, flags);
+    }
+
     /// Closes the connection and discards what has not left this computer yet (linger 0: the peer sees a reset). A plain
     /// drop would let the kernel go on sending it for as long as the peer takes it. Never blocks.
     pub fn abort(self) {

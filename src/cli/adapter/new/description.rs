@@ -174,6 +174,9 @@ mod tests {
             exclusions: Vec::new(),
             max_velocity: 1.0,
             max_acceleration: 2.0,
+            max_jerk: None,
+            joint_prefix: String::new(),
+            gripper_joint: None,
             named_poses: BTreeMap::from([("home".to_owned(), home), ("zero".to_owned(), vec![0.0; dof.into()])]),
         };
         let table = ObjectConfig {
@@ -182,8 +185,13 @@ mod tests {
             pose: Isometry3::translation(0.0, 0.0, -0.02),
             padding: 0.0,
         };
-        Setup::load(&PlannerConfig { timeout: Duration::from_secs(1), robots: vec![robot], objects: vec![table] })
-            .unwrap()
+        Setup::load(&PlannerConfig {
+            timeout: Duration::from_secs(1),
+            padding: 0.0,
+            robots: vec![robot],
+            objects: vec![table],
+        })
+        .unwrap()
     }
 
     #[test]

@@ -149,7 +149,9 @@ impl ManipulatorAdapter for PiperAdapter {
 
     /// The data sheet's limits, narrowed by those that the controller has been given.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        Ok(self.arm.limits())
+        let (limits, odd) = self.arm.limits();
+        odd.iter().for_each(|what| tracing::warn!("{}", self.arm.about(what)));
+        Ok(limits)
     }
 
     // --- Mode ---
@@ -203,7 +205,7 @@ impl ManipulatorAdapter for PiperAdapter {
             position: joints_of(&self.arm.picture.joints.map(radians)),
             velocity: self.velocities(),
             effort: self.efforts(),
-            valid: None,
+            valid: self.arm.valid(),
         };
         Ok(())
     }
@@ -238,6 +240,9 @@ impl ManipulatorAdapter for PiperAdapter {
             }
         }
         self.arm.may_move()?;
+        if !self.arm.has_room() {
+            return Err(AdapterError::Busy);
+        }
         let mut joints: WireJoints = positions.map(millidegrees);
         let here = self.arm.picture.joints.iter().zip(&self.arm.ranges);
         for (target, (here, range)) in joints.iter_mut().zip(here) {

@@ -7,6 +7,7 @@ pub mod emulator;
 mod golden;
 mod guard;
 mod hold;
+mod own_limits;
 pub mod picture;
 pub mod protocol;
 mod session;

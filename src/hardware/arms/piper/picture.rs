@@ -18,6 +18,8 @@ const BURST: Duration = Duration::from_millis(4);
 const FAR: u32 = 360_000;
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
+/// After this time an arm at exactly zero is taken to be there.
+const ZEROS: Duration = Duration::from_secs(1);
 /// A motor that says no more than this stands [0.001 rad/s].
 pub const STANDSTILL: i32 = 20;
 /// Room for the text of the firmware.
@@ -96,6 +98,8 @@ pub struct Picture {
     /// What was counted.
     pub counts: Counts,
     belief: Belief,
+    /// Since when every joint has read exactly zero.
+    zeros_since: Option<Mono>,
     joint_parts: Triple,
     pose_parts: Triple,
     text: [u8; TEXT],
@@ -121,6 +125,7 @@ impl Default for Picture {
             guard: Guard::default(),
             counts: Counts::default(),
             belief: Belief::default(),
+            zeros_since: None,
             joint_parts: Triple::default(),
             pose_parts: Triple::default(),
             text: [0; TEXT],
@@ -192,8 +197,14 @@ impl Picture {
         if far || (elsewhere && joints == [0; DOF]) || !self.belief.take(joints, now) {
             return self.counts.damaged += 1;
         }
+        self.zeros_since = (joints == [0; DOF]).then(|| self.zeros_since.unwrap_or(now));
         (self.joints, self.joints_at) = (joints, now);
         self.counts.sets += 1;
+    }
+
+    /// Whether every joint reads exactly zero, and has not done so for long yet.
+    pub fn only_zeros(&self, now: Mono) -> bool {
+        self.joints == [0; DOF] && self.zeros_since.is_none_or(|since| now.since(since) < ZEROS)
     }
 
     /// Whether joint positions were refused lately, so that the believed ones may be the wrong ones.

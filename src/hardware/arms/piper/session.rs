@@ -5,8 +5,9 @@ use std::time::Duration;
 
 use super::hold::{self, WireRanges};
 use super::limits;
+use super::own_limits;
 use super::picture::Picture;
-use super::protocol::{self, DOF, Follow, MoveMode, Status, WireJoints, radians};
+use super::protocol::{self, DOF, Driver, Follow, MoveMode, Status, WireJoints, radians};
 use super::wire::Wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, AdapterResult};
@@ -124,6 +125,11 @@ impl Session {
         Ok(())
     }
 
+    /// Whether another set point may wait for the bus.
+    pub fn has_room(&self) -> bool {
+        self.wire.as_ref().is_some_and(Wire::has_room)
+    }
+
     /// Takes back what has not left this computer; see [`Wire::discard`]. Where that fails, the connection ends.
     pub fn discard(&mut self) {
         let discarded = self.wire.as_mut().map(Wire::discard);
@@ -208,28 +214,14 @@ impl Session {
             self.send(&questions)?;
             self.watch(ANSWER_TIMEOUT / 2, answered)?; // what stays unanswered is known from the data sheet
         }
-        let limits = self.limits();
+        let (limits, _) = self.limits();
         self.ranges = hold::ranges(&limits.position_lower, &limits.position_upper);
         Ok(())
     }
 
-    /// The data sheet's limits, narrowed by those that the controller has been given.
-    pub fn limits(&self) -> JointLimits {
-        let mut limits = limits();
-        let positions = limits.position_lower.iter_mut().zip(&mut limits.position_upper);
-        let all = positions.zip(&mut limits.velocity_max).zip(&self.picture.limits);
-        for (((lower, upper), speed), own) in all {
-            let Some(own) = own else { continue };
-            let decidegrees = |value: i16| (f64::from(value) / 10.0).to_radians();
-            let (low, high) = (lower.max(decidegrees(own.lower)), upper.min(decidegrees(own.upper)));
-            if low < high {
-                (*lower, *upper) = (low, high);
-            }
-            if own.speed > 0 {
-                *speed = speed.min(f64::from(own.speed) * 1e-3);
-            }
-        }
-        limits
+    /// The data sheet's limits, narrowed by those that the controller has been given; and what of these is odd.
+    pub fn limits(&self) -> (JointLimits, Vec<String>) {
+        own_limits::narrowed(&self.picture.limits)
     }
 
     /// Why there is no whole state.
@@ -256,7 +248,24 @@ impl Session {
         ))
     }
 
+    /// Whether the measured positions can be relied on: `Some(true)` where the motors' drivers answer the controller, and
+    /// the positions are not all exactly zero, which it says before it has measured; `Some(false)` where a joint does not
+    /// answer it, or none of the drivers has said anything about itself.
+    pub fn valid(&self) -> Option<bool> {
+        let silent =
+            |driver: &Driver| (driver.voltage, driver.driver_temperature, driver.motor_temperature) == (0, 0, 0);
+        if self.picture.status.silent != 0 || self.picture.drivers.iter().all(silent) {
+            return Some(false);
+        }
+        (self.picture.joints != [0; DOF]).then_some(true)
+    }
+
     // --- What may be done ---
+
+    /// A line about this arm.
+    pub fn about(&self, what: &str) -> String {
+        format!("{}: {what}", self.hardware_id)
+    }
 
     /// A refusal of our own.
     pub fn refuse(&self, why: String) -> AdapterError {
@@ -333,7 +342,7 @@ impl Session {
                     .into(),
             ));
         }
-        if self.picture.joints == [0; DOF] {
+        if self.picture.only_zeros(MonotonicClock.now()) {
             return Err(self.refuse(
                 "every joint reads exactly 0, as from a controller that has not measured yet: not enabled\nhint: if \
                  the arm truly lies there, move a joint a little by hand"

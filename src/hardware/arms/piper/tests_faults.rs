@@ -136,6 +136,7 @@ fn f12_zeros_are_no_pose_to_hold() {
     let error = arm.activate().unwrap_err().to_string();
     assert!(error.contains("every joint reads exactly 0") && error.contains("\nhint: "), "{error}");
     assert_eq!(ids(&emulator), [0u16; 0]);
+    assert_eq!(read(&mut arm).unwrap().valid, None, "whether they are measured is not known");
     // Zeros in between: not believed.
     let (emulator, mut arm) = connected();
     emulator.inject(Fault::new(FaultKind::ZeroState).times(5)).unwrap();
@@ -144,6 +145,30 @@ fn f12_zeros_are_no_pose_to_hold() {
         std::thread::sleep(Duration::from_millis(2));
     }
     assert!(arm.counts().0.damaged >= 5);
+    assert_eq!(read(&mut arm).unwrap().valid, Some(true));
+}
+
+#[test]
+fn positions_are_measured_when_the_joints_answer_their_controller() {
+    let (emulator, mut arm) = connected();
+    assert_eq!(read(&mut arm).unwrap().valid, Some(true));
+    // Joint 6 is silent, as the controller reports it.
+    emulator.mute(Some(0x2A1..=0x2A1));
+    let mut port = other(&emulator);
+    until("the report", || {
+        port.send(&[golden::frame("2A1#0000000000000020")]).unwrap();
+        read(&mut arm).unwrap().valid == Some(false)
+    });
+    emulator.mute(None);
+    until("joint 6", || read(&mut arm).unwrap().valid == Some(true));
+    // The drivers have not said anything yet.
+    emulator.mute(Some(0x261..=0x266));
+    until("empty drivers", || {
+        for joint in 1..=6 {
+            port.send(&[CanFrame::new(0x260 + joint, &[0; 8])]).unwrap();
+        }
+        read(&mut arm).unwrap().valid == Some(false)
+    });
 }
 
 #[test]

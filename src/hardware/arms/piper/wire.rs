@@ -26,7 +26,9 @@ const FILTERS: &[CanFilter] = &[
 ];
 /// Frames that may wait for the bus: two set points of four frames. A healthy bus takes one in 1 ms, and what waits when
 /// the arm loses its power reaches it when the power returns.
-const MAY_WAIT: usize = 8;
+const MAY_WAIT: usize = 2 * SET_POINT;
+/// Frames of a set point at most.
+const SET_POINT: usize = 4;
 /// Most events fetched in one go: a second's.
 const BATCH: usize = 4096;
 
@@ -67,6 +69,12 @@ impl Wire {
         let taken = if room { self.port.send(frames)? } else { 0 };
         self.counts.not_taken += (frames.len() - taken) as u64;
         if taken == frames.len() { Ok(()) } else { Err(self.no_room()) }
+    }
+
+    /// Whether another set point may wait for the bus.
+    pub fn has_room(&self) -> bool {
+        let waiting = self.port.waiting();
+        if self.discarding { waiting == 0 } else { waiting + SET_POINT <= MAY_WAIT }
     }
 
     /// Takes back what has not left this computer. What cannot be taken back goes out before anything else: until then

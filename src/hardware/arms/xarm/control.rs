@@ -4,7 +4,7 @@
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
-use super::protocol::commands::{Command, QUICK};
+use super::protocol::commands::{Command, QUICK, STOP};
 use super::protocol::frame::{self, Arrived, MAX_REQUEST, PRIVATE, Response, Status};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::spec::{AdapterError, AdapterResult};
@@ -123,8 +123,14 @@ impl Control {
         self.link.peer()
     }
 
-    /// Closes the connection and discards what has not left this computer.
-    pub fn abort(self) {
+    /// Closes the connection and discards what has not left this computer. Set points that have left it may still arrive,
+    /// and velocities would drive the arm on once more: a stop goes right behind them.
+    pub fn abort(mut self) {
+        if self.in_flight() > 0 {
+            let mut frame = [0; MAX_REQUEST];
+            let number = self.transaction % u16::MAX + 1;
+            self.link.send_now(Command::SetState(STOP).encode(number, self.protocol, &mut frame));
+        }
         self.link.abort();
     }
 
@@ -370,9 +376,34 @@ mod tests {
         assert!((0..WINDOW).all(|_| control.post(&Command::GetState, Purpose::Health).is_ok()));
         let full = control.post(&Command::GetState, Purpose::Health).unwrap_err();
         assert!(full.to_string().contains("does not keep up"), "{full}");
-        let answer =
-            control.ask(&Command::SetState(super::super::protocol::commands::STOP), Duration::from_secs(5), |_, _| ());
+        let answer = control.ask(&Command::SetState(STOP), Duration::from_secs(5), |_, _| ());
         assert_eq!(answer.map(|response| response.register), Ok(12));
         assert_eq!(server.join().unwrap()[6..], [12, 4]);
+    }
+
+    #[test]
+    fn set_points_that_may_arrive_late_are_followed_by_a_stop() {
+        let orders = |set_points: usize| {
+            let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+            let port = listener.local_addr().unwrap().port();
+            let endpoint = Endpoint { host: "127.0.0.1".into(), port };
+            let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
+            let (mut stream, _) = listener.accept().unwrap();
+            let velocity = Command::Velocity { joints: [0.0; 7], duration: Some(0.2) };
+            assert!((0..set_points).all(|_| control.post(&velocity, Purpose::Motion).is_ok()));
+            assert_eq!(control.post(&velocity, Purpose::Motion).is_err(), set_points == IN_FLIGHT);
+            control.abort();
+            let mut bytes = Vec::new();
+            let end = stream.read_to_end(&mut bytes);
+            assert_eq!(end.unwrap_err().kind(), std::io::ErrorKind::ConnectionReset);
+            let mut rest = &bytes[..];
+            let mut registers = Vec::new();
+            while let [_, _, _, _, _, length, register, ..] = *rest {
+                registers.push(register);
+                rest = &rest[6 + usize::from(length)..];
+            }
+            registers
+        };
+        assert_eq!(orders(IN_FLIGHT), [81, 81, 12]);
     }
 }

@@ -16,14 +16,12 @@ use crate::clock::Mono;
 use crate::hardware::sim::diary::{self, Happening};
 use crate::hardware::sim::faults::{Fault, FaultKind, FaultScript};
 use crate::hardware::sim::gripper::Gripper;
-use crate::hardware::sim::plant::{Plant, Tracking};
+use crate::hardware::sim::plant::Plant;
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::Joints;
 
 /// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
 const INITIAL: [f64; DOF] = [0.1, 0.6, -0.7, 0.05, 0.4, -0.1];
-/// How far joints are behind their set points [s].
-const LAG: f64 = 0.02;
 /// How the arm sinks when its motors are off, once they have been on: how fast [rad/s], and where its joints then lie.
 /// Until then somebody holds it.
 const FALL: f64 = 0.3;
@@ -101,7 +99,7 @@ impl Controller {
         let mut firmware = [0; 8];
         firmware.iter_mut().zip(options.firmware.bytes()).for_each(|(to, byte)| *to = byte);
         Self {
-            plant: Plant::new(&stops(), initial, Tracking::Lag(LAG), 0.0),
+            plant: Plant::lagging(&stops(), initial, options.lag),
             gripper: Gripper::new(gripper.stroke().unwrap_or_default(), GRIPPER_SPEED),
             has_gripper: gripper != GripperKind::None,
             gripper_on: false,

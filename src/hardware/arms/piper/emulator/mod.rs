@@ -19,7 +19,7 @@ use super::{GripperKind, NATIVE_RATE, Options, limits};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::arm::{check_lag, check_pose};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
 use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::CanFrame;
@@ -61,6 +61,9 @@ pub struct SimOptions {
     pub feedback_hz: f64,
     /// Its firmware, as the arm says it.
     pub firmware: String,
+    /// How far joints are behind their servo set points, 0 to 0.5 [s].
+    #[schemars(range(min = 0, max = 0.5))]
+    pub lag: f64,
     /// What goes wrong, and when (seconds after the first frame to the arm).
     pub faults: Vec<Fault>,
 }
@@ -71,6 +74,7 @@ impl Default for SimOptions {
             initial_positions: Vec::new(),
             feedback_hz: NATIVE_RATE,
             firmware: "S-V1.8-5".to_owned(),
+            lag: 0.02,
             faults: Vec::new(),
         }
     }
@@ -80,6 +84,7 @@ impl SimOptions {
     /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
     pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), Misfit> {
         check_script("the piper emulator", &self.faults, playable)
+            .and_then(|()| check_lag(self.lag))
             .and_then(|()| check_pose(&self.initial_positions, &stops()))
             .map_err(|misfit| misfit.within("sim"))?;
         match self.firmware.len() {

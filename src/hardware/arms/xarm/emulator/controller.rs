@@ -15,11 +15,9 @@ use super::wire::Request;
 use super::{SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, FaultScript};
-use crate::hardware::sim::plant::{Drive, Plant, Tracking};
+use crate::hardware::sim::plant::{Drive, Plant};
 use crate::joint::{JointLimits, Joints};
 
-/// How far joints are behind their set points [s].
-const LAG: f64 = 0.01;
 /// Acceleration of the emulated joints [rad/s²]: a real arm does less than its limit.
 const ACCELERATION: f64 = 12.0;
 /// Longest stretch that is advanced at once [s], so that queued moves follow one another.
@@ -156,7 +154,7 @@ impl Controller {
             identity,
             firmware,
             chain: Chain::of(model),
-            plant: Plant::new(&limits, initial, Tracking::Lag(LAG), 0.0),
+            plant: Plant::lagging(&limits, initial, options.lag),
             limits,
             tool: Tool::new(gripper),
             mode: 0,

@@ -31,7 +31,7 @@ use super::{Options, model_of};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::arm::{check_lag, check_pose};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
 use crate::hardware::sim::tcp_server::cannot_listen;
 use crate::hardware::spec::{AdapterError, AdapterResult};
@@ -79,6 +79,9 @@ pub struct SimOptions {
     pub port_503: bool,
     /// Registers whose replies take time, as those of a real box do.
     pub slow_replies: Vec<SlowReply>,
+    /// How far joints are behind their servo set points, 0 to 0.5 [s].
+    #[schemars(range(min = 0, max = 0.5))]
+    pub lag: f64,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
@@ -90,6 +93,7 @@ impl Default for SimOptions {
             firmware: "2.5.1".into(),
             port_503: true,
             slow_replies: Vec::new(),
+            lag: 0.01,
             faults: Vec::new(),
         }
     }
@@ -112,6 +116,7 @@ impl SimOptions {
     /// Refuses a pose outside `limits`, firmware that has no version, and faults that the emulator cannot play.
     pub(super) fn check(&self, limits: &JointLimits) -> Result<(), Misfit> {
         check_script("the xarm emulator", &self.faults, PLAYABLE)
+            .and_then(|()| check_lag(self.lag))
             .and_then(|()| check_pose(&self.initial_positions, limits))
             .map_err(|misfit| misfit.within("sim"))?;
         if let Some(i) = self.slow_replies.iter().position(|slow| !(0.0..=3600.0).contains(&slow.delay)) {

@@ -1,7 +1,8 @@
-//! `make bench`: what talking to a run costs: the round trip, and what readers do to the tick. Prints; judges, but
-//! fails on no figure.
+//! `make bench`: what talking to a run costs: a stop beside a flood, the round trip, and what readers do to the tick.
+//! Prints; judges, but fails on no figure. `cargo bench --bench rpc -- stops` measures stops only.
 
-#[path = "support/mod.rs"]
+mod stops;
+#[path = "../support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmarks")]
 mod support;
 
@@ -27,7 +28,15 @@ fn main() -> ExitCode {
     let effort = Effort::told();
     println!("\ndimos: what talking to a run costs{}\n", effort.of(" (quick)", ""));
     machine::print();
-    if let Err(e) = round_trip(effort).and_then(|()| readers(effort)).and_then(|()| python(effort)) {
+    let all = || {
+        stops::measure(effort)
+            .and_then(|()| round_trip(effort))
+            .and_then(|()| readers(effort))
+            .and_then(|()| python(effort))
+    };
+    // `-- stops`: only those.
+    let only_stops = std::env::args().any(|argument| argument == "stops");
+    if let Err(e) = if only_stops { stops::measure(effort) } else { all() } {
         support::skipped(&e);
     }
     effort.end()

@@ -1,0 +1,63 @@
+//! Dead time of emulated joints: set points take effect later than they arrive.
+
+use std::collections::VecDeque;
+
+use crate::joint::{Joints, MAX_DOF};
+
+/// Set points that can be on their way at a time: those of 1 s at 500 Hz.
+const CAPACITY: usize = 512;
+
+/// Set points on their way to the joints, in the order of their arrival. Allocates in [`DelayLine::new`] only.
+#[derive(Debug, Clone)]
+pub struct DelayLine {
+    /// Dead time [s].
+    delay: f64,
+    /// Time that has passed [s].
+    now: f64,
+    /// When each set point takes effect [s], and the set point [rad].
+    pending: VecDeque<(f64, Joints)>,
+}
+
+impl DelayLine {
+    /// An empty line with a dead time of `delay` [s].
+    pub fn new(delay: f64) -> Self {
+        let delay = if delay.is_finite() { delay.max(0.0) } else { 0.0 };
+        let capacity = if delay > 0.0 { CAPACITY } else { 0 };
+        Self { delay, now: 0.0, pending: VecDeque::with_capacity(capacity) }
+    }
+
+    /// Delays a set point [rad]. Returns what takes effect at once: this one without dead time, the oldest one where
+    /// the line is full.
+    pub fn push(&mut self, target: &[f64]) -> Option<Joints> {
+        let mut joints = [f64::NAN; MAX_DOF];
+        joints.iter_mut().zip(target).for_each(|(joint, value)| *joint = *value);
+        if self.delay == 0.0 {
+            return Some(joints);
+        }
+        let oldest = if self.pending.len() >= CAPACITY { self.pending.pop_front() } else { None };
+        self.pending.push_back((self.now + self.delay, joints));
+        oldest.map(|(_, joints)| joints)
+    }
+
+    /// Lets up to `limit` [s] pass, until the next set point takes effect: returns the time that passed and this set
+    /// point [rad]. `None`, and all of `limit` passes, when none does.
+    pub fn pass(&mut self, limit: f64) -> Option<(f64, Joints)> {
+        match self.pending.front().copied().filter(|(due, _)| *due <= self.now + limit) {
+            Some((due, joints)) => {
+                self.pending.pop_front();
+                let wait = (due - self.now).clamp(0.0, limit);
+                self.now += wait;
+                Some((wait, joints))
+            }
+            None => {
+                self.now += limit;
+                None
+            }
+        }
+    }
+
+    /// Discards all set points that are on their way.
+    pub fn clear(&mut self) {
+        self.pending.clear();
+    }
+}

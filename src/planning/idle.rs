@@ -1,0 +1,117 @@
+//! Joints of a model that are not planned. They are where they are measured: a gripper's joint where the opening says
+//! (`gripper_joint`), a joint that an arm of the run has under its name where that is. Of a gripper of which nothing is
+//! known the widest opening is taken; all others are at zero.
+
+use std::collections::{BTreeMap, HashMap};
+
+use super::config::RobotConfig;
+use super::setup::{PlannedRobot, Setup};
+use crate::collision::world::Robot;
+use crate::robot::kinematics::Kinematics;
+use crate::robot::model::RobotModel;
+
+/// Smaller changes of a joint that is not planned are noise [rad or m].
+const NOISE: f64 = 2e-4;
+
+/// What is measured besides the planned joints.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Measured {
+    /// Positions of joints, by the coordinator's name [rad or m].
+    pub positions: BTreeMap<String, f64>,
+    /// How far the gripper of an arm is open, 0–1, by each of the arm's joints.
+    pub grippers: BTreeMap<String, f64>,
+}
+
+impl Setup {
+    /// The same with the joints that are not planned where they are measured; `None`: they are there already.
+    pub fn with_idle_joints(&self, measured: &Measured) -> Option<Self> {
+        let mut changed = false;
+        let mut now = self.clone();
+        for robot in &mut now.robots {
+            let rest = robot.model.positions(&idle(&robot.config, &robot.model, &robot.joints, measured));
+            if rest.iter().zip(&robot.rest).all(|(a, b)| (a - b).abs() <= NOISE) {
+                continue;
+            }
+            let Ok(kinematics) = Kinematics::new(&robot.model, &robot.joints, &rest) else { continue };
+            robot.body = Robot { kinematics: kinematics.into(), ..robot.body.clone() };
+            robot.rest = rest;
+            changed = true;
+        }
+        changed.then_some(now)
+    }
+}
+
+impl PlannedRobot {
+    /// Gripper joints of which nothing says where they are, with their position at the widest opening [rad or m].
+    pub fn taken_as_open(&self) -> Vec<(String, f64)> {
+        let known = |name: &String| self.config.gripper_joint.as_ref().is_some_and(|gripper| gripper.joint == *name);
+        let unplanned = self.model.independent_joints().into_iter().filter(|joint| !self.joints.contains(joint));
+        let grippers = unplanned.filter(|joint| is_of_gripper(&self.model, &self.joints, *joint));
+        let named = grippers.filter_map(|joint| Some((self.model.joints.get(joint)?.name.clone(), joint)));
+        named.filter(|(name, _)| !known(name)).map(|(name, joint)| (name, widest(&self.model, joint))).collect()
+    }
+}
+
+/// Positions of the independent joints that are not planned, by the model's names.
+pub(super) fn idle(
+    config: &RobotConfig,
+    model: &RobotModel,
+    planned: &[usize],
+    measured: &Measured,
+) -> HashMap<String, f64> {
+    let mut positions = HashMap::new();
+    for index in model.independent_joints().into_iter().filter(|joint| !planned.contains(joint)) {
+        let Some(joint) = model.joints.get(index) else { continue };
+        let gripper = config.gripper_joint.as_ref().filter(|gripper| gripper.joint == joint.name);
+        let names = [format!("{}{}", config.joint_prefix, joint.name), joint.name.clone()];
+        let is_at = names.iter().find_map(|name| measured.positions.get(name));
+        let position = match (gripper, is_at) {
+            (Some(gripper), _) => {
+                let part = config.coordinator_joints.first().and_then(|joint| measured.grippers.get(joint));
+                gripper.closed + (gripper.open - gripper.closed) * part.copied().unwrap_or(1.0)
+            }
+            (None, Some(is_at)) => *is_at,
+            (None, None) if is_of_gripper(model, planned, index) => widest(model, index),
+            (None, None) => 0.0,
+        };
+        positions.insert(joint.name.clone(), position);
+    }
+    positions
+}
+
+/// Whether a joint moves something that the planned joints carry, and carries none of them.
+fn is_of_gripper(model: &RobotModel, planned: &[usize], joint: usize) -> bool {
+    let above = |joint: usize| {
+        std::iter::successors(model.joints.get(joint), |j| model.parent_joint(j.parent)).map(|joint| joint.child)
+    };
+    let carries = |upper: usize, lower: usize| above(lower).any(|child| child == upper + 1);
+    planned.iter().any(|p| carries(*p, joint)) && !planned.iter().any(|p| carries(joint, *p))
+}
+
+/// The end of a joint's range at which the links that it moves are farthest from each other and from what carries them.
+fn widest(model: &RobotModel, joint: usize) -> f64 {
+    let Some(own) = model.joints.get(joint) else { return 0.0 };
+    if !own.limits.lower.is_finite() || !own.limits.upper.is_finite() {
+        return 0.0;
+    }
+    let moves =
+        |j: usize| j == joint || model.joints.get(j).is_some_and(|o| o.mimic.is_some_and(|m| m.leader == joint));
+    let fingers: Vec<usize> = (0..model.joints.len()).filter(|j| moves(*j)).collect();
+    let spread = |position: f64| {
+        let named = HashMap::from([(own.name.clone(), position)]);
+        let poses = model.link_poses(&model.positions(&named));
+        // Where the middles of the shapes are; links without shapes count as their frames.
+        let middle = |link: usize| {
+            let pose = poses.get(link).copied().unwrap_or_default();
+            let shapes = model.links.get(link).map(|link| link.collisions.as_slice()).unwrap_or_default();
+            let sum: nalgebra::Vector3<f64> = shapes.iter().map(|shape| shape.origin.translation.vector).sum();
+            pose * nalgebra::Point3::from(sum / (shapes.len().max(1) as f64))
+        };
+        let mut middles: Vec<_> = fingers.iter().map(|j| middle(j + 1)).collect();
+        middles.push(middle(own.parent));
+        let pairs = middles.iter().enumerate().flat_map(|(i, a)| middles.iter().take(i).map(move |b| (a - b).norm()));
+        pairs.sum::<f64>()
+    };
+    let (lower, upper) = (own.limits.lower, own.limits.upper);
+    if spread(lower) > spread(upper) + 1e-9 { lower } else { upper }
+}

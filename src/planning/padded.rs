@@ -1,0 +1,288 @@
+//! The distance that plans keep from obstacles and other arms (`planner.padding`), and where they give it up: near a
+//! start or goal that is closer itself, for the pairs that are closer there, and for pairs that no pose keeps apart.
+//! Nothing touches anywhere.
+
+use std::f64::consts::{PI, TAU};
+use std::sync::Arc;
+
+use super::path::between;
+use crate::collision::report::{Contact, Pair};
+use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
+use crate::robot::model::Limits;
+use crate::robot::random::Random;
+
+/// How far around a start or goal the padding is given up [rad]: the first that leads to a pose that keeps it.
+const RADII: [f64; 3] = [0.1, 0.3, 1.0];
+/// Poses that are tried for each of these.
+const TRIES: usize = 100;
+/// A pair that is closer in this many poses, of all joints' ranges, is closer in every pose.
+const POSES: usize = 32;
+/// Part of its distance at the start or goal that a pair keeps around it, and when the motion is looked at again.
+const KEPT: f64 = 0.5;
+const KEPT_AGAIN: f64 = 0.4;
+
+/// Where the padding is given up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// Near the start.
+    Start,
+    /// Near the goal.
+    Goal,
+    /// In every pose: the two are closer whatever the arm does.
+    Everywhere,
+}
+
+impl Place {
+    /// Its name in rpc.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Start => "start",
+            Self::Goal => "goal",
+            Self::Everywhere => "everywhere",
+        }
+    }
+}
+
+/// A pair that does not keep the padding, and where.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GivenUp {
+    /// Where.
+    pub place: Place,
+    /// The start or goal [rad].
+    pub center: Vec<f64>,
+    /// How far around it [rad, Euclidean over all joints].
+    pub radius: f64,
+    /// The link.
+    pub link: String,
+    /// What it is close to.
+    pub other: String,
+    /// Their distance at the start or goal [m]; negative: they touch there.
+    pub distance: f64,
+}
+
+/// Configurations around a start or goal, where some pairs keep less.
+#[derive(Debug, Clone)]
+struct Zone {
+    center: Vec<f64>,
+    radius: f64,
+    checker: ExactChecker,
+}
+
+/// A checker that keeps a padding. Contacts have true distances: within the padding they are above 0.
+#[derive(Debug, Clone)]
+pub struct Padded {
+    padding: f64,
+    full: ExactChecker,
+    bare: ExactChecker,
+    zones: Vec<Zone>,
+    given_up: Vec<GivenUp>,
+}
+
+impl Padded {
+    /// A checker of a scene that keeps `padding` [m] everywhere.
+    pub fn new(scene: Arc<Scene>, padding: f64) -> Self {
+        let bare = ExactChecker::new(scene, Resolution::default());
+        Self { padding, full: bare.clone().with_padding(padding), bare, zones: Vec::new(), given_up: Vec::new() }
+    }
+
+    /// The padding [m].
+    pub fn padding(&self) -> f64 {
+        self.padding
+    }
+
+    /// Where it was given up.
+    pub fn given_up(&self) -> &[GivenUp] {
+        &self.given_up
+    }
+
+    /// Whether nothing touches, with or without distance.
+    pub fn touches_nothing(&mut self, q: &[f64]) -> bool {
+        self.bare.is_free(q)
+    }
+
+    /// Gives the padding up around a start or goal, for the pairs that are closer there.
+    pub fn give_up(&mut self, place: Place, center: &[f64]) {
+        let near = self.full.closer_than_padding(center);
+        let near: Vec<_> = near.into_iter().filter(|(pair, _)| self.full.pad(*pair) > 0.0).collect();
+        if near.is_empty() || self.zones.iter().any(|zone| zone.center == center) {
+            return;
+        }
+        let (always, here): (Vec<_>, Vec<_>) = near.into_iter().partition(|(pair, _)| self.is_always_closer(*pair));
+        for (pair, contact) in always {
+            let radius = f64::INFINITY;
+            self.given_up.push(given_up(Place::Everywhere, Vec::new(), radius, &contact));
+            self.relax(pair, 0.0);
+        }
+        if here.is_empty() {
+            return;
+        }
+        let mut zone = Zone { center: center.to_vec(), radius: 0.0, checker: self.full.clone() };
+        for (pair, contact) in &here {
+            zone.checker.set_pad(*pair, KEPT * contact.distance.max(0.0));
+        }
+        zone.radius = self.reach(&mut zone);
+        let noted = here.iter().map(|(_, contact)| given_up(place, center.to_vec(), zone.radius, contact));
+        self.given_up.extend(noted);
+        self.zones.push(zone);
+    }
+
+    /// Gives it up where it was given up before, in what may be another world: pairs that came later keep all of it.
+    pub fn give_up_again(&mut self, before: &[GivenUp]) {
+        for given_up in before.iter().filter(|given_up| given_up.place == Place::Everywhere) {
+            if let Some(pair) = self.full.pair_index(&given_up.link, &given_up.other) {
+                self.relax(pair, 0.0);
+            }
+        }
+        for given_up in before.iter().filter(|given_up| given_up.place != Place::Everywhere) {
+            let Some(pair) = self.full.pair_index(&given_up.link, &given_up.other) else { continue };
+            let at = self.zones.iter().position(|zone| zone.center == given_up.center).unwrap_or(self.zones.len());
+            if at == self.zones.len() {
+                let (center, radius) = (given_up.center.clone(), given_up.radius);
+                self.zones.push(Zone { center, radius, checker: self.full.clone() });
+            }
+            if let Some(zone) = self.zones.get_mut(at) {
+                zone.checker.set_pad(pair, KEPT_AGAIN * given_up.distance.max(0.0));
+            }
+        }
+        self.given_up = before.to_vec();
+    }
+
+    fn relax(&mut self, pair: usize, pad: f64) {
+        self.full.set_pad(pair, pad);
+        self.zones.iter_mut().for_each(|zone| zone.checker.set_pad(pair, pad));
+    }
+
+    /// Whether a pair is closer than the padding in all of a few poses, from all over the joints' ranges.
+    fn is_always_closer(&mut self, pair: usize) -> bool {
+        let mut random = Random::new(0);
+        let limits = self.full.limits().to_vec();
+        (0..POSES).all(|_| {
+            let q: Vec<f64> = limits.iter().map(|l| random.between(l.lower.max(-PI), l.upper.min(PI))).collect();
+            !self.full.keeps(pair, &q)
+        })
+    }
+
+    /// How far around its center a zone must go to a pose that keeps the padding.
+    fn reach(&mut self, zone: &mut Zone) -> f64 {
+        let mut random = Random::new(0);
+        let limits = self.full.limits().to_vec();
+        for radius in RADII {
+            for _ in 0..TRIES {
+                let away: Vec<f64> = zone.center.iter().map(|_| random.between(-1.0, 1.0)).collect();
+                let length = away.iter().map(|x| x * x).sum::<f64>().sqrt().max(1e-9);
+                let part = radius * random.between(0.2, 1.0) / length;
+                let inside = |((c, d), l): ((&f64, &f64), &Limits)| (c + d * part).max(l.lower).min(l.upper);
+                let to: Vec<f64> = zone.center.iter().zip(&away).zip(&limits).map(inside).collect();
+                if self.full.is_free(&to) && zone.checker.motion_is_free(&zone.center, &to, &Stop::never()) {
+                    return radius;
+                }
+            }
+        }
+        RADII[RADII.len() - 1]
+    }
+
+    /// The parts of a motion between which it enters or leaves a zone; none where it meets no zone.
+    fn cuts(&self, from: &[f64], to: &[f64]) -> Vec<f64> {
+        let mut cuts = Vec::new();
+        let mut met = false;
+        for zone in &self.zones {
+            // |from + t·d − center|² = radius²
+            let away = zone.away(from, self.full.turns());
+            let d: Vec<f64> = from.iter().zip(to).map(|(a, b)| b - a).collect();
+            let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+            let (a, b, c) = (dot(&d, &d), dot(&away, &d), dot(&away, &away) - zone.radius * zone.radius);
+            met |= c <= 0.0;
+            let root = b * b - a * c;
+            if a > 0.0 && root >= 0.0 {
+                let ends = [(-b - root.sqrt()) / a, (-b + root.sqrt()) / a];
+                met |= ends[0] <= 1.0 && ends[1] >= 0.0;
+                cuts.extend(ends.into_iter().filter(|t| *t > 1e-9 && *t < 1.0 - 1e-9));
+            }
+        }
+        if !met {
+            return Vec::new();
+        }
+        cuts.extend([0.0, 1.0]);
+        cuts.sort_by(f64::total_cmp);
+        cuts
+    }
+}
+
+impl Zone {
+    /// Where a configuration is as seen from the center, the short way round for joints that turn without end.
+    fn away(&self, q: &[f64], turns: &[bool]) -> Vec<f64> {
+        let apart = |((q, center), turns): ((&f64, &f64), &bool)| {
+            let d = q - center;
+            if *turns { d - (d / TAU).round() * TAU } else { d }
+        };
+        q.iter().zip(&self.center).zip(turns).map(apart).collect()
+    }
+
+    fn holds(&self, q: &[f64], turns: &[bool]) -> bool {
+        self.away(q, turns).iter().map(|x| x * x).sum::<f64>() <= self.radius * self.radius * (1.0 + 1e-9)
+    }
+}
+
+fn given_up(place: Place, center: Vec<f64>, radius: f64, contact: &Contact) -> GivenUp {
+    let (link, other, distance) = (contact.link.clone(), contact.other.clone(), contact.distance);
+    GivenUp { place, center, radius, link, other, distance }
+}
+
+impl CollisionChecker for Padded {
+    fn dof(&self) -> usize {
+        self.full.dof()
+    }
+
+    fn limits(&self) -> &[Limits] {
+        self.full.limits()
+    }
+
+    fn turns(&self) -> &[bool] {
+        self.full.turns()
+    }
+
+    fn resolution(&self) -> Resolution {
+        self.full.resolution()
+    }
+
+    fn is_free(&mut self, q: &[f64]) -> bool {
+        let Self { full, zones, .. } = self;
+        full.is_free(q) || zones.iter_mut().any(|zone| zone.holds(q, full.turns()) && zone.checker.is_free(q))
+    }
+
+    fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        if self.full.motion_is_free(from, to, stop) {
+            return true;
+        }
+        let cuts = if stop.is_over() { Vec::new() } else { self.cuts(from, to) };
+        let (mut a, mut b, mut middle) = (from.to_vec(), from.to_vec(), from.to_vec());
+        let Self { full, zones, .. } = self;
+        let mut piece_is_free = |pair: &[f64]| {
+            between(from, to, pair[0], &mut a);
+            between(from, to, pair[1], &mut b);
+            between(from, to, 0.5 * (pair[0] + pair[1]), &mut middle);
+            zones.iter_mut().any(|zone| zone.holds(&middle, full.turns()) && zone.checker.motion_is_free(&a, &b, stop))
+                || full.motion_is_free(&a, &b, stop)
+        };
+        !cuts.is_empty() && cuts.windows(2).all(&mut piece_is_free)
+    }
+
+    fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {
+        if self.is_free(q) { None } else { self.full.first_contact(q) }
+    }
+
+    fn clearance(&mut self, q: &[f64]) -> Option<Contact> {
+        self.bare.clearance(q)
+    }
+
+    fn contacts(&mut self, q: &[f64]) -> Vec<Contact> {
+        let Self { full, zones, .. } = self;
+        let zone = zones.iter_mut().find(|zone| zone.holds(q, full.turns()));
+        zone.map_or_else(|| full.contacts(q), |zone| zone.checker.contacts(q))
+    }
+
+    fn looks(&self) -> u64 {
+        let own = [&self.full, &self.bare].into_iter().chain(self.zones.iter().map(|zone| &zone.checker));
+        own.map(CollisionChecker::looks).sum()
+    }
+}

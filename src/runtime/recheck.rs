@@ -1,0 +1,126 @@
+//! Planned motions under way in a world that changes: after every change the rest of each is checked again. One that
+//! would come too close to something slows down along its path before it; where that is too late its arms are held.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::dispatch::lock;
+use super::motions::UnderWay;
+use super::plan_requests::all_positions;
+use super::planner_link::Planner;
+use super::planner_port::{PlannerPort, apart};
+use super::service::Service;
+use crate::collision::Stop;
+use crate::control::request::Request;
+use crate::planning::ahead::rests_before;
+use crate::planning::solve::Found;
+use crate::rpc::api::{BlockedReport, Moment, Recheck, RecheckReply};
+use crate::rpc::{Code, RpcError};
+use crate::telemetry::TaskState;
+
+/// The longest time to find out whether the rest of a motion is free; then it is cancelled.
+const LIMIT: Duration = Duration::from_secs(1);
+/// Plans that were carried out and may be under way.
+const RELEASED: usize = 64;
+
+/// A plan that was handed over, and the version of the world in which its motion was found free.
+pub(super) type Released = (Arc<Found>, u64);
+
+impl PlannerPort {
+    /// Remembers a plan that is handed over: it may be asked about while it is carried out.
+    pub(super) fn remember(&self, plan: u64, found: Arc<Found>, version: u64) {
+        let mut released = lock(&self.released);
+        while released.len() >= RELEASED {
+            released.pop_first();
+        }
+        released.insert(plan, (found, version));
+    }
+
+    /// What is in the way of a motion under way. In a world that did not change since the last time, nothing is.
+    pub(super) async fn recheck(&self, call: &Recheck, moment: &Moment) -> Result<RecheckReply, RpcError> {
+        let unknown = || RpcError::new(Code::UnknownPlan, format!("the planner does not know plan {}", call.plan));
+        let (found, verified) = lock(&self.released).get(&call.plan).cloned().ok_or_else(unknown)?;
+        self.measured(moment);
+        let version = self.desk.version();
+        if version == verified {
+            return Ok(RecheckReply::default());
+        }
+        let positions = all_positions(self.desk.setup(), moment)?;
+        let stop = Stop::new(Some(Instant::now() + LIMIT), None);
+        let blocked = apart(self.desk.look_ahead(found, positions, call.elapsed, stop)).await?;
+        let blocked = blocked.map_err(|failure| RpcError::new(Code::PlanOutdated, failure.what))?;
+        if blocked.is_none()
+            && let Some(released) = lock(&self.released).get_mut(&call.plan)
+        {
+            released.1 = released.1.max(version);
+        }
+        let report = |b: crate::planning::ahead::Blocked| BlockedReport { free_until: b.free_until, what: b.what };
+        Ok(RecheckReply { blocked: blocked.map(report) })
+    }
+}
+
+impl Service {
+    /// Checks what remains of every planned motion under way.
+    pub(super) async fn recheck(&self, planner: &Planner<'_>) {
+        let under_way = lock(&self.motions).under_way();
+        for motion in under_way {
+            self.recheck_motion(planner, &motion).await;
+        }
+    }
+
+    /// How far a motion is [s]; `None`: it has ended, or is slowing down already.
+    fn elapsed(&self, motion: &UnderWay) -> Option<f64> {
+        let view = self.task_view(motion.task as usize);
+        match view.state {
+            TaskState::Executing if view.motion == motion.number => Some(view.elapsed),
+            // The tick has taken it, and shows it with its next turn.
+            _ if view.motion < motion.number => Some(0.0),
+            _ => None,
+        }
+    }
+
+    pub(super) async fn recheck_motion(&self, planner: &Planner<'_>, motion: &UnderWay) {
+        let Some(elapsed) = self.elapsed(motion) else { return };
+        let asked = Recheck { plan: motion.plan, elapsed };
+        let (free_until, what) = match planner.recheck(&asked, self.moment(0), LIMIT + LIMIT / 2).await {
+            Ok(RecheckReply { blocked: None }) => return,
+            Ok(RecheckReply { blocked: Some(blocked) }) => (blocked.free_until, blocked.what),
+            // What is not known to be free is not driven through.
+            Err(e) => (f64::INFINITY, e.message),
+        };
+        let Some(elapsed) = self.elapsed(motion) else { return };
+        let tick = self.period().as_secs_f64();
+        let acceleration: Vec<f64> = motion.joints.iter().map(|joint| self.acceleration(*joint)).collect();
+        let in_time = rests_before(free_until, &motion.spline, &acceleration, elapsed, tick);
+        let ahead = (free_until - elapsed).max(0.0);
+        let text = match (in_time, free_until.is_finite()) {
+            (true, false) => format!("the world has changed, and {what}: the arm slows down"),
+            (true, true) => format!("in its way after {ahead:.2} s: {what}; the arm rests before it"),
+            (false, _) => format!(
+                "in its way after {ahead:.2} s, closer than the arm can brake along its path: {what}; held at once"
+            ),
+        };
+        tracing::warn!("motion {} on {}: {text}", motion.number, self.parts.names.task(motion.task));
+        let again = lock(&self.motions).blocked(motion.number, text, in_time);
+        if in_time {
+            let _ = self.ask(Request::Cancel { task: Some(motion.task) }).await;
+            if again {
+                self.go_around(motion);
+            }
+            return;
+        }
+        let arms = motion.joints.iter().filter_map(|joint| self.locate(*joint)).map(|(arm, _)| arm as u16);
+        let mut arms: Vec<u16> = arms.collect();
+        arms.dedup();
+        for arm in arms {
+            let _ = self.ask(Request::Stop { arm: Some(arm) }).await;
+        }
+    }
+
+    /// The acceleration limit of a joint [rad/s²].
+    fn acceleration(&self, joint: u16) -> f64 {
+        let located = self.locate(joint);
+        let limit = located.and_then(|(arm, j)| self.parts.config.arms.get(arm)?.limits.acceleration_max.get(j));
+        limit.copied().unwrap_or(0.0)
+    }
+}

@@ -1,0 +1,120 @@
+//! Around what got in the way: a planned motion that had to end before an obstacle is planned again from where it rests,
+//! to the goal that was asked for, and goes on as another motion. Done by a thread of its own: it waits for the arm and
+//! for the planner.
+
+use std::time::{Duration, Instant};
+
+use super::dispatch::lock;
+use super::motions::UnderWay;
+use super::service::{Service, internal};
+use crate::rpc::api::{ExecutePlan, Plan, Planning, Reply, Request as Call};
+use crate::rpc::{Code, RpcError};
+use crate::telemetry::{Phase, TaskState};
+
+/// How long the arm may take to come to rest.
+const REST: Duration = Duration::from_secs(10);
+/// How often is looked whether it rests, or whether there is a plan.
+const INTERVAL: Duration = Duration::from_millis(10);
+/// Joints slower than this are at rest [rad/s].
+const STILL: f64 = 0.02;
+/// Requests for plans that are remembered.
+const REMEMBERED: usize = 64;
+
+impl Service {
+    /// Remembers what a plan was asked for.
+    pub(super) fn remember_request(&self, plan: u64, request: Plan) {
+        let mut requests = lock(&self.plan_requests);
+        while requests.len() >= REMEMBERED {
+            requests.pop_first();
+        }
+        requests.insert(plan, request);
+    }
+
+    /// Begins to plan a motion that was ended again.
+    pub(super) fn go_around(&self, motion: &UnderWay) {
+        let (number, motion) = (motion.number, motion.clone());
+        let Some(me) = self.me.upgrade() else { return };
+        let thread = std::thread::Builder::new().name("replan".into()).spawn(move || {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_time().build();
+            let went_on = match runtime {
+                Ok(runtime) => runtime.block_on(me.plan_again(&motion)),
+                Err(e) => Err(RpcError::new(Code::Internal, e.to_string())),
+            };
+            if let Err(error) = &went_on {
+                tracing::warn!("motion {number}: not planned around what is in its way: {}", error.message);
+            }
+            lock(&me.motions).went_on(number, went_on.map_err(|error| error.message));
+        });
+        if let Err(e) = thread {
+            lock(&self.motions).went_on(number, Err(e.to_string()));
+        }
+    }
+
+    async fn plan_again(&self, motion: &UnderWay) -> Result<u64, RpcError> {
+        self.rested(motion).await?;
+        let unknown = || RpcError::new(Code::UnknownPlan, "it is not known any more what was asked for");
+        let request = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
+        let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
+        loop {
+            if let Err(ended) = self.may_go_on(motion) {
+                self.cancel_planning().await;
+                return Err(ended);
+            }
+            let asked = Call::Planning(Planning { plan: begun.plan });
+            let Reply::Planning(report) = self.planner_call(asked).await? else { return Err(internal()) };
+            match report.state.as_str() {
+                "PLANNING" => tokio::time::sleep(INTERVAL).await,
+                "PLANNED" => break,
+                _ => return Err(RpcError::new(Code::UnknownPlan, report.error.unwrap_or(report.state))),
+            }
+        }
+        self.may_go_on(motion)?;
+        let presence = motion.replan.clone().flatten();
+        let execute = ExecutePlan { plan: Some(begun.plan), replan: true, presence };
+        match self.planner_call(Call::ExecutePlan(execute)).await? {
+            Reply::ExecutePlan(begun) => Ok(begun.motion),
+            _ => Err(internal()),
+        }
+    }
+
+    /// Waits until the motion has ended and its arms rest.
+    async fn rested(&self, motion: &UnderWay) -> Result<(), RpcError> {
+        let began = Instant::now();
+        loop {
+            self.may_go_on(motion)?;
+            let view = self.task_view(motion.task as usize);
+            let ends = matches!(view.state, TaskState::Executing | TaskState::Cancelling);
+            let still = |joint: &u16| {
+                let (arm, j) = self.locate(*joint)?;
+                self.arm_view(arm)?.state.velocity.get(j).map(|velocity| velocity.abs() <= STILL)
+            };
+            if !ends && motion.joints.iter().all(|joint| still(joint).unwrap_or(false)) {
+                return Ok(());
+            }
+            if began.elapsed() > REST {
+                let what = format!("the arm does not rest after {} s", REST.as_secs());
+                return Err(RpcError::new(Code::NoAnswer, what));
+            }
+            tokio::time::sleep(INTERVAL).await;
+        }
+    }
+
+    /// Whether nobody has ended it meanwhile: by `cancel`, by a stop, or by going away with the lease.
+    fn may_go_on(&self, motion: &UnderWay) -> Result<(), RpcError> {
+        let ended = |what: &str| Err(RpcError::new(Code::ShuttingDown, what));
+        if self.is_closed() {
+            return ended("the run ends");
+        }
+        if !lock(&self.motions).is_replanning(motion.number) {
+            return ended("cancelled");
+        }
+        if motion.replan.as_ref().is_some_and(|asked| asked.as_ref().is_some_and(|presence| presence.is_over())) {
+            return ended("who asked for it has gone");
+        }
+        let mut arms = motion.joints.iter().filter_map(|joint| self.locate(*joint));
+        if arms.any(|(arm, _)| self.phase(arm) != Phase::Ready) {
+            return ended("the arm is not ready");
+        }
+        Ok(())
+    }
+}
