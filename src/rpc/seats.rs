@@ -194,7 +194,7 @@ mod tests {
         reserved.promote().unwrap();
         let gone: Vec<usize> = (0..all.len()).filter(|i| left(&all[*i])).collect();
         assert_eq!(gone, [3]);
-        all.iter().for_each(Seat::begin);
+        all.iter().chain([&reserved]).for_each(Seat::begin);
         let reserved = seats.take().unwrap();
         assert_eq!(reserved.promote().unwrap_err().code, Code::TooManyConnections);
         drop(all);

@@ -61,7 +61,7 @@ pub fn ranges(lower: &[f64], upper: &[f64]) -> WireRanges {
 
 /// Whether a measured position is outside its range by more than the wire's resolution.
 pub fn outside(measured: &WireJoints, ranges: &WireRanges) -> bool {
-    measured.iter().zip(ranges).any(|(here, (lower, upper))| !(lower - 1..=upper + 1).contains(&here))
+    measured.iter().zip(ranges).any(|(here, (lower, upper))| !(lower - 1..=upper + 1).contains(here))
 }
 
 /// The joint, counted from 1, that lies so far outside its range that no hold brings it back, and by how much [rad].

@@ -66,7 +66,7 @@ pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterRes
     let limits = identity.limits().unwrap_or_else(|| model.limits());
     let device = Device { model, firmware, serial, limits, torques: !currents };
     let gripper = Gripper::new(options.gripper, pulses);
-    Ok(Session::new(device, control, bus, motion, first, normal, condition, gripper))
+    Ok(Session::new(device, (control, bus), motion, first, normal, condition, gripper))
 }
 
 /// Connects to the joints' reports: those of port 30000 where there are any, else those of port 30003, which every

@@ -390,7 +390,7 @@ mod tests {
             let mut control = Control::new(TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap());
             let (mut stream, _) = listener.accept().unwrap();
             let velocity = Command::Velocity { joints: [0.0; 7], duration: Some(0.2) };
-            (0..set_points).for_each(|_| control.post(&velocity, Purpose::Motion).map(|_| ()).unwrap());
+            assert!((0..set_points).all(|_| control.post(&velocity, Purpose::Motion).is_ok()));
             assert_eq!(control.post(&velocity, Purpose::Motion).is_err(), set_points == IN_FLIGHT);
             control.abort();
             let mut bytes = Vec::new();

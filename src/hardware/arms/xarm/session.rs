@@ -113,8 +113,7 @@ impl Session {
     /// Begins with a first report. The arm counts as stopped until it is activated.
     pub fn new(
         device: Device,
-        control: Control,
-        bus: Option<Control>,
+        (control, bus): (Control, Option<Control>),
         reports: Stream<Motion>,
         first: Motion,
         normal: Stream<Health>,
