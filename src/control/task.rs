@@ -77,7 +77,7 @@ pub struct Claim {
 #[derive(Debug)]
 pub enum Body {
     /// See [`TrajectoryTask`].
-    Trajectory(TrajectoryTask),
+    Trajectory(Box<TrajectoryTask>),
     /// See [`ServoTask`].
     Servo(ServoTask),
     /// See [`VelocityTask`].
@@ -112,7 +112,7 @@ impl Task {
     pub fn new(config: &TaskConfig) -> Self {
         let width = config.joints.len();
         let body = match &config.kind {
-            TaskKind::Trajectory(p) => Body::Trajectory(TrajectoryTask::new(p.clone(), width)),
+            TaskKind::Trajectory(p) => Body::Trajectory(Box::new(TrajectoryTask::new(p.clone(), width))),
             TaskKind::Servo(p) => Body::Servo(ServoTask::new(p.clone())),
             TaskKind::Velocity(p) => Body::Velocity(VelocityTask::new(p.clone())),
             TaskKind::CartesianIk(p) => Body::Cartesian(Box::new(CartesianTask::new(*p.clone(), true))),

@@ -126,7 +126,8 @@ impl Plant {
     pub fn lagging(limits: &JointLimits, initial: &[f64], lag: f64) -> Self {
         let first_order = lag.min(FIRST_ORDER);
         let plant = Self::new(limits, initial, Tracking::Lag(first_order), 0.0);
-        Self { delayed: DelayLine::new(lag - first_order), ..plant }
+        // A set point is followed from the end of the present step on: half a step later, on average.
+        Self { delayed: DelayLine::new(lag - first_order - 0.5 * STEP), ..plant }
     }
 
     /// Joint positions [rad].

@@ -165,3 +165,27 @@ fn a_planned_move_never_passes_its_target() {
         assert_eq!(plant.positions()[0], target);
     }
 }
+
+#[test]
+fn a_dead_time_delays_set_points_and_a_stop_discards_those_on_their_way() {
+    let limits = JointLimits { acceleration_max: vec![10.0; 2], ..JointLimits::uniform(2, 2.0, 1.0) };
+    let mut plant = Plant::lagging(&limits, &[0.5, -0.5], 0.1);
+    plant.servo(&[0.6, -0.5]);
+    plant.enable(true);
+    plant.advance(0.2);
+    assert_eq!(plant.positions()[0], 0.5, "the motors were off");
+    plant.servo(&[0.6, -0.5]);
+    plant.advance(0.079);
+    assert_eq!(plant.positions()[0], 0.5, "80 ms of dead time");
+    plant.advance(0.004);
+    assert!(plant.positions()[0] > 0.5);
+    plant.servo(&[0.7, -0.5]);
+    plant.stop();
+    plant.advance(1.0);
+    assert!((0.5..0.51).contains(&plant.positions()[0]) && !plant.moving(), "{}", plant.positions()[0]);
+    plant.servo(&[0.7, -0.5]);
+    plant.advance(0.05);
+    plant.move_to(&[0.4, -0.5], 1.0);
+    plant.advance(1.0);
+    assert_eq!(plant.positions()[0], 0.4);
+}
