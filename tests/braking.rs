@@ -194,8 +194,8 @@ fn planned_motions_keep_the_jerk_limit_in_what_is_commanded() {
         }
         // Steps of the acceleration, from one tick to the next; the last tick is on its way to the hold.
         for four in commanded[..commanded.len() - 1].windows(4) {
-            for j in 0..DOF {
-                let [a, b, c, d] = [0, 1, 2, 3].map(|k: usize| four[k][j]);
+            for (j, a) in four[0].iter().enumerate() {
+                let [b, c, d] = [1, 2, 3].map(|k: usize| four[k][j]);
                 let step = (d - 3.0 * c + 3.0 * b - a) / (TICK * TICK);
                 assert!(step.abs() <= JERK * TICK * 1.02 + 1e-6, "joint {j}: a step of {step} rad/s²");
             }

@@ -25,7 +25,7 @@ use rustix::process::Signal;
 
 const BLUEPRINT: &str = "
 hardware:
-  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: remote, address: 'ADDRESS'}
+  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: remote, address: 'ADDRESS', accept_zero_pose: true}
 tasks:
   - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
 ";

@@ -76,6 +76,10 @@ fn holder(name: &str) -> Option<i32> {
 /// the first port; the device file behind a link. At least one.
 fn places(address: &str) -> BTreeSet<String> {
     let text = address.trim();
+    if text.starts_with("memory:") {
+        // A bus in memory belongs to one process: others have their own of the same number.
+        return BTreeSet::from([format!("{text} of process {}", std::process::id())]);
+    }
     if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
         // What stands behind an `@` is how to talk to it.
         let path = path.split_once('@').map_or(path, |(path, _)| path);

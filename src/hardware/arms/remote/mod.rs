@@ -43,7 +43,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     native_rate: NATIVE_RATE,
     accuracy: 0.02,
     lag: 0.1,
-    stale_after: Duration::from_millis(150),
+    stale_after: Duration::from_millis(200),
     address: AddressForm {
         form: address::FORM,
         required: true,

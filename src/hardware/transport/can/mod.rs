@@ -6,6 +6,7 @@
 
 pub mod address;
 pub mod bus;
+#[cfg(feature = "can")]
 mod in_flight;
 pub mod slcan;
 pub mod slcan_pty;
