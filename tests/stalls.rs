@@ -157,7 +157,8 @@ fn stopped_again_and_again(with_emulator: bool) {
         let wire = bounds().neighbours(&sent, began).and_then(|()| bounds().windows(&delivered, began));
         failures.extend(wire.err().map(|e| format!("stopped for {time:?}: {e}")));
         if state != "COMPLETED" {
-            println!("stopped for {time:?} ({took:?}): {state}, {}", three.phase());
+            let arm = three.home.status()["arms"][0].clone();
+            println!("stopped for {time:?} ({took:?}): {state}, {} {}", arm["phase"], arm["cause"]);
             held += usize::from(took < LONGEST);
         }
         three.ready();

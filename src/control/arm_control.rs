@@ -27,8 +27,9 @@ const MOVED: f64 = 0.02;
 const TRACKING_LIMIT: (f64, f64) = (0.1, 0.2);
 /// In velocity mode, how far the measured velocity may be from the set points [rad/s], and as a part of itself.
 const VELOCITY_TOLERANCE: (f64, f64) = (0.2, 0.2);
-/// A held joint further than this from its set points, besides its accuracy, has its set point drawn to it [rad].
-const DRAW: f64 = 0.02;
+/// A held joint that stands still further than this from its set points, besides its accuracy, has its set point drawn to
+/// it [rad].
+const DRAW: f64 = 0.04;
 /// How long that takes at most, within the joint's top speed [s].
 const DRAW_TIME: f64 = 0.1;
 /// The longest delay of this computer that is not taken for a state's age.
@@ -188,12 +189,12 @@ impl ArmControl {
         }
         let (Some(q), Some(limiter)) = (self.state.position.get(joint), self.limiters.get(joint)) else { return 0.0 };
         // The newest set point is in every window.
-        if (q - limiter.position()).abs() <= DRAW / 2.0 {
+        if (q - limiter.position()).abs() <= DRAW / 4.0 {
             return 0.0;
         }
         let distance = self.set_points.distance(joint, *q, self.window_start());
         let coast = self.coast.0.get(joint).copied().unwrap_or_default();
-        if coast * distance > 0.0 && self.command.at < self.coast.1 {
+        if coast * distance > 0.0 && self.state.stamp < self.coast.1 {
             return distance - distance.clamp(-coast.abs(), coast.abs());
         }
         distance
@@ -219,6 +220,11 @@ impl ArmControl {
         // An arm whose connection broke has stopped by its own means, elsewhere.
         if !self.state.enabled || matches!(self.state.link, Link::Down | Link::Faulted) {
             self.standing = false;
+        }
+        // Before anything is compared with the set points: an arm that got none is beyond the last one.
+        let moved = self.starting.is_none() && self.command.mode.is_some_and(ControlMode::is_position);
+        if moved && self.gap_since.is_none() && self.written.gap(now) {
+            self.begin_to_coast(now);
         }
         self.failsafe.update(&self.state, self.freshness, now);
         if let Verdict::Jumped(joint, step) = verdict {
@@ -439,10 +445,7 @@ impl ArmControl {
             self.gap_since = None;
             return;
         }
-        if self.gap_since.is_none() {
-            self.gap_since = Some(self.command.seq);
-            self.begin_to_coast(now);
-        }
+        self.gap_since.get_or_insert(self.command.seq);
         let rest = self.command.mode.is_some_and(ControlMode::is_position);
         for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
             // Joints that follow positions have come to rest at the last one; velocities go on.
@@ -471,9 +474,15 @@ impl ArmControl {
     fn draw(&mut self, dt: f64) -> bool {
         let tolerance = DRAW + self.config.supervision.accuracy;
         let mut drawn = false;
+        // A position that jumped may be wrong: no set point is made from it before a reset.
+        if matches!(self.failsafe.cause(), Cause::PositionJump(..)) || self.belief.refused() > 0 {
+            return false;
+        }
         self.drawing = (self.drawing - dt).max(dt);
         for j in 0..self.config.dof {
-            let off = self.tracking_error(j).abs() > tolerance;
+            // One that still moves is on its way, and its set point is brought to rest like any other.
+            let stands = self.state.velocity.get(j).is_none_or(|v| v.abs() <= STANDSTILL);
+            let off = stands && self.tracking_error(j).abs() > tolerance;
             let q = self.state.position.get(j).copied().unwrap_or_default();
             if let Some(limiter) =
                 self.limiters.get_mut(j).filter(|_| off && self.freshness.fresh && self.gap_since.is_none())

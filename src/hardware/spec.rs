@@ -9,6 +9,7 @@
 //! something has come, and the age of the state is the device's doing alone.
 
 use std::os::fd::BorrowedFd;
+use std::time::Duration;
 
 use crate::arm::Pose;
 use crate::clock::Mono;
@@ -213,6 +214,11 @@ pub trait ManipulatorAdapter: Send {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
     /// Clears the device's error state. Moves nothing, enables nothing.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
+    /// Longest regular time between two set points that the device takes, known once it is connected. `None`: it takes one
+    /// in every tick, or in every period of its states where that is longer.
+    fn set_point_period(&self) -> Option<Duration> {
+        None
+    }
     /// Discards set points that have not left this computer. Called when the arm stopped answering, before anything else
     /// is sent: a set point that waits in a queue must not reach the arm later. By default the connection is dropped, and
     /// the device thread connects again; a TCP connection is reset, not closed, so that its send buffer is discarded.

@@ -61,9 +61,10 @@ impl DeviceConfig {
     }
 
     /// The longer of the tick's period and the arm's own for set points.
-    pub fn write_period(&self) -> Duration {
-        let own = Duration::from_secs_f64(1.0 / self.native_rate.max(0.1));
-        self.tick_period.max(own.min(LONGEST_WRITE_PERIOD))
+    /// `own`: what the adapter says of it.
+    pub fn write_period(&self, own: Option<Duration>) -> Duration {
+        let states = Duration::from_secs_f64(1.0 / self.native_rate.max(0.1));
+        self.tick_period.max(own.unwrap_or(states.min(LONGEST_WRITE_PERIOD)))
     }
 
     /// A state older than this is stale.

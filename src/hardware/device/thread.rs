@@ -103,7 +103,7 @@ impl Worker {
         let Shared { wake, health, due } = shared;
         Self {
             due,
-            guard: WireGuard::new(config.dof, config.write_period(), config.supervision),
+            guard: WireGuard::new(config.dof, config.write_period(None), config.supervision),
             in_flight: 0,
             again: false,
             ordered_mode: None,
@@ -269,7 +269,9 @@ impl Worker {
         }
         self.take_command();
         self.read(adapter);
-        let (read_period, write_period) = (self.config.read_period(), self.config.write_period());
+        let write_period = self.config.write_period(adapter.set_point_period());
+        self.guard.set_period(write_period);
+        let read_period = self.config.read_period();
         Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range(), read_period, write_period })
     }
 
@@ -403,7 +405,7 @@ impl Worker {
             Ok(()) if self.stop_owed => {}
             Ok(()) => self.write_errors = 0,
             // Not sent, and no failure: the tick sees that it was not written.
-            Err(AdapterError::Busy) => (self.in_flight, self.again) = (MAX_IN_FLIGHT, true),
+            Err(AdapterError::Busy) => self.again = true,
             Err(error) => {
                 if matches!(error, AdapterError::Timeout(_)) {
                     self.in_flight += 1;
@@ -420,15 +422,14 @@ impl Worker {
     fn drop_what_is_pending(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let age = self.config.clock.now().since(self.state.stamp.max(self.last_read));
         let stale = age > self.config.state_timeout() && self.state.seq != 0;
-        if self.connected && self.in_flight > 0 && stale {
+        if self.connected && (self.in_flight > 0 || self.again) && stale {
             self.trouble("set points are not acknowledged and no state arrives: what is pending is discarded");
             self.discard(adapter);
         }
     }
 
     fn discard(&mut self, adapter: &mut dyn ManipulatorAdapter) {
-        self.in_flight = 0;
-        self.guard.forget();
+        (self.in_flight, self.again) = (0, false);
         self.state.self_held = true;
         adapter.discard_pending();
         if !adapter.is_connected() {

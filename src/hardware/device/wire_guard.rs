@@ -46,6 +46,11 @@ impl WireGuard {
         }
     }
 
+    /// The longer of the tick's and the arm's own period for set points.
+    pub fn set_period(&mut self, period: Duration) {
+        self.period = period;
+    }
+
     /// The limits that commands keep.
     pub fn set_limits(&mut self, limits: &JointLimits) {
         let limits = limits.clone().with_defaults();
@@ -94,7 +99,8 @@ impl WireGuard {
 
     /// Whether the first position is where the arm is, or where it was sent last and has been since.
     fn starts_at(&self, command: &ArmCommand, state: &ArmState) -> bool {
-        let seed = self.supervision.seed_tolerance();
+        // A little more than the tick allows, which made it from an earlier reading.
+        let seed = self.supervision.seed_tolerance().max(2.0 * self.supervision.accuracy);
         let standing = self.last.filter(|last| last.mode.is_position());
         (0..self.dof).all(|j| {
             let (Some(value), Some(q)) = (command.values.get(j), state.position.get(j)) else { return false };
@@ -147,12 +153,12 @@ mod tests {
     fn the_first_set_point_is_where_the_arm_is_measured_now() {
         let (mut g, servo) = (guard(), ControlMode::ServoPosition);
         let admits = |g: &WireGuard, value, q, age| g.admits(&command(100, value, 2), servo, &state(q), age, P);
-        assert!(admits(&g, 0.504, 0.5, P) && !admits(&g, 0.506, 0.5, P));
+        assert!(admits(&g, 0.504, 0.5, P) && !admits(&g, 0.511, 0.5, P));
         assert!(!admits(&g, 0.5, 0.5, 3 * P), "an old reading");
-        g.wrote(&command(90, 0.509, 1), servo);
-        assert!(admits(&g, 0.509, 0.5, P), "it stands there");
+        g.wrote(&command(90, 0.515, 1), servo);
+        assert!(admits(&g, 0.515, 0.5, P), "it stands there");
         g.forget();
-        assert!(!admits(&g, 0.509, 0.5, P));
+        assert!(!admits(&g, 0.515, 0.5, P));
     }
 
     #[test]

@@ -179,7 +179,7 @@ impl World {
             rounding: arm.rounding,
             stale_after: arm.stale_after(),
             // Its stop is a target: what was told last, within 0.02 rad of what is measured, which is a little old.
-            stopped_within: (arm.name == "piper").then_some(0.025),
+            stopped_within: (arm.name == "piper").then_some(0.085),
             time_limit: arm.time_limit,
         };
         Ok(Bed { run, gate: self.gate.clone(), arm, bounds, world: self, _folder: folder })

@@ -206,13 +206,12 @@ fn f04_a_broken_connection_is_noticed_and_made_again() {
 }
 
 #[test]
-fn f18_noise_is_skipped_and_damage_costs_one_reading() {
+fn f18_noise_is_skipped_and_a_damaged_or_lost_reply_is_asked_for_again() {
     let (emulator, mut arm) = connected(&[]);
     emulator.inject(Fault::new(FaultKind::Garbage)).unwrap();
     assert!(close(&read(&mut *arm).unwrap().position, &START));
     for kind in [FaultKind::Corrupt, FaultKind::Truncated, FaultKind::Silent] {
         emulator.inject(Fault::new(kind)).unwrap();
-        assert!(matches!(read(&mut *arm), Err(AdapterError::Timeout(_))), "{kind:?}");
         assert!(close(&read(&mut *arm).unwrap().position, &START), "{kind:?}");
     }
     emulator.inject(Fault::new(FaultKind::Nan)).unwrap();

@@ -222,7 +222,7 @@ fn an_unplugged_adapter_is_an_io_error() {
 }
 
 #[test]
-fn what_the_adapter_has_not_read_is_taken_back() {
+fn a_discard_closes_the_channel_and_opens_it_again() {
     let pty = Pty::open().unwrap();
     let mut port = open("arm", pty.path(), 500_000, &[]).unwrap();
     assert_eq!(heard(&pty, "O\r"), "\rC\rS6\rO\r");
@@ -230,8 +230,9 @@ fn what_the_adapter_has_not_read_is_taken_back() {
     assert_eq!(port.send(&frames), Ok(4));
     assert_eq!(port.discard(), Ok(0));
     assert_eq!(port.send(&frames[3..]), Ok(1));
-    // A channel that is closed and opened again empties the adapter, too.
-    assert_eq!(heard(&pty, "t47120702\r"), "\rC\rS6\rO\rt47120702\r");
+    // What is still in this computer is flushed; a channel that is closed and opened again empties the adapter, too.
+    let heard = heard(&pty, "O\rt47120702\r");
+    assert!(heard.ends_with("\rC\rS6\rO\rt47120702\r"), "{heard:?}");
 }
 
 #[test]
