@@ -9,9 +9,6 @@ use crate::hardware::spec::AdapterResult;
 
 /// Farthest that a hold may be from the measured position [rad].
 const WINDOW: f64 = 0.02;
-/// Farthest that a hold may be from a set point that was written within the last [`STREAMED`] [rad].
-const STEP: f64 = 0.05;
-const STREAMED: Duration = Duration::from_millis(300);
 /// How long positions that contradict each other get to agree: some 10 sets do where every fifth is wrong.
 const SETTLE_TIMEOUT: Duration = Duration::from_millis(300);
 /// How long the controller gets to refuse a target outside the limits, and to clear that error.
@@ -77,15 +74,7 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 impl Session {
     /// Commands the arm to stay where it is.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
-        let written = self.written();
-        let mut target = target(&self.picture.joints, written.as_ref(), &self.ranges, self.strict);
-        // Frames that waited are measured earlier than they arrive: an arm that was just streamed to is near its set point.
-        if let Some(written) = written.filter(|_| MonotonicClock.now().since(self.written_at) < STREAMED) {
-            for (target, written) in target.iter_mut().zip(&written) {
-                *target = (*target)
-                    .clamp(written.saturating_sub(millidegrees(STEP)), written.saturating_add(millidegrees(STEP)));
-            }
-        }
+        let target = target(&self.picture.joints, self.written().as_ref(), &self.ranges, self.strict);
         self.write(100, follow, target)
     }
 

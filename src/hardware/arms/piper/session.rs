@@ -44,8 +44,6 @@ pub struct Session {
     pub picture: Picture,
     /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
     pub written: Option<WireJoints>,
-    /// When.
-    pub written_at: Mono,
     /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
     pub control: Option<(u8, Follow)>,
     /// Its joint limits [0.001°].
@@ -67,7 +65,6 @@ impl Session {
             wire: None,
             picture,
             written: None,
-            written_at: Mono::ZERO,
             control: None,
             ranges,
             strict: false,
@@ -111,7 +108,6 @@ impl Session {
         self.picture.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
         self.send(&frames)?;
         (self.written, self.control) = (Some(target), Some((speed, follow)));
-        self.written_at = MonotonicClock.now();
         Ok(())
     }
 
@@ -125,7 +121,7 @@ impl Session {
         }
         let [_, targets @ ..] = protocol::joint_targets(SPEED, follow, target);
         self.send(&targets)?;
-        (self.written, self.written_at) = (Some(target), MonotonicClock.now());
+        self.written = Some(target);
         Ok(())
     }
 
