@@ -178,9 +178,8 @@ impl World {
             period: PERIOD,
             rounding: arm.rounding,
             stale_after: arm.stale_after(),
-            // Its stop is a target: what was written last, within 0.02 rad of what is measured. Frames that waited were measured
-            // up to the stall earlier than they arrive, and an arm at full speed has gone on since.
-            stopped_within: (arm.name == "piper").then_some(0.15),
+            // Its stop is a target: what was written last, within 0.02 rad of what is measured, which is a little old.
+            stopped_within: (arm.name == "piper").then_some(0.025),
             time_limit: arm.time_limit,
         };
         Ok(Bed { run, gate: self.gate.clone(), arm, bounds, world: self, _folder: folder })

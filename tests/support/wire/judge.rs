@@ -99,8 +99,22 @@ impl Bounds {
             (Some(told), Some(truth), Some(most)) => told.iter().zip(truth).all(|(a, b)| (a - b).abs() <= most),
             _ => false,
         };
+        // Its stop at full speed may be measured by frames that waited in the stall: then the last set point of all goes
+        // back towards the arm, and stays.
+        let last = told.iter().rev().find_map(|one| position(&one.what));
+        let stays = |one: &Told| {
+            let after = told.iter().filter(|later| later.at >= one.at).filter_map(|later| position(&later.what));
+            position(&one.what).is_some() && after.into_iter().all(|values| Some(values) == last)
+        };
+        let nearer = |before: &Told, one: &Told| match (position(&before.what), position(&one.what), &one.truth) {
+            (Some(from), Some(to), Some(truth)) if self.stopped_within.is_some() => {
+                let mut joints = from.iter().zip(to).zip(truth);
+                joints.all(|((from, to), truth)| (to - truth).abs() <= (from - truth).abs() + self.rounding)
+            }
+            _ => false,
+        };
         let mut all = Vec::new();
-        for part in told.chunk_by(|_, next| !stops(next)) {
+        for part in told.chunk_by(|one, next| !(stops(next) || (nearer(one, next) && stays(next)))) {
             all.extend(chains(part, position));
         }
         all
