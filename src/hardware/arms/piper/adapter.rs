@@ -111,6 +111,9 @@ fn fill(out: &mut [f64], values: &[f64]) {
     out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
 }
 
+/// How long a stop waits for positions that are measured now.
+const LIVE_TIMEOUT: Duration = Duration::from_millis(60);
+
 impl ManipulatorAdapter for PiperAdapter {
     // --- Lifecycle ---
 
@@ -259,6 +262,8 @@ impl ManipulatorAdapter for PiperAdapter {
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
         if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
+            // Where the arm is now: not where it was before a pause of its feedback. One that stays silent is held there.
+            self.arm.watch(LIVE_TIMEOUT, Picture::is_live)?;
             self.arm.settle()?;
         }
         let before = self.arm.picture.motors.map(|motor| i32::from(motor.speed).abs());

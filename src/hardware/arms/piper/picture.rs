@@ -10,12 +10,16 @@ use super::guard::Guard;
 use super::protocol::{
     DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
 };
-use crate::clock::Mono;
+use crate::clock::{Clock, Mono, MonotonicClock};
 
 /// Frames of one burst arrive within less than a period of the arm.
 const BURST: Duration = Duration::from_millis(4);
 /// No joint is farther round than this [0.001°].
 const FAR: u32 = 360_000;
+/// Positions come every 5 ms. After a longer pause than this those that waited on their way arrive first, all at once.
+const PAUSE: Duration = Duration::from_millis(20);
+/// For how long after a pause positions may be such.
+pub const WAITED: Duration = Duration::from_millis(10);
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
 /// After this time an arm at exactly zero is taken to be there.
@@ -71,6 +75,8 @@ pub struct Picture {
     pub joints: WireJoints,
     /// When `joints` was completed.
     pub joints_at: Mono,
+    /// When the first of them arrived after the latest pause of [`PAUSE`].
+    pub resumed_at: Mono,
     /// x, y, z [0.001 mm], roll, pitch, yaw [0.001°].
     pub pose: Option<[i32; 6]>,
     /// The controller's state.
@@ -111,6 +117,7 @@ impl Default for Picture {
         Self {
             joints: [0; DOF],
             joints_at: Mono::ZERO,
+            resumed_at: Mono::ZERO,
             pose: None,
             status: Status::default(),
             status_at: Mono::ZERO,
@@ -198,6 +205,9 @@ impl Picture {
             return self.counts.damaged += 1;
         }
         self.zeros_since = (joints == [0; DOF]).then(|| self.zeros_since.unwrap_or(now));
+        if now.since(self.joints_at) > PAUSE {
+            self.resumed_at = now;
+        }
         (self.joints, self.joints_at) = (joints, now);
         self.counts.sets += 1;
     }
@@ -205,6 +215,12 @@ impl Picture {
     /// Whether every joint reads exactly zero, and has not done so for long yet.
     pub fn only_zeros(&self, now: Mono) -> bool {
         self.joints == [0; DOF] && self.zeros_since.is_none_or(|since| now.since(since) < ZEROS)
+    }
+
+    /// Whether the positions are measured now, as far as their arrival shows.
+    pub fn is_live(&self) -> bool {
+        let now = MonotonicClock.now();
+        now.since(self.joints_at) <= PAUSE && self.joints_at.since(self.resumed_at) >= WAITED
     }
 
     /// Whether joint positions were refused lately, so that the believed ones may be the wrong ones.
