@@ -484,7 +484,8 @@ impl Worker {
         }
         self.mode_wanted = None;
         self.ordered_mode = Some(mode);
-        let age = self.config.clock.now().since(self.state.stamp);
+        // By its arrival: a device whose clock drifts would never be commanded again.
+        let age = self.config.clock.now().since(self.last_read);
         if !self.guard.admits(command, mode, &self.state, age, self.config.read_period()) {
             self.health.withheld.fetch_add(1, Relaxed);
             return gripper;
