@@ -150,9 +150,10 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
 
 fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     let start = bed.arm.ends[0].map(|q| q * 0.95);
-    // What the case before left behind may still hold the arm on its way.
+    // The stream of the case before keeps its joints at zero until it is cancelled; and the arm may be held on its way.
     for _ in 0..5 {
         bed.ready();
+        let _ = bed.run.handle().cancel();
         let _ = bed.run.move_arm("arm", &start, 1.0).and_then(|m| bed.run.wait(m.motion));
         bed.rest();
         if bed.truth().iter().zip(&start).all(|(q, start)| (q - start).abs() < 0.05) {

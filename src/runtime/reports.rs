@@ -74,6 +74,7 @@ impl Service {
             ("read_errors", &health.read_errors),
             ("writes", &health.writes),
             ("write_errors", &health.write_errors),
+            ("withheld", &health.withheld),
             ("reconnects", &health.reconnects),
         ];
         Some(ArmReport {

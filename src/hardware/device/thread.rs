@@ -484,8 +484,7 @@ impl Worker {
         }
         self.mode_wanted = None;
         self.ordered_mode = Some(mode);
-        // By its arrival: a device whose clock drifts would never be commanded again.
-        let age = self.config.clock.now().since(self.last_read);
+        let age = self.config.clock.now().since(self.state.stamp);
         if !self.guard.admits(command, mode, &self.state, age, self.config.read_period()) {
             self.health.withheld.fetch_add(1, Relaxed);
             return gripper;

@@ -224,9 +224,10 @@ impl Bed {
         while !holds(self) {
             assert!(
                 began.elapsed() < PATIENCE,
-                "{}: not within {PATIENCE:?}: {what}: {:?}",
+                "{}: not within {PATIENCE:?}: {what}: {:?}, {:?}",
                 self.arm.name,
-                self.phase()
+                self.phase(),
+                self.run.status().tasks
             );
             std::thread::sleep(Duration::from_millis(2));
         }
