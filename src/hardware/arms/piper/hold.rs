@@ -72,9 +72,13 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 }
 
 impl Session {
-    /// Commands the arm to stay where it is.
+    /// Commands the arm to stay where it is. Where its feedback has paused while set points were streamed, that is the last
+    /// of them, which it is at or comes to: what was measured before the pause would pull it back.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
-        let target = target(&self.picture.joints, self.written().as_ref(), &self.ranges, self.strict);
+        let target = match self.written() {
+            Some(written) if self.streamed && !self.picture.is_live() => written,
+            written => target(&self.picture.joints, written.as_ref(), &self.ranges, self.strict),
+        };
         self.write(100, follow, target)
     }
 

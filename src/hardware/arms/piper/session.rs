@@ -44,6 +44,8 @@ pub struct Session {
     pub picture: Picture,
     /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
     pub written: Option<WireJoints>,
+    /// It is a set point of a stream: the arm is at most its lag behind it.
+    pub streamed: bool,
     /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
     pub control: Option<(u8, Follow)>,
     /// Its joint limits [0.001°].
@@ -65,6 +67,7 @@ impl Session {
             wire: None,
             picture,
             written: None,
+            streamed: false,
             control: None,
             ranges,
             strict: false,
@@ -107,7 +110,7 @@ impl Session {
         let frames = protocol::joint_targets(speed, follow, target);
         self.picture.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
         self.send(&frames)?;
-        (self.written, self.control) = (Some(target), Some((speed, follow)));
+        (self.written, self.control, self.streamed) = (Some(target), Some((speed, follow)), false);
         Ok(())
     }
 
@@ -117,11 +120,13 @@ impl Session {
         const SPEED: u8 = 100;
         let Status { control, mode, .. } = self.picture.status;
         if self.control != Some((SPEED, follow)) || (control, mode) != (1, MoveMode::Joint as u8) {
-            return self.write(SPEED, follow, target);
+            self.write(SPEED, follow, target)?;
+            self.streamed = true;
+            return Ok(());
         }
         let [_, targets @ ..] = protocol::joint_targets(SPEED, follow, target);
         self.send(&targets)?;
-        self.written = Some(target);
+        (self.written, self.streamed) = (Some(target), true);
         Ok(())
     }
 
