@@ -195,6 +195,40 @@ fn in_velocity_mode_a_joint_that_does_not_follow_holds_the_arm() {
 }
 
 #[test]
+fn an_arm_braked_by_velocities_goes_on_braking_after_a_short_gap() {
+    let mut config = figured(0.05, 0.005);
+    config.limits.acceleration_max = vec![1.0; 6];
+    config.supervision.stale_after = Duration::from_millis(80);
+    let mut rig = ready(config, one(velocity()));
+    for _ in 0..150 {
+        rig.velocity(0, &[0.8; 6]);
+        rig.tick();
+    }
+    rig.ask(Request::Stop { arm: Some(0) });
+    rig.run_for(0.3);
+    let stops = rig.arms[0].stops;
+    rig.arms[0].deaf = true;
+    rig.run(4);
+    rig.arms[0].deaf = false;
+    rig.run_until(2.0, |rig| rig.arms[0].stops > stops);
+    let last = rig.arms[0].written.clone().unwrap();
+    assert!(last[0].abs() < 1e-9, "the stop came at {} rad/s", last[0]);
+    // A gap as long as an age limit: the stop is all that is left.
+    assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+    rig.make_ready();
+    for _ in 0..150 {
+        rig.velocity(0, &[-0.8; 6]);
+        rig.tick();
+    }
+    assert!(rig.arms[0].v[0] < -0.7, "{:?}", rig.arms[0].v);
+    rig.ask(Request::Stop { arm: Some(0) });
+    let stops = rig.commands[0].stop_seq;
+    rig.arms[0].deaf = true;
+    rig.run(9);
+    assert!(rig.commands[0].stop_seq > stops);
+}
+
+#[test]
 fn a_wrong_reading_is_not_believed_and_three_that_agree_are_a_jump() {
     let mut rig = ready(figured(0.05, 0.005), one(servo()));
     rig.arms[0].q = vec![0.4; 6];

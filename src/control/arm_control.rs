@@ -386,7 +386,7 @@ impl ArmControl {
                 Routed::NotReady
             }
             Phase::Held | Phase::Standby => {
-                self.come_to_rest(dt);
+                self.come_to_rest(now, dt);
                 Routed::NotReady
             }
             Phase::Activating => {
@@ -454,10 +454,12 @@ impl ArmControl {
     }
 
     /// Slows down by commands; when at rest, asks the arm to stop by its own means and leaves it alone.
-    fn come_to_rest(&mut self, dt: f64) {
+    fn come_to_rest(&mut self, now: Mono, dt: f64) {
         if let Some(mode) = self.command.mode {
-            // A velocity that cannot be reduced, because nothing gets through, goes on: the stop replaces it.
-            let stuck = self.gap_since.is_some() && mode == ControlMode::Velocity;
+            // A velocity that cannot be reduced, because nothing gets through, goes on: the stop replaces it. After a short
+            // gap the ramp continues.
+            let silent = now.since(self.written.last().at) > self.config.supervision.stale_after;
+            let stuck = self.gap_since.is_some() && silent && mode == ControlMode::Velocity;
             let drawn = mode.is_position() && self.draw(dt);
             if drawn || !(stuck || self.settled(dt)) {
                 return self.hold(mode, dt);
