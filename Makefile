@@ -49,7 +49,7 @@ $(READERS)/node_modules/.package-lock.json: $(READERS)/package-lock.json
 test-rerun: .venv/readers-installed
 	.venv/bin/pip install -q rerun-sdk==0.41.0
 	.venv/bin/rerun analytics disable
-	DIMOS_RERUN=1 cargo test --locked --test readers rerun
+	DIMOS_RERUN=1 cargo test --locked --test process readers::rerun
 
 # Compute time of a tick, cost per arm, memory, start-up, processor time; the way to the wire and back; what talking to a
 # run costs; how fast logs
@@ -70,5 +70,5 @@ jitter:
 # Arms idle and moving beside eight busy processes, half an hour each, and runs that are stopped and continued 200 times:
 # no arm may be held by that. Two and a half hours.
 soak:
-	DIMOS_SOAK=1800 DIMOS_STALLS=200 cargo test --locked --test stalls --test stalls_soak -- --nocapture --test-threads 1
-	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --locked --test stalls_soak -- --nocapture --test-threads 1
+	DIMOS_SOAK=1800 DIMOS_STALLS=200 cargo test --locked --test realtime stalls -- --nocapture --test-threads 1
+	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --locked --test realtime stalls_soak -- --nocapture --test-threads 1

@@ -12,7 +12,7 @@
 //!     └──(ring, drop-counted)──▶ recorder ─▶ MCAP          └──▶ rpc: published joint state
 //! ```
 //!
-//! A module may use only those above it in this list; `tests/layering.rs` checks that.
+//! A module may use only those above it in this list; `tests/logic/layering.rs` checks that.
 //!
 //! As a library: [`runtime::Run`] builds a run from a blueprint, [`hardware::registry`] makes adapters,
 //! [`hardware::spec::ManipulatorAdapter`] is what a new arm implements, [`testing`] stands in for one in unit tests,

@@ -1,4 +1,4 @@
-"""Tries assets/python/dimos_client.py against a live run of tests/python_client.rs; fails at what is not as it says."""
+"""Tries assets/python/dimos_client.py against a live run of tests/process/python_client.rs; fails at what is not as it says."""
 
 import itertools
 import math

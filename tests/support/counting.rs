@@ -1,30 +1,58 @@
-//! An allocator that counts the allocations of each thread, for the conformance suite.
+//! An allocator that counts what each thread asks of it. `logic/main.rs` makes it the binary's.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-struct Counting;
+/// Counts, and passes every call on to the system's allocator.
+pub struct Counting;
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+    static WATCHED: Cell<bool> = const { Cell::new(false) };
+    static WATCHED_CALLS: Cell<u64> = const { Cell::new(0) };
 }
 
-// SAFETY: everything is handed on to the system's allocator unchanged.
+fn count(allocates: bool) {
+    // A thread that is ending has no cells any more.
+    let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + u64::from(allocates)));
+    let watched = WATCHED.try_with(Cell::get).unwrap_or(false);
+    let _ = WATCHED_CALLS.try_with(|n| n.set(n.get() + u64::from(watched)));
+}
+
+// SAFETY: passes every call on to the system's allocator; counting neither allocates nor unwinds.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        let _ = ALLOCATIONS.try_with(|count| count.set(count.get() + 1));
+        count(true);
         unsafe { System.alloc(layout) }
     }
 
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count(true);
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count(true);
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        count(false);
         unsafe { System.dealloc(pointer, layout) }
     }
 }
 
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-/// How many the calling thread has made.
+/// How many allocations the calling thread has made.
 pub fn allocations() -> u64 {
     ALLOCATIONS.with(Cell::get)
+}
+
+/// Counts every call of the calling thread from now on, releases too; or no more.
+pub fn watch(on: bool) {
+    WATCHED.set(on);
+}
+
+/// How many calls [`watch`] saw on the calling thread.
+pub fn watched_calls() -> u64 {
+    WATCHED_CALLS.get()
 }

@@ -1,8 +1,6 @@
 //! The coordinator on a virtual clock, between arms in memory and a list of requests. Every command that goes out
 //! is checked here against what no command may ever do; the tests look at the rest.
 
-// Each test binary uses its own part of this file.
-#![allow(dead_code)]
 // The check compares several lists joint by joint.
 #![allow(clippy::needless_range_loop)]
 

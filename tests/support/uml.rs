@@ -12,12 +12,9 @@
 //! A test that needs it is written as usual, with its body handed to [`in_guest`]:
 //!
 //! ```ignore
-//! #[path = "support/uml.rs"]
-//! mod uml;
-//!
 //! #[test]
 //! fn two_arms_on_two_interfaces() {
-//!     uml::in_guest("two_arms_on_two_interfaces", &uml::Guest::with(uml::VCAN), || {
+//!     uml::in_guest(module_path!(), "two_arms_on_two_interfaces", &uml::Guest::with(uml::VCAN), || {
 //!         let left = /* … emulator and adapter on "vcan0" and "vcan1" … */;
 //!     });
 //! }
@@ -28,8 +25,6 @@
 //! pair sends, the other hears. A vendor's SDK that sends without local loopback needs a pair: the SDK on `can0`
 //! (`Command::new(".venv/bin/python")` in the body; the checkout is the working directory), the emulator on `sim0`.
 //! [`run`] runs a shell script instead. [`sh`] runs a command in the body: `uml::sh("ip link set vcan0 down")`.
-
-#![allow(dead_code, reason = "each test uses what it needs")]
 
 use std::fs::{self, File};
 use std::os::unix::fs::PermissionsExt;
@@ -91,14 +86,15 @@ pub struct Ran {
     pub output: String,
 }
 
-/// Runs `body` in a guest: here, it starts the guest with the same test; in the guest, it runs the body. `name` is the
-/// test's, with its modules.
-pub fn in_guest(name: &str, guest: &Guest, body: impl FnOnce()) {
+/// Runs `body` in a guest: here, it starts the guest with the same test; in the guest, it runs the body. `module` is the
+/// test's `module_path!()`, `name` the name of its function.
+pub fn in_guest(module: &str, name: &str, guest: &Guest, body: impl FnOnce()) {
     if std::env::var_os(INSIDE).is_some() {
         return body();
     }
+    let name = module.split_once("::").map_or(name.to_owned(), |(_, inner)| format!("{inner}::{name}"));
     let this = std::env::current_exe().expect("the test's own path");
-    let script = format!("{}\nexport {INSIDE}=1\n'{}' --exact {name} --nocapture\n", guest.setup, this.display());
+    let script = format!("{}\nexport {INSIDE}=1\n'{}' --exact '{name}' --nocapture\n", guest.setup, this.display());
     let Some(ran) = run(guest.modules, &script, guest.limit) else { return };
     assert_eq!(ran.status, 0, "in the guest:\n{}", ran.output);
     assert!(ran.output.contains("1 passed"), "no test is named {name}:\n{}", ran.output);

@@ -131,7 +131,7 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
     let folder = root.join("src/hardware/arms").join(&arm.name.snake);
     let next = [
         ("DIMOS_REGENERATE=1 cargo test --lib blueprint".to_owned(), "brings the generated pages up to date"),
-        ("cargo test --test conformance".to_owned(), "every arm of the table, this one too"),
+        ("cargo test --test logic conformance::".to_owned(), "every arm of the table, this one too"),
         (format!("cargo run -- run {}", arm.blueprint()), "with its emulator"),
         (
             format!("cargo run -- run {}", arm.planner()),

@@ -6,9 +6,6 @@
 //!     ◀──────────── gate ─────────────────────────────────────────────
 //! ```
 
-// Each test binary uses its own part of these files.
-#![allow(dead_code)]
-
 pub mod arms;
 pub mod can;
 pub mod decode;

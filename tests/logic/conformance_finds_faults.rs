@@ -1,0 +1,385 @@
+//! The conformance suite must be able to fail: adapters that are wrong in one way each, and the check that says so.
+
+use std::os::fd::BorrowedFd;
+
+use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::arms::{mock, xarm, yourarm};
+use dimos::hardware::conformance::gently::{Motion, move_gently, refusal};
+use dimos::hardware::conformance::{Outcome, checks, run};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
+use dimos::hardware::spec::*;
+use dimos::joint::{ControlMode, JointLimits};
+
+use crate::support::counting;
+
+type Inner = Box<dyn ManipulatorAdapter>;
+
+/// What is wrong with an adapter.
+const DEGREES: u8 = 0;
+const WRONG_SIGN: u8 = 1;
+const SWAPPED_JOINTS: u8 = 2;
+const DEAF_TO_STOP: u8 = 3;
+const MOVES_ON_ACTIVATION: u8 = 4;
+const ENABLES_ON_CONNECT: u8 = 5;
+const HIDES_ERRORS: u8 = 6;
+const CLAIMS_TO_BE_CONNECTED: u8 = 7;
+const ACCEPTS_ANY_MODE: u8 = 8;
+const ZERO_VELOCITIES: u8 = 9;
+const FAILS_WITHOUT_SENSOR: u8 = 10;
+const DROPS_POWER_ON_LEAVING: u8 = 11;
+const HIDES_SILENCE: u8 = 12;
+const STAMPS_ANEW: u8 = 13;
+const CLEARS_ERRORS_ON_CONNECT: u8 = 14;
+const STOP_DROPS_POWER: u8 = 15;
+const CONFIRMS_ALWAYS: u8 = 16;
+const STOP_CLEARS_ERRORS: u8 = 17;
+const STOP_IS_FINAL: u8 = 18;
+const MOVES_ON_RECONNECTING: u8 = 19;
+const OLD_NEWS_AFTER_CONNECT: u8 = 20;
+const WRONG_SIGN_BOTH_WAYS: u8 = 21;
+const IGNORES_MODEL: u8 = 22;
+const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
+const VELOCITIES_IN_DEGREES: u8 = 24;
+const OBEYS_WITHOUT_POWER: u8 = 25;
+const ALLOCATES_FOR_NEWS: u8 = 26;
+const GRIPPER_GOES_ON: u8 = 27;
+const STOP_LOCKS_GRIPPER: u8 = 28;
+const NO_MISTAKE: u8 = 255;
+
+/// An arm with one mistake.
+struct Wrong<const MISTAKE: u8> {
+    inner: Inner,
+    /// How often it was connected.
+    connections: u32,
+    /// It was stopped once.
+    stopped: bool,
+    /// Where the gripper was sent [m].
+    gripper: f64,
+    /// The last reading.
+    last: Option<JointReading>,
+    /// The next reading is to be the last once more.
+    repeat: bool,
+}
+
+impl<const MISTAKE: u8> Wrong<MISTAKE> {
+    /// Around the arm in memory.
+    const SPEC: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        dof: (6, 6),
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((mock::SPEC.create)(config)?))),
+        ..mock::SPEC
+    };
+    /// Around an arm with a wire and an emulator.
+    const WIRED: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((yourarm::SPEC.create)(config)?))),
+        ..yourarm::SPEC
+    };
+
+    /// Around an arm that sends its state by itself.
+    const PUSHED: AdapterSpec = AdapterSpec {
+        name: "wrong",
+        create: |config: &AdapterConfig| Ok(Box::new(Self::around((xarm::SPEC.create)(config)?))),
+        ..xarm::SPEC
+    };
+    /// Around an arm that is said to fall without power.
+    const FALLING: AdapterSpec = AdapterSpec { holds_when_disabled: false, ..Self::SPEC };
+
+    fn around(inner: Inner) -> Self {
+        Self { inner, connections: 0, stopped: false, gripper: 0.0, last: None, repeat: false }
+    }
+
+    fn spoil(values: &mut [f64]) {
+        match MISTAKE {
+            DEGREES => values.iter_mut().for_each(|value| *value = value.to_degrees()),
+            WRONG_SIGN | WRONG_SIGN_BOTH_WAYS => values[1] = -values[1],
+            SWAPPED_JOINTS => values.swap(1, 2),
+            _ => {}
+        }
+    }
+}
+
+impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
+    fn connect(&mut self) -> AdapterResult<()> {
+        let result = self.inner.connect();
+        if MISTAKE == IGNORES_MODEL {
+            return Ok(());
+        }
+        result?;
+        self.connections += 1;
+        self.repeat = MISTAKE == OLD_NEWS_AFTER_CONNECT;
+        match MISTAKE {
+            ENABLES_ON_CONNECT => self.inner.write_enable(true),
+            CLEARS_ERRORS_ON_CONNECT => self.inner.write_clear_errors(),
+            MOVES_ON_RECONNECTING if self.connections > 1 => {
+                let mut positions = [0.0; 6];
+                self.inner.read_joint_positions(&mut positions)?;
+                self.inner.write_joint_positions(&positions.map(|value| value + 0.1), 0.5)
+            }
+            CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => self.inner.write_joint_positions(&[1.0; 6], 0.01),
+            _ => Ok(()),
+        }
+    }
+    fn disconnect(&mut self) {
+        self.inner.disconnect();
+    }
+    fn is_connected(&self) -> bool {
+        MISTAKE == CLAIMS_TO_BE_CONNECTED || self.inner.is_connected()
+    }
+    fn activate(&mut self) -> AdapterResult<()> {
+        self.inner.activate()?;
+        if MISTAKE == MOVES_ON_ACTIVATION { self.inner.write_joint_positions(&[0.1; 6], 0.5) } else { Ok(()) }
+    }
+    fn deactivate(&mut self) -> AdapterResult<()> {
+        self.inner.deactivate()?;
+        if MISTAKE == DROPS_POWER_ON_LEAVING { self.inner.write_enable(false) } else { Ok(()) }
+    }
+    fn get_info(&self) -> ManipulatorInfo {
+        self.inner.get_info()
+    }
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.inner.state_fd()
+    }
+    fn get_dof(&self) -> usize {
+        self.inner.get_dof()
+    }
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        self.inner.get_limits()
+    }
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        let result = self.inner.set_control_mode(mode);
+        if MISTAKE == ACCEPTS_ANY_MODE { Ok(()) } else { result }
+    }
+    fn get_control_mode(&self) -> ControlMode {
+        self.inner.get_control_mode()
+    }
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        self.inner.read_joint_positions(positions)?;
+        Self::spoil(positions);
+        Ok(())
+    }
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        if let Some(last) = self.last.filter(|_| std::mem::take(&mut self.repeat)) {
+            *reading = last;
+            return Ok(());
+        }
+        match (self.inner.read_joints(reading), self.last) {
+            (Err(_), Some(last)) if MISTAKE == HIDES_SILENCE => *reading = last,
+            (result, _) => result?,
+        }
+        Self::spoil(&mut reading.position[..6]);
+        if MISTAKE == ALLOCATES_FOR_NEWS && self.last.is_some_and(|last| last.stamp != reading.stamp) {
+            std::hint::black_box(reading.position.to_vec());
+        }
+        if MISTAKE == ZERO_VELOCITIES {
+            reading.velocity = Some(Default::default());
+        }
+        if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_IN_DEGREES) {
+            *velocity = velocity.map(f64::to_degrees);
+        }
+        if MISTAKE == STAMPS_ANEW {
+            reading.stamp = Some(MonotonicClock.now());
+        }
+        self.last = Some(*reading);
+        Ok(())
+    }
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        let known = self.inner.read_joint_velocities(velocities)?;
+        if MISTAKE == ZERO_VELOCITIES {
+            velocities.fill(0.0);
+        }
+        Ok(known)
+    }
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        self.inner.read_state()
+    }
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        let error = self.inner.read_error()?;
+        Ok(if MISTAKE == HIDES_ERRORS { (0, String::new()) } else { error })
+    }
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        self.inner.read_enabled()
+    }
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        if MISTAKE == STOP_IS_FINAL && self.stopped {
+            return Err(AdapterError::Rejected("stopped".into()));
+        }
+        if let (WRONG_SIGN_BOTH_WAYS, Ok(mut positions)) = (MISTAKE, <[f64; 6]>::try_from(positions)) {
+            Self::spoil(&mut positions);
+            return self.inner.write_joint_positions(&positions, velocity);
+        }
+        let result = self.inner.write_joint_positions(positions, velocity);
+        if MISTAKE == OBEYS_WITHOUT_POWER { Ok(()) } else { result }
+    }
+    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
+        self.inner.write_joint_velocities(velocities)
+    }
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        self.stopped = true;
+        match MISTAKE {
+            DEAF_TO_STOP if self.inner.is_connected() => Ok(Stop::Confirmed),
+            CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => Ok(Stop::Confirmed),
+            CONFIRMS_ALWAYS => self.inner.write_stop().or(Ok(Stop::Confirmed)),
+            STOP_DROPS_POWER => self.inner.write_enable(false).map(|()| Stop::Confirmed),
+            STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
+            // The arm's own stop holds the gripper too; this one does not.
+            GRIPPER_GOES_ON | STOP_LOCKS_GRIPPER => {
+                let stop = self.inner.write_stop()?;
+                self.inner.write_gripper_position(self.gripper).map(|()| stop)
+            }
+            _ => self.inner.write_stop(),
+        }
+    }
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        self.inner.write_enable(enable)
+    }
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        self.inner.write_clear_errors()
+    }
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.inner.read_gripper_position()
+    }
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        self.inner.get_gripper_range()
+    }
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        match MISTAKE {
+            GRIPPER_GOES_ON if self.stopped => return Ok(()),
+            STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
+            _ => self.gripper = position,
+        }
+        self.inner.write_gripper_position(position)
+    }
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        if MISTAKE == FAILS_WITHOUT_SENSOR { Err(AdapterError::Unsupported) } else { Ok(None) }
+    }
+}
+
+#[test]
+fn each_mistake_is_found_by_the_check_for_it() {
+    let cases: &[(AdapterSpec, &str)] = &[
+        (Wrong::<DEGREES>::SPEC, "planned_moves_arrive"),
+        (Wrong::<WRONG_SIGN>::SPEC, "planned_moves_arrive"),
+        (Wrong::<SWAPPED_JOINTS>::SPEC, "set_points_are_followed"),
+        (Wrong::<DEAF_TO_STOP>::SPEC, "stop_ends_motion"),
+        (Wrong::<MOVES_ON_ACTIVATION>::SPEC, "activation_holds"),
+        (Wrong::<ENABLES_ON_CONNECT>::SPEC, "connecting_changes_nothing"),
+        (Wrong::<HIDES_ERRORS>::SPEC, "errors_have_code_and_text"),
+        (Wrong::<CLAIMS_TO_BE_CONNECTED>::SPEC, "not_connected_is_said"),
+        (Wrong::<ACCEPTS_ANY_MODE>::SPEC, "modes_are_what_it_says"),
+        (Wrong::<ZERO_VELOCITIES>::SPEC, "velocities_are_kept"),
+        (Wrong::<FAILS_WITHOUT_SENSOR>::SPEC, "optional_parts_never_fail"),
+        (Wrong::<DROPS_POWER_ON_LEAVING>::SPEC, "leaving_moves_nothing"),
+        (Wrong::<WRONG_SIGN_BOTH_WAYS>::WIRED, "joints_are_the_arms_own"),
+        (Wrong::<IGNORES_MODEL>::WIRED, "wrong_model_is_refused"),
+        (Wrong::<HIDES_SILENCE>::WIRED, "silence_is_noticed"),
+        (Wrong::<STAMPS_ANEW>::WIRED, "frozen_state_is_noticed"),
+        (Wrong::<STAMPS_ANEW>::SPEC, "frozen_state_is_noticed"),
+        (Wrong::<DEAF_TO_STOP>::WIRED, "stop_ends_motion"),
+        (Wrong::<DEAF_TO_STOP>::SPEC, "stop_ends_velocity"),
+        (Wrong::<DEAF_TO_STOP>::WIRED, "stop_ends_velocity"),
+        (Wrong::<STOP_DROPS_POWER>::SPEC, "stop_ends_streaming"),
+        (Wrong::<STOP_CLEARS_ERRORS>::WIRED, "stop_in_error_is_harmless"),
+        (Wrong::<STOP_IS_FINAL>::WIRED, "stop_is_no_fault"),
+        (Wrong::<GRIPPER_GOES_ON>::WIRED, "stop_holds_the_gripper"),
+        (Wrong::<STOP_LOCKS_GRIPPER>::SPEC, "stop_holds_the_gripper"),
+        (Wrong::<ENABLES_ON_CONNECT>::WIRED, "cut_when_disabled"),
+        (Wrong::<CLAIMS_TO_BE_CONNECTED>::WIRED, "cut_when_enabled"),
+        (Wrong::<OLD_NEWS_AFTER_CONNECT>::WIRED, "cut_when_enabled"),
+        (Wrong::<MOVES_ON_RECONNECTING>::WIRED, "cut_when_enabled"),
+        (Wrong::<MOVES_ON_RECONNECTING>::WIRED, "cut_while_streaming"),
+        (Wrong::<CANNOT_STOP_AFTER_RECONNECTING>::SPEC, "cut_in_motion"),
+        (Wrong::<CLEARS_ERRORS_ON_CONNECT>::WIRED, "cut_in_error"),
+        (Wrong::<ENABLES_ON_CONNECT>::WIRED, "power_cut"),
+        (Wrong::<CONFIRMS_ALWAYS>::WIRED, "stop_into_the_void"),
+        (Wrong::<OBEYS_WITHOUT_POWER>::SPEC, "disabled_arms_do_not_move"),
+        (Wrong::<OBEYS_WITHOUT_POWER>::FALLING, "disabled_arms_do_not_move"),
+        (Wrong::<ALLOCATES_FOR_NEWS>::PUSHED, "reads_do_not_allocate"),
+    ];
+    std::thread::scope(|scope| {
+        for (row, name) in cases {
+            scope.spawn(move || {
+                let check = checks().find(|check| check.name == *name).unwrap();
+                let outcome = run(row, check, Some(counting::allocations));
+                assert!(matches!(outcome, Outcome::Failed(_)), "{name}: {outcome:?}");
+                println!("{name}: {outcome:?}");
+            });
+        }
+    });
+}
+
+/// What was found above was the mistake, and not the wrapping.
+#[test]
+fn without_a_mistake_the_same_checks_pass() {
+    for (row, name) in [
+        (Wrong::<NO_MISTAKE>::FALLING, "disabled_arms_do_not_move"),
+        (Wrong::<NO_MISTAKE>::PUSHED, "reads_do_not_allocate"),
+    ] {
+        let check = checks().find(|check| check.name == name).unwrap();
+        assert_eq!(run(&row, check, Some(counting::allocations)), Outcome::Passed, "{name}");
+    }
+}
+
+/// The small slow motion of a wrong arm, which begins to be interrupted at the `looks`th look.
+fn moved_gently(row: &AdapterSpec, looks: u32) -> (Motion, Inner) {
+    let config = AdapterConfig {
+        hardware_id: "arm".into(),
+        address: String::new(),
+        dof: 6,
+        options: serde_json::json!({"initial_positions": [0, 0, 0, 0, 0, 0]}),
+    };
+    let mut adapter = (row.create)(&config).unwrap();
+    adapter.connect().unwrap();
+    let mut left = looks;
+    let interrupted = std::cell::Cell::new(false);
+    let motion = move_gently(&mut *adapter, &|| interrupted.get(), &mut |_| {
+        left -= 1;
+        interrupted.set(left == 0);
+    });
+    (motion, adapter)
+}
+
+#[test]
+fn the_small_slow_motion_ends_where_something_is_odd() {
+    let cases: &[(AdapterSpec, &str)] = &[
+        (Wrong::<DEGREES>::SPEC, "joint 1 was sent by +2.00° and moved by"),
+        (Wrong::<WRONG_SIGN>::SPEC, "joint 2 was sent by +2.00° and moves the other way"),
+        (Wrong::<SWAPPED_JOINTS>::SPEC, "joint 3 moved by"),
+        (Wrong::<MOVES_ON_ACTIVATION>::SPEC, "moved by 0.5"),
+        (Wrong::<DEAF_TO_STOP>::SPEC, "in spite of a stop"),
+        (Wrong::<STOP_DROPS_POWER>::SPEC, "the motors went off"),
+        (Wrong::<VELOCITIES_IN_DEGREES>::SPEC, "are they in rad/s"),
+        (Wrong::<STOP_IS_FINAL>::SPEC, "stopped"),
+    ];
+    std::thread::scope(|scope| {
+        for (row, says) in cases {
+            scope.spawn(move || {
+                let (motion, mut adapter) = moved_gently(row, u32::MAX);
+                let odd = motion.odd.unwrap_or_else(|| panic!("{says}: nothing was odd in {:?}", motion.ways));
+                assert!(odd.contains(says), "{odd}");
+                println!("{odd}");
+                // Whatever it was, the arm stands.
+                let mut before = [0.0; 6];
+                let mut after = [0.0; 6];
+                adapter.read_joint_positions(&mut before).unwrap();
+                std::thread::sleep(std::time::Duration::from_millis(100));
+                adapter.read_joint_positions(&mut after).unwrap();
+                assert_eq!(before, after, "{says}");
+            });
+        }
+    });
+}
+
+#[test]
+fn the_small_slow_motion_can_be_interrupted_and_refused() {
+    let (motion, mut adapter) = moved_gently(&mock::SPEC, 3);
+    assert!(motion.interrupted && motion.odd.is_none() && motion.ways.len() == 1, "{motion:?}");
+    assert_eq!(motion.left, "motors off, as they were found");
+    assert!(refusal(&mut *adapter).is_ok());
+    adapter.set_control_mode(ControlMode::ServoPosition).unwrap();
+    adapter.activate().unwrap();
+    adapter.write_joint_positions(&[0.0, 0.0, 0.0, 6.25, 0.0, 0.0], 1.0).unwrap();
+    std::thread::sleep(std::time::Duration::from_secs(3));
+    let refused = refusal(&mut *adapter).unwrap_err();
+    assert!(refused.contains("joint 4 at 358.10° has 1.90° to its upper limit"), "{refused}");
+}

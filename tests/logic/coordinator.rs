@@ -1,0 +1,496 @@
+//! What the coordinator does with trajectories, streams, stops and arms, on a virtual clock.
+
+use dimos::arm::{Link, VelocitySource};
+use dimos::control::config::*;
+use dimos::control::request::Request;
+use dimos::joint::ControlMode;
+use dimos::telemetry::{Cause, Event, Outcome, Phase, Reason, TaskState};
+
+use crate::support::rig::*;
+
+fn one(kind: TaskKind) -> Vec<TaskConfig> {
+    vec![task("t", kind, 0..6, 10)]
+}
+
+fn params(change: impl FnOnce(&mut TrajectoryParams)) -> TaskKind {
+    let mut p = TrajectoryParams::default();
+    change(&mut p);
+    TaskKind::Trajectory(p)
+}
+
+#[test]
+fn a_trajectory_is_accepted_followed_and_completed_on_arrival() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    rig.arms[0].lag = 0.05;
+    assert_eq!(rig.execute(0, sweep(7, 0..6, 0.0, 1.0, 2.0)), Outcome::Accepted);
+    assert_eq!(rig.tasks[0].motion, 7);
+    assert_eq!(rig.execute(0, sweep(8, 0..6, 0.0, 1.0, 2.0)), Outcome::AlreadyExecuting(0));
+    assert_eq!(rig.retired, [8], "a refused motion is given back");
+    let took = rig.run_until(4.0, |r| r.tasks[0].state == TaskState::Completed);
+    assert!((1.9..2.6).contains(&took), "{took}");
+    assert!(rig.arms[0].q.iter().all(|q| (q - 1.0).abs() <= 0.01), "{:?}", rig.arms[0].q);
+    assert_eq!((rig.tasks[0].progress, rig.tasks[0].remaining), (1.0, 0.0));
+    assert_eq!(rig.retired, [8, 7]);
+    rig.run_for(1.0);
+    assert!(rig.arms[0].q.iter().all(|q| (q - 1.0).abs() <= 1e-3), "the goal is held");
+}
+
+#[test]
+fn it_does_not_complete_by_the_clock() {
+    let mut rig = Rig::one_arm(one(params(|p| p.path_tolerance = 0.0)));
+    rig.execute(0, sweep(1, 0..6, 0.0, 0.3, 1.0));
+    rig.run_for(0.5);
+    rig.arms[0].blocked = true;
+    let stuck_at = rig.arms[0].q[0];
+    let took = rig.run_until(5.0, |r| r.tasks[0].state == TaskState::Aborted);
+    assert!((2.4..2.7).contains(&took), "goal time of 2 s after the end: {took}");
+    match rig.tasks[0].reason {
+        Reason::GoalTolerance(0, error) => assert!((error - (stuck_at - 0.3)).abs() < 1e-9, "{error}"),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn leaving_the_path_aborts_with_joint_and_error() {
+    let mut rig = Rig::one_arm(one(params(|p| p.path_tolerance = 0.05)));
+    rig.execute(0, sweep(1, 0..6, 0.0, 1.0, 2.0));
+    rig.run_for(0.5);
+    rig.arms[0].blocked = true;
+    rig.run_until(1.0, |r| r.tasks[0].state == TaskState::Aborted);
+    assert!(matches!(rig.tasks[0].reason, Reason::PathTolerance(0, e) if e < -0.05 && e > -0.08), "{:?}", rig.tasks[0]);
+    assert_eq!(rig.phase(0), Phase::Ready);
+    rig.run_for(1.0);
+    assert_eq!(rig.speed(0), 0.0);
+}
+
+#[test]
+fn cancel_slows_down_along_the_path() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    let joints: Vec<u16> = (0..6).collect();
+    // Joint k goes k + 1 times as far as joint 0: a straight line, which the cancel must not leave.
+    let goal: Vec<f64> = (1..=6).map(|k| 0.25 * k as f64).collect();
+    rig.execute(0, motion(1, &joints, &[(0.0, &[0.0; 6]), (2.5, &goal)]));
+    rig.run_for(1.2);
+    let speed = rig.speed(0);
+    assert!(speed > 0.8, "{speed}");
+    assert_eq!(rig.ask(Request::Cancel { task: Some(0) }), Outcome::Cancelled);
+    assert_eq!(rig.tasks[0].state, TaskState::Cancelling);
+    assert_eq!(rig.ask(Request::Cancel { task: None }), Outcome::Cancelled, "again, on the way");
+    let mut ticks = 0;
+    while rig.speed(0) > 0.0 {
+        rig.tick();
+        let q = rig.commanded(0);
+        for k in 1..6 {
+            let off = q[k] - q[0] * (k + 1) as f64;
+            assert!(off.abs() < 1e-3, "joint {k} is off the path by {off}");
+        }
+        ticks += 1;
+        assert!(ticks < 100);
+    }
+    let took = (ticks + 2) as f64 * rig.dt();
+    assert!(took >= speed / A_MAX - 0.03 && took <= 1.6 * speed / A_MAX, "{took} s from {speed} rad/s");
+    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Aborted, Reason::Cancelled));
+    assert_eq!(rig.retired, [1]);
+    assert_eq!(rig.ask(Request::Cancel { task: Some(0) }), Outcome::AlreadyStopped);
+    assert_eq!(rig.execute(0, sweep(2, 0..6, 5.0, 0.0, 1.0)).name(), "START_STATE_MISMATCH");
+}
+
+#[test]
+fn cancel_is_the_ordinary_end_of_a_stream() {
+    let mut rig = Rig::one_arm(vec![task("v", velocity(), 0..6, 5)]);
+    for _ in 0..4 {
+        rig.velocity(0, &[0.3; 6]);
+        rig.run_for(0.1);
+    }
+    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Executing, Reason::None));
+    assert_eq!(rig.ask(Request::Cancel { task: Some(0) }), Outcome::Cancelled);
+    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Idle, Reason::StreamEnded));
+    rig.run_for(0.5);
+    assert_eq!((rig.tasks[0].state, rig.speed(0)), (TaskState::Idle, 0.0), "at rest, and it stays so");
+}
+
+#[test]
+fn cancel_ends_a_trajectory_that_has_not_begun_to_move() {
+    let mut rig = Rig::one_arm(vec![task("v", velocity(), 0..6, 5), task("t", trajectory(), 0..6, 10)]);
+    rig.velocity(0, &[0.3; 6]);
+    rig.run_for(0.3);
+    rig.arms[0].mode_delay = u32::MAX; // It never takes up another mode again.
+    let start = rig.arms[0].q[0];
+    assert_eq!(rig.execute(1, sweep(1, 0..6, start, 0.5, 1.0)), Outcome::Accepted);
+    rig.run_for(0.5);
+    assert_eq!(rig.tasks[1].state, TaskState::Executing);
+    rig.ask(Request::Cancel { task: Some(1) });
+    rig.run(3);
+    assert_eq!((rig.tasks[1].state, rig.tasks[1].reason), (TaskState::Aborted, Reason::Cancelled));
+}
+
+#[test]
+fn a_trajectory_that_takes_over_from_a_velocity_does_not_fault() {
+    let mut rig = Rig::one_arm(vec![task("v", velocity(), 0..6, 5), task("t", trajectory(), 0..6, 10)]);
+    for _ in 0..50 {
+        rig.velocity(0, &[1.4; 6]);
+        rig.tick();
+    }
+    let start = rig.arms[0].q[0];
+    // By the time the arm stands still it is 0.25 rad further, too far from the trajectory's start.
+    assert_eq!(rig.execute(1, sweep(1, 0..6, start, 1.5, 2.0)), Outcome::Accepted);
+    rig.run_for(1.0);
+    assert_eq!(rig.phase(0), Phase::Ready, "{:?}", rig.events);
+    assert_eq!(rig.tasks[1].state, TaskState::Aborted);
+    assert!(matches!(rig.tasks[1].reason, Reason::PathTolerance(0, e) if e > 0.05), "{:?}", rig.tasks[1]);
+}
+
+#[test]
+fn two_trajectory_tasks_on_two_arms_run_at_once() {
+    let mut rig = Rig::two_arms(vec![task("l", trajectory(), 0..7, 10), task("r", trajectory(), 7..13, 10)]);
+    assert_eq!(rig.execute(0, sweep(1, 0..7, 0.0, 0.5, 1.0)), Outcome::Accepted);
+    assert_eq!(rig.execute(1, sweep(2, 7..13, 0.0, -0.5, 1.5)), Outcome::Accepted);
+    rig.run_until(2.0, |r| r.tasks[0].state == TaskState::Completed);
+    assert_eq!(rig.tasks[1].state, TaskState::Executing);
+    rig.run_until(2.0, |r| r.tasks[1].state == TaskState::Completed);
+    assert!((rig.arms[0].q[6] - 0.5).abs() < 0.01 && (rig.arms[1].q[5] + 0.5).abs() < 0.01);
+}
+
+#[test]
+fn one_trajectory_moves_both_arms_and_ends_when_one_of_them_faults() {
+    let mut rig = Rig::two_arms(vec![task("both", trajectory(), 0..13, 10)]);
+    rig.execute(0, sweep(1, 0..13, 0.0, 1.0, 2.0));
+    rig.run_for(1.0);
+    assert!(rig.speed(0) > 0.4 && (rig.speed(0) - rig.speed(1)).abs() < 1e-9);
+    rig.arms[1].error = 17;
+    rig.tick();
+    assert_eq!((rig.phase(0), rig.phase(1)), (Phase::Ready, Phase::Held));
+    let reason = Reason::ArmHeld(1, Cause::Fault(17));
+    assert_eq!((rig.tasks[0].state, rig.tasks[0].reason), (TaskState::Aborted, reason));
+    rig.run_for(0.5);
+    assert_eq!((rig.speed(0), rig.speed(1)), (0.0, 0.0));
+    assert_eq!(rig.execute(0, sweep(2, 0..13, 0.5, 1.0, 2.0)), Outcome::ArmLatched(1, Cause::Fault(17)));
+    assert_eq!(rig.ask(Request::Reset { arm: 1 }), Outcome::StillFaulted(1, Cause::Fault(17)));
+}
+
+#[test]
+fn a_waiting_arm_makes_the_other_one_wait_too() {
+    let mut rig = Rig::two_arms(vec![task("both", trajectory(), 0..13, 10), task("v", velocity(), 7..13, 5)]);
+    rig.arms[1].mode_delay = 30;
+    rig.velocity(1, &[0.0; 6]);
+    rig.run_for(0.6);
+    assert_eq!(rig.arms[1].mode, ControlMode::Velocity);
+    rig.execute(0, sweep(1, 0..13, 0.0, 0.5, 1.0));
+    for _ in 0..200 {
+        rig.tick();
+        let (a, b) = (rig.samples[0].command.values[0], rig.arms[1].q[0]);
+        assert!((a - b).abs() < 0.02, "apart: {a} and {b}");
+    }
+    assert_eq!(rig.tasks[0].state, TaskState::Completed);
+}
+
+#[test]
+fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
+    for (stop_takes_hold, lag, sag) in [(false, 0.0, 0.0), (true, 0.0, 0.0), (true, 0.06, 0.0), (false, 0.06, 0.03)] {
+        let mut sagging = arm("arm", 6);
+        sagging.supervision.accuracy = 0.02;
+        let mut rig = Rig::new(100.0, vec![sagging], one(trajectory()));
+        rig.make_ready();
+        (rig.arms[0].stop_takes_hold, rig.arms[0].lag, rig.arms[0].sag) = (stop_takes_hold, lag, sag);
+        rig.run_for(1.0);
+        let commanded = rig.commanded(0)[0];
+        rig.execute(0, sweep(1, 0..6, commanded, 1.0, 2.0));
+        rig.run_for(1.0);
+        assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
+        assert_eq!(rig.phase(0), Phase::Held);
+        assert!(rig.told(Event::Task(0, TaskState::Aborted, Reason::ArmHeld(0, Cause::Operator))));
+        rig.run_for(2.0);
+        assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, 1), "at rest it is left alone, stopped once");
+        let rest = rig.arms[0].q[0];
+        let here = |rig: &Rig, what: &str| {
+            let moved = (rig.arms[0].q[0] - rest).abs();
+            assert!(moved < 0.005, "{what} moved it by {moved} ({stop_takes_hold} {lag} {sag})");
+        };
+        let id = rig.send(Request::Execute { task: 0, motion: sweep(2, 0..6, rest, 1.2, 1.0) });
+        rig.tick();
+        assert_eq!(rig.outcome(id), Outcome::ArmLatched(0, Cause::Operator));
+        assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+        assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.phase(0), Phase::Standby);
+        rig.run_for(0.5);
+        here(&rig, "reset");
+        let id = rig.send(Request::Execute { task: 0, motion: sweep(3, 0..6, rest, 1.2, 1.0) });
+        rig.tick();
+        assert_eq!(rig.outcome(id).name(), "ARM_NOT_READY");
+        assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+        let before = rig.events.len();
+        for _ in 0..100 {
+            rig.tick();
+            here(&rig, "enable");
+        }
+        assert_eq!(rig.phase(0), Phase::Ready);
+        assert_eq!(rig.events.len(), before + 1, "told of Ready, and of nothing else");
+    }
+}
+
+#[test]
+fn an_arm_that_is_being_disabled_or_enabled_may_be_silent_meanwhile() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    assert_eq!(rig.ask(Request::Park { arm: 0 }), Outcome::Accepted);
+    rig.run_for(0.6);
+    rig.arms[0].silent = true; // its device thread waits for the motors
+    rig.run_for(0.5);
+    assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "no fault, and nothing is sent");
+    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::StartStateUnavailable(0), "not on an old state");
+    (rig.arms[0].silent, rig.arms[0].enabled) = (false, false);
+    rig.run(3);
+    assert_eq!(rig.phase(0), Phase::Disabled);
+
+    let mut rig = Rig::one_arm(one(trajectory()));
+    rig.ask(Request::Park { arm: 0 });
+    rig.run_for(0.6);
+    rig.arms[0].link = Link::Faulted;
+    rig.run(3);
+    assert_eq!((rig.phase(0), rig.samples[0].cause), (Phase::Held, Cause::LinkLost), "a broken connection is a fault");
+}
+
+#[test]
+fn a_stop_while_an_arm_is_being_enabled_is_not_lost() {
+    let mut rig = Rig::new(100.0, vec![arm("arm", 6)], one(trajectory()));
+    rig.arms[0].enabled = false;
+    rig.run(3);
+    assert_eq!(rig.phase(0), Phase::Disabled);
+    assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
+    rig.arms[0].enabled = true; // the motors were on their way
+    rig.run(3);
+    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+    rig.run_for(0.5);
+    assert_eq!((rig.phase(0), rig.commands[0].mode, rig.arms[0].stops), (Phase::Held, None, 1));
+    assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+}
+
+#[test]
+fn activating_again_and_again_does_not_sink() {
+    let mut sagging = arm("arm", 6);
+    sagging.supervision.accuracy = 0.02;
+    let mut rig = Rig::new(100.0, vec![sagging], one(trajectory()));
+    rig.make_ready();
+    rig.arms[0].sag = 0.02;
+    rig.arms[0].lag = 0.03;
+    rig.run_for(1.0);
+    let before = rig.arms[0].q[0];
+    for _ in 0..20 {
+        rig.ask(Request::Stop { arm: Some(0) });
+        rig.run_for(1.0);
+        rig.ask(Request::Reset { arm: 0 });
+        rig.ask(Request::Ready { arm: 0 });
+        rig.run_for(0.5);
+    }
+    assert_eq!(rig.phase(0), Phase::Ready);
+    assert!((rig.arms[0].q[0] - before).abs() < 1e-6, "sank by {}", before - rig.arms[0].q[0]);
+}
+
+#[test]
+fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    for (off, carried) in [(true, 0.03), (true, 0.4), (false, 0.4)] {
+        assert_eq!(rig.ask(Request::Park { arm: 0 }), Outcome::Accepted);
+        rig.run_for(0.6);
+        rig.arms[0].enabled = !off;
+        rig.run(3);
+        assert_eq!(rig.phase(0), if off { Phase::Disabled } else { Phase::Standby });
+        rig.arms[0].setpoint = None;
+        for _ in 0..40 {
+            rig.arms[0].q.iter_mut().for_each(|q| *q += carried / 40.0);
+            rig.run(1);
+        }
+        let there = rig.arms[0].q[0];
+        rig.run(3);
+        rig.arms[0].enabled = true;
+        rig.run(3);
+        assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+        rig.run_for(0.5);
+        assert!((rig.arms[0].q[0] - there).abs() < 0.005, "{} from {there}", rig.arms[0].q[0]);
+        assert_eq!(rig.phase(0), Phase::Ready);
+    }
+}
+
+#[test]
+fn the_first_command_after_activation_holds() {
+    let mut rig = Rig::new(100.0, vec![arm("arm", 6)], one(trajectory()));
+    rig.arms[0].q = vec![0.7, -0.4, 2.1, 0.0, 1.99, -1.995];
+    rig.arms[0].mode_delay = 5;
+    let before = rig.arms[0].q.clone();
+    rig.run(2);
+    assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "nothing is sent before `enable`");
+    assert_eq!(rig.execute(0, sweep(1, 0..6, 0.0, 0.1, 1.0)), Outcome::ArmNotReady(0, Phase::Standby, Cause::None));
+    rig.ask(Request::Ready { arm: 0 });
+    assert_eq!(rig.phase(0), Phase::Activating);
+    let ready_after = rig.run_until(1.0, |r| r.phase(0) == Phase::Ready);
+    assert!(ready_after >= 0.2, "{ready_after}");
+    for (q, b) in rig.arms[0].q.iter().zip(&before) {
+        assert!((q - b).abs() <= 0.005, "{q} from {b}");
+    }
+}
+
+#[test]
+fn an_arm_is_not_taken_up_without_a_fresh_state() {
+    let mut rig = Rig::new(100.0, vec![arm("arm", 6)], one(trajectory()));
+    assert_eq!(rig.coordinator.tick(time(&rig), &[Default::default()], || None).arms[0].phase, Phase::Unknown);
+    rig.run(2);
+    rig.arms[0].silent = true;
+    rig.run(10);
+    assert_ne!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.commands[0].mode, None);
+}
+
+fn time(rig: &Rig) -> dimos::control::coordinator::TickTime {
+    let next = rig.now.after(rig.config.period());
+    dimos::control::coordinator::TickTime { now: rig.now, next, skipped: 0, late_ns: 0, woke_late_ns: 0 }
+}
+
+#[test]
+fn a_start_up_to_the_tolerance_away_is_faded_out_within_limits() {
+    for offset in [0.0, 0.01, -0.03, 0.049] {
+        let mut rig = Rig::one_arm(one(trajectory()));
+        assert_eq!(rig.execute(0, sweep(1, 0..6, offset, 0.8, 1.5)), Outcome::Accepted);
+        rig.run_until(3.0, |r| r.tasks[0].state == TaskState::Completed);
+        let limited = rig.count(|e| matches!(e, Event::Limited(..)));
+        assert_eq!(limited, 0, "{offset}: {:?}", rig.events);
+    }
+    let mut rig = Rig::one_arm(one(trajectory()));
+    let refused = rig.execute(0, sweep(1, 0..6, 0.051, 0.8, 1.2));
+    assert!(matches!(refused, Outcome::StartStateMismatch(0, by) if (by - 0.051).abs() < 1e-12));
+}
+
+#[test]
+fn a_trajectory_shorter_than_its_fade_still_arrives() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    assert_eq!(rig.execute(0, sweep(1, 0..6, 0.04, 0.041, 0.02)), Outcome::Accepted);
+    rig.run_until(2.0, |r| r.tasks[0].state == TaskState::Completed);
+    assert!((rig.arms[0].q[0] - 0.041).abs() < 0.01);
+}
+
+#[test]
+fn velocities_are_estimated_and_marked_where_the_arm_has_none() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    rig.arms[0].reports_velocity = false;
+    rig.execute(0, sweep(1, 0..6, 0.0, 1.0, 2.0));
+    rig.run_for(1.0);
+    let state = rig.samples[0].state;
+    assert_eq!(state.velocity_source, VelocitySource::Estimated);
+    assert!((state.velocity[0] - rig.arms[0].v[0]).abs() < 0.05, "{}", state.velocity[0]);
+    rig.run_until(3.0, |r| r.tasks[0].state == TaskState::Completed);
+}
+
+#[test]
+fn a_slow_servo_stream_makes_a_smooth_motion() {
+    // 50 Hz and 30 Hz into a 100 Hz tick: the second one never falls on the same tick of its period.
+    for (rate, jitter) in [(50.0, false), (30.0, false), (50.0, true)] {
+        let mut rig = Rig::one_arm(one(servo()));
+        let wave = |t: f64| 0.6 * (1.0 - (1.2 * t).cos());
+        let (mut due, mut worst, mut slowest, mut k) = (0.0, 0.0f64, f64::MAX, 0u64);
+        for tick in 0..500 {
+            let t = tick as f64 * rig.dt();
+            if t + 1e-9 >= due {
+                rig.servo(0, &[wave(t); 6]);
+                k += 1;
+                let late = if jitter && k % 3 == 0 { 0.008 } else { 0.0 };
+                due = k as f64 / rate + late;
+            }
+            rig.tick();
+            let q = rig.commanded(0)[0];
+            if tick > 50 {
+                worst = worst.max((q - wave(t)).abs());
+                let true_v: f64 = 0.72 * (1.2 * t).sin();
+                if true_v > 0.3 {
+                    slowest = slowest.min(rig.speed(0) / true_v);
+                }
+            }
+        }
+        assert!(worst < 0.72 * 2.5 / rate, "{rate} Hz: off by {worst} rad");
+        assert!(slowest > 0.85, "{rate} Hz, jitter {jitter}: down to {slowest} of the speed: stop and go");
+    }
+}
+
+#[test]
+fn a_servo_stream_that_starts_at_speed_is_caught_up_with() {
+    for speed in [0.3, 0.8, 1.4] {
+        let mut rig = Rig::one_arm(one(servo()));
+        for k in 1..120 {
+            let id = rig.servo(0, &[speed * k as f64 * 0.01; 6]);
+            rig.tick();
+            assert_eq!(rig.outcome(id), Outcome::Accepted);
+        }
+        assert_eq!(rig.phase(0), Phase::Ready, "{speed}: {:?}", rig.events);
+        let behind = (speed * 119.0 * 0.01 - rig.commanded(0)[0]).abs();
+        assert!(behind < if speed > 1.3 { 0.25 } else { 1e-6 }, "{speed}: {behind}");
+    }
+}
+
+#[test]
+fn grippers_open_on_request_and_only_where_there_is_one() {
+    let mut with = arm("arm", 6);
+    let mut without = arm("bare", 6);
+    (with.gripper, without.gripper) = (true, false);
+    let mut rig = Rig::new(100.0, vec![with, without], one(trajectory()));
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }).name(), "ARM_NOT_READY");
+    rig.make_ready();
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }), Outcome::Accepted);
+    assert_eq!((rig.arms[0].gripper, rig.commands[0].gripper_seq), (0.04, 1));
+    assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04 }), Outcome::NoGripper(1));
+    for unfit in [f64::NAN, f64::INFINITY, -0.1] {
+        assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit }).name(), "OUT_OF_LIMITS");
+    }
+    assert_eq!(rig.arms[0].gripper, 0.04);
+}
+
+#[test]
+fn requests_for_what_does_not_exist_are_refused() {
+    let mut rig = Rig::one_arm(one(trajectory()));
+    assert_eq!(rig.execute(9, sweep(1, 0..6, 0.0, 0.1, 1.0)), Outcome::WrongTask(9));
+    assert_eq!(rig.execute(0, sweep(1, 3..9, 0.0, 0.1, 1.0)), Outcome::WrongTask(0));
+    assert_eq!(rig.ask(Request::Servo { task: 0, target: [0.0; 16] }), Outcome::WrongTask(0));
+    assert_eq!(rig.ask(Request::Velocity { task: 4, target: [0.0; 16] }), Outcome::WrongTask(4));
+    for request in [Request::Stop { arm: Some(5) }, Request::Reset { arm: 5 }, Request::Ready { arm: 5 }] {
+        assert_ne!(rig.ask(request), Outcome::Accepted);
+    }
+    assert_eq!(rig.ask(Request::Cancel { task: Some(5) }), Outcome::WrongTask(5));
+    assert_eq!(rig.tasks[0].state, TaskState::Idle);
+}
+
+#[test]
+fn shutdown_brings_everything_to_rest_and_takes_nothing_more() {
+    let tasks = vec![task("t", trajectory(), 0..7, 10), task("v", velocity(), 7..13, 10)];
+    let mut rig = Rig::two_arms(tasks);
+    rig.execute(0, sweep(1, 0..7, 0.0, 1.2, 1.8));
+    for _ in 0..90 {
+        rig.velocity(1, &[0.8; 6]);
+        rig.tick();
+    }
+    assert!(!rig.coordinator.at_rest());
+    assert_eq!(rig.ask(Request::Shutdown), Outcome::Cancelled);
+    let took = rig.run_until(2.0, |r| r.coordinator.at_rest());
+    assert!(took < 1.0, "{took}");
+    assert_eq!((rig.speed(0), rig.speed(1)), (0.0, 0.0));
+    assert_eq!(rig.execute(0, sweep(2, 0..7, 0.5, 1.2, 1.8)), Outcome::ShuttingDown);
+    assert_eq!(rig.ask(Request::Servo { task: 1, target: [0.0; 16] }), Outcome::ShuttingDown);
+    assert_eq!(rig.retired, [1, 2]);
+}
+
+#[test]
+fn a_servo_task_with_a_default_begins_by_itself() {
+    let at = |q: f64| TaskKind::Servo(ServoParams { timeout: 0.0, default_positions: Some(vec![q; 6]) });
+    let mut config = task("home", at(0.15), 0..6, 10);
+    config.auto_start = true;
+    let mut rig = Rig::one_arm(vec![config]);
+    rig.run_for(1.0);
+    assert!((rig.arms[0].q[0] - 0.15).abs() < 1e-9 && rig.tasks[0].state == TaskState::Executing);
+}
+
+#[test]
+fn a_burst_of_requests_is_answered_within_a_few_ticks_and_a_stop_in_it_is_not_kept_waiting() {
+    let mut rig = Rig::one_arm(vec![task("s", servo(), 0..6, 10)]);
+    let ids: Vec<u64> = (0..255).map(|k| rig.servo(0, &[1e-4 * k as f64; 6])).collect();
+    let stop = rig.send(Request::Stop { arm: None });
+    rig.tick();
+    assert_eq!(rig.outcome(stop), Outcome::Accepted);
+    assert_eq!(rig.phase(0), Phase::Held);
+    ids.iter().for_each(|id| assert_eq!(rig.outcome(*id), Outcome::Accepted));
+}

@@ -1,0 +1,142 @@
+//! Frames, Jacobians and inverse kinematics of real arms; Pinocchio is the judge.
+
+use std::collections::HashMap;
+
+use dimos::collision::Stop;
+use dimos::planning::ik::{Ik, IkSettings};
+use dimos::robot::kinematics::Kinematics;
+use dimos::robot::model::RobotModel;
+use dimos::robot::random::Random;
+use dimos::robot::urdf::from_text;
+use serde_json::json;
+
+use crate::support::python::ask_python;
+use crate::support::shared::shared;
+
+const ARMS: [(&str, &str); 4] = [("panda", "fer_hand"), ("xarm6", "link6"), ("xarm7", "link7"), ("piper", "link6")];
+
+fn arm(name: &str) -> Option<(std::path::PathBuf, RobotModel)> {
+    let path = shared(&format!("models/{name}"))?.join(format!("{name}.urdf"));
+    let model = from_text(name, &std::fs::read_to_string(&path).unwrap()).unwrap();
+    Some((path, model))
+}
+
+fn random_q(kinematics: &Kinematics, random: &mut Random) -> Vec<f64> {
+    kinematics.limits().iter().map(|l| random.between(l.lower.max(-3.0), l.upper.min(3.0))).collect()
+}
+
+#[test]
+fn frames_and_jacobians_are_pinocchios() {
+    for (name, _) in ARMS {
+        let Some((path, model)) = arm(name) else { return };
+        let kinematics = Kinematics::whole(&model).unwrap();
+        let mut random = Random::new(8);
+        let configurations: Vec<Vec<f64>> = (0..20).map(|_| random_q(&kinematics, &mut random)).collect();
+        // Pinocchio is told where followers stand.
+        let all = |q: &Vec<f64>| -> HashMap<String, f64> {
+            let named = kinematics.names().iter().cloned().zip(q.iter().copied()).collect();
+            let positions = model.positions(&named);
+            let moving = model.joints.iter().zip(positions).filter(|(j, _)| j.is_movable());
+            moving.map(|(j, p)| (j.name.clone(), p)).collect()
+        };
+        let links: Vec<&str> = model.links.iter().map(|l| l.name.as_str()).collect();
+        let told: Vec<_> = configurations.iter().map(all).collect();
+        let question = json!({ "urdf": path, "links": links, "configurations": told });
+        let Some(answers) = ask_python("kinematics.py", "pinocchio", &question) else { return };
+        let (mut frames, mut columns) = (kinematics.frames(), vec![[0.0; 6]; kinematics.dof()]);
+        for (q, answer) in configurations.iter().zip(answers.as_array().unwrap()) {
+            kinematics.forward(q, &mut frames);
+            for (l, link) in links.iter().enumerate() {
+                let expected = &answer[link];
+                let found = kinematics.link_frame(l, &frames);
+                for r in 0..3 {
+                    let place = expected["translation"][r].as_f64().unwrap();
+                    assert!((found.translation[r] - place).abs() < 1e-9, "{name} {link}");
+                    for c in 0..3 {
+                        let turn = expected["rotation"][r][c].as_f64().unwrap();
+                        assert!((found.matrix3.col(c)[r] - turn).abs() < 1e-9, "{name} {link}");
+                    }
+                }
+                kinematics.jacobian(l, &frames, &mut columns);
+                for (j, joint) in kinematics.names().iter().enumerate() {
+                    // A leader's column holds its followers' as well.
+                    let index = model.joint_index(joint).unwrap();
+                    let followers = model
+                        .joints
+                        .iter()
+                        .filter_map(|f| f.mimic.filter(|m| m.leader == index).map(|m| (f.name.as_str(), m.multiplier)));
+                    let mut column = [0.0; 6];
+                    for (who, factor) in std::iter::once((joint.as_str(), 1.0)).chain(followers) {
+                        for (sum, x) in column.iter_mut().zip(expected["jacobian"][who].as_array().unwrap()) {
+                            *sum += factor * x.as_f64().unwrap();
+                        }
+                    }
+                    for (a, b) in columns[j].iter().zip(column) {
+                        assert!((a - b).abs() < 1e-9, "{name} {link} {joint}: {:?} {column:?}", columns[j]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn reachable_poses_are_reached_and_others_are_said() {
+    for (name, tip) in ARMS {
+        let Some((_, model)) = arm(name) else { return };
+        let tip = model.link_index(tip).unwrap();
+        let joints = model.chain(0, tip).unwrap().into_iter().filter(|&j| model.joints[j].is_independent());
+        let kinematics = Kinematics::new(&model, &joints.collect::<Vec<_>>(), &[]).unwrap();
+        let mut ik = Ik::new(&kinematics, tip);
+        let mut random = Random::new(9);
+        let mut missed = 0;
+        for seed in 0..300 {
+            let (goal, near) = (random_q(&kinematics, &mut random), random_q(&kinematics, &mut random));
+            let target = ik.pose(&goal);
+            let settings = IkSettings { seed, ..IkSettings::default() };
+            let Ok(found) = ik.solve(&target, &near, &settings, |_| true, &Stop::never()) else {
+                missed += 1;
+                continue;
+            };
+            assert_eq!(Ok(&found), ik.solve(&target, &near, &settings, |_| true, &Stop::never()).as_ref());
+            let reached = ik.pose(&found[0]);
+            assert!(reached.translation.distance(target.translation) < 2e-6, "{name}");
+            assert!(reached.matrix3.abs_diff_eq(target.matrix3, 1e-5), "{name}");
+            for (q, l) in found[0].iter().zip(kinematics.limits()) {
+                assert!(*q >= l.lower && *q <= l.upper, "{name}");
+            }
+            // Close to the goal the solution is the one close by.
+            let beside: Vec<f64> = goal.iter().map(|q| q + 0.003).collect();
+            if let Ok(found) = ik.solve(&target, &beside, &settings, |_| true, &Stop::never()) {
+                let far = found[0].iter().zip(&goal).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                missed += usize::from(far > 0.3);
+            }
+        }
+        assert!(missed <= 6, "{name}: {missed} of 300");
+        let mut far = ik.pose(&vec![0.0; kinematics.dof()]);
+        far.translation.x += 5.0;
+        let failure = ik.solve(&far, &vec![0.0; kinematics.dof()], &IkSettings::default(), |_| true, &Stop::never());
+        let failure = failure.unwrap_err();
+        assert!(failure.position > 3.0 && failure.to_string().contains("not reached"), "{failure}");
+        let here = ik.pose(&random_q(&kinematics, &mut random));
+        let rejected = ik.solve(&here, &vec![0.1; kinematics.dof()], &IkSettings::default(), |_| false, &Stop::never());
+        assert!(rejected.unwrap_err().to_string().contains("collides"));
+    }
+}
+
+#[test]
+fn a_position_alone_is_enough_when_asked() {
+    let Some((_, model)) = arm("xarm6") else { return };
+    let tip = model.link_index("link6").unwrap();
+    let joints = model.chain(0, tip).unwrap().into_iter().filter(|&j| model.joints[j].is_independent());
+    let kinematics = Kinematics::new(&model, &joints.collect::<Vec<_>>(), &[]).unwrap();
+    let mut ik = Ik::new(&kinematics, tip);
+    let mut target = ik.pose(&[0.3, -0.4, -0.8, 0.1, 0.9, 0.0]);
+    target.matrix3 = glamx::DMat3::IDENTITY;
+    let settings = IkSettings { position_only: true, solutions: 3, ..IkSettings::default() };
+    let found = ik.solve(&target, &[0.0; 6], &settings, |_| true, &Stop::never()).unwrap();
+    assert_eq!(found.len(), 3);
+    for q in &found {
+        assert!(ik.pose(q).translation.distance(target.translation) < 2e-6);
+    }
+}

@@ -1,0 +1,38 @@
+//! What needs no process, no vendor's program and no real time: the coordinator on a virtual clock, blueprints, models,
+//! plans, adapters against their emulators in memory or on this computer's ports.
+
+#[path = "../support/mod.rs"]
+mod support;
+
+/// Whether programs that tests start may schedule in real time.
+const REALTIME: bool = false;
+
+#[global_allocator]
+static ALLOCATOR: support::counting::Counting = support::counting::Counting;
+
+mod blueprint_fuzz;
+mod blueprint_one_mistake;
+mod blueprint_registry;
+mod blueprints;
+mod braking;
+mod can_bus;
+mod cartesian_tasks;
+mod conformance;
+mod conformance_finds_faults;
+mod conformance_pushed;
+mod coordinator;
+mod device_stops;
+mod faults_virtual;
+mod guards_virtual;
+mod kinematics;
+mod layering;
+mod model;
+mod no_alloc;
+mod planning;
+mod planning_timing;
+mod robot_models;
+mod rpc;
+mod templates;
+mod verify;
+mod xacro;
+mod yaml_reader;

@@ -1,0 +1,343 @@
+//! Robot descriptions: the vendors' in `../shared`, those in the box, and the verbs that show them.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use dimos::robot::mesh::Mesh;
+use dimos::robot::urdf::Meshes;
+use dimos::robot::{Geometry, Link, RobotModel, Source, builtin, load};
+use nalgebra::{Isometry3, Point3, Vector3};
+
+use crate::support::shared;
+
+fn robot(source: &Source) -> RobotModel {
+    load(source).into_model().unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn in_the_box(name: &str) -> RobotModel {
+    robot(&Source::new(format!("builtin:{name}")))
+}
+
+/// Numbers in -1…1, the same in every run.
+fn random(seed: u64) -> impl FnMut() -> f64 {
+    let mut state = seed;
+    move || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / f64::from(1_u32 << 30) - 1.0
+    }
+}
+
+#[test]
+fn vendors_models_are_read_with_their_meshes() {
+    let Some(models) = shared::shared("models") else { return };
+    for (name, links, moving) in [("panda", 14, 8), ("piper", 11, 8), ("xarm6", 17, 7), ("xarm7", 18, 8)] {
+        let loaded = load(&Source::new(models.join(name).join(format!("{name}.urdf"))));
+        assert_eq!(loaded.render(false), "", "{name}");
+        let robot = loaded.model.unwrap();
+        assert_eq!((robot.links.len(), robot.independent_joints().len()), (links, moving), "{name}");
+        for mesh in robot.meshes() {
+            let read = Mesh::load(mesh).unwrap_or_else(|e| panic!("{e}"));
+            let (low, high) = read.bounds();
+            assert!((high - low).norm() < 1.0, "{}: {low} {high}", mesh.uri);
+            assert!(read.vertices.len() * 3 < read.triangles.len() * 4, "{}: not welded", mesh.uri);
+        }
+    }
+}
+
+/// The same files through another reader: `urdf-rs`.
+#[test]
+fn another_reader_reads_the_same() {
+    let Some(shared) = shared::shared("models") else { return };
+    let mut files: Vec<PathBuf> =
+        ["panda", "piper", "xarm6", "xarm7"].map(|n| shared.join(n).join(format!("{n}.urdf"))).to_vec();
+    files.push(shared.join("../planning/panda/panda_spherized.urdf"));
+    files.push(shared.join("../planning/panda/panda.urdf"));
+    let texts = files.iter().map(|f| (f.display().to_string(), std::fs::read_to_string(f).unwrap()));
+    let own = builtin::NAMES.iter().map(|n| ((*n).to_owned(), builtin::text(n).unwrap().to_owned()));
+    for (name, text) in texts.chain(own) {
+        let ours = dimos::robot::urdf::from_text(&name, &text).unwrap();
+        let theirs = urdf_rs::read_from_string(&text).unwrap();
+        assert_eq!((ours.links.len(), ours.joints.len()), (theirs.links.len(), theirs.joints.len()), "{name}");
+        for joint in &theirs.joints {
+            let own = &ours.joints[ours.joint_index(&joint.name).unwrap()];
+            let [r, p, y] = *joint.origin.rpy;
+            let pose = dimos::robot::model::pose(*joint.origin.xyz, [r, p, y]);
+            assert!((own.origin.to_homogeneous() - pose.to_homogeneous()).norm() < 1e-15, "{name} {}", joint.name);
+            assert_eq!(ours.links[own.parent].name, joint.parent.link);
+            assert_eq!(ours.links[own.child].name, joint.child.link);
+            if own.kind.name() == "revolute" || own.kind.name() == "prismatic" {
+                assert!(
+                    (own.axis.into_inner() - Vector3::from(*joint.axis.xyz)).norm() < 1e-15,
+                    "{name} {}",
+                    joint.name
+                );
+                let limits = (own.limits.lower, own.limits.upper, own.limits.velocity);
+                assert_eq!(
+                    limits,
+                    (joint.limit.lower, joint.limit.upper, joint.limit.velocity),
+                    "{name} {}",
+                    joint.name
+                );
+            }
+        }
+        for link in &theirs.links {
+            let own = &ours.links[ours.link_index(&link.name).unwrap()];
+            assert_eq!((own.visuals.len(), own.collisions.len()), (link.visual.len(), link.collision.len()), "{name}");
+        }
+    }
+}
+
+/// Poses of links in the frame of `base`, for joints by name.
+fn poses(robot: &RobotModel, base: &str, joints: &HashMap<String, f64>) -> HashMap<String, Isometry3<f64>> {
+    let all = robot.link_poses(&robot.positions(joints));
+    let base = all[robot.link_index(base).unwrap()].inverse();
+    robot.links.iter().zip(all).map(|(link, pose)| (link.name.clone(), base * pose)).collect()
+}
+
+fn agree(ours: &RobotModel, theirs: &RobotModel, base: &str, least: usize) {
+    let mut next = random(3);
+    let mut compared = 0;
+    for _ in 0..50 {
+        let joints: HashMap<String, f64> = theirs
+            .independent_joints()
+            .iter()
+            .map(|i| {
+                (theirs.joints[*i].name.clone(), next() * if theirs.joints[*i].kind.is_angle() { 3.0 } else { 0.05 })
+            })
+            .collect();
+        let (a, b) = (poses(ours, base, &joints), poses(theirs, base, &joints));
+        for (name, pose) in &a {
+            let Some(other) = b.get(name) else { continue };
+            let error = (pose.to_homogeneous() - other.to_homogeneous()).amax();
+            assert!(error <= 1e-9, "{} {name}: {error:e}", ours.name);
+            compared += 1;
+        }
+    }
+    assert!(compared >= 50 * least, "{}: {compared} poses", ours.name);
+}
+
+#[test]
+fn robots_in_the_box_move_as_the_vendors_do() {
+    let Some(models) = shared::shared("models") else { return };
+    for (own, vendor, base, least) in [
+        ("xarm6_gripper", "xarm6", "link_base", 16),
+        ("xarm7_gripper", "xarm7", "link_base", 17),
+        ("xarm6", "xarm6", "link_base", 8),
+    ] {
+        agree(&in_the_box(own), &robot(&Source::new(models.join(vendor).join(format!("{vendor}.urdf")))), base, least);
+    }
+    let mut ours = in_the_box("piper_gripper");
+    // The vendor's second finger moves on its own; ours follows the first.
+    ours.joints.iter_mut().for_each(|j| j.mimic = None);
+    agree(&ours, &robot(&Source::new(models.join("piper/piper.urdf"))), "base_link", 9);
+    for (own, vendor) in [("xarm5", "xarm5"), ("lite6", "lite6"), ("xarm850", "uf850")] {
+        let source =
+            Source { meshes: Meshes::Ignore, ..Source::new(models.join(format!("../xacro/out/{vendor}.urdf"))) };
+        agree(&in_the_box(own), &robot(&source), "link_base", 7);
+    }
+}
+
+#[test]
+fn yourarm_stands_as_its_sheet_says() {
+    let robot = in_the_box("yourarm");
+    let at = |joints: &[(&str, f64)]| {
+        let joints = joints.iter().map(|(n, q)| ((*n).to_owned(), *q)).collect();
+        poses(&robot, "base_link", &joints)["flange"]
+    };
+    let flange = at(&[]);
+    assert!((flange.translation.vector - Vector3::new(0.4, 0.0, 0.55)).norm() < 1e-12);
+    assert!((flange * Vector3::z() - Vector3::x()).norm() < 1e-12, "its z axis points out of the hand");
+    let turned = at(&[("joint1", std::f64::consts::FRAC_PI_2), ("joint3", std::f64::consts::FRAC_PI_2)]);
+    assert!((turned.translation.vector - Vector3::new(0.0, 0.0, 0.15)).norm() < 1e-12, "{turned}");
+    let limits = robot.joints.iter().filter(|j| j.is_movable()).map(|j| j.limits.lower.to_degrees().round());
+    assert_eq!(limits.collect::<Vec<_>>(), [-170.0, -100.0, -70.0, -175.0, -100.0, -270.0]);
+}
+
+/// How far a point of a link's frame lies outside the nearest of its shapes [m].
+fn outside(link: &Link, point: &Point3<f64>) -> f64 {
+    let distance = |shape: &dimos::robot::Shape| {
+        let p = shape.origin.inverse_transform_point(point);
+        match &shape.geometry {
+            Geometry::Box { size } => (p.coords.abs() - size / 2.0).max(),
+            Geometry::Sphere { radius } => p.coords.norm() - radius,
+            Geometry::Cylinder { radius, length } => (p.x.hypot(p.y) - radius).max(p.z.abs() - length / 2.0),
+            Geometry::Capsule { radius, length } => {
+                (p - Point3::new(0.0, 0.0, p.z.clamp(-length / 2.0, length / 2.0))).norm() - radius
+            }
+            Geometry::Mesh(_) => f64::INFINITY,
+        }
+    };
+    link.collisions.iter().map(distance).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn shapes_in_the_box_cover_the_vendors_meshes() {
+    let Some(models) = shared::shared("models") else { return };
+    for (own, vendor) in [("xarm6_gripper", "xarm6"), ("xarm7_gripper", "xarm7"), ("piper_gripper", "piper")] {
+        let (ours, theirs) = (in_the_box(own), robot(&Source::new(models.join(vendor).join(format!("{vendor}.urdf")))));
+        let mut vertices = 0;
+        for link in &theirs.links {
+            let Some(own) = ours.link_index(&link.name).map(|i| &ours.links[i]) else { continue };
+            for shape in &link.visuals {
+                let Geometry::Mesh(file) = &shape.geometry else { continue };
+                for vertex in Mesh::load(file).unwrap().vertices {
+                    let out = outside(own, &(shape.origin * vertex));
+                    assert!(out <= 0.0, "{vendor} {}: {vertex} lies {out} m outside", link.name);
+                    vertices += 1;
+                }
+            }
+        }
+        assert!(vertices > 5000, "{vendor}: {vertices}");
+    }
+}
+
+#[test]
+fn every_robot_in_the_box_is_sound() {
+    for name in builtin::NAMES {
+        let loaded = load(&Source::new(format!("builtin:{name}")));
+        assert_eq!(loaded.render(false), "", "{name}");
+        let robot = loaded.model.unwrap();
+        for joint in robot.joints.iter().filter(|j| j.is_movable()) {
+            assert!(
+                joint.limits.lower < joint.limits.upper && joint.limits.velocity.is_finite(),
+                "{name} {}",
+                joint.name
+            );
+        }
+        assert!(robot.links.iter().filter(|l| !l.collisions.is_empty()).count() >= 6, "{name}");
+        assert_eq!(robot.meshes().count(), 0, "{name}");
+    }
+    let wrong = load(&Source::new("builtin:xarm66")).render(false);
+    assert!(
+        wrong.contains("no robot in the box is named `xarm66`") && wrong.contains("lite6, lite6_gripper"),
+        "{wrong}"
+    );
+}
+
+struct Ended {
+    code: i32,
+    out: String,
+    err: String,
+}
+
+fn dimos(arguments: &[&str]) -> Ended {
+    let output = Command::new(env!("CARGO_BIN_EXE_dimos")).arg("model").args(arguments).output().unwrap();
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    Ended { code: output.status.code().unwrap(), out: text(&output.stdout), err: text(&output.stderr) }
+}
+
+#[test]
+fn joints_are_found_for_a_pose_and_what_is_missing_is_said() {
+    let pose = ["--pose", "0.35", "0.05", "0.3", "--rpy", "3.1", "-.1", "0.2"];
+    let ik = dimos(&[&["ik", "builtin:yourarm"], &pose[..]].concat());
+    assert_eq!(ik.code, 0, "{}", ik.err);
+    let joints: Vec<&str> = ik.out.lines().nth(1).unwrap().split_whitespace().collect();
+    let fk = dimos(&[&["fk", "builtin:yourarm"], &joints[..]].concat());
+    assert!(fk.out.contains("xyz   0.350000 0.050000 0.300000  m"), "{}", fk.out);
+    assert!(fk.out.contains("rpy   3.1000") && fk.out.contains(" 0.2000"), "{}", fk.out);
+    // From where the solution is nearest to: another seed, another arm of the same hand.
+    let seed: Vec<String> = joints.iter().map(|q| (q.parse::<f64>().unwrap() + 0.1).to_string()).collect();
+    let seed: Vec<&str> = seed.iter().map(String::as_str).collect();
+    let near = dimos(&[&["ik", "builtin:yourarm"], &pose[..], &["--json", "--seed"], &seed[..]].concat());
+    let near: serde_json::Value = serde_json::from_str(&near.out).unwrap();
+    assert!(near["reached"] == true && near["position_error"].as_f64().unwrap() < 1e-6, "{near}");
+    for (q, expected) in near["positions"].as_array().unwrap().iter().zip(&joints) {
+        assert!((q.as_f64().unwrap() - expected.parse::<f64>().unwrap()).abs() < 1e-3, "{near} {joints:?}");
+    }
+    let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3"]);
+    assert!(far.code == 1 && far.err.contains("is not reached") && far.err.contains("mm"), "{}", far.err);
+    let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3", "--json"]);
+    let told: serde_json::Value = serde_json::from_str(&far.out).unwrap();
+    assert!(far.code == 1 && told["reached"] == false && told["position_error"].as_f64().unwrap() > 1.0, "{told}");
+    for wrong in [
+        &["ik", "builtin:yourarm"][..],
+        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--quat", "0", "0", "0", "2"],
+        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--seed", "0"],
+        &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--link", "flnge"],
+    ] {
+        assert_eq!(dimos(wrong).code, 2, "{wrong:?}");
+    }
+}
+
+#[test]
+fn verbs_show_a_robot() {
+    let info = dimos(&["info", "builtin:xarm6_gripper"]);
+    assert_eq!((info.code, info.err.as_str()), (0, ""));
+    for what in ["7 of them move on their own", "-178.2", "follows drive_joint", "link2 → link3", "cylinder r"] {
+        assert!(info.out.contains(what), "{what}\n{}", info.out);
+    }
+    let json: serde_json::Value = serde_json::from_str(&dimos(&["info", "builtin:piper", "--json"]).out).unwrap();
+    assert_eq!(json["joints"][2]["lower"], -2.9670597);
+    let tree = dimos(&["tree", "builtin:yourarm_gripper"]).out;
+    assert!(tree.contains("├─ finger_left  (finger_joint, prismatic)") && tree.contains("└─ tcp"), "{tree}");
+    let fk = dimos(&["fk", "builtin:yourarm", "0", "0", "0", "0", "0", "-.5", "--link", "flange"]);
+    assert!(fk.out.contains("xyz   0.400000 0.000000 0.550000  m"), "{}{}", fk.out, fk.err);
+    let wrong = dimos(&["fk", "builtin:yourarm", "0", "--link", "flange"]);
+    assert!(wrong.code == 2 && wrong.err.contains("takes 6 positions, found 1"), "{}", wrong.err);
+    let expanded = dimos(&["expand", "builtin:yourarm"]).out;
+    assert!(expanded.contains("<joint name=\"joint1\" type=\"revolute\">"), "{expanded}");
+}
+
+#[test]
+fn check_reports_everything_at_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("r.urdf");
+    let shape = |tag: &str, mesh: &str| format!("<{tag}><geometry><mesh filename='{mesh}'/></geometry></{tag}>");
+    let body = format!(
+        "<robot name='r'>\n<link name='a'>{}{}</link>\n<link name='b'/>\n<joint name='j' type='revolute'><parent link='a'/>\
+         <child link='b'/><axis xyz='0 0 0'/>\n<limit lower='1' upper='-1' velocity='1'/></joint></robot>",
+        shape("visual", "package://nowhere/a.stl"),
+        shape("collision", "gone.stl"),
+    );
+    std::fs::write(&file, &body).unwrap();
+    let path = file.to_str().unwrap();
+    let found = dimos(&["check", path]);
+    assert_eq!(found.code, 2);
+    for what in [
+        "this axis is zero",
+        "r.urdf:5:15",
+        "above the upper limit",
+        "collision mesh cannot be found",
+        "--package nowhere=FOLDER",
+    ] {
+        assert!(found.err.contains(what), "{what}\n{}", found.err);
+    }
+    let json: serde_json::Value = serde_json::from_str(&dimos(&["check", path, "--json"]).out).unwrap();
+    assert_eq!((json["valid"].as_bool(), json["problems"].as_array().unwrap().len()), (Some(false), 4));
+    // A collision mesh that is there but broken is found too; a visual one only warned of.
+    std::fs::write(folder.path().join("gone.stl"), "solid\nendsolid").unwrap();
+    let fine =
+        body.replace("axis xyz='0 0 0'", "axis xyz='0 0 1'").replace("lower='1' upper='-1'", "lower='-1' upper='1'");
+    std::fs::write(&file, &fine).unwrap();
+    let found = dimos(&["check", path]);
+    assert!(found.code == 2 && found.err.contains("cannot be used"), "{}", found.err);
+    assert_eq!(dimos(&["check", "no/such/file.urdf"]).code, 2);
+    assert_eq!(dimos(&["check", "builtin:lite6"]).code, 0);
+}
+
+#[test]
+fn xacro_and_srdf_work_from_the_command_line() {
+    let Some(root) = shared::shared("xacro") else { return };
+    let package = format!("xarm_description={}", root.join("pkgs/xarm_description").display());
+    let file = root.join("pkgs/xarm_description/urdf/xarm_device.urdf.xacro");
+    let srdf = root.join("pkgs/xarm_description/srdf/xarm.srdf.xacro");
+    let file = file.to_str().unwrap();
+    let common = ["--package", &package, "--xacro-arg", "dof:=6", "--xacro-arg", "limited:=true"];
+    let tree = dimos(&[&["tree", file][..], &common].concat());
+    assert!(tree.code == 0 && tree.out.contains("link6  (joint6, revolute)"), "{}{}", tree.out, tree.err);
+    let typo = dimos(&["tree", file, "--package", &package, "--xacro-arg", "dof:=6", "--xacro-arg", "limted:=true"]);
+    assert!(typo.err.contains("did you mean `limited`?"), "{}", typo.err);
+    let loaded = load(&Source {
+        packages: [("xarm_description".to_owned(), root.join("pkgs/xarm_description"))].into(),
+        xacro_args: [("dof".to_owned(), "6".to_owned())].into(),
+        srdf: Some(srdf),
+        meshes: Meshes::Ignore,
+        ..Source::new(Path::new(file))
+    });
+    let robot = loaded.model.as_ref().unwrap_or_else(|| panic!("{}", loaded.render(false)));
+    let group = loaded.semantics.groups.iter().find(|g| g.name == "xarm6").unwrap();
+    assert_eq!(loaded.semantics.group_joints(robot, &group.name).unwrap().len(), 6);
+    assert!(loaded.semantics.poses.iter().any(|p| p.positions.len() == 6), "{:?}", loaded.semantics.poses);
+    assert!(loaded.semantics.disabled.len() > 5);
+}

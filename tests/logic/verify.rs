@@ -1,0 +1,415 @@
+//! `replay --verify`: what was recorded comes out the same again, and what was changed is found.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use dimos::blueprint::{Blueprint, Overrides};
+use dimos::control::config::{CartesianParams, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams};
+use dimos::control::point_to_point::point_to_point;
+use dimos::control::request::Request;
+use dimos::control::tasks::cartesian::Goal;
+use dimos::hardware::registry::Registry;
+use dimos::joint::{JointLimits, joints_of, make_joints};
+use dimos::recording::messages::{JointState, Text, Tick};
+use dimos::replay::recorded::RecordedError;
+use dimos::replay::verify::{Finding, Verification, verify};
+use dimos::robot::kinematics::Kinematics;
+use dimos::robot::{Source, load};
+use dimos::rpc::api;
+use dimos::rpc::client::Client;
+use dimos::rpc::place::RunFolder;
+use dimos::runtime::{Options, Record, Run};
+
+use crate::support::tampered::{rewrite, tamper, without_attachments};
+use crate::support::virtual_run::{VirtualRun, one_arm};
+
+fn reproducible(log: &Path) -> Verification {
+    let found = verify(log).unwrap();
+    assert_eq!(found.finding, Finding::Reproducible);
+    found
+}
+
+/// A run of one arm with everything that can happen to it, and where its log is.
+fn eventful(folder: &Path) -> (PathBuf, u64) {
+    let mut config = one_arm(6);
+    let task = |name: &str, kind, priority, auto_start| TaskConfig {
+        name: name.into(),
+        kind,
+        joints: (0..6).collect(),
+        priority,
+        auto_start,
+    };
+    let by_itself = ServoParams { timeout: 0.3, default_positions: Some(vec![0.05; 6]) };
+    config.tasks.push(task("servo", TaskKind::Servo(by_itself), 20, true));
+    config.tasks.push(task("velocity", TaskKind::Velocity(VelocityParams::default()), 30, false));
+    config.tasks.push(task("other", TaskKind::Trajectory(TrajectoryParams::default()), 20, false));
+    let log = folder.join("eventful.mcap");
+    let mut run = VirtualRun::start(&config, &log);
+    let limits = JointLimits::uniform(6, 3.0, 2.0).with_defaults();
+    let motion = |from: &[f64], to: f64| point_to_point(&make_joints("arm", 6), from, &[to; 6], &limits, 0.9).unwrap();
+    let go = |run: &mut VirtualRun, to: f64| {
+        let from = run.states[0].position[..6].to_vec();
+        run.execute(0, &motion(&from, to));
+    };
+    let steps = |run: &mut VirtualRun, n: usize| (0..n).for_each(|_| run.step());
+    run.step();
+    run.ask(Request::Ready { arm: 0 });
+    steps(&mut run, 120); // the servo task starts by itself, and times out
+    go(&mut run, 0.5);
+    go(&mut run, 0.6); // refused: it is executing already
+    steps(&mut run, 30);
+    run.ask(Request::Cancel { task: Some(0) });
+    run.ask(Request::Gripper { arm: 0, opening: 0.1 + 0.2 });
+    steps(&mut run, 60);
+    for k in 0..80 {
+        // A stream at 50 Hz, then a jump in it.
+        if k % 2 == 0 {
+            let q = run.states[0].position[0] + 0.004 * f64::from(k).sin();
+            run.ask(Request::Servo { task: 1, target: joints_of(&[q, q, q, q, q, if k == 78 { 2.0 } else { q }]) });
+        }
+        run.step();
+    }
+    for request in [Request::Reset { arm: 0 }, Request::Ready { arm: 0 }] {
+        run.ask(request);
+        steps(&mut run, 40);
+    }
+    for _ in 0..50 {
+        run.ask(Request::Velocity { task: 2, target: joints_of(&[0.3, -0.2, 1e9, 0.1, 0.0, -0.0]) });
+        run.step();
+    }
+    go(&mut run, 0.0); // loses its joints to the stream of velocities, or waits for the change of mode
+    steps(&mut run, 80);
+    // The arm reports no velocities from here on.
+    run.states[0].velocity_source = dimos::arm::VelocitySource::Absent;
+    go(&mut run, -0.4);
+    steps(&mut run, 20);
+    run.overrun(1);
+    run.overrun(3);
+    steps(&mut run, 10);
+    run.overrun(15); // more than an arm may lose: it holds
+    steps(&mut run, 20);
+    for request in [Request::Reset { arm: 0 }, Request::Ready { arm: 0 }] {
+        run.ask(request);
+        steps(&mut run, 40);
+    }
+    go(&mut run, 0.3);
+    steps(&mut run, 25);
+    run.states[0].error = 31;
+    steps(&mut run, 40);
+    run.ask(Request::Reset { arm: 0 }); // refused: the fault still stands
+    run.states[0].position[2] = f64::NAN;
+    run.step();
+    run.states[0].position[2] = 0.1;
+    run.states[0].error = 0;
+    steps(&mut run, 2);
+    run.ask(Request::Stop { arm: None });
+    run.ask(Request::Stop { arm: Some(9) });
+    run.ask(Request::Servo { task: 1, target: [f64::NAN; 16] });
+    run.ask(Request::Park { arm: 0 });
+    steps(&mut run, 5);
+    run.ask(Request::Shutdown);
+    steps(&mut run, 50);
+    let ticks = run.tick;
+    run.finish();
+    (log, ticks)
+}
+
+#[test]
+fn whatever_happens_to_an_arm_comes_out_the_same_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, ticks) = eventful(folder.path());
+    let found = reproducible(&log);
+    assert_eq!(found.ticks, ticks);
+    assert!(found.requests > 100 && found.events > 130, "{found:?}");
+}
+
+/// An end effector that is taken to poses and moved with twists, past everything that can stop it.
+#[test]
+fn motions_of_an_end_effector_come_out_the_same_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = one_arm(6);
+    let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
+    let (kinematics, link) = (Kinematics::whole(&model).unwrap(), model.link_index("flange").unwrap());
+    let steered = Box::new(CartesianParams::new(kinematics, link));
+    for (name, kind, priority) in
+        [("poses", TaskKind::CartesianIk(steered.clone()), 20), ("twists", TaskKind::EefTwist(steered.clone()), 30)]
+    {
+        config.tasks.push(TaskConfig {
+            name: name.into(),
+            kind,
+            joints: (0..6).collect(),
+            priority,
+            auto_start: false,
+        });
+    }
+    let log = folder.path().join("steered.mcap");
+    let mut run = VirtualRun::start(&config, &log);
+    run.states[0].position = joints_of(&[0.1, -0.3, 0.6, 0.0, 0.8, 0.2]);
+    run.step();
+    run.ask(Request::Ready { arm: 0 });
+    (0..40).for_each(|_| run.step());
+    for k in 0..400u32 {
+        let (turn, t) = (0.1 * f64::from(k), f64::from(k) * 0.01);
+        let pose = Goal::Pose { position: [0.3 + 0.05 * t.sin(), 0.1 * t, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
+        let linear = [0.1 * turn.cos(), 0.1 * turn.sin(), if k == 333 { f64::NAN } else { 0.02 }];
+        match k % 200 {
+            0..100 if k % 2 == 0 => run.ask(Request::Steer { task: 1, goal: pose }),
+            120..180 => run.ask(Request::Steer {
+                task: 2,
+                goal: Goal::Twist { linear, angular: [0.1 + 0.2, 0.0, -0.0], tool: k > 200 },
+            }),
+            185 => run.ask(Request::Cancel { task: Some(2) }),
+            _ => {}
+        }
+        run.step();
+    }
+    let moved = run.states[0].position;
+    assert!((moved[0] - 0.1).abs() > 0.05, "nothing moved: {moved:?}");
+    run.finish();
+    let found = reproducible(&log);
+    assert!(found.ticks > 400 && found.requests > 200, "{found:?}");
+}
+
+/// The next number in the direction of infinity.
+fn ulp(value: &mut f64) {
+    *value = value.next_up();
+}
+
+#[track_caller]
+fn first_difference(log: &Path) -> dimos::replay::compare::Difference {
+    match verify(log).unwrap().finding {
+        Finding::Different(d) => d,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn one_bit_of_a_command_is_found_at_its_tick_and_joint() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    // Commands begin with the second tick, when the arm was enabled.
+    let number = 140;
+    tamper(&log, &copy, "/joint_commands", number, |m: &mut JointState| ulp(&mut m.position[3]));
+    let d = first_difference(&copy);
+    assert_eq!((d.tick, d.what, d.joint.as_deref()), (number as u64 + 1, "position command", Some("arm_joint4")));
+    assert!((d.time - 1.41).abs() < 1e-9, "{}", d.time);
+    assert_ne!(d.logged, d.rerun);
+}
+
+#[test]
+fn one_bit_of_a_state_is_found_where_it_first_matters() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    // The hold begins where the arm is measured when it is enabled, in the second tick.
+    tamper(&log, &copy, "/joint_states", 1, |m: &mut JointState| ulp(&mut m.position[4]));
+    let d = first_difference(&copy);
+    assert_eq!((d.tick, d.what, d.joint.as_deref()), (1, "position command", Some("arm_joint5")));
+    // Where velocities are estimated, every position matters.
+    let estimated = 540;
+    tamper(&log, &copy, "/joint_states", estimated, |m: &mut JointState| m.position[2] += 1e-9);
+    let d = first_difference(&copy);
+    assert_eq!((d.tick, d.what), (estimated as u64, "estimated velocity"));
+    assert_eq!(d.joint.as_deref(), Some("arm_joint3"));
+}
+
+#[test]
+fn a_changed_request_or_time_shows_in_what_came_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    tamper(&log, &copy, "/dimos/requests", 1, |m: &mut Text| m.data = m.data.replace("0.5", "0.51"));
+    let found = verify(&copy).unwrap();
+    assert!(matches!(found.finding, Finding::Different(_)), "{found:?}");
+    tamper(&log, &copy, "/dimos/tick", 3, |m: &mut Tick| m.skipped = 1);
+    let d = first_difference(&copy);
+    assert_eq!((d.tick, d.what), (3, "event"));
+}
+
+#[test]
+fn what_is_missing_ends_the_verification_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, ticks) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    let incomplete = |log: &Path| match verify(log).unwrap() {
+        Verification { finding: Finding::Incomplete { tick, why }, ticks, .. } => {
+            assert_eq!(tick, ticks);
+            (tick, why)
+        }
+        other => panic!("{other:?}"),
+    };
+    tamper(&log, &copy, "/dimos/tick", 200, |m: &mut Tick| m.dropped = 7);
+    assert_eq!(incomplete(&copy), (200, "7 samples were lost up to tick 200".into()));
+    tamper(&log, &copy, "/dimos/requests", 0, |m: &mut Text| m.data = m.data.replace("\"id\":1", "\"id\":99"));
+    assert_eq!(incomplete(&copy), (1, "request 1 is missing".into()));
+    tamper(&log, &copy, "/dimos/requests", 0, |m: &mut Text| m.data = m.data.replace("ready", "dance"));
+    assert!(incomplete(&copy).1.contains("dance"));
+    let bytes = std::fs::read(&log).unwrap();
+    let mut before = 0;
+    for length in [bytes.len() / 4, bytes.len() / 2, bytes.len() - 1] {
+        std::fs::write(&copy, &bytes[..length]).unwrap();
+        let (tick, why) = incomplete(&copy);
+        assert!(tick >= before && why.contains("ends"), "{tick}: {why}");
+        before = tick;
+    }
+    assert_eq!(before, ticks - 1, "events of the last tick may have been cut off");
+    without_attachments(&log, &copy);
+    let error = verify(&copy).unwrap_err();
+    assert!(matches!(error, RecordedError::NoCoordinator { .. }), "{error}");
+    assert!(error.to_string().contains("\nhint: "));
+    rewrite(&log, &copy, |_, _| None);
+    reproducible(&copy);
+}
+
+/// Whatever a file says, it is told that something is wrong with it, or that nothing is.
+#[test]
+fn damaged_messages_break_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, copy) = (folder.path().join("short.mcap"), folder.path().join("copy.mcap"));
+    let mut run = VirtualRun::start(&one_arm(2), &log);
+    run.step();
+    run.ask(Request::Ready { arm: 0 });
+    (0..30).for_each(|_| run.step());
+    let limits = JointLimits::uniform(2, 3.0, 2.0).with_defaults();
+    run.execute(0, &point_to_point(&make_joints("arm", 2), &[0.0; 2], &[0.05; 2], &limits, 1.0).unwrap());
+    (0..60).for_each(|_| run.step());
+    run.finish();
+    let mut random = 0x9e37_79b9_7f4a_7c15u64;
+    let mut next = move || {
+        random ^= random << 13;
+        random ^= random >> 7;
+        random ^= random << 17;
+        random
+    };
+    let mut found = [0; 3];
+    for _ in 0..150 {
+        rewrite(&log, &copy, |topic, bytes| {
+            if topic.starts_with("/arm_status") || !next().is_multiple_of(40) {
+                return None;
+            }
+            let mut bytes = bytes.to_vec();
+            let at = 4 + next() as usize % (bytes.len() - 4);
+            bytes[at] = next() as u8;
+            Some(bytes)
+        });
+        found[match verify(&copy).unwrap().finding {
+            Finding::Reproducible => 0,
+            Finding::Different(_) => 1,
+            Finding::Incomplete { .. } => 2,
+        }] += 1;
+        let _ = dimos::replay::motion::RecordedMotion::read(&copy, 0, u64::MAX).map(|m| dimos::replay::fit::fit(&m));
+    }
+    assert!(found[1] > 10 && found[2] > 10, "{found:?}");
+}
+
+fn blueprint(name: &str, set: &[&str]) -> Blueprint {
+    let set = set.iter().map(|s| (*s).to_owned()).collect();
+    let registry = Registry::builtin();
+    let found = dimos::blueprint::find(name).unwrap_or_else(|e| panic!("{}", e.message));
+    let loaded = dimos::blueprint::load(&found, &Overrides { set, sim: false }, &registry);
+    loaded.blueprint.clone().unwrap_or_else(|| panic!("{}", loaded.render(false)))
+}
+
+/// Starts a real run: threads, devices, socket.
+fn start(folder: &Path, blueprint: &Blueprint, probe: Option<dimos::control::tick_loop::Probe>) -> (Run, Client) {
+    let options = Options {
+        record: Record::To(folder.join("real.mcap")),
+        folder: RunFolder::at(folder),
+        probe,
+        hold_latency: false,
+        ..Options::default()
+    };
+    let run = Run::start(blueprint, options).unwrap();
+    let client = Client::connect("real", run.socket().unwrap()).unwrap();
+    (run, client)
+}
+
+fn wait_for_end(client: &mut Client, motion: u64) -> String {
+    for _ in 0..600 {
+        let report = client.call(api::Motion { motion }).unwrap();
+        if report.done {
+            return report.state;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    panic!("the motion does not end");
+}
+
+/// Moves, cancel, stop, reset, enable, gripper, on a loop that now and then is late. What comes of all that depends
+/// on the machine; what matters is that it comes out the same again.
+fn exercise(name: &str, dof: usize) {
+    let folder = tempfile::tempdir().unwrap();
+    let probe = Box::new(|tick| {
+        if tick == 40 || tick == 90 || tick == 91 {
+            std::thread::sleep(Duration::from_millis(27));
+        }
+    });
+    let (run, mut client) = start(folder.path(), &blueprint(name, &[]), Some(probe));
+    let begin = |client: &mut Client, target: Vec<f64>| {
+        client.call(api::Move { arm: "arm".into(), target, speed: 0.8 }).ok().map(|begun| begun.motion)
+    };
+    let goal: Vec<f64> = (0..dof).map(|j| 0.1 + 0.02 * j as f64).collect();
+    let motion = begin(&mut client, goal.clone()).expect("the arm is ready");
+    wait_for_end(&mut client, motion);
+    let motion = begin(&mut client, vec![0.0; dof]);
+    client.call(api::Cancel { task: None, arm: None }).unwrap();
+    motion.map(|motion| wait_for_end(&mut client, motion));
+    let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03 });
+    begin(&mut client, vec![0.25; dof]);
+    client.call(api::Stop { arm: None }).unwrap();
+    let _ = client.call(api::ArmReset { arm: "arm".into() });
+    let _ = client.call(api::ArmEnable { arm: "arm".into() });
+    begin(&mut client, goal).map(|motion| wait_for_end(&mut client, motion));
+    // The run ends in mid-motion.
+    begin(&mut client, vec![0.0; dof]);
+    let ended = run.stop();
+    let found = reproducible(&ended.log.unwrap());
+    assert!(found.ticks > 40 && found.requests >= 6 && found.events > 12, "{found:?}");
+}
+
+#[test]
+fn a_run_of_yourarm_is_reproducible() {
+    exercise("coordinator-yourarm", 6);
+}
+
+#[test]
+fn a_run_of_mock_is_reproducible() {
+    exercise("coordinator-mock", 7);
+}
+
+const STREAMED: &str = "
+name: streamed
+coordinator: {tick_rate: 200}
+hardware:
+  - hardware_id: arm
+    joints: {prefix: arm, count: 3}
+    adapter_type: mock
+    options: {velocity_feedback: false, faults: [{kind: error_code, at: 1.2, code: 22}]}
+tasks:
+  - {name: servo, type: servo, joint_names: {hardware: arm}}
+  - {name: velocity, type: velocity, joint_names: {hardware: arm}, priority: 5}
+";
+
+#[test]
+fn streams_and_an_arm_fault_are_reproducible() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("streamed.yaml");
+    std::fs::write(&path, STREAMED).unwrap();
+    let (run, mut client) = start(folder.path(), &blueprint(path.to_str().unwrap(), &[]), None);
+    // Until the fault comes, and refused from then on.
+    let mut refused = 0;
+    for k in 0..400 {
+        let x = 0.1 * (f64::from(k) * 0.02).sin();
+        let sent = client.call(api::Servo { task: "servo".into(), positions: vec![x, -x, x / 3.0] });
+        refused += u32::from(sent.is_err());
+        if refused > 20 {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(7));
+    }
+    assert!(refused > 20, "the fault did not come");
+    let ended = run.stop();
+    let found = reproducible(&ended.log.unwrap());
+    assert!(found.requests > 40, "{found:?}");
+}

@@ -1,0 +1,12 @@
+//! What others wrote is the judge: the vendors' SDKs, and a kernel that has CAN (in a guest).
+
+#[path = "../support/mod.rs"]
+mod support;
+
+/// Whether programs that tests start may schedule in real time.
+const REALTIME: bool = true;
+
+mod can_kernel;
+mod piper_kernel;
+mod piper_sdk;
+mod xarm_sdk;

@@ -1,0 +1,145 @@
+//! `dimos adapter emulate` with the real binary: an emulator in one process, its client in another.
+
+use dimos::hardware::registry;
+use dimos::joint::ControlMode;
+use rustix::process::Signal;
+
+use crate::support::program::{Home, Started, eventually};
+
+/// A loopback address that no other test uses.
+fn loopback(test: u32) -> String {
+    let id = std::process::id() * 8 + test;
+    format!("127.{}.{}.{}", 64 + (id >> 16) % 128, (id >> 8) % 256, 1 + id % 254)
+}
+
+/// An emulator that is up.
+fn emulate(home: &Home, arguments: &str) -> Started {
+    let emulator = home.start(&format!("adapter emulate {arguments}"));
+    emulator.until("Ctrl-C ends it");
+    emulator
+}
+
+#[test]
+fn a_run_in_another_process_moves_the_emulated_arm() {
+    let (home, address) = (Home::new(), loopback(1));
+    let emulator = emulate(&home, &format!("yourarm --bind {address}"));
+    let said = emulator.out();
+    let command = said.lines().find_map(|line| line.trim().strip_prefix("reach it")).unwrap().trim().to_owned();
+    assert_eq!(command, format!("dimos run coordinator-yourarm --set hardware.arm.address={address}"));
+    assert!(said.contains("yourarm SIMULATED at"), "{said}");
+
+    let run = home.run(&format!("{} --no-record", command.strip_prefix("dimos run ").unwrap()));
+    home.dimos("move arm 0.1 -0.2 0.5 0 0.7 0.1").with(0);
+    let positions = home.positions("arm");
+    for (is, wanted) in positions.iter().zip([0.1, -0.2, 0.5, 0.0, 0.7, 0.1]) {
+        assert!((is - wanted).abs() < 1e-3, "{positions:?}");
+    }
+    // The end of the emulator is the end of the connection, and no end of the run.
+    emulator.end(Signal::INT).with(130);
+    eventually("the run says so", || home.dimos("status --json").with(0).out.contains("connection"));
+    run.end(Signal::TERM);
+}
+
+#[test]
+fn a_scripted_fault_strikes() {
+    let (home, address) = (Home::new(), loopback(2));
+    home.write("faults.yaml", "- {at: 0.5, kind: error_code, code: 3}\n");
+    let emulator = emulate(&home, &format!("yourarm --bind {address} --fault faults.yaml --fault at=1e5,kind=estop"));
+    let mut adapter = registry::create("yourarm", &address, 6).unwrap();
+    adapter.connect().unwrap();
+    adapter.activate().unwrap();
+    adapter.set_control_mode(ControlMode::Position).unwrap();
+    let mut error = (0, String::new());
+    eventually("the error", || {
+        error = adapter.read_error().unwrap();
+        error.0 != 0
+    });
+    assert_eq!(error.0, 3);
+    adapter.disconnect();
+    emulator.until("the client is gone");
+    let told = emulator.end(Signal::TERM).with(143).err;
+    let at = |what: &str| {
+        let line = told.lines().find(|line| line.ends_with(what)).unwrap_or_else(|| panic!("{what}: {told}"));
+        line.split_whitespace().find_map(|word| word.parse::<f64>().ok()).unwrap()
+    };
+    let (came, struck) = (at(" s  a client connected"), at(" s  the fault error_code strikes"));
+    assert!(struck >= came + 0.5 && at(" s  the client is gone") >= struck, "{told}");
+    assert!(!told.contains("estop"), "{told}");
+}
+
+#[test]
+fn the_faults_of_an_arm_are_listed() {
+    let home = Home::new();
+    let listed = |arm: &str| home.dimos(&format!("adapter emulate {arm} --fault list")).with(0).out;
+    let (yourarm, remote) = (listed("yourarm"), listed("remote"));
+    assert!(yourarm.contains("power_loss") && yourarm.contains("garbage") && !yourarm.contains("leader"), "{yourarm}");
+    assert!(
+        remote.contains("frozen") && !remote.contains("garbage") && remote.contains("time stamps and all"),
+        "{remote}"
+    );
+    if cfg!(feature = "can") {
+        let piper = listed("piper");
+        assert!(piper.contains("leader") && !piper.contains("bus_off"), "{piper}");
+    }
+}
+
+#[test]
+fn what_cannot_be_is_refused() {
+    let home = Home::new();
+    for (arguments, says) in [
+        ("mock", "mock has no emulator"),
+        ("yourarm --bind 10.0.0.1", "not a loopback address"),
+        ("yourarm --pty", "speaks TCP"),
+        ("yourarm --can vcan0", "speaks TCP"),
+        ("yourarm --can vcan0 --pty", "cannot be used with"),
+        ("yourarm --fault at=1,kind=panic", "cannot play the fault \"panic\"; it can play \"stall\""),
+        ("yourarm --fault at=1,kind=explode", "unknown variant `explode`"),
+        ("yourarm --fault nowhere.yaml", "--fault nowhere.yaml"),
+        ("yourarm --fault nonsense", "hint: one fault, like at=2,kind=stall"),
+        ("yourarm --option sim.initial_positions=[9,0,0,0,0,0]", "within the joint limits"),
+        ("yourarm --model yourarm7", "unknown field `model`"),
+        ("yourarm --dof 7", "6 joints, not 7"),
+        ("nobodysarm", "there are mock, yourarm"),
+    ] {
+        let address = loopback(3);
+        let place = if arguments.contains("--") { String::new() } else { format!(" --bind {address}") };
+        home.dimos(&format!("adapter emulate {arguments}{place} --duration 1s")).with(2).says(&[says]);
+    }
+}
+
+#[test]
+fn what_it_says_fits_the_model() {
+    let (home, address) = (Home::new(), loopback(5));
+    if std::net::TcpListener::bind((address.as_str(), 502))
+        .is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied)
+    {
+        println!("SKIPPED: port 502 (sysctl net.ipv4.ip_unprivileged_port_start=502)");
+        assert!(std::env::var("DIMOS_NO_SKIP").is_err(), "DIMOS_NO_SKIP is set");
+        return;
+    }
+    for (model, blueprint) in [("lite6", Some("coordinator-lite6")), ("xarm850", None)] {
+        let line = format!("adapter emulate xarm --model {model} --bind {address} --duration 100ms");
+        let said = home.dimos(&line).with(0).out;
+        assert!(said.contains(&format!("--dof 6 --model {model}\n")), "{said}");
+        assert!(said.contains(&format!("options: {{model: {model}}}")), "{said}");
+        assert_eq!(said.contains("reach it"), blueprint.is_some(), "{said}");
+        assert!(blueprint.is_none_or(|name| said.contains(&format!("dimos run {name} "))), "{said}");
+    }
+}
+
+#[test]
+fn a_program_finds_the_address_and_an_end() {
+    let (home, address) = (Home::new(), loopback(4));
+    let started =
+        home.dimos(&format!("adapter emulate yourarm --bind {address} --duration 100ms --json")).with(0).json();
+    assert!(started["address"].as_str().unwrap().starts_with(&format!("{address}:")), "{started}");
+    assert_eq!(
+        (&started["event"], &started["simulated"], &started["dof"]),
+        (&"started".into(), &true.into(), &6.into())
+    );
+    // Its port is free again, and taken while it is used.
+    let first = emulate(&home, &format!("yourarm --bind {address}"));
+    let again = format!("adapter emulate yourarm --bind {address} --duration 1s");
+    home.dimos(&again).with(3).says(&["cannot listen at", "hint: take another address"]);
+    first.end(Signal::INT).with(130);
+}

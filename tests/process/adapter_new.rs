@@ -1,0 +1,236 @@
+//! `dimos adapter new`: what it writes is built, tested and run as a user would; what is in the way stays as it is.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use rustix::process::Signal;
+use serde_json::json;
+
+use crate::support::program::{Home, Started, UP};
+
+const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
+
+/// All files below a folder with their texts, by path.
+fn files(folder: &Path) -> Vec<(PathBuf, String)> {
+    let mut all = Vec::new();
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            all.extend(files(&path));
+        } else {
+            all.push((path.clone(), fs::read_to_string(&path).unwrap()));
+        }
+    }
+    all.sort();
+    all
+}
+
+/// Builds and tests the crate in a folder, with the libraries of this checkout as they were built for it; fails on any
+/// warning. Answers the folder of its programs.
+fn cargo_test(folder: &Path) -> PathBuf {
+    fs::copy(Path::new(CHECKOUT).join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
+    let programs = Path::new(env!("CARGO_BIN_EXE_dimos")).parent().unwrap();
+    let output = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()))
+        .args(["test", "--offline", "--quiet"])
+        .current_dir(folder)
+        .env("CARGO_TARGET_DIR", programs.parent().unwrap())
+        .stdin(Stdio::null())
+        .output()
+        .unwrap();
+    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    println!("{text}");
+    assert!(output.status.success(), "cargo test in {}", folder.display());
+    // Places in its own files have relative paths; warnings of dimos are told elsewhere.
+    let own = |line: &str| ["--> src/", "--> tests/"].iter().any(|start| line.trim_start().starts_with(start));
+    assert!(!text.lines().any(own), "it does not compile without warnings");
+    programs.to_owned()
+}
+
+#[test]
+fn a_crate_of_its_own_is_built_tested_and_run() {
+    let home = Home::new();
+    let made = home.dimos("adapter new acme-arm --dof 7 --transport tcp").with(0);
+    let next: Vec<&str> = made.out.lines().skip_while(|line| *line != "next:").skip(1).collect();
+    assert_eq!(next.len(), 4, "{}", made.out);
+    assert!(next[0].contains("cd acme-arm && cargo test"), "{}", made.out);
+    let folder = home.path().join("acme-arm");
+    let programs = cargo_test(&folder);
+
+    let acme = |arguments: &str, at: &Path| {
+        let mut command = Command::new(programs.join("acme-arm"));
+        home.settle(command.args(arguments.split_whitespace())).current_dir(at).stdin(Stdio::null());
+        Started::of(&mut command).wait().with(0)
+    };
+    let rows = acme("list-adapters --json", &folder).json();
+    let mut rows = rows.as_array().unwrap().iter();
+    let row = rows.clone().find(|row| row["name"] == "acme_arm").expect("its row");
+    assert_eq!((&row["dof"]["max"], &row["transport"]), (&7.into(), &"tcp".into()));
+    assert!(rows.any(|row| row["name"] == "yourarm"), "the arms in the box are there too");
+
+    acme("run coordinator-acme-arm --sim --duration 1s --no-record", &folder);
+    // Elsewhere the program has its blueprint all the same.
+    acme("check coordinator-acme-arm", home.path());
+    let listed = acme("list-blueprints", home.path()).out;
+    assert!(listed.contains("coordinator-acme-arm") && listed.contains("coordinator-yourarm"), "{listed}");
+    plans_and_moves(&home, &programs.join("acme-arm"));
+}
+
+/// The new arm's description and its planner, from anywhere, before anything in them has been changed.
+fn plans_and_moves(home: &Home, program: &Path) {
+    let start = |arguments: &str| {
+        let mut command = Command::new(program);
+        Started::of(home.settle(command.args(arguments.split_whitespace())).stdin(Stdio::null()))
+    };
+    let acme = |arguments: &str| start(arguments).wait().with(0);
+    let checked = acme("model check builtin:acme_arm");
+    assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
+    let tip = acme("model fk builtin:acme_arm 0 0 0 0 0 0 0 --link flange --json").json();
+    assert!((tip["xyz"][2].as_f64().unwrap() - 1.1).abs() < 1e-9, "it stands straight up: {tip}");
+    let checked = acme("check acme-arm-planner");
+    assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
+
+    let run = start("run acme-arm-planner --sim --no-record");
+    run.until(UP);
+    let planned = acme("plan arm --named home").out;
+    assert!(planned.contains("clearance"), "{planned}");
+    acme("preview");
+    acme("execute");
+    is_at(home, &[0.0, 0.53, 0.0, 0.53, 0.0, 0.53, 0.0]);
+    acme("move arm --named zero --speed 1");
+    is_at(home, &[0.0; 7]);
+    acme("move arm --pose 0.4 0.2 0.4 --speed 1");
+    let refused = start("plan arm --pose 0.3 0 -0.2").wait().with(1);
+    assert!(refused.err.contains("hint: "), "{}", refused.err);
+    run.end(Signal::INT).with(130);
+}
+
+fn is_at(home: &Home, goal: &[f64]) {
+    let is = home.positions("arm");
+    assert!(is.len() == goal.len() && is.iter().zip(goal).all(|(is, goal)| (is - goal).abs() < 0.01), "{is:?}");
+}
+
+/// The conformance suite over the table of that checkout.
+const SUITE: &str = r#"
+use real::hardware::conformance::{Outcome, checks, run};
+
+#[test]
+fn the_table_conforms() {
+    let table = skeleton::hardware::arms::TABLE;
+    assert_eq!(table.len(), 3);
+    for row in table {
+        std::thread::scope(|scope| {
+            for check in checks() {
+                scope.spawn(move || match run(row, check, None) {
+                    Outcome::Failed(why) => panic!("{} {}: {why}", row.name, check.name),
+                    outcome => println!("{} {}: {outcome:?}", row.name, check.name),
+                });
+            }
+        });
+    }
+}
+"#;
+
+/// A checkout of dimos as far as a new arm sees it: the table of arms, and around it what the sources name as `crate::…`,
+/// borrowed from the real one. So new arms are compiled and tested without building the tree again.
+fn checkout(at: &Path) {
+    for (path, text) in [
+        (
+            "Cargo.toml",
+            format!(
+                "[package]\nname = \"dimos\"\nversion = \"0.0.0\"\nedition = \"2024\"\n\n[lib]\nname = \"skeleton\"\n\n\
+                 [dependencies]\nreal = {{ package = \"dimos\", path = {CHECKOUT:?} }}\nschemars = \"1\"\n\
+                 serde = {{ version = \"1\", features = [\"derive\"] }}\n\n{}",
+                profiles()
+            ),
+        ),
+        (
+            "src/lib.rs",
+            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{fit, kit, registry, sim, spec, \
+             transport};\n}\n"
+                .into(),
+        ),
+        (
+            "src/hardware/arms/mod.rs",
+            "use crate::hardware::registry::AdapterSpec;\n\npub mod nothing;\n\npub const TABLE: &[AdapterSpec] = &[];\n"
+                .into(),
+        ),
+        ("src/hardware/arms/nothing.rs", String::new()),
+        ("src/robot/builtin.rs", "\nrobots!(\n    \"lite6\",\n    \"piper\"\n);\n".into()),
+        ("tests/conformance.rs", SUITE.into()),
+    ] {
+        let path = at.join(path);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+}
+
+/// The profiles of a new crate's manifest.
+fn profiles() -> String {
+    let manifest = fs::read_to_string(Path::new(CHECKOUT).join("assets/templates/crate/manifest.toml")).unwrap();
+    manifest[manifest.find("[profile.dev]").unwrap()..].to_owned()
+}
+
+#[test]
+fn arms_in_the_tree_are_built_and_tested() {
+    let home = Home::new();
+    let tree = home.path().join("tree");
+    checkout(&tree);
+    for (name, transport, dof) in [("otto", "serial", 16), ("acme", "tcp", 1), ("penny-2", "can", 5)] {
+        let line = format!("adapter new {name} --dof {dof} --transport {transport} --in-tree --path tree --json");
+        let report = home.dimos(&line).with(0).json();
+        assert_eq!(report["changed"], json!(["tree/src/hardware/arms/mod.rs", "tree/src/robot/builtin.rs"]));
+        let files = if transport == "can" { 8 } else { 9 };
+        assert_eq!(report["written"].as_array().unwrap().len(), files, "{report}");
+        let blueprint = fs::read_to_string(tree.join(format!("blueprints/coordinator-{name}.yaml"))).unwrap();
+        assert!(blueprint.contains(&format!("count: {dof}}}")), "{blueprint}");
+        let snake = name.replace('-', "_");
+        assert!(blueprint.contains(&format!("adapter_type: {snake}\n")), "{blueprint}");
+        home.dimos(&format!("model check tree/assets/robots/{snake}.urdf")).with(0);
+        let planner = fs::read_to_string(tree.join(format!("blueprints/{name}-planner.yaml"))).unwrap();
+        assert!(planner.contains(&format!("model_path: builtin:{snake} #")), "{planner}");
+    }
+    let robots = fs::read_to_string(tree.join("src/robot/builtin.rs")).unwrap();
+    assert!(
+        robots.contains("    \"acme\",\n    \"lite6\",\n    \"otto\",\n    \"penny_2\",\n    \"piper\"\n);"),
+        "{robots}"
+    );
+    let table = fs::read_to_string(tree.join("src/hardware/arms/mod.rs")).unwrap();
+    assert!(table.contains("pub mod acme;\npub mod nothing;\npub mod otto;\npub mod penny_2;\n"), "{table}");
+    assert!(table.contains("&[otto::SPEC, acme::SPEC, penny_2::SPEC];"), "{table}");
+    cargo_test(&tree);
+}
+
+#[test]
+fn nothing_is_written_over_and_nothing_half() {
+    let home = Home::new();
+    let tree = home.path().join("tree");
+    checkout(&tree);
+    fs::create_dir_all(home.path().join("taken")).unwrap();
+    fs::create_dir_all(tree.join("blueprints")).unwrap();
+    fs::write(tree.join("blueprints/coordinator-planned.yaml"), "mine").unwrap();
+    fs::create_dir_all(tree.join("src/hardware/arms/there")).unwrap();
+    let before = files(home.path());
+    for (arguments, part) in [
+        ("taken --dof 6 --transport tcp", "taken is there already: nothing was written"),
+        ("acme --dof 6 --transport tcp --path nowhere", "there is no folder nowhere"),
+        ("acme --dof 6 --transport tcp --dimos taken", "taken is no checkout of dimos"),
+        ("acme --dof 6 --transport tcp --in-tree --path taken", "taken is no checkout of dimos"),
+        ("planned --dof 6 --transport tcp --in-tree --path tree", "coordinator-planned.yaml is there already"),
+        ("there --dof 6 --transport can --in-tree --path tree", "arms/there is there already"),
+        ("nothing --dof 6 --transport can --in-tree --path tree", "it has `pub mod nothing;` already"),
+        ("lite6 --dof 6 --transport tcp --in-tree --path tree", "it has \"lite6\" already"),
+        ("yourarm --dof 6 --transport serial", "there is an adapter yourarm already"),
+        ("loop --dof 6 --transport serial", "it is a word of Rust"),
+        ("../acme --dof 6 --transport serial", "begin it with a lower-case letter"),
+        ("acme --dof 0 --transport tcp", "--dof"),
+        ("acme --dof 17 --transport tcp", "--dof"),
+        ("acme --dof 6 --transport usb", "--transport"),
+        ("acme --dof 6", "--transport"),
+    ] {
+        let refused = home.dimos(&format!("adapter new {arguments}"));
+        assert_eq!((refused.code, refused.out.as_str()), (Some(2), ""), "{arguments}: {}", refused.err);
+        assert!(refused.err.contains(part), "{arguments}: {}", refused.err);
+    }
+    assert_eq!(files(home.path()), before);
+}

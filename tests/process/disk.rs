@@ -1,0 +1,93 @@
+//! The disk of a log: too little room refuses a start, and a log that ends early ends its run, with words and exit
+//! code 5. The real binary, on a small file system of its own where this user may mount one.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::support::program::{Home, Started, eventually};
+
+const RUN: &str = "coordinator-mock";
+
+/// A small file system in memory. Gone when this is dropped.
+struct Disk(PathBuf);
+
+impl Disk {
+    /// `None`: this user may not mount one, which is said.
+    fn mount(home: &Home, megabytes: u64) -> Option<Self> {
+        let at = home.path().join("disk");
+        std::fs::create_dir(&at).unwrap();
+        let mut mount = Command::new("mount");
+        mount.args(["-t", "tmpfs", "-o", &format!("size={megabytes}m"), "dimos-test"]).arg(&at);
+        let mounted = mount.output().is_ok_and(|output| output.status.success());
+        if !mounted {
+            println!("not checked: no file system can be mounted here");
+        }
+        mounted.then(|| Self(at))
+    }
+
+    fn write(&self, name: &str, megabytes: usize) {
+        std::fs::write(self.0.join(name), vec![1; megabytes << 20]).unwrap();
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(&self.0).status();
+    }
+}
+
+fn run(home: &Home, log: &Path, more: &str) -> Started {
+    home.run(&format!("{RUN} --record {} {more}", log.display()))
+}
+
+#[test]
+fn a_start_with_too_little_room_is_refused() {
+    let home = Home::new();
+    let Some(disk) = Disk::mount(&home, 8) else { return };
+    let log = disk.0.join("logs/run.mcap");
+    let start = format!("run {RUN} --record {}", log.display());
+    let refused = home.dimos(&format!("{start} --duration 300ms")).with(1);
+    let refused = refused.says(&["MB are free on its disk, and 200.0 MB must be", "hint: make room"]);
+    assert!(!refused.err.contains("goes on") && !log.exists(), "{}", refused.err);
+    // The limit is the blueprint's.
+    home.dimos(&format!("{start} --duration 300ms --set recording.min_free=1MB")).with(0);
+    home.dimos(&format!("{start} --set recording.min_free=lots")).with(2).says(&["recording.min_free", "200 MB"]);
+}
+
+#[test]
+fn a_disk_that_fills_up_ends_the_run_with_a_log_that_is_whole() {
+    let home = Home::new();
+    let Some(disk) = Disk::mount(&home, 64) else { return };
+    let log = disk.0.join("run.mcap");
+    let run = run(&home, &log, "--set recording.min_free=32MB");
+    disk.write("other", 40);
+    let ended = run.wait().with(5).says(&["MB are free on its disk, and 32.0 MB must be", "its log is incomplete"]);
+    assert!(!ended.err.contains("goes on"), "{}", ended.err);
+    home.dimos(&format!("replay {} --verify", log.display())).with(0);
+    assert_eq!(home.runs().runs().unwrap(), []);
+    assert!(home.dimos("status").with(0).out.contains("MB are free"), "what became of it is told");
+}
+
+#[test]
+fn a_disk_without_any_room_left_ends_the_run() {
+    let home = Home::new();
+    let Some(disk) = Disk::mount(&home, 8) else { return };
+    let run = run(&home, &disk.0.join("run.mcap"), "--set recording.min_free=0");
+    let _ = std::fs::write(disk.0.join("other"), vec![1; 16 << 20]);
+    run.wait().with(5).says(&["ends here: ", "its log is incomplete"]);
+}
+
+#[test]
+fn a_log_that_is_removed_ends_the_run() {
+    let home = Home::new();
+    let folder = home.path().join("logs");
+    let first = run(&home, &folder.join("run.mcap"), "");
+    std::fs::remove_dir_all(&folder).unwrap();
+    first.wait().with(5).says(&["it was removed or replaced", "its log is incomplete"]);
+    // In the background there is nobody to read it: `down` and `status` say what became of the run.
+    let log = folder.join("again.mcap");
+    home.dimos(&format!("run {RUN} -d --record {}", log.display())).with(0);
+    std::fs::remove_file(&log).unwrap();
+    eventually("the run has ended", || home.runs().runs().unwrap().is_empty());
+    home.dimos(&format!("down {RUN}")).with(1).says(&["it was removed or replaced"]);
+}

@@ -1,0 +1,34 @@
+//! The program as users have it: the real binary, whole runs, one beside another.
+
+#[path = "../support/mod.rs"]
+mod support;
+
+/// Whether programs that tests start may schedule in real time: they run one beside another.
+const REALTIME: bool = false;
+
+mod adapter_emulate;
+mod adapter_new;
+mod adapter_test;
+mod adding_an_arm;
+mod arms_in_the_box;
+mod assets;
+mod changed_world;
+mod cli_verbs;
+mod daemon;
+mod disk;
+mod first_run;
+mod gripper_joint;
+mod jog;
+mod leases;
+mod library;
+mod onto;
+mod planner_attach;
+mod planner_faults;
+mod planner_run;
+mod python_client;
+mod readers;
+mod remote_shim;
+mod rpc_page;
+mod small_verbs;
+mod stops;
+mod xarm_runs;

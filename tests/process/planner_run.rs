@@ -1,0 +1,520 @@
+//! Planning in a run, with the real binary: from a plan to its motion, the world around it, and all that is refused.
+//! Long because all of it happens in the one cell at its top.
+
+use std::time::Instant;
+
+use dimos::rpc::api::{ArmEnable, ArmReset, ExecutePlan, Lease, Motion, Plan, PlanGoal, Planning, Status};
+use rustix::process::Signal;
+
+use crate::support::program::{Home, Started, eventually};
+
+/// An ideal arm in memory, with YourArm's description.
+const BLUEPRINT: &str = include_str!("support/lab.yaml");
+const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
+/// Two walls that leave no way from one side of the arm to the other, as far as a search can tell in a minute.
+const WALLS: [&str; 2] = ["world add front --box 2 0.02 4 --at 1.1 0 0", "world add back --box 2 0.02 4 --at -1.1 0 0"];
+const LEFT: &str = "1.5 -0.3 0.6 0 0.8 0";
+const RIGHT: &str = "-1.5 -0.3 0.6 0 0.8 0";
+
+fn up() -> (Home, Started) {
+    let home = Home::new();
+    home.write("lab.yaml", BLUEPRINT);
+    let run = home.run("lab.yaml --no-record");
+    home.dimos("move arm --named home --speed 1").with(0);
+    (home, run)
+}
+
+/// On the left of the walls, with something to plan that takes as long as it may.
+fn up_between_walls() -> (Home, Started) {
+    let (home, run) = up();
+    home.dimos(&format!("move arm {LEFT} --speed 1")).with(0);
+    WALLS.iter().for_each(|wall| drop(home.dimos(wall).with(0)));
+    (home, run)
+}
+
+#[track_caller]
+fn is_at(home: &Home, arm: &str, goal: &[f64]) {
+    let is = home.positions(arm);
+    assert!(is.iter().zip(goal).all(|(is, goal)| (is - goal).abs() < 0.01), "{is:?} for {goal:?}");
+}
+
+/// Where the planner says that an arm's end effector will be when a plan has been carried out [m].
+fn end(preview: &serde_json::Value) -> Vec<f64> {
+    let way = preview["end_effectors"]["arm"].as_array().unwrap();
+    way.last().unwrap().as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
+}
+
+#[test]
+fn a_plan_is_shown_then_carried_out() {
+    let (home, _run) = up();
+    let planned = home.dimos("plan arm 0.3 -0.2 0.5 0 0.4 0").with(0).says(&["nothing has moved"]);
+    assert!(planned.out.contains("clearance") && planned.out.contains("rad long"), "{}", planned.out);
+    is_at(&home, "arm", &HOME);
+    let shown = home.dimos("preview --out plan.json").with(0);
+    assert!(shown.out.contains("arm_joint6") && shown.out.contains("arm x y z [m]"), "{}", shown.out);
+    home.dimos("execute").with(0).says(&["planned, collision-checked"]);
+    is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
+    // The file is a trajectory like any other, from where the plan began.
+    home.dimos("execute plan.json").with(1).says(&["START_STATE_MISMATCH"]);
+    home.dimos("move arm --named home").with(0).says(&["planned, collision-checked"]);
+    home.dimos("execute plan.json").with(0);
+    is_at(&home, "arm", &[0.3, -0.2, 0.5, 0.0, 0.4, 0.0]);
+    home.dimos("move arm --named home --direct").with(2);
+    home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --direct").with(0).says(&["direct, not collision-checked"]);
+    // Who is there already is no failure: `move --named home` may be said twice.
+    home.dimos("move arm --named home").with(0);
+    home.dimos("move arm --named home").with(0);
+    is_at(&home, "arm", &HOME);
+}
+
+#[test]
+fn poses_lines_and_seeds() {
+    let (home, _run) = up();
+    for orientation in ["--rpy 3.14 0 0", "--quat 1 0 0 0", ""] {
+        home.dimos(&format!("plan arm --pose 0.35 0.1 0.3 {orientation}")).with(0);
+        let preview = home.dimos("preview --json").with(0).json();
+        let there = end(&preview);
+        assert!(there.iter().zip([0.35, 0.1, 0.3]).all(|(is, goal)| (is - goal).abs() < 1e-4), "{there:?}");
+    }
+    home.dimos("move arm --pose 0.35 0 0.35 --rpy 3.14 0.2 0").with(0);
+    let line = home.dimos("plan arm --pose 0.35 0.15 0.35 --rpy 3.14 0.2 0 --linear --json").with(0).json();
+    assert_eq!(line["summary"]["fraction"], 1.0);
+    let preview = home.dimos("preview --json").with(0).json();
+    for at in preview["end_effectors"]["arm"].as_array().unwrap() {
+        let [x, y, z] = [0, 1, 2].map(|axis| at[axis].as_f64().unwrap());
+        assert!((x - 0.35).abs() < 2e-3 && (z - 0.35).abs() < 2e-3 && (-0.001..0.151).contains(&y), "{at}");
+    }
+    home.dimos("plan arm --pose 1.5 0 0.35 --rpy 3.14 0.2 0 --linear")
+        .with(1)
+        .says(&["% of the straight line", "hint: "]);
+    // A detour around a post is searched, with the same result for the same seed.
+    home.dimos("move arm --named home").with(0);
+    home.dimos("world add post --box 0.04 0.04 0.4 --at 0.22 0.12 0.2").with(0);
+    let detour = |seed| {
+        let planned = home.dimos(&format!("plan arm 1.0 -0.3 0.6 0 0.8 0 --seed {seed} --json")).with(0).json();
+        assert!(planned["summary"]["waypoints"].as_u64().unwrap() > 2, "{planned}");
+        assert!(planned["summary"]["clearance"].as_f64().unwrap() > 0.0, "{planned}");
+        home.dimos("preview --json").with(0).json()["trajectory"].take()
+    };
+    let (first, again, other) = (detour(1), detour(1), detour(2));
+    assert!(first == again && first != other);
+    home.dimos("execute").with(0);
+    is_at(&home, "arm", &[1.0, -0.3, 0.6, 0.0, 0.8, 0.0]);
+}
+
+#[test]
+fn what_cannot_be_planned_is_refused_in_words() {
+    let (home, _run) = up();
+    home.dimos("world add box --box 0.1 0.1 0.2 --at 0.4 0 0.1").with(0);
+    let table: &[(&str, i32, &[&str])] = &[
+        ("plan arm --pose 0.4 0 0.1", 1, &["the goal collides: link \"arm/", "mm deep in obstacle \"box\"", "hint: "]),
+        ("plan arm 0 1.5 1.5 0 0 0", 1, &["the goal collides: link \"arm/", "deep in link \"arm/"]),
+        ("plan arm --pose 5 0 0.3 --rpy 0 0 0", 1, &["arm: the pose is not reached: ", "mm", "hint: "]),
+        ("plan arm 9 0 0 0 0 0", 1, &["goal: arm_joint1 at 9.0000 rad is outside its limits", "hint: "]),
+        ("plan arm 0 0 0", 2, &["arm has 6 joints, the goal 3 values"]),
+        ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
+        ("plan amr --named home", 1, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
+        ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has the length 1.414"]),
+        ("plan arm 0 0 0 0 0 0 --linear", 2, &["linear needs a pose"]),
+        ("plan arm", 2, &["required"]),
+        ("preview", 1, &["UNKNOWN_PLAN", "hint: `dimos plan` makes one"]),
+        ("preview 4711", 1, &["UNKNOWN_PLAN"]),
+        ("execute --plan 4711", 1, &["UNKNOWN_PLAN"]),
+    ];
+    // The way home has made plans: the ones that are asked about here are gone with a new run.
+    for (arguments, code, words) in table.iter().filter(|(arguments, ..)| *arguments != "preview") {
+        home.dimos(arguments).with(*code).says(words);
+    }
+    // The arm stands in something that was put there later.
+    home.dimos("world add ball --sphere 0.1 --at 0.24 0 0.36").with(0);
+    let stuck = ["the start collides: link \"arm/", "obstacle \"ball\"", "hint: "];
+    home.dimos("plan arm 0.5 -0.3 0.6 0 0.8 0").with(1).says(&stuck);
+    home.dimos("plan arm --pose 0.3 0 0.36 --rpy 3.14 0.5 0 --linear").with(1).says(&stuck[..2]);
+    is_at(&home, "arm", &HOME);
+    let fresh = Home::new();
+    fresh.write("lab.yaml", BLUEPRINT);
+    let _run = fresh.run("lab.yaml --no-record");
+    fresh.dimos("preview").with(1).says(table[10].2);
+    fresh.dimos("execute").with(1).says(&["UNKNOWN_PLAN"]);
+}
+
+#[test]
+fn a_plan_is_refused_when_the_arm_or_the_world_is_not_as_it_was() {
+    let (home, _run) = up();
+    home.dimos("plan arm 0.8 -0.3 0.6 0 0.8 0").with(0);
+    home.dimos("move arm 0.3 -0.3 0.6 0 0.8 0 --direct").with(0);
+    home.dimos("execute").with(1).says(&["START_STATE_MISMATCH", "the trajectory starts 0.3", "arm_joint1", "hint: "]);
+    is_at(&home, "arm", &[0.3, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // An obstacle that came after the plan.
+    home.dimos("plan arm -0.6 -0.3 0.6 0 0.8 0").with(0);
+    home.dimos("world add late --sphere 0.05 --at 0.26 -0.08 0.36").with(0);
+    home.dimos("execute").with(1).says(&[
+        "PLAN_OUTDATED",
+        "is no longer free",
+        "obstacle \"late\"",
+        "hint: plan again",
+    ]);
+    is_at(&home, "arm", &[0.3, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    home.dimos("world remove late").with(0);
+    home.dimos("execute").with(0);
+    is_at(&home, "arm", &[-0.6, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // Planning needs no motors, motion does.
+    home.dimos("arm disable arm").with(0);
+    home.dimos("plan arm --named home").with(0);
+    home.dimos("execute").with(1).says(&["ARM_NOT_READY", "hint: "]);
+    home.dimos("arm enable arm").with(0);
+    home.dimos("execute").with(0);
+    is_at(&home, "arm", &HOME);
+}
+
+#[test]
+fn cancel_and_ctrl_c_end_planning_at_once() {
+    let (home, _run) = up_between_walls();
+    let began = Instant::now();
+    let planning = home.start(&format!("plan arm {RIGHT} --timeout 60s"));
+    let mut client = home.client();
+    let planner = || home.dimos("cancel").with(0).out.contains("planning: CANCELLED");
+    eventually("it plans", planner);
+    planning.wait().with(1).says(&["no plan: cancelled"]);
+    let planning = home.start(&format!("plan arm {RIGHT} --timeout 60s"));
+    eventually("the planner is busy", || home.status()["planner"]["state"] == "PLANNING");
+    home.dimos("plan arm --named home").with(1).says(&["PLANNING", "hint: "]);
+    planning.end(Signal::INT).with(130).says(&["planning was cancelled: nothing has moved"]);
+    assert!(began.elapsed().as_secs() < 40, "nothing waits for the 60 s");
+    // A request that runs out of time says so, and the arm did not notice any of it.
+    home.dimos(&format!("plan arm {RIGHT} --timeout 300ms")).with(1).says(&["in time", "--timeout"]);
+    let status = client.call(Status {}).unwrap();
+    assert_eq!((status.arms[0].phase.as_str(), status.tasks[0].state.as_str()), ("ready", "COMPLETED"));
+    home.dimos("plan arm 1.2 -0.3 0.6 0 0.8 0").with(0);
+}
+
+#[test]
+fn a_planned_motion_is_cancelled_and_stopped_like_any_other() {
+    let (home, _run) = up();
+    let far = "move arm 2 -0.3 0.6 0 0.8 0 --speed 0.2";
+    let moving = home.start(far);
+    eventually("it moves", || home.positions("arm")[0] > 0.1);
+    assert!(home.dimos("cancel arm").with(0).out.contains("traj_arm: CANCELLED"));
+    moving.wait().with(1).says(&["ABORTED"]);
+    let moving = home.start(far);
+    let before = home.positions("arm")[0];
+    eventually("it moves on", || home.positions("arm")[0] > before + 0.1);
+    home.dimos("stop").with(0);
+    moving.wait().with(1);
+    assert!(home.positions("arm")[0] < 1.9);
+    home.dimos("plan arm --named home").with(0);
+    home.dimos("execute").with(1).says(&["ARM_LATCHED", "hint: "]);
+    let mut client = home.client();
+    client.call(ArmReset { arm: "arm".into() }).unwrap();
+    client.call(ArmEnable { arm: "arm".into() }).unwrap();
+    home.dimos("execute").with(0);
+    is_at(&home, "arm", &HOME);
+}
+
+#[test]
+fn nothing_is_planned_again_for_a_client_that_has_gone() {
+    let (home, _run) = up();
+    home.dimos("plan arm 1.4 -0.3 0.6 0 0.8 0 --speed 0.2").with(0);
+    let mut client = home.client();
+    let execute = ExecutePlan { plan: None, replan: true, presence: None };
+    let begun = client.call(execute).unwrap();
+    eventually("it moves", || home.positions("arm")[0] > 0.1);
+    drop(client);
+    eventually("its lease is free", || home.status()["arms"][0]["commander"].is_null());
+    home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
+    let mut client = home.client();
+    let mut report = client.call(Motion { motion: begun.motion }).unwrap();
+    eventually("the motion ends", || {
+        report = client.call(Motion { motion: begun.motion }).unwrap();
+        report.done
+    });
+    let error = report.error.unwrap_or_default();
+    assert!(report.next.is_none() && error.contains("who asked for it has gone"), "{error}");
+}
+
+#[test]
+fn one_commands_the_other_may_only_plan() {
+    let (home, _run) = up();
+    let mut holder = home.client();
+    holder.call(Lease { arm: Some("arm".into()) }).unwrap();
+    home.dimos("plan arm 0.5 -0.3 0.6 0 0.8 0").with(0);
+    home.dimos("execute").with(1).says(&["LEASE_HELD", "arm is commanded by ", "hint: "]);
+    home.dimos("move arm --named home").with(1).says(&["LEASE_HELD"]);
+    is_at(&home, "arm", &HOME);
+    drop(holder);
+    eventually("the lease is free", || home.dimos("execute --plan 4711").err.contains("UNKNOWN_PLAN"));
+    home.dimos("move arm 0.5 -0.3 0.6 0 0.8 0").with(0);
+}
+
+#[test]
+fn the_world_is_changed_while_it_runs() {
+    let (home, _run) = up();
+    let world = || home.dimos("world list").with(0).out;
+    home.write("two.ply", "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n0.1 0 0\n");
+    home.write("tetra.obj", "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n");
+    for (name, shape) in [
+        ("box", "--box 0.1 0.1 0.2"),
+        ("ball", "--sphere 0.05"),
+        ("can", "--cylinder 0.05 0.3 --padding 0.01"),
+        ("mesh", "--mesh tetra.obj"),
+        ("cloud", "--cloud two.ply"),
+    ] {
+        home.dimos(&format!("world add {name} {shape} --at 0.6 0.6 0.6")).with(0);
+        assert!(world().contains(name));
+        // It is really there: the arm's flange cannot be where it is.
+        home.dimos(&format!("world move {name} --at 0.38 0.02 0.3")).with(0);
+        let hit = home.dimos("plan arm --pose 0.4 0.02 0.3 --rpy 3.14 0 0").with(1);
+        assert!(hit.err.contains(&format!("obstacle \"{name}\"")), "{}", hit.err);
+        home.dimos(&format!("world move {name} --at -0.6 0.6 0.6")).with(0);
+        home.dimos("plan arm --pose 0.4 0.02 0.3 --rpy 3.14 0 0").with(0);
+    }
+    home.write("no.ply", "hello");
+    let refused: &[(&str, i32, &[&str])] = &[
+        ("world add bad --sphere -1 --at 0 0 1", 2, &["a size of the shape is -1, and must be above 0"]),
+        ("world add bad --box 0 1 1 --at 0 0 1", 2, &["a size of the shape is 0"]),
+        ("world add bad --sphere 1 --padding -1 --at 0 0 1", 2, &["padding is -1"]),
+        ("world add bad --mesh none.stl --at 0 0 1", 2, &["none.stl: "]),
+        ("world add bad --cloud no.ply --at 0 0 1", 2, &["no.ply: not a PLY point cloud"]),
+        ("world add bad --cloud /dev/zero --at 0 0 1", 2, &["/dev/zero: not a file"]),
+        ("world move nobody --at 0 0 1", 1, &["UNKNOWN_OBJECT"]),
+        ("world remove nobody", 1, &["UNKNOWN_OBJECT"]),
+        ("world detach box", 2, &["nobody holds box"]),
+        ("world attach box amr", 1, &["did you mean `arm`?"]),
+        ("world attach box arm --link fingr", 2, &["no link named `fingr`"]),
+        ("world attach box arm --touch link9", 2, &["no link named `link9`"]),
+    ];
+    let before = world();
+    refused.iter().for_each(|(arguments, code, words)| drop(home.dimos(arguments).with(*code).says(words)));
+    assert_eq!(world(), before, "what is refused changes nothing");
+    home.dimos("world remove --all").with(0);
+    home.dimos("world list").with(0).says(&["the world is empty"]);
+    home.write(
+        "kitchen.yaml",
+        "shelf: {shape: {box: [0.1, 0.1, 0.1]}, pose: {xyz: [0, 0.5, 0.5]}}\npan: {shape: {mesh: tetra.obj}}\n",
+    );
+    home.dimos("world load kitchen.yaml").with(0);
+    assert!(world().contains("shelf") && world().contains("tetra.obj"));
+    home.write("wrong.yaml", "ok: {shape: {sphere: 1}}\nbad: {shape: {box: [0.1, 0.1]}}\n");
+    home.dimos("world load wrong.yaml").with(2).says(&["wrong.yaml: bad: "]);
+    assert!(!world().contains("ok"));
+}
+
+#[test]
+fn what_an_arm_holds_goes_with_it() {
+    let (home, _run) = up();
+    // A rod that hangs from the flange.
+    home.dimos("plan arm 0.1 -0.3 0.6 0 0.8 0 --json").with(0);
+    let at: Vec<f64> = home.dimos("preview --json").with(0).json()["end_effectors"]["arm"][0]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|v| v.as_f64().unwrap())
+        .collect();
+    home.dimos(&format!("world add rod --cylinder 0.01 0.3 --at {} {} {}", at[0] + 0.02, at[1], at[2] - 0.2)).with(0);
+    home.dimos("world attach rod arm --touch link6").with(0);
+    for refused in
+        ["world attach rod arm", "world move rod --at 0 0 1", "world remove rod", "world add rod --sphere 1 --at 0 0 1"]
+    {
+        home.dimos(refused).with(2).says(&["arm holds rod", "hint: `dimos world detach rod`"]);
+    }
+    // It would be put into a block that the arm itself does not come near to.
+    let (turn, reach) = (0.8_f64, (at[0] + 0.02).hypot(at[1]));
+    let (x, y) = (reach * turn.cos(), reach * turn.sin());
+    home.dimos(&format!("world add block --box 0.1 0.1 0.04 --at {x} {y} 0.04")).with(0);
+    let rod_hits = ["link \"arm/rod\"", "obstacle \"block\""];
+    home.dimos("plan arm 0.8 -0.3 0.6 0 0.8 0").with(1).says(&rod_hits);
+    home.dimos("world remove --all").with(0);
+    assert!(home.dimos("world list").with(0).out.contains("arm flange"), "what is held is not removed");
+    home.dimos("move arm 1.0 -0.3 0.6 0 0.8 0").with(0);
+    home.dimos("world detach rod").with(0);
+    let world = home.dimos("world list --json").with(0).json();
+    let rod = &world["objects"][0];
+    assert!(rod["held_by"].is_null(), "{rod}");
+    // It was carried about the arm's axis by 1 rad, and stays there.
+    let [x, y] = [0, 1].map(|axis| rod["pose"]["xyz"][axis].as_f64().unwrap());
+    let (from, to) = ((at[0] + 0.02).hypot(at[1]), x.hypot(y));
+    assert!((from - to).abs() < 2e-3 && (y.atan2(x) - at[1].atan2(at[0] + 0.02) - 1.0).abs() < 0.02, "{rod}");
+    home.dimos("move arm 0.2 -0.3 0.6 0 0.8 0").with(0);
+    let world = home.dimos("world list --json").with(0).json();
+    assert_eq!(&world["objects"][0], rod);
+    home.dimos("world remove rod").with(0);
+}
+
+#[test]
+fn mistakes_of_a_blueprint_are_found_by_check_where_they_are() {
+    let home = Home::new();
+    let table = [
+        ("end_effector_link: flange", "end_effector_link: flnge", "the model has no link `flnge`", "lab.yaml:11:26"),
+        ("[joint1,", "[jont1,", "the model has no joint `jont1`", "lab.yaml:12:21"),
+        ("builtin:yourarm", "builtin:yourrm", "no robot in the box is named `yourrm`", "lab.yaml:10:19"),
+        ("builtin:yourarm", "none.urdf", "none.urdf: ", "lab.yaml:10:19"),
+        (
+            "end_effector_link",
+            "base_link: bse\n      end_effector_link",
+            "the model has no link `bse`",
+            "lab.yaml:11:18",
+        ),
+        ("home: [0,", "home: [9,", "`joint1` at 9 rad is outside the model's limits", "lab.yaml:16:15"),
+        ("home: [0,", "home: [", "5 positions for 6 joints", "lab.yaml:16:15"),
+        ("{box: [1.2, 1.2, 0.02]}", "{box: [1.2, 0, 0.02]}", "a size of the shape is 0", "lab.yaml:18:20"),
+        ("{box: [1.2, 1.2, 0.02]}", "{mesh: none.stl}", "there is no file none.stl", "lab.yaml:18:20"),
+        (
+            "      named_poses",
+            "      collision_exclusion_pairs: [[link1, lnk3]]\n      named_poses",
+            "no link `lnk3`",
+            "lab.yaml:15:34",
+        ),
+        ("task_name: traj_arm", "task_name: traj_rm", "there is no task `traj_rm`", "lab.yaml:14:30"),
+    ];
+    for (right, wrong, words, place) in table {
+        assert!(BLUEPRINT.contains(right));
+        home.write("lab.yaml", &BLUEPRINT.replacen(right, wrong, 1));
+        for verb in ["check lab.yaml", "run lab.yaml --no-record"] {
+            home.dimos(verb).with(2).says(&[words, place, "nothing was connected"]);
+        }
+    }
+}
+
+#[test]
+fn every_planner_blueprint_in_the_box_moves_its_arms_home() {
+    let boxed: &[(&str, &[(&str, &str)])] = &[
+        ("yourarm-planner", &[("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")]),
+        ("xarm6-planner", &[("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")]),
+        ("xarm7-planner", &[("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")]),
+        ("piper-planner", &[("arm", "0.3 0.1 0.2 --rpy 0 2 0")]),
+        ("dual-yourarm-planner", &[("left", "0.35 0.4 0.3 --rpy 3.14 0 0"), ("right", "0.35 -0.4 0.3 --rpy 3.14 0 0")]),
+    ];
+    for (blueprint, arms) in boxed {
+        let home = Home::new();
+        home.dimos(&format!("check {blueprint} --sim")).with(0);
+        let _run = home.run(&format!("{blueprint} --sim --no-record"));
+        for (arm, pose) in *arms {
+            home.dimos(&format!("move {arm} --pose {pose}")).with(0);
+            let planned = home.dimos(&format!("move {arm} --named home --speed 1"));
+            planned.with(0).says(&["planned, collision-checked"]);
+        }
+        home.dimos("down").with(0);
+    }
+}
+
+#[test]
+fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
+    let home = Home::new();
+    let mocks = "--set hardware.left.adapter_type=mock --set hardware.right.adapter_type=mock";
+    let _run = home.run(&format!("dual-yourarm-planner --no-record {mocks}"));
+    let mut client = home.client();
+    let both = |left: [f64; 6], right: [f64; 6]| {
+        let goal = |robot: &str, joints: [f64; 6]| PlanGoal {
+            robot: robot.into(),
+            joints: Some(joints.into()),
+            ..PlanGoal::default()
+        };
+        Plan { goals: vec![goal("left", left), goal("right", right)], speed: 1.0, seed: 3, timeout: None }
+    };
+    let turned = |angle| [angle, -0.3, 0.6, 0.0, 0.8, 0.0];
+    let mut planned = |plan: Plan| {
+        let number = client.call(plan).unwrap().plan;
+        let mut report = client.call(Planning { plan: number }).unwrap();
+        eventually("planning ends", || {
+            report = client.call(Planning { plan: number }).unwrap();
+            report.state != "PLANNING"
+        });
+        report
+    };
+    let report = planned(both(turned(0.4), turned(-0.4)));
+    assert_eq!((report.state.as_str(), report.summary.unwrap().joints.len()), ("PLANNED", 12), "{:?}", report.error);
+    home.dimos("execute").with(0);
+    is_at(&home, "left", &turned(0.4));
+    is_at(&home, "right", &turned(-0.4));
+    // Both reach for the middle between them.
+    let across = |angle| [angle, 0.0, 0.0, 0.0, 0.0, 0.0];
+    let report = planned(both(across(-1.3), across(1.3)));
+    let why = report.error.unwrap_or_default();
+    assert!(report.state == "FAILED" && why.contains("left/link") && why.contains("right/link"), "{why}");
+    // A plan for one arm minds where the other one stands by now.
+    home.dimos("plan left -1.3 0 0 0 0 0").with(0);
+    home.dimos("move right 1.3 0 0 0 0 0 --direct --speed 1").with(0);
+    home.dimos("execute").with(1).says(&["PLAN_OUTDATED", "left/link", "right/link"]);
+    home.dimos("plan left -1.3 0 0 0 0 0").with(1).says(&["left/link", "right/link"]);
+}
+
+#[test]
+fn several_arms_are_sent_together_from_the_command_line() {
+    let home = Home::new();
+    let mocks = "--set hardware.left.adapter_type=mock --set hardware.right.adapter_type=mock";
+    let _run = home.run(&format!("dual-yourarm-planner --no-record {mocks}"));
+    home.dimos("plan --goal left=named:home --goal right=0,-0.3,0.6,0,0.8,0").with(0).says(&["nothing has moved"]);
+    let preview = home.dimos("preview --json").with(0).json();
+    assert_eq!(preview["trajectory"]["joint_names"].as_array().unwrap().len(), 12);
+    let done = home.dimos("execute").with(0);
+    assert!(done.out.contains("left_joint1") && done.out.contains("right_joint6"), "{}", done.out);
+    // One straight line in the space of both: each has done the same part of its way at every moment. A busy machine may
+    // hold an arm up; then it begins again.
+    let (there, home_pose) =
+        ("left=0.8,-0.3,0.6,0,0.8,0 --goal right=-0.4,-0.3,0.6,0,0.8,0", "left=named:home --goal right=named:home");
+    let arrived = (0..5).any(|_| {
+        home.dimos(&format!("move --goal {home_pose}")).with(0);
+        home.dimos(&format!("move --goal {there} --speed 0.2 --no-wait")).with(0);
+        let mut between = 0;
+        eventually("it ends", || {
+            let state = home.dimos("state --json").with(0).json();
+            let turned = |arm: usize| state["arms"][arm]["joints"][0]["position"].as_f64().unwrap();
+            let (left, right) = (turned(0) / 0.8, turned(1) / -0.4);
+            let task = home.status()["tasks"][0].take();
+            let held = task["reason"].as_str().is_some_and(|why| why.contains("its states"));
+            assert!(held || (left - right).abs() < 0.03, "{left} of the way, and {right}");
+            between += usize::from((0.1..0.9).contains(&left));
+            assert!(task["state"] != "ABORTED" || held, "{task}");
+            task["state"] != "EXECUTING"
+        });
+        between > 0 && home.status()["tasks"][0]["state"] == "COMPLETED"
+    });
+    assert!(arrived);
+    is_at(&home, "left", &[0.8, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    is_at(&home, "right", &[-0.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // Poses, each in its own way, and the ways to type it wrong.
+    home.dimos("plan --goal left=pose:0.35,0.4,0.3,3.14,0,0 --goal right=pose:0.35,-0.4,0.3").with(0);
+    home.dimos("plan --goal left=pose:0.35,0.4,0.3,1,0,0,0").with(0);
+    for (arguments, words) in [
+        ("plan --goal left", "must be ROBOT=GOAL"),
+        ("plan --goal left=home", "not a number"),
+        ("plan --goal left=pose:1,2", "a pose has 3, 6 or 7 numbers"),
+        ("plan --goal left=pos:1,2,3", "must be ROBOT=GOAL"),
+        ("plan left --goal right=named:home", "cannot be used with"),
+        ("move --goal left=named:home --direct", "cannot be used with"),
+        ("plan --goal left=named:home --named home", "cannot be used with"),
+        ("plan --goal left=named:home --goal left=named:home", "left has a goal already"),
+        ("plan", "required"),
+    ] {
+        home.dimos(arguments).with(2).says(&[words]);
+    }
+}
+
+#[test]
+fn a_goal_at_a_limit_is_refused_when_it_is_planned() {
+    let (home, _run) = up();
+    home.dimos("down").with(0);
+    home.write(
+        "lab.yaml",
+        &BLUEPRINT.replace("adapter_type: mock", "adapter_type: mock, limits: {position: [-1.5, 1.5]}"),
+    );
+    let _run = home.run("lab.yaml --no-record");
+    // The model reaches to 2.967 rad, this arm to 1.5, and commands stay 0.01 rad inside.
+    let words = ["goal: arm_joint1 at 1.4950 rad is outside its limits -1.4900 … 1.4900", "hint: "];
+    home.dimos("plan arm 1.495 -0.3 0.6 0 0.8 0").with(1).says(&words);
+    let robot = home.client().call(dimos::rpc::api::Planner {}).unwrap().robots.remove(0);
+    assert_eq!(robot.limits[0], [Some(-1.49), Some(1.49)]);
+    home.dimos("move arm 1.49 -0.3 0.6 0 0.8 0 --speed 1").with(0);
+    is_at(&home, "arm", &[1.49, -0.3, 0.6, 0.0, 0.8, 0.0]);
+    // No solution of a pose lies outside either.
+    for side in ["0.1 0.35 0.3", "-0.2 0.35 0.3"] {
+        let planned = home.dimos(&format!("plan arm --pose {side} --json"));
+        if planned.code == Some(0) {
+            let goal = planned.json()["summary"]["goal"].take();
+            assert!(goal.as_array().unwrap().iter().all(|q| q.as_f64().unwrap().abs() <= 1.49 + 1e-9), "{goal}");
+            home.dimos("execute").with(0);
+        } else {
+            planned.with(1).says(&["the pose is not reached"]);
+        }
+    }
+}

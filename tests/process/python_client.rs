@@ -1,0 +1,70 @@
+//! `assets/python/dimos_client.py` against the real binary: read, stream, move, servo from a policy loop, grip, stop.
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use crate::support::program::{Ended, Home, Started};
+
+const BLUEPRINT: &str = "
+hardware:
+  - {hardware_id: arm, joints: {prefix: arm, count: 6}, adapter_type: mock}
+tasks:
+  - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
+  - {name: servo_arm, type: servo, joint_names: {hardware: arm}, priority: 20}
+  - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 30}
+  - {name: twist_arm, type: eef_twist, joint_names: {hardware: arm}, priority: 40, params:
+      {model_path: 'builtin:yourarm', end_effector_link: flange, joint_prefix: arm_}}
+  - {name: pose_arm, type: cartesian_ik, joint_names: {hardware: arm}, priority: 50, params:
+      {model_path: 'builtin:yourarm', end_effector_link: flange, joint_prefix: arm_}}
+";
+
+/// `python3 ARGUMENTS`, with the client to import; `None` where there is no Python.
+fn python(home: &Home, arguments: &[&str]) -> Option<Ended> {
+    if Command::new("python3").arg("--version").stdout(Stdio::null()).status().is_err() {
+        assert!(std::env::var_os("DIMOS_NO_SKIP").is_none_or(|v| v != "1"), "python3 is missing");
+        println!("SKIPPED: python3 (make test-tools)");
+        return None;
+    }
+    let mut command = Command::new("python3");
+    let assets = Path::new(env!("CARGO_MANIFEST_DIR")).join("assets/python");
+    command.args(arguments).env("PYTHONPATH", assets).env("PYTHONPYCACHEPREFIX", home.path());
+    Some(Started::of(home.settle(&mut command).stdin(Stdio::null())).wait())
+}
+
+fn file(name: &str) -> String {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(name).display().to_string()
+}
+
+#[test]
+fn the_client_does_all_that_it_says() {
+    let home = Home::new();
+    home.write("scripts.yaml", BLUEPRINT);
+    let run = home.run("scripts.yaml --no-record");
+    let Some(ended) = python(&home, &[&file("tests/python/try_client.py")]) else { return };
+    assert!(ended.with(0).out.ends_with("all is as it says\n"));
+    run.wait().with(0).says(&["asked to end"]);
+}
+
+#[test]
+fn the_example_follows_its_policy() {
+    let home = Home::new();
+    home.write("scripts.yaml", BLUEPRINT);
+    let example = file("assets/python/example_policy.py");
+    let Some(alone) = python(&home, &[&example, "servo_arm"]) else { return };
+    alone.with(1).says(&["error: no run is live [NO_RUN]\nhint: start one: dimos run"]);
+    let _run = home.run("scripts.yaml --no-record");
+    let Some(ended) = python(&home, &[&example, "servo_arm", "--seconds", "1"]) else { return };
+    assert!(ended.with(0).out.contains(" targets in 1."), "it says how it kept its time");
+}
+
+#[test]
+fn the_files_are_python_3_9_of_bounded_length() {
+    let home = Home::new();
+    let check = "import ast, sys; [ast.parse(open(f).read(), feature_version=(3, 9)) for f in sys.argv[1:]]";
+    let files = [file("assets/python/dimos_client.py"), file("assets/python/example_policy.py")];
+    let Some(ended) = python(&home, &["-c", check, &files[0], &files[1]]) else { return };
+    ended.with(0);
+    let Some(ended) = python(&home, &["-m", "py_compile", &files[0], &files[1]]) else { return };
+    ended.with(0);
+    assert!(std::fs::read_to_string(&files[0]).unwrap().lines().count() <= 350, "one file that can be read");
+}

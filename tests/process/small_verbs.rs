@@ -1,0 +1,199 @@
+//! The small verbs with the real binary: `state --watch`, `arm gripper`, `task`, `completions`, `man`, `doctor`.
+
+use std::io::{BufRead, BufReader, Write};
+use std::process::Stdio;
+
+use dimos::rpc::api::{State, Status};
+use rustix::process::Signal;
+use serde_json::Value;
+
+use crate::support::program::{Home, Started, eventually};
+
+const BLUEPRINT: &str = "
+hardware:
+  - {hardware_id: arm, joints: {prefix: arm, count: 2}, adapter_type: mock}
+  - {hardware_id: bare, joints: {prefix: bare, count: 1}, adapter_type: mock, options: {gripper: false}}
+tasks:
+  - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}
+  - {name: servo_arm, type: servo, joint_names: {hardware: arm}, priority: 20}
+  - {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 30}
+";
+
+fn up() -> (Home, Started) {
+    let home = Home::new();
+    home.write("verbs.yaml", BLUEPRINT);
+    let run = home.run("verbs.yaml --no-record");
+    (home, run)
+}
+
+/// Starts a command that reads from us.
+fn fed(home: &Home, arguments: &str) -> Started {
+    Started::of(home.command(arguments).stdin(Stdio::piped()))
+}
+
+#[test]
+fn watching_the_state_goes_on_until_nobody_reads() {
+    let (home, run) = up();
+    let mut command = home.command("state --watch --json --rate 50");
+    let mut watch = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    let mut lines = BufReader::new(watch.stdout.take().unwrap()).lines();
+    let states: Vec<Value> = (0..5).map(|_| serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap()).collect();
+    assert!(states.windows(2).all(|s| s[0]["tick"].as_u64() <= s[1]["tick"].as_u64()), "{states:?}");
+    assert!(states[0]["tick"] != states[4]["tick"]);
+    drop(lines);
+    assert!(watch.wait().unwrap().success(), "nobody reads any more");
+
+    let tables = home.start("state --watch --rate 50");
+    eventually("tables follow each other", || tables.out().matches("JOINT").count() > 3);
+    assert!(!tables.out().contains('\x1b'), "no terminal, no redraw");
+    run.end(Signal::TERM);
+    tables.wait().with(1).says(&["error: run \"verbs\"", "hint: "]);
+    home.dimos("state --rate 5").with(2);
+}
+
+#[test]
+fn a_gripper_opens_and_closes_as_far_as_it_goes() {
+    let (home, _run) = up();
+    let mut client = home.client();
+    let mut opening = || client.call(State {}).unwrap().arms[0].gripper.unwrap();
+    for (word, metres) in [("open", 0.08), ("close", 0.0), ("0.03", 0.03)] {
+        let said = home.dimos(&format!("arm gripper arm {word}")).with(0).out;
+        assert_eq!(said, format!("arm: gripper to {metres:.4} m\n"));
+        eventually(word, || (opening() - metres).abs() < 1e-3);
+    }
+    home.dimos("arm gripper bare open").with(1).says(&["bare has no gripper, or does not say how far it goes"]);
+    home.dimos("arm gripper rarm close").with(2).says(&["[UNKNOWN_ARM]", "did you mean `arm`?"]);
+    for wrong in ["ajar", "nan", ""] {
+        home.dimos(&format!("arm gripper arm {wrong}")).with(2);
+    }
+}
+
+#[test]
+fn tasks_are_listed_and_asked() {
+    let (home, _run) = up();
+    let list = home.dimos("task list").with(0).out;
+    assert_eq!(list.lines().count(), 4, "{list}");
+    assert_eq!(home.dimos("task list --json").with(0).json()[1]["name"], "servo_arm");
+    assert!(home.dimos("task invoke servo_arm state").with(0).out.contains("IDLE"));
+    assert_eq!(home.dimos("task invoke servo_arm cancel").with(0).out, "servo_arm: ALREADY_STOPPED\n");
+    home.dimos("task invoke sevro_arm state").with(2).says(&["did you mean `servo_arm`?"]);
+    home.dimos("task invoke servo_arm jump").with(2);
+}
+
+#[test]
+fn targets_are_streamed_from_a_file() {
+    let (home, _run) = up();
+    let ramp: String = (0..=50).map(|i| format!("{}, {}\n", f64::from(i) * 0.004, f64::from(i) * -0.002)).collect();
+    home.write("ramp.csv", &format!("# two joints\n\n{ramp}"));
+    let said = home.dimos("task stream servo_arm ramp.csv --rate 100 --json").with(0).json();
+    assert_eq!((&said["task"], &said["targets"]), (&"servo_arm".into(), &51.into()));
+    assert!(said["seconds"].as_f64().unwrap() >= 0.5, "{said}");
+    eventually("the last target is reached and held", || {
+        let now = home.positions("arm");
+        (now[0] - 0.2).abs() < 1e-3 && (now[1] + 0.1).abs() < 1e-3
+    });
+
+    home.write("bad.txt", "0.2 -0.1\n0.2 -0.1 0\n");
+    let refused = home.dimos("task stream servo_arm bad.txt").with(2);
+    assert!(refused.err.contains("error: bad.txt:2: 3 numbers for 2 joints\nhint: "), "{}", refused.err);
+    home.dimos("task stream traj_arm ramp.csv").with(1).says(&["is a trajectory task", "[WRONG_TASK]"]);
+    home.dimos("task stream servo_arm missing.txt").with(2);
+    let idle = || home.dimos("task invoke servo_arm state --json").with(0).json()["state"] == "IDLE";
+    eventually("the stream is stale", idle);
+    home.write("far.txt", "1.5 0\n");
+    home.dimos("task stream servo_arm far.txt").with(1).says(&["[START_STATE_MISMATCH]"]);
+    home.write("jump.txt", "0.2 -0.1\n0.2 -0.1\n0.9 -0.1\n");
+    home.dimos("task stream servo_arm jump.txt").with(1).says(&["servo_arm: FAULT after", "hint: "]);
+}
+
+#[test]
+fn targets_are_streamed_from_stdin_and_a_stream_that_ends_leaves_the_arm_at_rest() {
+    let (home, _run) = up();
+    let mut client = home.client();
+    let mut velocity = || client.call(State {}).unwrap().arms[0].joints[0].velocity.unwrap();
+
+    let mut stream = fed(&home, "task stream velocity_arm");
+    let mut input = stream.stdin();
+    eventually("the arm moves", || {
+        input.write_all(b"[0.1, 0]\n").unwrap();
+        velocity() > 0.05
+    });
+    drop(input);
+    assert!(stream.wait().with(0).out.starts_with("velocity_arm: "));
+    let task = home.dimos("task invoke velocity_arm state --json").with(0).json();
+    assert_eq!((&task["state"], &task["reason"]), (&"IDLE".into(), &"its stream was ended".into()), "no fault: {task}");
+    eventually("the arm is at rest", || velocity().abs() < 1e-6);
+    home.dimos("move arm 0 0").with(0);
+
+    let mut stream = fed(&home, "task stream velocity_arm -");
+    let mut input = stream.stdin();
+    input.write_all(b"0.1 0\n").unwrap();
+    eventually("it streams", || home.status()["arms"][0]["commander"]["program"] == "dimos task");
+    stream.end(Signal::INT).with(130);
+    drop(input);
+
+    let mut stream = fed(&home, "task stream velocity_arm");
+    let mut input = stream.stdin();
+    input.write_all(b"0.1 0\n0.1 zero\n").unwrap();
+    stream.wait().with(2).says(&["stdin:2: \"zero\" is not a finite number"]);
+    eventually("the arm is at rest", || velocity().abs() < 1e-6);
+}
+
+#[test]
+fn a_streamer_that_is_killed_gives_up_its_lease_and_its_stream_goes_stale() {
+    let (home, _run) = up();
+    let mut watcher = home.client();
+    let mut stream = fed(&home, "task stream velocity_arm --rate 50");
+    let mut input = stream.stdin();
+    let mut feed = || input.write_all(b"0.1 0\n").unwrap();
+    eventually("the arm moves", || {
+        feed();
+        watcher.call(State {}).unwrap().arms[0].joints[0].velocity.unwrap() > 0.05
+    });
+    let holder = watcher.call(Status {}).unwrap().arms.remove(0).commander.unwrap();
+    assert_eq!((holder.pid, holder.program.as_str()), (Some(stream.pid() as i32), "dimos task"));
+    stream.end(Signal::KILL);
+    eventually("the lease is free and the arm at rest", || {
+        let free = watcher.call(Status {}).unwrap().arms[0].commander.is_none();
+        free && watcher.call(State {}).unwrap().arms[0].joints[0].velocity.unwrap().abs() < 1e-6
+    });
+    let arm = watcher.call(Status {}).unwrap().arms.remove(0);
+    assert_eq!(arm.phase, "ready", "that is no fault");
+}
+
+#[test]
+fn completions_and_manual_know_the_verbs() {
+    let home = Home::new();
+    for shell in ["bash", "zsh", "fish"] {
+        let script = home.dimos(&format!("completions {shell}")).with(0).out;
+        assert!(script.contains("list-adapters") && script.contains("gripper"), "{shell}");
+    }
+    home.dimos("completions tcsh").with(2);
+    let page = home.dimos("man").with(0).out;
+    assert!(page.starts_with(".ie") && page.contains("list\\-adapters"), "{page}");
+    home.dimos("man --dir pages").with(0);
+    for page in ["dimos.1", "dimos-move.1", "dimos-task-stream.1"] {
+        assert!(home.path().join("pages").join(page).exists(), "{page}");
+    }
+}
+
+#[test]
+fn the_doctor_finds_what_prevents_a_run() {
+    let home = Home::new();
+    let findings = home.dimos("doctor --json").with(0).json();
+    let findings = findings.as_array().unwrap();
+    for check in ["kernel", "rtprio", "memlock", "cpu_dma_latency", "governor", "clock source", "log folder"] {
+        let finding = findings.iter().find(|f| f["check"] == check).unwrap_or_else(|| panic!("no {check}"));
+        assert_eq!(finding["level"] == "ok", finding["fix"].is_null(), "{finding}");
+    }
+    let sockets = findings.iter().find(|f| f["check"] == "sockets folder").unwrap();
+    assert!(sockets["found"].as_str().unwrap().ends_with("0 live runs"), "{sockets}");
+    assert!(home.dimos("doctor").with(0).out.starts_with("CHECK"));
+    assert!(home.runs().runs().unwrap().is_empty(), "nothing is left behind");
+
+    std::fs::remove_dir_all(home.path().join("run")).unwrap();
+    std::fs::create_dir(home.path().join("run")).unwrap();
+    home.write("run/dimos", "in the way");
+    let ended = home.dimos("doctor").with(1).says(&["error: no run can work: ", "hint: "]);
+    assert!(ended.out.contains("BAD"), "{}", ended.out);
+}

@@ -1,0 +1,136 @@
+//! Whole runs with an xArm, judged by what its emulator received: another client takes the arm over, stops it; a box that
+//! takes its time; an arm at zero.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::time::Duration;
+
+use dimos::hardware::arms::xarm::emulator::{Received, XArmEmulator};
+use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::sim::faults::{Fault, FaultKind};
+use serde_json::{Value, json};
+
+use crate::support::program;
+use crate::support::program::{Home, Started, eventually};
+
+fn emulator(options: Value) -> XArmEmulator {
+    let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
+    XArmEmulator::start(&config, &Place::InProcess).unwrap()
+}
+
+fn run(home: &Home, emulator: &XArmEmulator, more: &str) -> Started {
+    let address = emulator.address();
+    home.start(&format!("run coordinator-xarm6 --no-record --set hardware.arm.address={address} {more}"))
+}
+
+const NO_GRIPPER: &str = "--set hardware.arm.options.gripper=none";
+
+fn phase(home: &Home) -> (String, String) {
+    let arm = &home.status()["arms"][0];
+    let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
+    (text(&arm["phase"]), text(&arm["cause"]["name"]))
+}
+
+fn up(home: &Home, run: &Started) {
+    run.until(program::UP);
+    eventually("ready", || phase(home).0 == "ready");
+}
+
+/// Another client of the controller. It speaks protocol 2, the run 3.
+fn send(client: &mut TcpStream, register: u8, payload: &[u8]) {
+    let head = [0, 1, 0, 2, 0, payload.len() as u8 + 1, register];
+    client.write_all(&[&head[..], payload].concat()).unwrap();
+    assert_ne!(client.read(&mut [0; 64]).unwrap(), 0);
+}
+
+fn connect(emulator: &XArmEmulator) -> TcpStream {
+    TcpStream::connect(emulator.address().rsplit_once(':').unwrap().0).unwrap()
+}
+
+/// What the run sent after the first request of another client that changes mode, state, motors or position.
+fn ours(emulator: &XArmEmulator) -> Vec<Received> {
+    let trace = emulator.trace();
+    let theirs = trace.iter().position(|r| r.protocol == 2 && !r.second).unwrap_or(trace.len());
+    let orders = [11, 12, 16, 19, 21, 23, 29, 30, 81];
+    trace.into_iter().skip(theirs).filter(|r| r.protocol == 3 && orders.contains(&r.register)).collect()
+}
+
+/// Set points that were on their way already are refused by the controller.
+fn only_refused_set_points(received: &[Received]) -> bool {
+    received.len() <= 2 && received.iter().all(|r| r.register == 29 && r.status & 0x58 != 0)
+}
+
+#[test]
+fn an_arm_that_another_client_takes_over_is_left_to_it() {
+    for spacing in [0, 5, 200] {
+        let (home, emulator) = (Home::new(), emulator(json!({})));
+        let run = run(&home, &emulator, NO_GRIPPER);
+        up(&home, &run);
+        let goal = emulator.joints().0.map(|q| q + 0.4);
+        let mut client = connect(&emulator);
+        emulator.record();
+        send(&mut client, 19, &[0, 0]);
+        std::thread::sleep(Duration::from_millis(spacing));
+        send(&mut client, 12, &[0]);
+        std::thread::sleep(Duration::from_millis(spacing));
+        let numbers: Vec<f32> = goal[..6].iter().map(|q| *q as f32).chain([0.0, 3.0, 8.0, 0.0]).collect();
+        send(&mut client, 23, &numbers.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>());
+        let there = || emulator.joints().0.iter().zip(&goal[..6]).all(|(q, goal)| (q - goal).abs() < 1e-3);
+        eventually("the client's goal", there);
+        eventually("the hold", || phase(&home) == ("held".into(), "mode_changed".into()));
+        // A stop that somebody asks for goes to the arm; the end of the run by itself sends nothing.
+        run.end(rustix::process::Signal::INT);
+        let ours = ours(&emulator);
+        assert!(there() && emulator.enabled() && only_refused_set_points(&ours), "{spacing} ms: {ours:?}");
+    }
+}
+
+#[test]
+fn a_stop_by_another_client_is_named_and_reset_and_enable_take_the_arm_back() {
+    let (home, emulator) = (Home::new(), emulator(json!({})));
+    let run = run(&home, &emulator, NO_GRIPPER);
+    up(&home, &run);
+    let mut client = connect(&emulator);
+    emulator.record();
+    send(&mut client, 12, &[4]);
+    eventually("the hold", || phase(&home) == ("held".into(), "stopped_elsewhere".into()));
+    assert!(run.err().contains("another client stopped the arm (state 4)"), "{}", run.err());
+    assert!(only_refused_set_points(&ours(&emulator)), "{:?}", ours(&emulator));
+    home.dimos("arm reset arm").with(0);
+    home.dimos("arm enable arm").with(0);
+    eventually("ready", || phase(&home).0 == "ready");
+    run.end(rustix::process::Signal::INT).with(130);
+}
+
+#[test]
+fn a_box_that_takes_its_time_is_enabled_stopped_and_reset() {
+    for delay in [0.3, 0.6, 1.2] {
+        let home = Home::new();
+        let slow = |register: u8, delay: f64| json!({"register": register, "delay": delay});
+        let slow = json!([slow(11, delay), slow(12, 0.25), slow(16, 0.25), slow(124, 0.1)]);
+        let emulator = emulator(json!({"gripper": "xarm", "sim": {"slow_replies": slow}}));
+        let run = run(&home, &emulator, "");
+        up(&home, &run);
+        let stopped = home.dimos("stop --json").with(0).json();
+        assert_eq!(stopped["coordinator-xarm6"]["arms"]["arm"], "confirmed", "{delay} s");
+        home.dimos("arm reset arm").with(0);
+        home.dimos("arm enable arm").with(0);
+        eventually("ready", || phase(&home).0 == "ready");
+        run.end(rustix::process::Signal::INT).with(130);
+        assert!(!emulator.enabled());
+    }
+}
+
+#[test]
+fn an_arm_at_zero_is_enabled_and_one_that_has_not_measured_is_not() {
+    let zero = json!({"sim": {"initial_positions": [0, 0, 0, 0, 0, 0]}});
+    let (home, at_zero) = (Home::new(), emulator(zero));
+    let started = run(&home, &at_zero, NO_GRIPPER);
+    up(&home, &started);
+    started.end(rustix::process::Signal::INT).with(130);
+    let (home, unmeasured) = (Home::new(), emulator(json!({})));
+    unmeasured.inject(Fault::new(FaultKind::ZeroState).lasting(60.0)).unwrap();
+    let ended = run(&home, &unmeasured, NO_GRIPPER).wait();
+    assert!(ended.err.contains("not measured yet"), "{}", ended.err);
+    assert!(!unmeasured.enabled());
+}

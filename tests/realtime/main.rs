@@ -1,0 +1,17 @@
+//! Whole runs whose times are judged, on the wire or by what an emulator received. Each runs alone.
+
+#[path = "../support/mod.rs"]
+mod support;
+
+/// Whether programs that tests start may schedule in real time.
+const REALTIME: bool = true;
+
+#[allow(dead_code, reason = "a library's public parts")]
+#[path = "../../assets/templates/serial/mod.rs"]
+mod serial;
+
+mod faults;
+mod stalls;
+mod stalls_soak;
+mod wire_first;
+mod wire_stalls;

@@ -1,0 +1,200 @@
+//! This computer's stalls are not the arm's fault: a run at full speed that is stopped and continued, with its emulator or
+//! beside it, goes on; what it tells the arm is judged on the wire between the two. `DIMOS_STALLS=200` stops them so often.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use dimos::rpc::api::{ArmEnable, ArmReset, Cancel, Motion, Move};
+use dimos::rpc::client::Client;
+use rustix::process::Signal;
+
+use crate::support::program;
+use crate::support::program::{Home, Started, eventually};
+use crate::support::wire::arms::{PERIOD, YOURARM, furthest};
+use crate::support::wire::decode;
+use crate::support::wire::judge::Bounds;
+use crate::support::wire::stream::{Proxy, own_address};
+use crate::support::wire::{Gate, now};
+
+/// A stop that took longer than planned, on a busy computer, is no longer a short one.
+const LONGEST: Duration = Duration::from_millis(95);
+/// Top speeds of the arm's joints [rad/s], and their acceleration [rad/s²], from its sheet.
+const TOP_SPEED: [f64; 6] = [180.0, 180.0, 180.0, 360.0, 360.0, 360.0];
+const ACCELERATION: f64 = 10.0;
+
+fn times() -> usize {
+    std::env::var("DIMOS_STALLS").ok().and_then(|n| n.parse().ok()).unwrap_or(6)
+}
+
+/// The emulator in a process of its own, the wire in this one, and a run in a third.
+struct Three {
+    home: Home,
+    run: Started,
+    emulator: Started,
+    gate: Gate,
+    client: Client,
+    _proxy: Proxy,
+}
+
+impl Three {
+    fn start() -> Self {
+        let (home, address) = (Home::new(), own_address());
+        let emulator = home.start(&format!("adapter emulate yourarm --bind {address}"));
+        emulator.until("Ctrl-C ends it");
+        let gate = Gate::new(Arc::new(Vec::new));
+        let proxy = Proxy::tcp(&format!("{address}:9760"), &gate, decode::yourarm());
+        let blueprint = format!("coordinator-yourarm --no-record --set hardware.arm.address={}", proxy.address);
+        let run = home.run(&blueprint);
+        let client = home.client();
+        let mut three = Self { home, run, emulator, gate, client, _proxy: proxy };
+        three.ready();
+        three
+    }
+
+    fn phase(&self) -> String {
+        self.home.status()["arms"][0]["phase"].as_str().unwrap().to_owned()
+    }
+
+    fn ready(&mut self) {
+        eventually("it is ready", || {
+            let ready = self.phase() == "ready";
+            if !ready {
+                // It is this client that has the arm.
+                let _ = self.client.call(ArmReset { arm: "arm".into() });
+                let _ = self.client.call(ArmEnable { arm: "arm".into() });
+            }
+            ready
+        });
+    }
+
+    /// Begins a motion from one end to the other, and waits until it has its full speed.
+    fn at_full_speed(&mut self) -> u64 {
+        let here = self.home.positions("arm");
+        let [near, far] = YOURARM.near_and_far(&here);
+        let go = |target: [f64; 6]| Move { arm: "arm".into(), target: target.to_vec(), speed: 1.0 };
+        if furthest(&near, &here) > 0.2 {
+            let motion = self.begin(go(near));
+            self.done(motion);
+            self.ready();
+            self.gate.forget();
+        }
+        let motion = self.begin(go(far));
+        let began = Instant::now();
+        let fast =
+            |gate: &Gate| gate.speed(PERIOD).iter().zip(TOP_SPEED).any(|(v, top)| v.abs() > 0.9 * top.to_radians());
+        while !fast(&self.gate) {
+            assert!(began.elapsed() < program::PATIENCE, "it does not move: {}", self.phase());
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        motion
+    }
+
+    /// Begins a motion; a busy computer may have held the arm just before.
+    fn begin(&mut self, motion: Move) -> u64 {
+        for _ in 0..5 {
+            match self.client.call(motion.clone()) {
+                Ok(begun) => return begun.motion,
+                Err(error) => println!("{error}"),
+            }
+            self.ready();
+        }
+        panic!("no motion begins: {}", self.phase());
+    }
+
+    fn done(&mut self, motion: u64) -> String {
+        loop {
+            let report = self.client.call(Motion { motion }).unwrap();
+            if report.done {
+                return report.state;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+fn bounds() -> Bounds {
+    Bounds {
+        velocity: TOP_SPEED.map(f64::to_radians).to_vec(),
+        acceleration: vec![ACCELERATION; 6],
+        period: PERIOD,
+        rounding: YOURARM.rounding,
+        stale_after: YOURARM.stale_after(),
+        stopped_within: None,
+        time_limit: YOURARM.time_limit,
+    }
+}
+
+/// Stops processes for so long; answers how long it took.
+fn stop(processes: &[&Started], time: Duration) -> Duration {
+    let began = Instant::now();
+    processes.iter().for_each(|p| p.signal(Signal::STOP));
+    std::thread::sleep(time);
+    processes.iter().for_each(|p| p.signal(Signal::CONT));
+    began.elapsed()
+}
+
+/// Between 20 and 90 ms, spread evenly over any number of stops.
+fn spread(i: usize) -> Duration {
+    Duration::from_millis(20 + (70.0 * (i as f64 * 0.618).fract()) as u64)
+}
+
+/// Stops a run at full speed again and again for less than 0.1 s, then once for longer.
+fn stopped_again_and_again(with_emulator: bool) {
+    let mut three = Three::start();
+    let (mut held, mut failures) = (0, Vec::new());
+    for i in 0..times() {
+        three.gate.forget();
+        let motion = three.at_full_speed();
+        let (began, time) = (now(), spread(i));
+        let emulator = with_emulator.then_some(&three.emulator);
+        let took = stop(&[&three.run].into_iter().chain(emulator).collect::<Vec<_>>(), time);
+        let state = three.done(motion);
+        let (sent, delivered) = (three.gate.sent(), three.gate.delivered());
+        let wire = bounds().neighbours(&sent, began).and_then(|()| bounds().windows(&delivered, began));
+        failures.extend(wire.err().map(|e| format!("stopped for {time:?}: {e}")));
+        if state != "COMPLETED" {
+            let arm = three.home.status()["arms"][0].clone();
+            println!("stopped for {time:?} ({took:?}): {state}, {} {}", arm["phase"], arm["cause"]);
+            held += usize::from(took < LONGEST);
+        }
+        three.ready();
+    }
+    if held > 0 {
+        failures.push(format!("{held} of {} short stops ended the motion", times()));
+    }
+    // Standing still for so long is no hiccup.
+    three.at_full_speed();
+    let emulator = with_emulator.then_some(&three.emulator);
+    stop(&[&three.run].into_iter().chain(emulator).collect::<Vec<_>>(), Duration::from_millis(150));
+    std::thread::sleep(Duration::from_millis(300));
+    if three.phase() != "held" {
+        failures.push(format!("it is {} after 150 ms without a tick", three.phase()));
+    }
+    assert!(failures.is_empty(), "{}", failures.join("\n"));
+}
+
+#[test]
+fn a_run_that_is_stopped_with_its_emulator_goes_on() {
+    stopped_again_and_again(true);
+}
+
+#[test]
+fn a_run_that_is_stopped_alone_goes_on() {
+    stopped_again_and_again(false);
+}
+
+#[test]
+fn an_emulator_that_is_stopped_alone_holds_the_arm() {
+    let mut three = Three::start();
+    // A computer that stands still itself may count it in its own favour: then it is tried again.
+    let held = (0..3).any(|_| {
+        three.ready();
+        three.at_full_speed();
+        stop(&[&three.emulator], Duration::from_secs_f64(YOURARM.stale_after() + 0.02));
+        std::thread::sleep(Duration::from_millis(200));
+        let held = three.phase() == "held";
+        let _ = three.client.call(Cancel::default());
+        held
+    });
+    assert!(held, "it is {} after its arm was silent for 20 ms longer than it may be", three.phase());
+}

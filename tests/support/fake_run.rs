@@ -1,0 +1,219 @@
+//! A run without arms: a scripted backend behind a real socket.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use dimos::rpc::api::*;
+use dimos::rpc::place::RunFolder;
+use dimos::rpc::report::*;
+use dimos::rpc::server::Server;
+use dimos::rpc::streams::Streams;
+use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError, Subject};
+
+/// Answers like a run with one 2-joint arm named `arm`.
+#[derive(Default)]
+pub struct FakeBackend {
+    pub streams: Streams,
+    /// Everything that was asked, in order.
+    pub asked: Mutex<Vec<Request>>,
+    /// How often `motion` was asked.
+    pub polls: AtomicU64,
+    /// When set, a motion does not end until it is cancelled.
+    pub endless: bool,
+    /// When set, a motion ends aborted.
+    pub aborts: bool,
+    /// When set, stops are not confirmed.
+    pub unconfirmed: bool,
+}
+
+impl FakeBackend {
+    pub fn asked(&self) -> Vec<Request> {
+        self.asked.lock().unwrap().clone()
+    }
+
+    fn motion(&self, motion: u64) -> MotionReport {
+        let polls = self.polls.fetch_add(1, Ordering::Relaxed);
+        let cancelled = self.asked().iter().any(|r| matches!(r, Request::Cancel(_)));
+        let done = cancelled || (!self.endless && polls >= 2);
+        let state = match (done, cancelled || self.aborts) {
+            (false, _) => "EXECUTING",
+            (true, true) => "ABORTED",
+            (true, false) => "COMPLETED",
+        };
+        let joint = |joint: &str, target, actual| Deviation { joint: joint.into(), target, actual };
+        MotionReport {
+            motion,
+            task: "traj_arm".into(),
+            state: state.into(),
+            done,
+            progress: polls as f64 / 10.0,
+            elapsed: 0.4,
+            remaining: 0.1,
+            error: (state == "ABORTED").then(|| "arm_joint1 was 0.2000 rad off the path".into()),
+            replanning: false,
+            next: None,
+            deviation: done.then(|| vec![joint("arm_joint1", 0.3, 0.3004), joint("arm_joint2", -0.2, -0.1)]),
+        }
+    }
+}
+
+impl Backend for FakeBackend {
+    fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>> {
+        self.asked.lock().unwrap().push(request.clone());
+        Box::pin(async move {
+            Ok(match request {
+                Request::Status(_) => Reply::Status(status()),
+                Request::State(_) => Reply::State(state()),
+                Request::Move(m) if m.arm != "arm" => {
+                    return Err(RpcError::unknown(Code::UnknownArm, "arm", &m.arm, &["arm"]));
+                }
+                Request::Move(m) => Reply::Move(MoveReply {
+                    motion: 7,
+                    task: "traj_arm".into(),
+                    duration: 0.5,
+                    joints: vec!["arm_joint1".into(), "arm_joint2".into()],
+                    start: vec![0.0, 0.0],
+                    target: m.target,
+                }),
+                Request::Execute(e) => Reply::Execute(ExecuteReply {
+                    motion: 8,
+                    task: e.task.unwrap_or_else(|| "traj_arm".into()),
+                    duration: e.trajectory.points.last().map_or(0.0, |p| p.time_from_start),
+                }),
+                Request::Motion(m) => Reply::Motion(self.motion(m.motion)),
+                Request::Cancel(_) => Reply::Cancel(CancelReply {
+                    tasks: [("traj_arm".into(), "CANCELLED".into())].into(),
+                    planning: false,
+                }),
+                Request::Stop(_) => {
+                    let how = if self.unconfirmed { Confirmation::SentNotConfirmed } else { Confirmation::Confirmed };
+                    Reply::Stop(StopReply { arms: [("arm".into(), how)].into() })
+                }
+                Request::ArmReset(a) => Reply::ArmReset(ArmReply { arm: a.arm, phase: "standby".into(), note: None }),
+                Request::ArmEnable(a) => {
+                    Reply::ArmEnable(ArmReply { arm: a.arm, phase: "activating".into(), note: None })
+                }
+                Request::ArmDisable(a) => {
+                    Reply::ArmDisable(ArmReply { arm: a.arm, phase: "disabled".into(), note: None })
+                }
+                Request::Gripper(g) => {
+                    let text = format!("{} has no gripper", g.arm);
+                    return Err(RpcError::new(Code::NoGripper, text));
+                }
+                // Longer than any request may take.
+                Request::Servo(_) => std::future::pending().await,
+                Request::Velocity(_) => panic!("a defect of the backend"),
+                Request::Shutdown(_) => Reply::Shutdown(Done {}),
+                // The rest is the planner's.
+                _ => return Err(RpcError::new(Code::NoPlanner, "this run has no planner")),
+            })
+        })
+    }
+
+    fn arms_of(&self, subject: Subject<'_>) -> Vec<String> {
+        let is_meant = match subject {
+            Subject::All | Subject::Joints(_) => true,
+            Subject::Arm(name) => name == "arm",
+            Subject::Task(name) => name == "traj_arm" || name == "t",
+        };
+        is_meant.then(|| "arm".to_owned()).into_iter().collect()
+    }
+
+    fn streams(&self) -> &Streams {
+        &self.streams
+    }
+}
+
+/// Starts a run of that name; it ends when the server is dropped.
+pub fn start(folder: &Path, run: &str, backend: FakeBackend) -> (Server, Arc<FakeBackend>) {
+    let backend = Arc::new(backend);
+    let claim = RunFolder::at(folder).claim(run).expect("the name is free");
+    (Server::start(claim, backend.clone()).expect("the socket opens"), backend)
+}
+
+/// Waits until `what` holds, for 30 s at most.
+pub fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let began = Instant::now();
+    while began.elapsed() < Duration::from_secs(30) {
+        if holds() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    panic!("not within 30 s: {what}");
+}
+
+pub fn status() -> StatusReport {
+    let figures = Percentiles { p50: 4.1, p99: 11.0, p99_9: 22.25, max: 103.0 };
+    StatusReport {
+        run: "test".into(),
+        pid: std::process::id(),
+        version: "0.1.0".into(),
+        blueprint: "coordinator-yourarm".into(),
+        started: "2026-01-01T00:00:00Z".into(),
+        uptime: 123.4,
+        tick_rate: 100.0,
+        simulated: true,
+        log: Some("/tmp/test.mcap".into()),
+        realtime: vec![RealtimeReport {
+            what: "SCHED_FIFO 80 for the tick".into(),
+            granted: false,
+            remedy: Some("ulimit -r 80".into()),
+        }],
+        ticks: TickReport { count: 12340, overruns: 2, skipped: 3, lateness_us: figures, compute_us: figures },
+        recorder: Some(RecorderReport { messages: 5, dropped: 0, error: None }),
+        arms: vec![ArmReport {
+            hardware_id: "arm".into(),
+            adapter: "yourarm".into(),
+            address: "sim".into(),
+            simulated: true,
+            link: "up".into(),
+            phase: "held".into(),
+            cause: Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into() }),
+            enabled: true,
+            mode: "servo_position".into(),
+            state_age_ms: Some(3.2),
+            measured_rate_hz: Some(99.8),
+            native_rate_hz: 100.0,
+            on_exit: "hold".into(),
+            counters: [("reads".into(), 12345), ("read_errors".into(), 1)].into(),
+            ..Default::default()
+        }],
+        tasks: vec![TaskReport {
+            name: "traj_arm".into(),
+            kind: "trajectory".into(),
+            joints: (1..=6).map(|i| format!("arm_joint{i}")).collect(),
+            priority: 10,
+            state: "EXECUTING".into(),
+            progress: Some(0.42),
+            ..Default::default()
+        }],
+        planner: None,
+    }
+}
+
+pub fn state() -> StateReport {
+    let joint = |i: u32, position, source: &str| JointReport {
+        name: format!("arm_joint{i}"),
+        position: Some(position),
+        velocity: Some(-0.01),
+        velocity_source: source.into(),
+        effort: None,
+        command: Some(position),
+    };
+    StateReport {
+        tick: 12340,
+        stamp: 1.7e9,
+        arms: vec![ArmStateReport {
+            hardware_id: "arm".into(),
+            simulated: true,
+            age_ms: Some(2.5),
+            joints: vec![joint(1, 1.5, "measured"), joint(2, -0.25, "estimated")],
+            gripper: Some(0.04),
+            pose: Some(PoseReport { xyz: [0.1, 0.2, 0.3], rpy: [0.0; 3] }),
+            wrench: None,
+        }],
+    }
+}
