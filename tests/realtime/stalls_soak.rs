@@ -4,7 +4,7 @@
 //! `DIMOS_SOAK_ALL=1` takes every shipped blueprint.
 
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use dimos::rpc::api::{Execute, Point, State, Trajectory};
 use dimos::rpc::client::Client;
@@ -73,7 +73,7 @@ impl Soaked {
             // Inwards, so that no joint leaves its range.
             let inwards: Vec<f64> = start.iter().map(|q| if *q > 0.0 { -0.1 } else { 0.1 }).collect();
             let turn = std::f64::consts::TAU / 4.0;
-            let points = (0..=16 * (seconds / 4.0).ceil() as usize).map(|i| {
+            let points = (0..=16 * (seconds / 4.0).floor() as usize).map(|i| {
                 let (time, rests) = (i as f64 * 0.25, i % 16 == 0);
                 let (swing, speed) = (1.0 - (turn * time).cos(), turn * (turn * time).sin());
                 Point {
@@ -125,6 +125,9 @@ fn blueprints() -> Vec<String> {
     names.chain(["remote".to_owned()]).collect()
 }
 
+/// How long one request moves an arm [s].
+const LONGEST_MOTION: f64 = 120.0;
+
 /// A computer that does not run a program for so long is too busy to judge anything on it: the cycle of a shim in Python
 /// is several such waits, one after the other.
 const STANDSTILL: Duration = Duration::from_millis(20);
@@ -138,9 +141,17 @@ fn watched(names: &[String], realtime: bool, time: f64) -> (Duration, Vec<String
     let _busy = Busy::start(number("DIMOS_SOAK_BUSY", 8.0) as usize);
     // A shim is an ordinary program, whatever its run is.
     let watch = Watch::start(realtime && !names.iter().any(|name| name == "remote"));
-    let moving = runs.iter().filter(|(moving, _)| *moving);
-    let mut found: Vec<String> = moving.filter_map(|(_, run)| run.move_all(time).err()).collect();
-    std::thread::sleep(Duration::from_secs_f64(time));
+    let (began, mut found) = (Instant::now(), Vec::new());
+    loop {
+        // One motion after the other, with a moment of rest between them: a request holds a few minutes at most.
+        let left = time - began.elapsed().as_secs_f64();
+        let moving = runs.iter().filter(|(moving, _)| *moving && left > 4.0);
+        found.extend(moving.filter_map(|(_, run)| run.move_all(left.min(LONGEST_MOTION)).err()));
+        std::thread::sleep(Duration::from_secs_f64(left.clamp(0.0, LONGEST_MOTION + 1.0)));
+        if left <= LONGEST_MOTION + 1.0 || !found.is_empty() {
+            break;
+        }
+    }
     let stalled = watch.stood_still();
     found.extend(runs.into_iter().flat_map(|(moving, run)| run.end(if moving { "moving" } else { "idle" })));
     (stalled, found)
