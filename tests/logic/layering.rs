@@ -197,7 +197,7 @@ fn a_module_uses_only_what_stands_above_it() {
             }
         }
     }
-    fail_on(&found, "layers (architecture, section 2)");
+    fail_on(&found, "layers (`src/lib.rs`)");
 }
 
 #[test]

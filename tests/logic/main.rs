@@ -28,6 +28,7 @@ mod kinematics;
 mod layering;
 mod model;
 mod no_alloc;
+mod pages;
 mod planning;
 mod planning_timing;
 mod robot_models;

@@ -16,6 +16,7 @@ mod changed_world;
 mod cli_verbs;
 mod daemon;
 mod disk;
+mod fault_table;
 mod first_run;
 mod gripper_joint;
 mod jog;
