@@ -1,4 +1,4 @@
-//! `dimos replay --verify`: how many ticks a second, on a log of ten minutes at 100 Hz (`--quick`: of 20 s).
+//! `dimos replay --verify`: ticks per second, on a log of ten minutes at 100 Hz (`--quick`: of 20 s).
 
 #[path = "../tests/support/virtual_run.rs"]
 #[allow(dead_code, reason = "shared with tests")]
@@ -21,12 +21,12 @@ const GOAL: f64 = 200_000.0;
 
 fn main() {
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
-    let ticks = support::Effort::told().of(2_000, 60_000);
+    let ticks = support::Effort::from_environment().of(2_000, 60_000);
     for dof in [6, 7] {
         let log = folder.path().join(format!("{dof}.mcap"));
         record(dof, ticks, &log);
         let size = std::fs::metadata(&log).map_or(0, |m| m.len()) as f64 / 1e6;
-        // The best of a few: others use this machine as well.
+        // The best of a few: the machine may be busy.
         let best = (0..5).map(|_| ticks_per_second(&log)).fold(0.0, f64::max);
         let verdict = if best >= GOAL { "met" } else { "missed" };
         println!("verify, {dof} joints, {ticks} ticks, {size:.1} MB: {best:.0} ticks/s (goal {GOAL:.0}: {verdict})");
@@ -40,7 +40,7 @@ fn ticks_per_second(log: &std::path::Path) -> f64 {
     found.ticks as f64 / began.elapsed().as_secs_f64()
 }
 
-/// An arm that goes to and fro.
+/// Records an arm that moves back and forth.
 fn record(dof: usize, ticks: u64, log: &std::path::Path) {
     let mut run = VirtualRun::start(&one_arm(dof), log);
     let limits = JointLimits::uniform(dof, 3.0, 2.0).with_defaults();
@@ -50,7 +50,7 @@ fn record(dof: usize, ticks: u64, log: &std::path::Path) {
     run.ask(Request::Ready { arm: 0 });
     while run.tick < ticks {
         if run.tick > 100 && run.tasks[0].state != TaskState::Executing {
-            let motion = point_to_point(&names, &from, &to, &limits, 0.7).expect("the way is free");
+            let motion = point_to_point(&names, &from, &to, &limits, 0.7).expect("a valid motion");
             run.execute(0, &motion);
             std::mem::swap(&mut from, &mut to);
         }

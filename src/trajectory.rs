@@ -1,21 +1,21 @@
-//! Joint trajectories: as they are given, and as smooth curves that can be sampled in real time.
+//! Joint trajectories: as given, and as smooth curves that can be sampled in real time.
 //!
-//! Between two points the curve is quintic where both state velocity and acceleration, cubic where both state a
-//! velocity. Where velocities are missing they are chosen so that the curve is smooth, never leaves the range
-//! of its neighbours and rests at both ends (Fritsch and Carlson, "Monotone piecewise cubic interpolation", 1980).
+//! Between two points the curve is quintic if both have velocity and acceleration, cubic if both have a velocity.
+//! Missing velocities are chosen so that the curve is smooth, stays within the range of its neighbours and is at rest
+//! at both ends (Fritsch and Carlson, "Monotone piecewise cubic interpolation", 1980).
 
 use serde::{Deserialize, Serialize};
 
-/// Longest trajectory that a client or a file may give [s].
+/// Maximum duration of a trajectory from a client or a file [s].
 pub const MAX_DURATION: f64 = 24.0 * 3600.0;
 
-/// A trajectory as clients send it and files hold it.
+/// A trajectory as clients send it and files store it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct JointTrajectory {
     /// The joints that move, in the order of the points' values.
     pub joint_names: Vec<String>,
-    /// Where they are when; times strictly increase from 0.
+    /// The points; times strictly increase from 0.
     pub points: Vec<TrajectoryPoint>,
 }
 
@@ -27,21 +27,21 @@ pub struct TrajectoryPoint {
     pub time_from_start: f64,
     /// Joint positions [rad].
     pub positions: Vec<f64>,
-    /// Joint velocities [rad/s]; empty where they are left open.
+    /// Joint velocities [rad/s]; empty if not given.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub velocities: Vec<f64>,
-    /// Joint accelerations [rad/s²]; empty where they are left open.
+    /// Joint accelerations [rad/s²]; empty if not given.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub accelerations: Vec<f64>,
 }
 
-/// Why a trajectory is not one.
+/// Why a trajectory is not valid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum TrajectoryError {
-    /// No joint is named.
+    /// The list of joints is empty.
     #[error("the trajectory names no joints")]
     NoJoints,
-    /// A joint is named twice.
+    /// A joint is listed twice.
     #[error("joint {0:?} is named twice")]
     DuplicateJoint(String),
     /// Fewer than two points.
@@ -54,9 +54,9 @@ pub enum TrajectoryError {
         point: usize,
         /// Which of its values.
         what: &'static str,
-        /// How many it has.
+        /// Number of values.
         given: usize,
-        /// How many it should have.
+        /// Required number of values.
         joints: usize,
     },
     /// A value is NaN or infinite.
@@ -76,7 +76,7 @@ pub enum TrajectoryError {
         point: usize,
         /// Its time [s].
         time: f64,
-        /// What is wrong with it.
+        /// The problem.
         problem: &'static str,
     },
 }
@@ -101,7 +101,7 @@ impl JointTrajectory {
             let problem = match last {
                 _ if !p.time_from_start.is_finite() => Some("is not finite"),
                 None if p.time_from_start != 0.0 => Some("should be 0: the first point is the start"),
-                Some(t) if p.time_from_start <= t => Some("does not come after the point before it"),
+                Some(t) if p.time_from_start <= t => Some("is not later than that of the previous point"),
                 _ => None,
             };
             if let Some(problem) = problem {
@@ -132,12 +132,12 @@ impl JointTrajectory {
         }
     }
 
-    /// Length in time [s].
+    /// Returns the duration [s].
     pub fn duration(&self) -> f64 {
         self.points.last().map_or(0.0, |p| p.time_from_start)
     }
 
-    /// The same path at `speed` times the speed (0–1].
+    /// Returns the same path at `speed` times the speed (0–1].
     pub fn scaled(&self, speed: f64) -> Self {
         let mut scaled = self.clone();
         for p in &mut scaled.points {
@@ -160,21 +160,21 @@ pub struct Sample {
     pub acceleration: f64,
 }
 
-/// A trajectory as one polynomial per joint and segment, ready to be sampled without allocation.
+/// A trajectory as one polynomial per joint and segment; sampling does not allocate.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spline {
     joints: usize,
     times: Vec<f64>,
-    /// Coefficients of ascending powers of the time in the segment, segment by segment, joint by joint.
+    /// Coefficients in ascending powers of the time in the segment, segment by segment, joint by joint.
     coefficients: Vec<[f64; 6]>,
 }
 
-/// Remembers the segment of the last sample, so that the next one is found at once.
+/// Remembers the segment of the last sample for fast lookup.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Cursor(usize);
 
 impl Spline {
-    /// The curve through a trajectory's points.
+    /// Builds the curve through a trajectory's points.
     pub fn new(trajectory: &JointTrajectory) -> Result<Self, TrajectoryError> {
         trajectory.validate()?;
         let joints = trajectory.joint_names.len();
@@ -194,7 +194,7 @@ impl Spline {
                 };
                 let reach = curve.iter().rev().fold(0.0, |sum, c| sum * h + c.abs());
                 if !curve.iter().all(|c| c.is_finite()) || !reach.is_finite() {
-                    let problem = "is too close to the point before it for what lies between them";
+                    let problem = "is too close to the previous point for the change between them";
                     return Err(TrajectoryError::Time { point: s + 1, time: times[s + 1], problem });
                 }
                 coefficients[s * joints + j] = curve;
@@ -203,23 +203,23 @@ impl Spline {
         Ok(Self { joints, times, coefficients })
     }
 
-    /// Number of joints.
+    /// Returns the number of joints.
     pub fn joints(&self) -> usize {
         self.joints
     }
 
-    /// Length in time [s].
+    /// Returns the duration [s].
     pub fn duration(&self) -> f64 {
         self.times.last().copied().unwrap_or(0.0)
     }
 
-    /// Times of the points [s].
+    /// Returns the times of the points [s].
     pub fn times(&self) -> &[f64] {
         &self.times
     }
 
-    /// Fills in one sample per joint at time `t` [s since the start]; before the start and after the end the arm
-    /// rests at the first and last point.
+    /// Computes one sample per joint at time `t` [s since the start]; outside its duration the arm is at rest at the
+    /// first or last point.
     pub fn sample(&self, t: f64, cursor: &mut Cursor, out: &mut [Sample]) {
         let last = self.times.len().saturating_sub(2);
         let mut s = cursor.0.min(last);
@@ -245,12 +245,12 @@ impl Spline {
         }
     }
 
-    /// Position of a joint at the start [rad]; NaN for a joint that does not exist.
+    /// Returns the position of a joint at the start [rad]; NaN for a joint that does not exist.
     pub fn start(&self, joint: usize) -> f64 {
         self.coefficients.get(..self.joints).and_then(|first| first.get(joint)).map_or(f64::NAN, |c| c[0])
     }
 
-    /// Position of a joint at the end [rad]; NaN for a joint that does not exist.
+    /// Returns the position of a joint at the end [rad]; NaN for a joint that does not exist.
     pub fn goal(&self, joint: usize) -> f64 {
         let segment = self.coefficients.len().saturating_sub(self.joints);
         let length = self.times.windows(2).last().map_or(0.0, |t| t[1] - t[0]);
@@ -258,7 +258,7 @@ impl Spline {
         last.map_or(f64::NAN, |c| evaluate(c, length).position)
     }
 
-    /// The largest |velocity| and |acceleration| and the range of positions of one joint, from a dense sampling
+    /// Returns the largest |velocity| and |acceleration| and the range of positions of one joint, from a dense sampling
     /// of every segment (33 samples each, ends included).
     pub fn extremes(&self, joint: usize) -> Extremes {
         let mut e = Extremes { lowest: f64::MAX, highest: f64::MIN, fastest: 0.0, steepest: 0.0 };
@@ -276,16 +276,16 @@ impl Spline {
     }
 }
 
-/// How far a joint goes along a trajectory.
+/// Range of a joint's motion along a trajectory.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extremes {
     /// Lowest position [rad].
     pub lowest: f64,
     /// Highest position [rad].
     pub highest: f64,
-    /// Highest speed [rad/s].
+    /// Maximum speed [rad/s].
     pub fastest: f64,
-    /// Highest acceleration, either way [rad/s²].
+    /// Maximum acceleration magnitude [rad/s²].
     pub steepest: f64,
 }
 
@@ -318,7 +318,7 @@ fn quintic((p0, p1, v0, v1): (f64, f64, f64, f64), a0: f64, a1: f64, h: f64) -> 
     ]
 }
 
-/// Velocities of one joint at the points: those stated, and for the others the monotone choice.
+/// Returns the velocities of one joint at the points: those given, otherwise the monotone choice.
 fn velocities_of(trajectory: &JointTrajectory, times: &[f64], j: usize) -> Vec<f64> {
     let points = &trajectory.points;
     let slope = |s: usize| (points[s + 1].positions[j] - points[s].positions[j]) / (times[s + 1] - times[s]);
@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said() {
+    fn errors_are_reported() {
         let one = trajectory(vec![point(0.0, &[0.0], &[], &[])]);
         assert_eq!(one.validate(), Err(TrajectoryError::TooFewPoints(1)));
         let late = trajectory(vec![point(0.5, &[0.0], &[], &[]), point(1.0, &[0.0], &[], &[])]);

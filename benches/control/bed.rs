@@ -1,4 +1,4 @@
-//! A test bed for the coordinator: arms that do what they are told, and somebody who keeps their tasks busy.
+//! Test bed for the coordinator: arms that follow their commands, and load for their tasks.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -19,10 +19,10 @@ use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
 /// Joints of each arm.
 pub const DOF: usize = 7;
-/// After so many ticks all tasks are under way.
+/// Number of ticks after which all tasks are active.
 pub const SETTLED: u64 = 200;
 
-/// What the tasks do; there is one per arm.
+/// Load of the tasks; one task per arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Load {
     /// All arms hold.
@@ -35,11 +35,11 @@ pub enum Load {
     Velocity,
     /// All move their end effectors with streams of twists, with a new twist in every tick.
     Twist,
-    /// One after the other: trajectory, servo, velocity.
+    /// In turn: trajectory, servo, velocity.
     EveryType,
 }
 
-/// Arms, and what keeps them busy.
+/// Arms and their load.
 pub struct Bed {
     config: CoordinatorConfig,
     motion: Spline,
@@ -48,7 +48,7 @@ pub struct Bed {
 }
 
 impl Bed {
-    /// So many arms under a load, ticking at 100 Hz.
+    /// Creates arms under a load, ticking at 100 Hz.
     pub fn new(arms: usize, load: Load) -> Self {
         let limits = JointLimits::uniform(DOF, 3.0, 3.0).with_defaults();
         let arm = |i| ArmConfig {
@@ -91,19 +91,19 @@ impl Bed {
         Self { config, motion: motion(), holds: load == Load::Hold, sent: 0 }
     }
 
-    /// What the coordinator is made from.
+    /// Returns the coordinator's configuration.
     pub fn config(&self) -> &CoordinatorConfig {
         &self.config
     }
 
-    /// What the tasks are told in a tick, for the views they showed after the one before.
+    /// Queues the requests of a tick, given the views after the previous one.
     pub fn requests(&mut self, tick: u64, tasks: &[TaskView], queue: &mut VecDeque<Envelope>) {
         if tick == 10 {
             for arm in 0..self.config.arms.len() {
                 self.send(Request::Ready { arm: arm as u16 }, queue);
             }
         }
-        // By then the arms are ready.
+        // The arms are ready by then.
         if self.holds || tick < SETTLED / 2 {
             return;
         }
@@ -131,7 +131,7 @@ impl Bed {
         queue.push_back(Envelope { id: self.sent, request });
     }
 
-    /// Whether the load is what it should be.
+    /// Returns whether all tasks are active.
     pub fn is_busy(&self, tasks: &[TaskView]) -> bool {
         self.holds || tasks.iter().all(|t| t.state == TaskState::Executing)
     }
@@ -139,25 +139,25 @@ impl Bed {
 
 /// An arm of 7 joints and its flange.
 fn xarm7() -> CartesianParams {
-    let model = load(&Source::new("builtin:xarm7")).into_model().expect("the description in the box");
+    let model = load(&Source::new("builtin:xarm7")).into_model().expect("a built-in description");
     let link = model.link_index("link7").expect("its last link");
     CartesianParams::new(Kinematics::whole(&model).expect("a tree of joints"), link)
 }
 
-/// A twist along a circle, once around in 4 s.
+/// Returns a twist along a circle, one revolution in 4 s.
 fn circle(time: f64) -> Goal {
     let turn = time * std::f64::consts::TAU / 4.0;
     Goal::Twist { linear: [0.02 * turn.cos(), 0.02 * turn.sin(), 0.0], angular: [0.0; 3], tool: false }
 }
 
-/// Positions and velocities of a swing of 0.2 rad that takes 4 s.
+/// Returns positions and velocities of a swing of 0.2 rad with a period of 4 s.
 fn swing(time: f64) -> (Joints, Joints) {
     let turn = std::f64::consts::TAU / 4.0;
     let values = |v| joints_of(&[v; DOF]);
     (values(0.1 * (1.0 - (turn * time).cos())), values(0.1 * turn * (turn * time).sin()))
 }
 
-/// A motion of 40 s that ends where it began, with a point every 0.25 s.
+/// Returns a motion of 40 s that ends at its start, with a point every 0.25 s.
 fn motion() -> Spline {
     let points = (0..=160).map(|i| f64::from(i) * 0.25).map(|time| {
         let (positions, velocities) = swing(time);
@@ -172,7 +172,7 @@ fn motion() -> Spline {
     Spline::new(&JointTrajectory { joint_names, points: points.collect() }).expect("a valid trajectory")
 }
 
-/// An arm before its first tick: connected, enabled, at zero.
+/// Returns an arm's state before its first tick: connected, enabled, at zero.
 pub fn fresh_arm() -> ArmState {
     ArmState {
         seq: 1,
@@ -185,7 +185,7 @@ pub fn fresh_arm() -> ArmState {
     }
 }
 
-/// Lets an arm be where it was told to be.
+/// Moves an arm to its commanded position.
 pub fn follow(state: &mut ArmState, command: &ArmCommand, now: Mono) {
     let dt = now.seconds_since(state.stamp).clamp(1e-6, 0.1);
     match command.mode {

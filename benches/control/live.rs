@@ -1,4 +1,4 @@
-//! What a run costs: start-up, memory, processor time; measured on the real binary.
+//! Resources of a run: start-up time, memory, processor time; measured on the real binary.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,14 +9,14 @@ use dimos::recording::replay::{LogReader, Payload, Selection};
 use crate::support::process::{self, Memory};
 use crate::support::run::{LiveRun, keep_moving};
 
-/// How long a run settles at most before anything is measured.
+/// Maximum settling time before a measurement.
 const SETTLE: Duration = Duration::from_secs(2);
 
-/// From the start of the process to its first joint state [ms].
+/// Time from the start of the process to its first joint state [ms].
 pub struct StartUp {
-    /// Until the tick had it.
+    /// Until the tick received it.
     pub known: f64,
-    /// Until it could be read from the log file.
+    /// Until it was readable in the log file.
     pub readable: f64,
 }
 
@@ -45,31 +45,31 @@ pub fn start_up(blueprint: &str) -> Result<StartUp, String> {
     Ok(StartUp { known: first.saturating_sub(wall) as f64 * 1e-6, readable })
 }
 
-/// Unix time of the first joint state in a log that is still being written [ns].
+/// Returns the Unix time of the first joint state in a log that is still being written [ns].
 fn first_joint_state(log: &Path) -> Option<u64> {
     let mut reader = LogReader::open(log).ok()?;
     reader.select(Selection { topics: vec!["/joint_states".into()], ..Selection::default() }).ok()?;
     reader.next_entry().ok()?.map(|e| e.log_time)
 }
 
-/// What a run in motion needs.
+/// Resources of a run in motion.
 pub struct Cost {
-    /// Its memory.
+    /// Memory.
     pub memory: Memory,
     /// Processor time of each thread, in per cent of one core.
     pub threads: BTreeMap<String, f64>,
-    /// Compute times of its ticks meanwhile [µs].
+    /// Compute times of its ticks during the measurement [µs].
     pub compute: Vec<f64>,
 }
 
 impl Cost {
-    /// Processor time of all threads together.
+    /// Returns the processor time of all threads together.
     pub fn total(&self) -> f64 {
         self.threads.values().sum()
     }
 }
 
-/// Measures a run in motion for so long.
+/// Measures a run in motion for this time.
 pub fn cost(blueprint: &str, arguments: &[&str], time: Duration) -> Result<Cost, String> {
     let mut run = LiveRun::start(blueprint, arguments).map_err(|e| e.to_string())?;
     let mut client = run.client()?;

@@ -1,5 +1,5 @@
-//! `make bench`: what a tick and a run cost. Prints; judges, but fails on no figure.
-//! `cargo bench --bench control -- ticks arms tasks start runs` measures only what is named.
+//! `make bench`: cost of a tick and of a run. Prints and judges figures; no figure fails it.
+//! `cargo bench --bench control -- ticks arms tasks start runs` runs only the named parts.
 
 mod bed;
 mod live;
@@ -22,11 +22,11 @@ use tick::{Pace, Plant, Ticks};
 const TWO_ARMS: &str = include_str!("two-arms.yaml");
 
 fn main() -> ExitCode {
-    let effort = Effort::told();
-    println!("\ndimos: what a tick and a run cost{}\n", effort.of(" (quick)", ""));
+    let effort = Effort::from_environment();
+    println!("\ndimos: cost of a tick and of a run{}\n", effort.of(" (quick)", ""));
     machine::print();
     let before = machine::CpuTimes::now();
-    // As in a run: memory locked, idle states held off, where that is granted.
+    // As in a run: memory locked, deep idle states disabled, if permitted.
     let (_grants, _hold) = dimos::rt::host::prepare_process(true);
     type Section = (&'static str, fn(Effort));
     let sections: [Section; 5] =
@@ -37,7 +37,7 @@ fn main() -> ExitCode {
         section(effort);
     }
     let (busy, stolen) = machine::CpuTimes::since(before);
-    println!("meanwhile: {busy:.0} % of all cores busy, {stolen:.2} % stolen by the hypervisor");
+    println!("during the measurement: {busy:.0} % of all cores busy, {stolen:.2} % stolen by the hypervisor");
     effort.end()
 }
 
@@ -45,7 +45,7 @@ fn repeat(times: usize, mut measure: impl FnMut() -> Ticks) -> Vec<Ticks> {
     (0..times).map(|_| measure()).collect()
 }
 
-/// The quantile of each repeat [µs].
+/// Returns the quantile of each repeat [µs].
 fn micros(repeats: &[Ticks], q: f64) -> Vec<f64> {
     repeats.iter().map(|r| quantile(&r.times, q) * 1e-3).collect()
 }
@@ -104,7 +104,7 @@ fn task_types(effort: Effort) {
     let ticks = effort.of(1_000, 50_000);
     let mut rows = Vec::new();
     for (name, arms, load) in [
-        ("two arms that hold", 2, Load::Hold),
+        ("two held arms", 2, Load::Hold),
         ("two trajectories", 2, Load::Trajectory),
         ("two servo streams, a target each tick", 2, Load::Servo),
         ("two velocity streams, a target each tick", 2, Load::Velocity),
@@ -126,14 +126,14 @@ fn start(effort: Effort) {
             Ok(all) => all.into_iter().map(|s| (s.known, s.readable)).unzip(),
             Err(e) => return support::skipped(&format!("start-up of {blueprint}: {e}")),
         };
-        rows.push(Measure::new(format!("{blueprint}, until the tick has it"), "ms", known));
+        rows.push(Measure::new(format!("{blueprint}, until the tick receives it"), "ms", known));
         let goal = Goal::AtMost(50.0);
-        rows.push(Measure::new(format!("{blueprint}, until the log file has it"), "ms", readable).goal(goal));
+        rows.push(Measure::new(format!("{blueprint}, until it is in the log file"), "ms", readable).goal(goal));
     }
     print("From the start of the process to its first joint state", &rows);
 }
 
-/// A run that is measured: its name, what is run, and the goals for its processor time and memory.
+/// A measured run: name, blueprint, and goals for processor time and memory.
 struct Case<'a> {
     name: &'a str,
     blueprint: &'a str,
@@ -160,7 +160,7 @@ fn try_runs(effort: Effort) -> Result<(), String> {
     ];
     let time = Duration::from_secs(effort.of(1, 10));
     let mut all: Vec<Vec<Cost>> = cases.iter().map(|_| Vec::new()).collect();
-    // One after the other and again, so that a busy minute of the machine meets all of them.
+    // Interleaved, so that a busy minute of the machine affects all of them.
     for _ in 0..effort.of(1, 5) {
         for (case, costs) in cases.iter().zip(&mut all) {
             match live::cost(case.blueprint, case.arguments, time) {
@@ -191,12 +191,11 @@ fn print_run(case: &Case<'_>, costs: &[Cost]) {
         rows.push(with(measure, (name == "tick").then_some(0.5)));
     }
     rows.push(Measure::new("memory, resident", "MiB", each(&|c| c.memory.now)));
-    rows.push(with(Measure::new("memory, the most resident", "MiB", each(&|c| c.memory.most)), case.memory));
+    rows.push(with(Measure::new("peak resident memory", "MiB", each(&|c| c.memory.most)), case.memory));
     let compute = |q| each(&|c| quantile(&c.compute, q));
-    rows.push(Measure::new("tick, wake-up to the last command handed over, p50", "µs", compute(0.5)));
+    rows.push(Measure::new("tick, wake-up to the last command passed on, p50", "µs", compute(0.5)));
     rows.push(
-        Measure::new("tick, wake-up to the last command handed over, p99", "µs", compute(0.99))
-            .goal(Goal::AtMost(20.0)),
+        Measure::new("tick, wake-up to the last command passed on, p99", "µs", compute(0.99)).goal(Goal::AtMost(20.0)),
     );
     print(&format!("Run at 100 Hz in motion, recorded: {}", case.name), &rows);
 }

@@ -1,4 +1,4 @@
-//! How long a tick takes: `Coordinator::tick` alone, and all that the tick thread does.
+//! Duration of a tick: `Coordinator::tick` alone, and everything the tick thread does.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use crate::support::measure::quantile;
 
 const PERIOD: Duration = Duration::from_millis(10);
 
-/// Times of single ticks [ns], and how long all of them took.
+/// Durations of single ticks [ns], and of all of them.
 pub struct Ticks {
     /// One entry per tick.
     pub times: Vec<f64>,
@@ -31,7 +31,7 @@ pub struct Ticks {
     pub rate: f64,
 }
 
-/// Whether ticks follow each other at once, or every 10 ms, with caches that have grown cold meanwhile.
+/// Whether ticks follow each other at once, or every 10 ms with cold caches.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pace {
     /// At once.
@@ -79,8 +79,8 @@ pub fn coordinator(arms: usize, load: Load, pace: Pace, ticks: usize) -> Ticks {
     })
 }
 
-/// Times the whole tick as the tick thread runs it, with slots, wake-ups, rings and figures. Free-running on a
-/// virtual clock: by the clock. Paced: by the thread's processor time, sleep and wake-up included.
+/// Times the whole tick as the tick thread runs it, with slots, wake-ups, rings and statistics. Free-running on a
+/// virtual clock: wall time. Paced: the thread's processor time, including sleep and wake-up.
 pub fn whole(arms: usize, load: Load, pace: Pace, plant: Plant, ticks: usize) -> Ticks {
     on_a_thread(move || {
         let clock = VirtualClock::starting_at(Mono(1_000_000_000));
@@ -105,8 +105,8 @@ pub fn whole(arms: usize, load: Load, pace: Pace, plant: Plant, ticks: usize) ->
     })
 }
 
-/// Median processor time that a real-time thread needs to sleep and wake up at 100 Hz [µs]: what the machine takes
-/// for itself.
+/// Returns the median processor time that a real-time thread needs to sleep and wake up at 100 Hz [µs]: the cost of the
+/// machine itself.
 pub fn sleeper(ticks: usize) -> f64 {
     on_a_thread(move || {
         host::enter_realtime(host::TICK_PRIORITY);
@@ -155,16 +155,16 @@ impl Meter {
     }
 }
 
-/// What stands in for the arms.
+/// Replacement of the arms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Plant {
-    /// Arms that are at once where they were told to be.
+    /// Arms that reach their commands at once.
     Ideal,
     /// The adapter `mock`, called in every tick: one write, one read.
     Mock,
 }
 
-/// Everything around the tick thread, all played by the probe.
+/// The environment of the tick thread, simulated by the probe.
 struct World {
     bed: Bed,
     pulse: Arc<Pulse>,
@@ -242,7 +242,7 @@ impl World {
         (ports, world)
     }
 
-    /// What all the others do between two ticks.
+    /// Runs the other threads' work between two ticks.
     fn turn(&mut self, tick: u64, now: Mono) {
         for (view, slot) in self.views.iter_mut().zip(&mut self.task_views) {
             *view = slot.read();
@@ -273,7 +273,7 @@ fn mock_arm(clock: &VirtualClock) -> MockArm {
     mock
 }
 
-/// One write and one read, as a device thread makes them.
+/// Makes one write and one read, like a device thread.
 fn exchange(mock: &mut MockArm, reading: &mut JointReading, state: &mut ArmState, command: &ArmCommand) {
     if let Some(mode) = command.mode {
         if mock.get_control_mode() != mode {

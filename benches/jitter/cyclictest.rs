@@ -1,14 +1,14 @@
-//! `cyclictest` as the yardstick: the same FIFO priority, idle states held off, memory locked.
+//! `cyclictest` as the reference: same FIFO priority, deep idle states disabled, memory locked.
 
 use std::process::Command;
 use std::time::Duration;
 
 use crate::Lateness;
 
-/// Latest wake-up that is told apart [µs].
+/// Maximum lateness that its histogram resolves [µs].
 const LATEST: usize = 20_000;
 
-/// Runs it for so long; `None` where its output cannot be understood.
+/// Runs it for this time; fails if its output is not understood.
 pub fn run(period: Duration, time: Duration, priority: i32) -> Result<Lateness, String> {
     let output = Command::new("cyclictest")
         .args(["--mlockall", "--threads=1", "--policy=fifo", "--latency=0", "--quiet"])

@@ -1,4 +1,5 @@
-//! `make jitter`: how late the tick wakes up, beside `cyclictest`. Prints; judges, but fails on no figure.
+//! `make jitter`: wake-up lateness of the tick compared with `cyclictest`. Prints and judges figures; no figure fails
+//! it.
 
 mod cyclictest;
 mod ours;
@@ -13,10 +14,10 @@ use dimos::rt::host::TICK_PRIORITY;
 use support::measure::{figure, print_rows, quantile, verdict};
 use support::{Effort, machine};
 
-/// What is allowed on top of cyclictest's p99, where its own spread is not more [µs].
+/// Minimum allowance on top of cyclictest's p99; its own spread applies if larger [µs].
 const ALLOWANCE: f64 = 20.0;
 
-/// How late wake-ups were [µs].
+/// Wake-up lateness [µs].
 #[derive(Debug, Clone, Copy)]
 pub struct Lateness {
     p50: f64,
@@ -26,13 +27,13 @@ pub struct Lateness {
 }
 
 impl Lateness {
-    /// Of single wake-ups.
+    /// Computes it from single wake-ups.
     pub fn of(late: Vec<f64>) -> Self {
         let at = |q| quantile(&late, q);
         Self { p50: at(0.5), p99: at(0.99), p99_9: at(0.999), max: at(1.0) }
     }
 
-    /// Of wake-ups counted by their lateness, and the longest.
+    /// Computes it from a histogram and the maximum.
     pub fn of_counts(counts: &[(f64, usize)], max: f64) -> Self {
         let all = counts.iter().flat_map(|&(late, n)| std::iter::repeat_n(late, n));
         Self { max, ..Self::of(all.collect()) }
@@ -43,20 +44,20 @@ impl Lateness {
     }
 }
 
-/// What became of the periods of a run.
+/// Account of a run's periods.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Periods {
-    /// There was a tick.
+    /// Periods with a tick.
     pub ticked: usize,
-    /// Skipped, and told as such with the lateness that cost it.
+    /// Periods reported as skipped, with the lateness that caused it.
     pub skipped: usize,
-    /// Neither.
+    /// Periods unaccounted for.
     pub unaccounted: usize,
 }
 
 fn main() -> ExitCode {
-    let effort = Effort::told();
-    println!("\ndimos: lateness of the tick beside cyclictest{}\n", effort.of(" (quick)", ""));
+    let effort = Effort::from_environment();
+    println!("\ndimos: lateness of the tick compared with cyclictest{}\n", effort.of(" (quick)", ""));
     machine::print();
     let yardstick = machine::cyclictest().is_some();
     if !yardstick {
@@ -74,7 +75,7 @@ fn main() -> ExitCode {
     effort.end()
 }
 
-/// Interleaved pairs at one rate.
+/// Measures interleaved pairs at one rate.
 fn compare(rate: u32, effort: Effort, yardstick: bool) -> Result<(), String> {
     let (period, time) = (Duration::from_secs(1) / rate, Duration::from_secs(effort.of(1, 10)));
     let before = machine::CpuTimes::now();
@@ -85,7 +86,7 @@ fn compare(rate: u32, effort: Effort, yardstick: bool) -> Result<(), String> {
             break;
         }
         let yardstick = yardstick.then(|| cyclictest::run(period, time, TICK_PRIORITY)).transpose()?;
-        // An overloaded machine makes the emulator late as well, and then the arm is held.
+        // An overloaded machine also delays the emulator, and then the arm is held.
         let ran = match ours::run(period, time) {
             Ok(ran) => ran,
             Err(e) => {
@@ -101,7 +102,7 @@ fn compare(rate: u32, effort: Effort, yardstick: bool) -> Result<(), String> {
         periods.unaccounted += ran.periods.unaccounted;
     }
     if ours.is_empty() {
-        return Err("no run could be measured".into());
+        return Err("no run was measured".into());
     }
     let (busy, stolen) = machine::CpuTimes::since(before);
     let mut rows = vec![["", "p50", "p99", "p99.9", "max"].map(str::to_owned).to_vec()];
@@ -118,10 +119,10 @@ fn compare(rate: u32, effort: Effort, yardstick: bool) -> Result<(), String> {
     judge(&theirs, medians(&ours)[1], fifo);
     let Periods { ticked, skipped, unaccounted } = periods;
     println!(
-        "  periods: {ticked} ticks + {skipped} skipped and told, {unaccounted} unaccounted for: {}",
+        "  periods: {ticked} ticks + {skipped} reported as skipped, {unaccounted} unaccounted for: {}",
         verdict(unaccounted == 0)
     );
-    println!("  meanwhile: {busy:.0} % of all cores busy, {stolen:.2} % stolen by the hypervisor\n");
+    println!("  during the measurement: {busy:.0} % of all cores busy, {stolen:.2} % stolen by the hypervisor\n");
     Ok(())
 }
 

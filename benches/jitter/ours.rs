@@ -1,4 +1,4 @@
-//! Lateness of a run's tick, from its log, and whether every period is accounted for.
+//! Lateness of a run's tick, from its log, and an account of every period.
 
 use std::path::Path;
 use std::time::Duration;
@@ -10,20 +10,20 @@ use dimos::rpc::api::Status;
 use crate::support::run::{LiveRun, keep_moving};
 use crate::{Lateness, Periods};
 
-/// How long a run settles before anything is measured.
+/// Settling time before a measurement.
 const SETTLE: Duration = Duration::from_secs(1);
 
-/// What a run did.
+/// Result of a run.
 pub struct Ran {
-    /// How late its ticks were.
+    /// Lateness of its ticks.
     pub late: Lateness,
-    /// What became of each period.
+    /// Account of its periods.
     pub periods: Periods,
     /// Whether its tick ran under FIFO.
     pub fifo: bool,
 }
 
-/// Runs the shipped blueprint with its emulator, in motion, for so long.
+/// Runs the shipped blueprint with its emulator, in motion, for this time.
 pub fn run(period: Duration, time: Duration) -> Result<Ran, String> {
     let rate = format!("coordinator.tick_rate={}", 1.0 / period.as_secs_f64());
     let mut run = LiveRun::start("coordinator-yourarm", &["--set", &rate]).map_err(|e| e.to_string())?;
@@ -53,7 +53,7 @@ fn ticks(log: &Path, from: u64, to: u64) -> Result<Vec<Tick>, String> {
     Ok(ticks)
 }
 
-/// A period has a tick in the log, or was skipped and is told as such, or neither.
+/// Counts periods with a tick in the log, periods reported as skipped, and the rest.
 fn account(ticks: &[Tick], period: Duration) -> Periods {
     let mut periods = Periods { ticked: ticks.len().min(1), ..Periods::default() };
     for (before, tick) in ticks.iter().zip(ticks.iter().skip(1)) {

@@ -1,8 +1,8 @@
-//! How long it takes to plan, over a file of problems.
+//! Planning times over a file of problems.
 //!
 //! `cargo bench --bench planning -- --problems FILE.jsonl --urdf FILE [--srdf FILE] [--package NAME=DIR]
 //! [--level exact] [--shapes true|vamp] [--seed N] [--limit N] [--out FILE.json]`; `--ik LINK --urdf FILE` and
-//! `--timing` measure those parts alone.
+//! `--timing` measure only these parts.
 
 mod parts;
 mod problems;
@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 
 use clap::Parser;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::planning::planner::{Plan, PlanError, PlanSettings, plan};
+use dimos::planning::path_planner::{Plan, PlanError, PlanSettings, plan};
 use dimos::planning::timing::{TimingSettings, bounds, time};
 use problems::{Arm, Problem, Shapes, load, packages};
 use serde::Serialize;
@@ -29,57 +29,57 @@ use serde::Serialize;
 #[derive(Debug, Parser)]
 #[command(name = "planning", about = "Times the planner on a file of problems")]
 struct Arguments {
-    /// Problems, one JSON record a line.
+    /// Problems, one JSON record per line
     #[arg(long, value_name = "FILE")]
     problems: Option<PathBuf>,
-    /// The robot.
+    /// URDF of the robot
     #[arg(long, value_name = "FILE")]
     urdf: Option<PathBuf>,
-    /// Pairs that may touch.
+    /// SRDF with allowed collision pairs
     #[arg(long, value_name = "FILE")]
     srdf: Option<PathBuf>,
-    /// Where `package://NAME` is.
+    /// Folder of `package://NAME`
     #[arg(long, value_name = "NAME=DIR")]
     package: Vec<String>,
-    /// How collisions are checked.
+    /// Collision checker
     #[arg(long, default_value = "exact")]
     level: Level,
-    /// How cylinders are taken.
+    /// Geometry of cylinders
     #[arg(long, default_value = "true")]
     shapes: Shapes,
-    /// What all randomness comes from.
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Only the first N problems.
+    /// Use only the first N problems
     #[arg(long, value_name = "N")]
     limit: Option<usize>,
-    /// How long one problem may take [s].
+    /// Timeout per problem [s]
     #[arg(long, default_value_t = 10.0)]
     timeout: f64,
-    /// Where the rows go.
+    /// Output file
     #[arg(long, value_name = "FILE.json")]
     out: Option<PathBuf>,
-    /// Solve random poses of this link as well.
+    /// Also solve random poses of this link
     #[arg(long, value_name = "LINK")]
     ik: Option<String>,
-    /// Time random paths as well.
+    /// Also time random paths
     #[arg(long)]
     timing: bool,
-    /// Given by cargo.
+    /// Passed by cargo
     #[arg(long, hide = true)]
     bench: bool,
-    /// Do little: to see that it works (or DIMOS_BENCH_QUICK=1).
+    /// Short run, to see that it works (or DIMOS_BENCH_QUICK=1)
     #[arg(long, hide = true)]
     quick: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Level {
-    /// Every solid against every other, in double precision; paths are proven free.
+    /// Every solid against every other, in double precision, with continuous motion checks.
     Exact,
 }
 
-/// What came out of one problem; nothing where it was not solved.
+/// Result of one problem; empty fields if not solved.
 #[derive(Debug, Serialize)]
 struct Row {
     problem: String,
@@ -91,16 +91,16 @@ struct Row {
     cost: Option<f64>,
     duration_s: Option<f64>,
     path: Option<Vec<Vec<f64>>>,
-    /// Processor time of this thread: what `total_us` would be on an idle machine.
+    /// Processor time of this thread: `total_us` on an idle machine.
     cpu_us: Option<f64>,
-    looks: Option<u64>,
+    checks: Option<u64>,
     timing_us: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     why: Option<String>,
-    /// Whether start and goal are inside the limits and free for this robot: if not, there is nothing to solve.
+    /// Whether start and goal are inside the limits and free for this robot; otherwise there is nothing to solve.
     #[serde(skip)]
     solvable: bool,
-    /// How long after its time was up the planner gave up.
+    /// Time from the timeout to the planner's return.
     #[serde(skip)]
     late_us: Option<f64>,
 }
@@ -186,7 +186,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
             cost: Some(plan.length),
             duration_s: None,
             cpu_us: Some(us(cpu)),
-            looks: Some(plan.looks),
+            checks: Some(plan.checks),
             timing_us: None,
             path: Some(plan.path),
             why: None,
@@ -209,7 +209,7 @@ fn row(problem: &Problem, found: Result<Plan, PlanError>, total: Duration, cpu: 
                 duration_s: none,
                 path: None,
                 cpu_us: None,
-                looks: None,
+                checks: None,
                 timing_us: None,
                 why,
                 solvable,
@@ -264,22 +264,22 @@ fn report(rows: &[Row], level: &Level) {
         let worst = quantile(late.clone(), 1.0) / 1e3;
         println!("{} ran out of time, and ended at most {worst:.2} ms after that", late.len());
     }
-    println!("solved / solvable / all: solvable where start and goal are inside the limits and touch nothing");
+    println!("solved / solvable / all; solvable: start and goal are inside the limits and collision-free");
     println!(
         "\ntiming, re-checks included: median {:.3} ms, p95 {:.3} ms",
         quantile(timing.clone(), 0.5),
         quantile(timing, 0.95)
     );
-    let mut looks: Vec<f64> = rows.iter().filter_map(|r| r.looks).map(|n| n as f64).collect();
-    looks.sort_by(f64::total_cmp);
+    let mut checks: Vec<f64> = rows.iter().filter_map(|r| r.checks).map(|n| n as f64).collect();
+    checks.sort_by(f64::total_cmp);
     println!(
-        "\nprocessor time: median {:.3} ms, p95 {:.3} ms, p99 {:.3} ms, max {:.3} ms; configurations looked at: median {:.0}, mean {:.0}",
+        "\nprocessor time: median {:.3} ms, p95 {:.3} ms, p99 {:.3} ms, max {:.3} ms; configurations checked: median {:.0}, mean {:.0}",
         cpu(0.5),
         cpu(0.95),
         cpu(0.99),
         cpu(1.0),
-        quantile(looks.clone(), 0.5),
-        looks.iter().sum::<f64>() / looks.len().max(1) as f64
+        quantile(checks.clone(), 0.5),
+        checks.iter().sum::<f64>() / checks.len().max(1) as f64
     );
 }
 

@@ -1,4 +1,4 @@
-//! The parts on their own: inverse kinematics of random reachable poses, timing of random paths.
+//! Parts of the planner: inverse kinematics of random reachable poses, time parameterization of random paths.
 
 use std::error::Error;
 use std::time::Instant;
@@ -14,7 +14,7 @@ use dimos::robot::random::Random;
 use crate::python::ask_python;
 use crate::{cpu_time, quantile};
 
-/// Solves `count` poses of link `tip`, each made from a random configuration, from another random one.
+/// Solves `count` poses of link `tip`, each from a random configuration, starting at another one.
 pub fn ik(model: &RobotModel, tip: &str, count: u64, seed: u64) -> Result<(), Box<dyn Error>> {
     let link = model.link_index(tip).ok_or(format!("{} has no link {tip:?}", model.name))?;
     let chain = model.chain(0, link).unwrap_or_default();
@@ -46,7 +46,7 @@ pub fn ik(model: &RobotModel, tip: &str, count: u64, seed: u64) -> Result<(), Bo
     Ok(())
 }
 
-/// Times random paths of 100 waypoints and 7 joints; toppra times the same, where it is installed.
+/// Times random paths of 100 waypoints and 7 joints, also with toppra if it is installed.
 pub fn timing(repeats: u64, seed: u64) -> Result<(), Box<dyn Error>> {
     const VELOCITY: f64 = 2.0;
     const ACCELERATION: f64 = 5.0;

@@ -1,4 +1,4 @@
-//! Planning problems from a file with one JSON record a line, and the robot they are for.
+//! Planning problems from a file with one JSON record per line, and their robot.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -15,21 +15,21 @@ use dimos::robot::model::{JointKind, RobotModel};
 use glamx::{DAffine3, DQuat, DVec3};
 use serde::Deserialize;
 
-/// How cylinders are taken.
+/// Geometry of cylinders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Shapes {
-    /// As they are.
+    /// As given.
     True,
-    /// As VAMP takes them: capsules, and boxes in the family `box`.
+    /// As in VAMP: capsules, and boxes in the family `box`.
     Vamp,
 }
 
 /// One problem.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Problem {
-    /// Its family.
+    /// Family.
     pub problem: String,
-    /// Its number there.
+    /// Number in the family.
     pub index: u64,
     joints: Vec<String>,
     start: Vec<f64>,
@@ -57,7 +57,7 @@ pub fn load(path: &Path, limit: Option<usize>) -> Result<Vec<Problem>, Box<dyn E
     lines.enumerate().map(read).collect()
 }
 
-/// A robot read for planning.
+/// A robot loaded for planning.
 pub struct Arm {
     model: Arc<RobotModel>,
     solids: Vec<Vec<Solid>>,
@@ -65,7 +65,7 @@ pub struct Arm {
 }
 
 impl Arm {
-    /// Reads a URDF, and the pairs that may touch from an SRDF.
+    /// Loads a URDF, and the allowed collision pairs of an SRDF.
     pub fn load(urdf: &Path, srdf: Option<&Path>, packages: BTreeMap<String, PathBuf>) -> Result<Self, Box<dyn Error>> {
         let source = Source { path: urdf.to_owned(), packages, srdf: srdf.map(Path::to_owned), ..Source::default() };
         let mut loaded = dimos::robot::load(&source);
@@ -75,18 +75,18 @@ impl Arm {
         let all = allowed.len();
         let allowed: Vec<_> = allowed.into_iter().filter_map(|pair| own_pair(&model, &pair)).collect();
         if allowed.len() < all {
-            println!("note      {} of the SRDF's {all} pairs name links that {} has", allowed.len(), model.name);
+            println!("note      {} of the SRDF's {all} pairs refer to links of {}", allowed.len(), model.name);
         }
         Ok(Self { model: Arc::new(model), solids, allowed })
     }
 
-    /// The model.
+    /// Returns the model.
     pub fn model(&self) -> &RobotModel {
         &self.model
     }
 
-    /// The kinematics of a problem's joints: by name, else by what remains without the prefix that all joints share,
-    /// else by an ending that only one joint has.
+    /// Returns the kinematics of a problem's joints: matched by name, otherwise by the name without the prefix shared
+    /// by all joints, otherwise by a unique suffix.
     pub fn kinematics(&self, problem: &Problem) -> Result<Kinematics, Box<dyn Error>> {
         let own: Vec<(usize, &str)> =
             self.model.independent_joints().into_iter().map(|j| (j, self.model.joints[j].name.as_str())).collect();
@@ -101,16 +101,16 @@ impl Arm {
             only(&|o| o == name)
                 .or_else(|| only(&|o| o[prefix..] == name[foreign..]))
                 .or_else(|| name.match_indices(['_', '/', '-']).find_map(|(at, _)| ends(&name[at..])))
-                .ok_or(format!("joint {name:?} of the problems is none of the robot's, nor has one joint its ending"))
+                .ok_or(format!("the robot has no joint {name:?}, nor a unique joint with that suffix"))
         };
         let joints = problem.joints.iter().map(find).collect::<Result<Vec<_>, _>>()?;
         for (i, joint) in joints.iter().enumerate() {
             if let Some(twin) = joints[..i].iter().position(|j| j == joint) {
                 let (a, b) = (&problem.joints[twin], &problem.joints[i]);
-                return Err(format!("joints {a:?} and {b:?} of the problems are one joint of the robot's").into());
+                return Err(format!("joints {a:?} and {b:?} of the problems match the same joint of the robot").into());
             }
         }
-        // Sliding joints of the others are a gripper's: it is open.
+        // Other prismatic joints belong to a gripper: it is open.
         let open = |j: &dimos::robot::Joint| if j.kind == JointKind::Prismatic { j.limits.upper } else { 0.0 };
         let mut rest: Vec<f64> = self.model.joints.iter().map(open).collect();
         for (j, joint) in self.model.joints.iter().enumerate() {
@@ -121,7 +121,7 @@ impl Arm {
         Ok(Kinematics::new(&self.model, &joints, &rest)?)
     }
 
-    /// The scene of a problem.
+    /// Returns the scene of a problem.
     pub fn scene(
         &self,
         kinematics: &Arc<Kinematics>,
@@ -147,7 +147,7 @@ impl Arm {
 }
 
 impl Problem {
-    /// Where it begins and should end.
+    /// Returns its start and goal.
     pub fn ends(&self) -> (&[f64], &[f64]) {
         (&self.start, &self.goal)
     }
@@ -167,7 +167,7 @@ fn solid(thing: &Thing, family: &str, shapes: Shapes) -> Result<Solid, Box<dyn E
     Ok(made?)
 }
 
-/// A pair of links as the model has them: by name, else by an ending that only one link has.
+/// Returns a pair of links by the model's names: matched by name, otherwise by a unique suffix.
 fn own_pair(model: &RobotModel, (a, b): &(String, String)) -> Option<(String, String)> {
     let own = |name: &String| {
         let ends = |suffix: &str| match model.links.iter().filter(|l| l.name.ends_with(suffix)).collect::<Vec<_>>()[..]
@@ -181,7 +181,7 @@ fn own_pair(model: &RobotModel, (a, b): &(String, String)) -> Option<(String, St
     Some((own(a)?, own(b)?))
 }
 
-/// `NAME=DIR` arguments.
+/// Parses `NAME=DIR` arguments.
 pub fn packages(arguments: &[String]) -> Result<BTreeMap<String, PathBuf>, Box<dyn Error>> {
     let mut named = BTreeMap::new();
     for argument in arguments {
@@ -191,7 +191,7 @@ pub fn packages(arguments: &[String]) -> Result<BTreeMap<String, PathBuf>, Box<d
     Ok(named)
 }
 
-/// Length of the prefix that all names share, up to a separator.
+/// Returns the length of the prefix that all names share, up to a separator.
 fn shared_prefix(names: &[&str]) -> usize {
     let first = names.first().copied().unwrap_or_default();
     let ends = first.match_indices(['_', '/', '-']).map(|(at, _)| at + 1);

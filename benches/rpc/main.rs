@@ -1,5 +1,5 @@
-//! `make bench`: what talking to a run costs: a stop beside a flood, the round trip, and what readers do to the tick.
-//! Prints; judges, but fails on no figure. `cargo bench --bench rpc -- stops` measures stops only.
+//! `make bench`: cost of talking to a run: a stop during a flood of requests, the round trip, and the effect of readers
+//! on the tick. Prints and judges figures; no figure fails it. `cargo bench --bench rpc -- stops` measures stops only.
 
 mod stops;
 #[path = "../support/mod.rs"]
@@ -25,8 +25,8 @@ const READERS: usize = 4;
 const FLOOD: f64 = 10_000.0;
 
 fn main() -> ExitCode {
-    let effort = Effort::told();
-    println!("\ndimos: what talking to a run costs{}\n", effort.of(" (quick)", ""));
+    let effort = Effort::from_environment();
+    println!("\ndimos: cost of talking to a run{}\n", effort.of(" (quick)", ""));
     machine::print();
     let all = || {
         stops::measure(effort)
@@ -46,7 +46,7 @@ fn fast_run() -> Result<LiveRun, String> {
     LiveRun::start("coordinator-mock", &["--set", "coordinator.tick_rate=1000"]).map_err(|e| e.to_string())
 }
 
-/// Request and reply of `state`, one after the other.
+/// Measures request and reply of `state`, one after the other.
 fn round_trip(effort: Effort) -> Result<(), String> {
     let (mut p50, mut p99) = (Vec::new(), Vec::new());
     for _ in 0..effort.of(1, 5) {
@@ -73,7 +73,7 @@ fn round_trip(effort: Effort) -> Result<(), String> {
     Ok(())
 }
 
-/// Lateness of the tick alone, with readers of the stream, and in a flood of requests, in turns.
+/// Measures the lateness of the tick alone, with readers of the stream, and in a flood of requests, in turns.
 fn readers(effort: Effort) -> Result<(), String> {
     let time = Duration::from_secs(effort.of(1, 10));
     let (mut alone, mut read, mut flooded) = (Vec::new(), Vec::new(), Vec::new());
@@ -90,8 +90,8 @@ fn readers(effort: Effort) -> Result<(), String> {
             Measure::new("alone", "µs", alone.clone()),
             Measure::new("4 readers of the joint state at 1 kHz", "µs", read),
             Measure::new("10 000 requests/s", "µs", flooded),
-            Measure::new("4 readers, beside alone", "×", read_ratio).goal(Goal::AtMost(1.1)),
-            Measure::new("10 000 requests/s, beside alone", "×", flood_ratio).goal(Goal::AtMost(1.1)),
+            Measure::new("4 readers, relative to none", "×", read_ratio).goal(Goal::AtMost(1.1)),
+            Measure::new("10 000 requests/s, relative to none", "×", flood_ratio).goal(Goal::AtMost(1.1)),
         ],
     );
     Ok(())
@@ -99,7 +99,7 @@ fn readers(effort: Effort) -> Result<(), String> {
 
 type Load = Box<dyn FnOnce(Client) + Send>;
 
-/// p99 lateness of a run of its own under a load [µs].
+/// Returns the p99 lateness of a separate run under a load [µs].
 fn lateness(time: Duration, loads: impl FnOnce(&Arc<AtomicBool>) -> Result<Vec<Load>, String>) -> Result<f64, String> {
     let mut run = fast_run()?;
     let stop = Arc::new(AtomicBool::new(false));
@@ -149,7 +149,7 @@ tasks:
   - {name: servo_arm, type: servo, joint_names: {hardware: arm}, priority: 20}
 ";
 
-/// A policy loop in Python at 100 Hz: what it says of its own time.
+/// Measures a policy loop in Python at 100 Hz by its own statistics.
 fn python(effort: Effort) -> Result<(), String> {
     let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
     let blueprint = folder.path().join("servo.yaml");

@@ -1,5 +1,5 @@
-//! How long a stop takes beside a flood of requests, and without one, in turns: from the moment it is sent until the
-//! reply says that the arm confirmed it. Over a connection that asks other things too, and over a new one.
+//! Duration of a stop with and without a flood of requests, in turns: from sending it until the reply says that the arm
+//! confirmed it. Over a connection with other requests, and over a new one.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
@@ -19,17 +19,17 @@ use super::support::run::LiveRun;
 
 /// Clients of the flood.
 const CLIENTS: usize = 18;
-/// Points of the trajectories that are asked in vain.
+/// Points of the rejected trajectories.
 const POINTS: usize = 4_500;
-/// How much longer than without the flood a stop may take [ms].
+/// Additional duration allowed for a stop during the flood [ms].
 const MARGIN: f64 = 15.0;
 
-/// How long stops took [ms].
+/// Durations of stops [ms].
 #[derive(Default)]
 struct Times {
-    /// Over a connection that asks other things too.
+    /// Over a connection with other requests.
     kept: Vec<f64>,
-    /// Over a connection of their own.
+    /// Over a new connection.
     new: Vec<f64>,
 }
 
@@ -39,7 +39,7 @@ impl Times {
     }
 }
 
-/// Measures it, and prints.
+/// Measures and prints.
 pub fn measure(effort: Effort) -> Result<(), String> {
     let (stops, turn) = (effort.of(20, 300), effort.of(5, 10));
     let mut run = LiveRun::start("coordinator-mock", &[]).map_err(|e| e.to_string())?;
@@ -71,13 +71,13 @@ pub fn measure(effort: Effort) -> Result<(), String> {
     drop(flood);
     let p99 = [quantile(&calm.all(), 0.99), quantile(&flooded.all(), 0.99)];
     print(
-        &format!("`stop` until it is confirmed, beside a flood by {CLIENTS} clients and without, in turns"),
+        &format!("`stop` until it is confirmed, with and without a flood by {CLIENTS} clients, in turns"),
         &[
-            Measure::new("without, over a connection that is kept", "ms", calm.kept),
-            Measure::new("without, over a new connection", "ms", calm.new),
-            Measure::new("beside the flood, over a connection that is kept", "ms", flooded.kept),
-            Measure::new("beside the flood, over a new connection", "ms", flooded.new),
-            Measure::new("p99 beside the flood, beyond p99 without", "ms", vec![p99[1] - p99[0]])
+            Measure::new("no flood, existing connection", "ms", calm.kept),
+            Measure::new("no flood, new connection", "ms", calm.new),
+            Measure::new("flood, existing connection", "ms", flooded.kept),
+            Measure::new("flood, new connection", "ms", flooded.new),
+            Measure::new("p99 in the flood, beyond p99 without", "ms", vec![p99[1] - p99[0]])
                 .goal(Goal::AtMost(MARGIN)),
             Measure::new("not confirmed", "", vec![unconfirmed]).goal(Goal::AtMost(0.0)),
         ],
@@ -85,20 +85,20 @@ pub fn measure(effort: Effort) -> Result<(), String> {
     Ok(())
 }
 
-/// Brings the arm back, however often that takes beside the flood.
+/// Makes the arm ready again, retrying during the flood.
 fn make_ready(client: &mut Client) -> Result<(), String> {
     let limit = Instant::now() + Duration::from_secs(20);
     loop {
         let reset = client.call(ArmReset { arm: "arm".into() });
         match reset.and_then(|_| client.call(ArmEnable { arm: "arm".into() })) {
             Ok(_) => return Ok(()),
-            Err(e) if Instant::now() > limit => return Err(format!("the arm does not become ready: {e}")),
+            Err(e) if Instant::now() > limit => return Err(format!("the arm is not ready in time: {e}")),
             Err(_) => std::thread::sleep(Duration::from_millis(20)),
         }
     }
 }
 
-/// Clients that ask as much as they can, or nothing for the moment.
+/// Clients that send as many requests as they can, or pause.
 struct Flood {
     on: Arc<AtomicBool>,
     over: Arc<AtomicBool>,
@@ -108,7 +108,7 @@ struct Flood {
 impl Flood {
     fn prepare(socket: &Path, joints: &[String]) -> Self {
         let (on, over) = (Arc::<AtomicBool>::default(), Arc::<AtomicBool>::default());
-        // It begins where no arm is, so it is refused each time, after it was read and checked.
+        // It does not start at the arm's position, so it is rejected each time, after it was read and checked.
         let point = |i: usize| Point {
             time_from_start: i as f64,
             positions: (0..joints.len()).map(|j| 1.5 - 0.125 * j as f64).collect(),
@@ -138,7 +138,7 @@ impl Drop for Flood {
     }
 }
 
-/// Asks in one of six ways; connects again when it is thrown out.
+/// Sends requests in one of six ways; reconnects when it is disconnected.
 fn one_client(kind: usize, socket: &Path, execute: &str, on: &AtomicBool, over: &AtomicBool) {
     while !over.load(Ordering::Relaxed) {
         let Ok(stream) = UnixStream::connect(socket) else { return };

@@ -1,4 +1,4 @@
-//! Where the figures come from: processor, kernel, versions, and how much the hypervisor took.
+//! Machine of the figures: processor, kernel, versions, and time stolen by the hypervisor.
 
 use std::fs;
 use std::process::Command;
@@ -21,7 +21,7 @@ pub fn print() {
     println!("date      {}\n", first_line("date", &["-u", "+%Y-%m-%d %H:%M UTC"]).unwrap_or_default());
 }
 
-/// Version of cyclictest, where it is installed.
+/// Returns the version of cyclictest, if it is installed.
 pub fn cyclictest() -> Option<String> {
     first_line("cyclictest", &["--help"])
 }
@@ -45,7 +45,7 @@ pub struct CpuTimes {
 }
 
 impl CpuTimes {
-    /// Up to now.
+    /// Returns the current values.
     pub fn now() -> Self {
         let stat = read("/proc/stat");
         let line = stat.lines().next().unwrap_or_default();
@@ -55,7 +55,7 @@ impl CpuTimes {
         Self { busy: at(0) + at(1) + at(2) + at(5) + at(6), stolen: at(7), all: t.iter().sum() }
     }
 
-    /// How busy the machine was since then, and what the hypervisor took, in per cent of all cores.
+    /// Returns the load of the machine since then, and the time stolen by the hypervisor, in per cent of all cores.
     pub fn since(before: Self) -> (f64, f64) {
         let now = Self::now();
         let part = |of: u64| 100.0 * of as f64 / (now.all - before.all).max(1) as f64;

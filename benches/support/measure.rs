@@ -1,6 +1,6 @@
-//! Repeated figures, their goals, and the table that shows both.
+//! Repeated figures, their goals, and their table.
 
-/// What a figure should come to.
+/// Goal of a figure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
     /// This or less.
@@ -19,12 +19,12 @@ pub struct Measure {
 }
 
 impl Measure {
-    /// What was measured, in which unit, and what came out each time.
+    /// Creates a figure from its name, unit, and repeats.
     pub fn new(what: impl Into<String>, unit: &'static str, repeats: Vec<f64>) -> Self {
         Self { what: what.into(), unit, repeats, goal: None }
     }
 
-    /// The same with a goal for its median.
+    /// Adds a goal for its median.
     pub fn goal(mut self, goal: Goal) -> Self {
         self.goal = Some(goal);
         self
@@ -46,12 +46,12 @@ impl Measure {
     }
 }
 
-/// The word beside a goal.
+/// Returns the word for a goal that is met or missed.
 pub fn verdict(met: bool) -> &'static str {
     if met { "met" } else { "missed" }
 }
 
-/// The value that a part `q` of the values does not exceed; NaN of nothing.
+/// Returns the value that a part `q` of the values does not exceed; NaN without values.
 pub fn quantile(values: &[f64], q: f64) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -59,14 +59,14 @@ pub fn quantile(values: &[f64], q: f64) -> f64 {
     sorted.get(rank - 1).copied().unwrap_or(f64::NAN)
 }
 
-/// Prints figures under a title: median, p95 and p99 over the repeats, beside the goal.
+/// Prints figures with a title: median, p95 and p99 over the repeats, and the goal.
 pub fn print(title: &str, measures: &[Measure]) {
     let head = ["", "median", "p95", "p99", "", "n", "goal", ""].map(str::to_owned);
     let rows = std::iter::once(head).chain(measures.iter().map(Measure::row)).map(Vec::from).collect();
     print_rows(title, rows);
 }
 
-/// Prints rows under a title, aligned: the first column to the left, the others to the right.
+/// Prints rows with a title, aligned: the first column left, the others right.
 pub fn print_rows(title: &str, rows: Vec<Vec<String>>) {
     println!("{title}");
     let columns = rows.iter().map(Vec::len).max().unwrap_or_default();
@@ -82,7 +82,7 @@ pub fn print_rows(title: &str, rows: Vec<Vec<String>>) {
     println!();
 }
 
-/// A figure with three digits that count.
+/// Formats a figure with three significant digits.
 pub fn figure(value: f64) -> String {
     match value.abs() {
         v if v >= 100.0 => format!("{value:.0}"),

@@ -1,4 +1,4 @@
-//! What the benchmarks share: the machine, statistics, tables, a live run of the real binary.
+//! Shared by the benchmarks: the machine, statistics, tables, a live run of the real binary.
 
 pub mod machine;
 pub mod measure;
@@ -8,30 +8,30 @@ pub mod run;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// How many parts could not be measured.
+/// Number of parts that could not be measured.
 static MISSING: AtomicUsize = AtomicUsize::new(0);
 
-/// Tells that a part could not be measured, and why; a tool that is not installed is no such reason.
+/// Reports a part that could not be measured, and why; not for tools that are not installed.
 pub fn skipped(what: &str) {
     println!("SKIPPED: {what}\n");
     MISSING.fetch_add(1, Ordering::Relaxed);
 }
 
-/// How much is measured: `--quick` on the command line or `DIMOS_BENCH_QUICK=1` makes it seconds long.
+/// Extent of the measurements: `--quick` on the command line or `DIMOS_BENCH_QUICK=1` reduces them to seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Effort {
-    /// Short: to see that every part works. Its figures say little.
+    /// Short: to see that every part works; its figures mean little.
     pub quick: bool,
 }
 
 impl Effort {
-    /// As this process was told.
-    pub fn told() -> Self {
+    /// Reads it from the command line and the environment.
+    pub fn from_environment() -> Self {
         let asked = std::env::args().any(|a| a == "--quick");
         Self { quick: asked || std::env::var_os("DIMOS_BENCH_QUICK").is_some_and(|v| v == "1") }
     }
 
-    /// How the benchmark ends: figures fail nothing, but the short form is there to see that every part runs.
+    /// Returns the exit code: no figure fails a benchmark, but the short form fails if a part did not run.
     pub fn end(self) -> ExitCode {
         match self.quick && MISSING.load(Ordering::Relaxed) > 0 {
             true => ExitCode::FAILURE,
@@ -39,7 +39,7 @@ impl Effort {
         }
     }
 
-    /// One of two numbers.
+    /// Selects one of two values.
     pub fn of<T>(self, quick: T, full: T) -> T {
         if self.quick { quick } else { full }
     }

@@ -1,4 +1,4 @@
-//! What the kernel says about another process: its memory, and the processor time of each of its threads.
+//! The kernel's figures of another process: memory, and processor time per thread.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -6,13 +6,13 @@ use std::fs;
 /// Resident memory [MiB].
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Memory {
-    /// Now.
+    /// Current.
     pub now: f64,
-    /// The most so far.
+    /// Peak.
     pub most: f64,
 }
 
-/// Resident memory of a process.
+/// Returns the resident memory of a process.
 pub fn memory(pid: u32) -> Memory {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let field = |name: &str| {
@@ -22,7 +22,7 @@ pub fn memory(pid: u32) -> Memory {
     Memory { now: field("VmRSS:").unwrap_or(f64::NAN), most: field("VmHWM:").unwrap_or(f64::NAN) }
 }
 
-/// Processor time that each thread of a process has used [ns], by thread name.
+/// Returns the processor time of each thread of a process [ns], by thread name.
 pub fn threads(pid: u32) -> BTreeMap<String, u64> {
     let mut times = BTreeMap::new();
     for task in fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten() {

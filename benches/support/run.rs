@@ -1,4 +1,4 @@
-//! A live run of the real binary, in a folder of its own.
+//! A live run of the real binary, in its own folder.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -8,23 +8,23 @@ use dimos::rpc::api::{Execute, Point, Shutdown, State, Trajectory};
 use dimos::rpc::client::Client;
 use dimos::rpc::place::RunFolder;
 
-/// How long a run gets to come up.
+/// Maximum time for a run to be up.
 const UP_LIMIT: Duration = Duration::from_secs(10);
-/// How long it gets to end.
+/// Maximum time for a run to end.
 const END_LIMIT: Duration = Duration::from_secs(10);
-/// Name of each run; its folder tells them apart.
+/// Name of each run; its folder distinguishes it.
 const NAME: &str = "bench";
 
-/// A run that is being started, or is up. Ends when it is dropped.
+/// A run that is starting or up. Ends when dropped.
 pub struct LiveRun {
     home: tempfile::TempDir,
     child: Child,
-    /// When the process was started.
+    /// Start of the process.
     pub started: Instant,
 }
 
 impl LiveRun {
-    /// Starts `dimos run BLUEPRINT` with more arguments, and does not wait.
+    /// Starts `dimos run BLUEPRINT` with further arguments, without waiting.
     pub fn start(blueprint: &str, arguments: &[&str]) -> std::io::Result<Self> {
         let home = tempfile::tempdir()?;
         let mut command = Command::new(env!("CARGO_BIN_EXE_dimos"));
@@ -36,17 +36,17 @@ impl LiveRun {
         Ok(Self { home, child, started })
     }
 
-    /// Its process.
+    /// Returns its pid.
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// The folder that stands for the user's own.
+    /// Returns the folder used as the user's home.
     pub fn folder(&self) -> &Path {
         self.home.path()
     }
 
-    /// Its log.
+    /// Returns its log.
     pub fn log(&self) -> PathBuf {
         self.home.path().join("log.mcap")
     }
@@ -56,7 +56,7 @@ impl LiveRun {
         let folder = RunFolder::at(self.home.path().join("dimos"));
         loop {
             if let Some(status) = self.child.try_wait().map_err(|e| e.to_string())? {
-                return Err(format!("the run ended at once: {status}"));
+                return Err(format!("the run ended during startup: {status}"));
             }
             match Client::find(&folder, Some(NAME)) {
                 Ok(client) => return Ok(client),
@@ -66,13 +66,13 @@ impl LiveRun {
         }
     }
 
-    /// Ends it, controlled, and hands on its log.
+    /// Shuts it down and passes its log to `read`.
     pub fn end<T>(mut self, read: impl FnOnce(&Path) -> T) -> Result<T, String> {
         self.client()?.call(Shutdown {}).map_err(|e| e.to_string())?;
         let limit = Instant::now() + END_LIMIT;
         while self.child.try_wait().map_err(|e| e.to_string())?.is_none() {
             if Instant::now() > limit {
-                return Err("the run does not end".into());
+                return Err("the run does not shut down".into());
             }
             std::thread::sleep(Duration::from_millis(5));
         }
@@ -82,14 +82,14 @@ impl LiveRun {
 
 impl Drop for LiveRun {
     fn drop(&mut self) {
-        // Only a run that was not ended is still there; its arm is emulated.
+        // Only a run that was not shut down is still live; its arm is emulated.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// Lets every arm of a run swing for so long [s] or a little longer, each by a trajectory task of its own. A swing ends
-/// where it began, at rest: a trajectory that does not is refused.
+/// Moves every arm of a run for at least this long [s], each with its own trajectory task. A swing ends at its start,
+/// at rest: other trajectories would be rejected.
 pub fn keep_moving(client: &mut Client, seconds: f64) -> Result<(), String> {
     let state = client.call(State {}).map_err(|e| e.to_string())?;
     let swings = (seconds / SWING).ceil().max(1.0) as usize;
@@ -103,11 +103,11 @@ pub fn keep_moving(client: &mut Client, seconds: f64) -> Result<(), String> {
     Ok(())
 }
 
-/// Time of a swing out and back [s], and points in it.
+/// Duration of a swing out and back [s], and its number of points.
 const SWING: f64 = 4.0;
 const STEPS: usize = 16;
 
-/// Step `i` of joints that swing out from `start` by 0.2 rad and back, at rest at both ends.
+/// Returns step `i` of joints that swing out from `start` by 0.2 rad and back, at rest at both ends.
 fn swing(start: &[f64], i: usize) -> Point {
     let turn = std::f64::consts::TAU / SWING;
     let time = i as f64 * SWING / STEPS as f64;

@@ -1,5 +1,5 @@
-//! An arm with its emulator and its real device thread, and a thread that does the tick's part: the coordinator is
-//! left out, what is measured lies behind it.
+//! An arm with its emulator and its real device thread, and a thread in place of the tick: the coordinator is omitted,
+//! the path behind it is measured.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -10,37 +10,37 @@ use dimos::control::tick_loop::next_deadline;
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::spec::ManipulatorAdapter;
 use dimos::joint::{ControlMode, MAX_DOF};
-use dimos::rt::beat::Beat;
+use dimos::rt::heartbeat::Heartbeat;
 use dimos::rt::host;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
 use dimos::rt::wake::Wake;
 
 use crate::timed::{Delays, Timed, moment};
 
-/// Longest wait for an arm.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Timeout for the arm.
+const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// An arm that is enabled, and follows set points.
+/// An enabled arm that follows setpoints.
 pub struct Arm {
     device: Device,
     commands: SlotWriter<ArmCommand>,
     states: SlotReader<ArmState>,
     wake: Wake,
-    /// How long each command took to the wire [µs].
+    /// Delay of each command to the wire [µs].
     pub sent: Delays,
-    /// How long each state took from the wire [µs], where the adapter's first joint is a moment.
+    /// Delay of each state from the wire [µs], if the adapter's first joint is a time stamp.
     pub arrived: Delays,
-    // Ends after the thread that talks to it.
+    // Dropped after the thread that uses it.
     _world: Box<dyn std::any::Any + Send>,
 }
 
 impl Arm {
-    /// Connects and enables an arm. `world` is kept as long as the arm: its emulator, say.
+    /// Connects and enables an arm. `world` is kept as long as the arm, for instance its emulator.
     pub fn new(
         inner: Box<dyn ManipulatorAdapter>,
         world: Box<dyn std::any::Any + Send>,
         period: Duration,
-        beat: &Arc<Beat>,
+        beat: &Arc<Heartbeat>,
         room: usize,
     ) -> Result<Self, String> {
         let text = |e: dimos::hardware::spec::AdapterError| e.to_string();
@@ -60,15 +60,15 @@ impl Arm {
             notes: Box::new(|_| {}),
         };
         let device = Device::spawn(config, adapter, state_writer, command_reader).map_err(|e| e.to_string())?;
-        device.connect().wait(PATIENCE).map_err(text)?;
-        device.activate().wait(PATIENCE).map_err(text)?;
+        device.connect().wait(TIMEOUT).map_err(text)?;
+        device.activate().wait(TIMEOUT).map_err(text)?;
         Ok(Self { wake: device.wake(), device, commands, states, sent, arrived, _world: world })
     }
 
-    /// Lets go of the arm; an error when it was lost meanwhile.
+    /// Releases the arm; an error if it was lost in the meantime.
     pub fn finish(mut self) -> Result<(), String> {
         let state = self.states.read();
-        let _ = self.device.finish(false).wait(PATIENCE);
+        let _ = self.device.finish(false).wait(TIMEOUT);
         self.device.join();
         match (state.link, state.self_held) {
             (Link::Up, false) => Ok(()),
@@ -77,21 +77,22 @@ impl Arm {
     }
 }
 
-/// What became of the periods.
+/// Account of the periods.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Periods {
-    /// A command was handed over.
+    /// Periods with a command.
     pub ticked: u64,
-    /// Skipped, because the machine stood still.
+    /// Skipped, because the machine was stalled.
     pub skipped: u64,
-    /// Handed over, but replaced by the next one before the device thread took it.
+    /// Commands replaced by the next one before the device thread took them.
     pub overwritten: u64,
-    /// The latest wake-up [µs].
+    /// Maximum lateness of a wake-up [µs].
     pub latest: f64,
 }
 
-/// Does what the tick does, for so many periods: reads all states, writes all commands, then wakes all device threads.
-pub fn tick(arms: &mut [Arm], period: Duration, periods: u64, beat: &Beat) -> Periods {
+/// Does the work of the tick for this many periods: reads all states, writes all commands, then wakes all device
+/// threads.
+pub fn tick(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat) -> Periods {
     let (_, _latency) = host::prepare_process(true);
     let mut counted = Periods::default();
     std::thread::scope(|scope| {
@@ -101,7 +102,7 @@ pub fn tick(arms: &mut [Arm], period: Duration, periods: u64, beat: &Beat) -> Pe
     counted
 }
 
-fn run(arms: &mut [Arm], period: Duration, periods: u64, beat: &Beat) -> Periods {
+fn run(arms: &mut [Arm], period: Duration, periods: u64, beat: &Heartbeat) -> Periods {
     host::enter_realtime(host::TICK_PRIORITY);
     let mut counted = Periods::default();
     let hold: Vec<[f64; MAX_DOF]> = arms.iter_mut().map(|arm| arm.states.read().position).collect();
@@ -127,7 +128,7 @@ fn run(arms: &mut [Arm], period: Duration, periods: u64, beat: &Beat) -> Periods
         }
         deadline = next;
     }
-    // Until the last commands are written.
+    // Waits until the last commands are written.
     std::thread::sleep(period * 2);
     counted
 }

@@ -1,4 +1,4 @@
-//! How fast packets are decoded.
+//! Decoding rates of packets.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -8,7 +8,7 @@ use dimos::hardware::arms::xarm::protocol::report::Motion;
 use crate::support::Effort;
 use crate::support::measure::{Goal, Measure, print};
 
-/// Packets per second of a decoder, in thousands.
+/// Returns the packets per second of a decoder, in thousands.
 fn rate(packets: u64, mut decode: impl FnMut(u64)) -> f64 {
     let began = Instant::now();
     (0..packets).for_each(&mut decode);
@@ -26,13 +26,12 @@ pub fn measure(effort: Effort) -> Result<(), String> {
     });
     let mut measures =
         vec![Measure::new("xArm reports of port 30000", "k/s", xarm.collect()).goal(Goal::AtLeast(200.0))];
-    measures
-        .push(Measure::new("Piper frames, put together", "k/s", piper(repeats, packets)).goal(Goal::AtLeast(1000.0)));
+    measures.push(Measure::new("Piper frames, assembled", "k/s", piper(repeats, packets)).goal(Goal::AtLeast(1000.0)));
     print("decoding, one thread", &measures);
     Ok(())
 }
 
-/// The frames of one burst of a Piper, over and over, decoded and put together to a picture of the arm.
+/// Decodes the frames of one burst of a Piper repeatedly, and assembles them to the arm's feedback.
 fn piper(repeats: usize, packets: u64) -> Vec<f64> {
     use dimos::clock::{Clock, MonotonicClock};
     use dimos::hardware::arms::piper::picture::Picture;

@@ -1,5 +1,5 @@
-//! `make bench`: the way of a command from the tick to the wire and of a state back, servo streams over minutes, and how
-//! fast packets are decoded. Prints; judges, but fails on no figure.
+//! `make bench`: latency of a command from the tick to the wire and of a state back, servo streams over minutes, and
+//! decoding rates of packets. Prints and judges figures; no figure fails it.
 //!
 //! `cargo bench --bench wire -- [commands] [states] [streams] [decoding] [remote] [--quick]`
 
@@ -19,18 +19,18 @@ use std::time::Duration;
 use bed::{Arm, tick};
 use dimos::hardware::arms::xarm;
 use dimos::hardware::registry::{self, AdapterConfig, Place};
-use dimos::rt::beat::Beat;
+use dimos::rt::heartbeat::Heartbeat;
 use support::measure::{Goal, Measure, print, quantile};
 use support::{Effort, machine};
 
-/// The xArm's register for set points.
-const SET_POINT: u8 = 29;
+/// The xArm's register for setpoints.
+const SETPOINT: u8 = 29;
 
 /// A part of the benchmark, by name.
 type Part = (&'static str, fn(Effort) -> Result<(), String>);
 
 fn main() -> ExitCode {
-    let effort = Effort::told();
+    let effort = Effort::from_environment();
     println!("\ndimos: from the tick to the wire and back{}\n", effort.of(" (quick)", ""));
     machine::print();
     let named: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
@@ -55,22 +55,23 @@ fn config(adapter: &str, address: String, dof: usize) -> AdapterConfig {
     AdapterConfig { hardware_id: adapter.to_owned(), address, dof, options: serde_json::json!({}) }
 }
 
-/// An arm of the box with its emulator.
-fn arm(name: &str, dof: usize, period: Duration, beat: &Arc<Beat>, room: usize) -> Result<Arm, String> {
+/// Returns a built-in arm with its emulator.
+fn arm(name: &str, dof: usize, period: Duration, beat: &Arc<Heartbeat>, room: usize) -> Result<Arm, String> {
     let text = |e: dimos::hardware::spec::AdapterError| e.to_string();
     let emulator = registry::emulate(name, dof).map_err(text)?;
     let adapter = registry::create(name, &emulator.address(), dof).map_err(text)?;
     Arm::new(adapter, Box::new(emulator), period, beat, room)
 }
 
-/// From the tick's write of a command to the end of the adapter's: xArms, whose adapter does not wait for replies.
+/// Measures from the tick's write of a command to the end of the adapter's write: xArms, whose adapter does not wait
+/// for replies.
 fn commands(effort: Effort) -> Result<(), String> {
     let (rate, periods) = (100.0, effort.of(30, 1500));
     let period = Duration::from_secs_f64(1.0 / rate);
     for (count, goal) in [(1, 200.0), (2, 200.0), (8, 300.0)] {
         let (mut p50, mut p99) = (Vec::new(), Vec::new());
         for _ in 0..effort.of(1, 5) {
-            let beat = Arc::new(Beat::default());
+            let beat = Arc::new(Heartbeat::default());
             let arms: Result<Vec<Arm>, String> =
                 (0..count).map(|_| arm("xarm", 7, period, &beat, 2 * periods as usize)).collect();
             let mut arms = arms?;
@@ -88,12 +89,12 @@ fn commands(effort: Effort) -> Result<(), String> {
     Ok(())
 }
 
-/// From a report's first byte on its way to its state in the slot.
+/// Measures from a report's first byte on its way to its state in the slot.
 fn states(effort: Effort) -> Result<(), String> {
     let (period, periods) = (Duration::from_millis(10), effort.of(30, 1500));
     let (mut p50, mut p99) = (Vec::new(), Vec::new());
     for _ in 0..effort.of(1, 5) {
-        let beat = Arc::new(Beat::default());
+        let beat = Arc::new(Heartbeat::default());
         let emulator = registry::emulate("xarm", 7).map_err(|e| e.to_string())?;
         let address = relay::start(&emulator.address())?;
         let adapter = registry::create("xarm", &address, 7).map_err(|e| e.to_string())?;
@@ -111,7 +112,7 @@ fn states(effort: Effort) -> Result<(), String> {
     Ok(())
 }
 
-/// Set points at the arm's own rate for a minute: what became of each.
+/// Sends setpoints at the arm's own rate for a minute, and accounts for each.
 fn streams(effort: Effort) -> Result<(), String> {
     let seconds: u64 = effort.of(1, 60);
     stream("xArm 6 at 250 Hz", 250, seconds, |period, beat, room| {
@@ -122,7 +123,7 @@ fn streams(effort: Effort) -> Result<(), String> {
         let address = dimos::hardware::registry::Emulator::address(&*emulator);
         let adapter = registry::create("xarm", &address, 6).map_err(|e| e.to_string())?;
         let arm = Arm::new(adapter, Box::new(emulator.clone()), period, beat, room)?;
-        let points = move || emulator.trace().iter().filter(|request| request.register == SET_POINT).count() as u64;
+        let points = move || emulator.trace().iter().filter(|request| request.register == SETPOINT).count() as u64;
         Ok((arm, Box::new(points)))
     })?;
     stream("Piper at 200 Hz", 200, seconds, |period, beat, room| {
@@ -134,7 +135,7 @@ fn streams(effort: Effort) -> Result<(), String> {
         let address = dimos::hardware::registry::Emulator::address(&*emulator);
         let adapter = registry::create("piper", &address, 6).map_err(|e| e.to_string())?;
         let arm = Arm::new(adapter, Box::new(emulator.clone()), period, beat, room)?;
-        // A set point is complete with its last frame.
+        // A setpoint is complete with its last frame.
         let points = move || emulator.trace().iter().filter(|(_, frame)| frame.id == 0x157).count() as u64;
         Ok((arm, Box::new(points)))
     })?;
@@ -147,10 +148,10 @@ fn stream(
     title: &str,
     rate: u32,
     seconds: u64,
-    make: impl Fn(Duration, &Arc<Beat>, usize) -> Result<Counted, String>,
+    make: impl Fn(Duration, &Arc<Heartbeat>, usize) -> Result<Counted, String>,
 ) -> Result<(), String> {
     let (period, periods) = (Duration::from_secs(1) / rate, seconds * u64::from(rate));
-    let beat = Arc::new(Beat::default());
+    let beat = Arc::new(Heartbeat::default());
     let (arm, points) = make(period, &beat, 2 * periods as usize)?;
     let mut arms = [arm];
     let before = points();
@@ -163,7 +164,7 @@ fn stream(
         &format!("servo stream, {title}, {seconds} s: {periods} periods"),
         &[
             Measure::new("delivered to the emulator", "%", vec![percent]).goal(Goal::AtLeast(99.5)),
-            Measure::new("skipped: the machine stood still", "periods", vec![counted.skipped as f64]),
+            Measure::new("skipped: the machine was stalled", "periods", vec![counted.skipped as f64]),
             Measure::new("overwritten before they were taken", "periods", vec![counted.overwritten as f64]),
             Measure::new("unaccounted", "periods", vec![unaccounted as f64]).goal(Goal::AtMost(0.0)),
             Measure::new("latest wake-up", "µs", vec![counted.latest]),

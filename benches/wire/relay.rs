@@ -1,4 +1,4 @@
-//! A relay between an xArm's emulator and its adapter, which writes the moment at which it passes a report on into the
+//! A relay between an xArm's emulator and its adapter, which writes the time at which it forwards a report into the
 //! report's first joint.
 
 use std::io::{Read, Write};
@@ -10,25 +10,25 @@ use dimos::rt::host;
 
 use crate::timed::moment;
 
-/// Length of a report of port 30000, and where its first joint is measured to be (a float, little-endian).
+/// Length of a report of port 30000, and the offset of its first measured joint (a float, little-endian).
 const FULL: usize = 804;
 const FIRST_JOINT: usize = 116;
-/// Reports ports of a controller.
+/// Report ports of a controller.
 const PORTS: u16 = 4;
 
-/// Passes on the reports of the emulator at `address`; answers the address at which an adapter finds both.
+/// Forwards the reports of the emulator at `address`; returns the address at which an adapter finds both.
 pub fn start(address: &str) -> Result<String, String> {
     let theirs = Address::parse(address)?;
     let (first, listeners) = adjacent().ok_or("no four free ports side by side")?;
     for (offset, listener) in (0..).zip(listeners) {
         let upstream = theirs.report(offset).to_string();
         std::thread::spawn(move || {
-            // One adapter each, and it connects once.
+            // One adapter per port; it connects once.
             if let (Ok((down, _)), Ok(up)) = (listener.accept(), TcpStream::connect(upstream)) {
                 let _ = down.set_nodelay(true);
                 let _ = up.set_read_timeout(Some(Duration::from_secs(2)));
                 host::enter_realtime(host::EMULATOR_PRIORITY);
-                pass_on(up, down, offset == 0);
+                forward(up, down, offset == 0);
             }
         });
     }
@@ -45,7 +45,7 @@ fn adjacent() -> Option<(u16, Vec<TcpListener>)> {
     })
 }
 
-fn pass_on(mut up: TcpStream, mut down: TcpStream, stamped: bool) {
+fn forward(mut up: TcpStream, mut down: TcpStream, stamped: bool) {
     let mut packet = [0; FULL];
     loop {
         let read = if stamped { up.read_exact(&mut packet).map(|()| FULL) } else { up.read(&mut packet) };

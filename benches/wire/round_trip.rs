@@ -1,4 +1,4 @@
-//! The round trip of `adapter_type: remote`: a command to a peer, and the state measured after it.
+//! Round trip of `adapter_type: remote`: a command to a peer, and the state measured after it.
 
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
@@ -17,10 +17,10 @@ use crate::support::measure::{Goal, Measure, print, quantile};
 
 /// Joints of the arm behind the peer.
 const DOF: usize = 6;
-/// Longest wait for anything.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Timeout of all waits.
+const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// An adapter that does nothing, in the form of the guide's skeleton: what remains is the way there and back.
+/// An adapter without work, in the form of the guide's skeleton: only the round trip remains.
 const IDLE_ARM: &str = "\
 class IdleArm:
     def __init__(self, address, dof=6): self.q, self.on, self.mode = [0.0] * dof, False, None
@@ -66,7 +66,7 @@ pub fn measure(effort: Effort) -> Result<(), String> {
     Ok(())
 }
 
-/// A shim that serves the idle arm. Ends when it is dropped.
+/// A shim that serves the idle arm. Ends when dropped.
 struct Shim {
     process: Child,
     address: String,
@@ -82,10 +82,10 @@ impl Shim {
         command.arg(shim).args(["idle:IdleArm", "--address", "none", "--at", &address, "--hz", "1000"]);
         command.current_dir(&folder).env("PYTHONPATH", &folder).stdout(Stdio::null()).stderr(Stdio::null());
         let shim = Self { process: command.spawn().map_err(|e| format!("SKIPPED: python3: {e}"))?, address };
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + TIMEOUT;
         while !socket.exists() {
             if Instant::now() > end {
-                return Err("the shim does not come up".into());
+                return Err("the shim did not start in time".into());
             }
             std::thread::sleep(Duration::from_millis(10));
         }
@@ -100,7 +100,7 @@ impl Drop for Shim {
     }
 }
 
-/// p50 and p99 [µs] of several series.
+/// Returns p50 and p99 [µs] of several series.
 fn repeats(effort: Effort, address: &str) -> Result<(Vec<f64>, Vec<f64>), String> {
     let (mut p50, mut p99) = (Vec::new(), Vec::new());
     for _ in 0..effort.of(1, 5) {
@@ -113,7 +113,7 @@ fn repeats(effort: Effort, address: &str) -> Result<(Vec<f64>, Vec<f64>), String
     Ok((p50, p99))
 }
 
-/// Commands at 100 Hz, and how long it took until the state after each was read [µs].
+/// Sends commands at 100 Hz and returns the times until the state after each was read [µs].
 fn series(address: &str, cycles: usize) -> AdapterResult<Vec<f64>> {
     let mut arm = registry::create("remote", address, DOF)?;
     arm.connect()?;
@@ -128,9 +128,9 @@ fn series(address: &str, cycles: usize) -> AdapterResult<Vec<f64>> {
     for _ in 0..cycles {
         let (before, began) = (reading.stamp, Instant::now());
         arm.write_joint_positions(hold.get(..DOF).unwrap_or_default(), 1.0)?;
-        while reading.stamp == before && began.elapsed() < PATIENCE {
+        while reading.stamp == before && began.elapsed() < TIMEOUT {
             if let Some(fd) = arm.state_fd() {
-                wake.wait_or_readable(fd, PATIENCE);
+                wake.wait_or_readable(fd, TIMEOUT);
             }
             arm.read_joints(&mut reading)?;
         }

@@ -1,4 +1,4 @@
-//! An adapter that does what another one does, and notes when its commands were on the wire and its states taken up.
+//! An adapter that wraps another one and records when commands were written and states were read.
 
 use std::os::fd::BorrowedFd;
 use std::sync::{Arc, Mutex};
@@ -8,27 +8,27 @@ use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::spec::{AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use dimos::joint::{ControlMode, JointLimits};
 
-/// A moment as a joint position: microseconds of the present second, a nanoradian each.
+/// Returns a time stamp as a joint position: microseconds of the current second, a nanoradian each.
 pub fn moment() -> f64 {
     (MonotonicClock.now().0 / 1_000 % 1_000_000) as f64 * 1e-9
 }
 
-/// Time since a [`moment`] [µs].
+/// Returns the time since a [`moment`] [µs].
 pub fn since(moment: f64) -> f64 {
     let then = (moment * 1e9).round();
     let now = (MonotonicClock.now().0 / 1_000 % 1_000_000) as f64;
     (now - then).rem_euclid(1e6)
 }
 
-/// Delays [µs]; room is kept for all, so that noting them allocates nothing.
+/// Delays [µs]; reserved in advance, so that recording does not allocate.
 pub type Delays = Arc<Mutex<Vec<f64>>>;
 
 /// The wrapped adapter.
 pub struct Timed {
     pub inner: Box<dyn ManipulatorAdapter>,
-    /// From the moment in a command's first joint until it was written.
+    /// From the time stamp in a command's first joint until it was written.
     pub sent: Delays,
-    /// From the moment in a state's first joint (a microradian each, as a report has it) until it was read.
+    /// From the time stamp in a state's first joint (a microradian each, as in a report) until it was read.
     pub arrived: Delays,
 }
 

@@ -1,4 +1,4 @@
-//! Why an asset is not there.
+//! Errors of assets.
 
 use std::fmt;
 use std::io;
@@ -6,12 +6,12 @@ use std::path::Path;
 
 use super::Asset;
 
-/// Why an asset is not there: what happened, where, and what to do about it.
+/// Why an asset is unavailable: what happened, where, and what to do.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AssetError {
-    /// What happened, in a sentence without full stop.
+    /// What happened: a sentence without full stop.
     pub what: String,
-    /// What to do about it.
+    /// What the user can do about it.
     pub hint: Option<String>,
 }
 
@@ -33,24 +33,24 @@ impl AssetError {
         self
     }
 
-    /// The file system refused.
+    /// Creates the error of a file system operation.
     pub(super) fn io(path: &Path, error: &io::Error) -> Self {
         let error = Self::new(format!("{}: {error}", path.display()));
-        error.hint("assets are kept in $XDG_CACHE_HOME/dimos/assets, which needs room and must be writable")
+        error.hint("assets are kept in $XDG_CACHE_HOME/dimos/assets, which needs free space and must be writable")
     }
 
-    /// The address gave another file.
+    /// Creates the error of a file with another checksum.
     pub(super) fn other_file(url: &str, wanted: &str, found: &str) -> Self {
-        let error = Self::new(format!("{url} is another file: its SHA-256 is {found}, and should be {wanted}"));
-        error.hint("if this is the file that you mean, put its check sum into the blueprint; nothing of it was kept")
+        let error = Self::new(format!("{url}: the SHA-256 of the file is {found}, expected {wanted}"));
+        error.hint("if this is the intended file, update the checksum in the blueprint; the download was discarded")
     }
 
-    /// An archive holds what is not unpacked.
+    /// Creates the error of an unsafe archive entry.
     pub(super) fn entry(name: &str, what: &str) -> Self {
-        Self::new(format!("its archive is refused: {name:?} {what}")).hint("nothing of it was kept")
+        Self::new(format!("the archive is rejected: {name:?} {what}")).hint("the download was discarded")
     }
 
-    /// The same, of this asset.
+    /// Adds the asset's name and position.
     pub(super) fn of(mut self, asset: &Asset) -> Self {
         let place = if asset.place.is_empty() { String::new() } else { format!("{}: ", asset.place) };
         self.what = format!("{place}the asset `{}`: {}", asset.name, self.what);

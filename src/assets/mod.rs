@@ -1,12 +1,12 @@
-//! Files that a blueprint names by an address and a check sum: fetched on first use, kept in the user's cache.
+//! Assets: files that a blueprint refers to by address and checksum, downloaded on first use and cached for the user.
 //!
 //! ```text
-//!  url ─▶ download ─▶ <sha256>.part ─▶ check sum ─▶ unpack ─▶ <sha256>.new/ ─rename─▶ <sha256>/
+//!  url ─▶ download ─▶ <sha256>.part ─▶ checksum ─▶ unpack ─▶ <sha256>.new/ ─rename─▶ <sha256>/
 //! ```
 //!
-//! The folder of an asset is there whole or not at all, and what is in it is what the check sum says: where it came
-//! from does not matter, and two blueprints share it. A download that breaks goes on where it was; only one process at
-//! a time fetches an asset. Nothing that is fetched may lie outside its folder or lead out of it.
+//! The folder of an asset is complete or absent, and its contents match the checksum: its origin does not matter, and
+//! two blueprints share it. Interrupted downloads resume; only one process at a time downloads an asset. Nothing can be
+//! unpacked outside the asset's folder.
 
 mod download;
 mod error;
@@ -26,88 +26,88 @@ use sha2::{Digest, Sha256};
 
 pub use error::AssetError;
 
-/// What a path into an asset begins with: `asset:NAME/path/inside`.
+/// Prefix of a path into an asset: `asset:NAME/path/inside`.
 pub const PREFIX: &str = "asset:";
-/// Another process may take so long to fetch the same asset.
-const LONGEST_FETCH: Duration = Duration::from_secs(3600);
-/// How often is looked whether it is done.
-const LOOK: Duration = Duration::from_millis(100);
+/// Maximum wait for another process that downloads the same asset.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(3600);
+/// Poll period of that wait.
+const POLL_PERIOD: Duration = Duration::from_millis(100);
 
-/// A file to fetch.
+/// A file to download.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Asset {
-    /// Its name in the blueprint.
+    /// Name in the blueprint.
     pub name: String,
-    /// Where it is: `https://`, `http://` or `file:///`.
+    /// Address: `https://`, `http://` or `file:///`.
     pub url: String,
     /// SHA-256 of the file, 64 hexadecimal digits.
     pub sha256: String,
-    /// Where the blueprint says so: `cell.yaml:12:3`.
+    /// Position in the blueprint: `cell.yaml:12:3`.
     pub place: String,
 }
 
-/// Who is told how a download goes.
+/// Receives the progress of a download.
 pub trait Progress {
-    /// So many bytes are there, of so many where that is known.
+    /// Bytes received, and the total if the server sent one.
     fn at(&mut self, bytes: u64, of: Option<u64>);
-    /// Something to know, in words.
+    /// A message for the user.
     fn note(&mut self, text: &str);
 }
 
-/// Tells nobody.
+/// Ignores progress.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Quiet;
+pub struct NoProgress;
 
-impl Progress for Quiet {
+impl Progress for NoProgress {
     fn at(&mut self, _: u64, _: Option<u64>) {}
     fn note(&mut self, _: &str) {}
 }
 
-/// The name and the path inside, where a path is one into an asset. `asset:NAME` alone is its folder.
+/// Splits a path into an asset into name and inner path. `asset:NAME` alone is its folder.
 pub fn split(path: &str) -> Option<(&str, &str)> {
     let rest = path.strip_prefix(PREFIX)?;
     Some(rest.split_once('/').unwrap_or((rest, "")))
 }
 
-/// The folder where assets are kept.
+/// The folder of cached assets.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Cache(PathBuf);
 
 impl Cache {
-    /// `$XDG_CACHE_HOME/dimos/assets`, or `~/.cache/dimos/assets`.
+    /// Returns the default cache: `$XDG_CACHE_HOME/dimos/assets` or `~/.cache/dimos/assets`.
     pub fn standard() -> Self {
         let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
         let caches = absolute("XDG_CACHE_HOME").or_else(|| absolute("HOME").map(|home| home.join(".cache")));
         Self(caches.unwrap_or_else(std::env::temp_dir).join("dimos/assets"))
     }
 
-    /// A folder of one's own.
+    /// Returns a cache in another folder.
     pub fn at(path: impl Into<PathBuf>) -> Self {
         Self(path.into())
     }
 
-    /// Where an asset is, once it is fetched.
+    /// Returns the folder of an asset once it is cached.
     pub fn folder(&self, sha256: &str) -> PathBuf {
         self.file(sha256, "")
     }
 
-    /// Whether an asset is there.
+    /// Returns whether an asset is cached.
     pub fn has(&self, sha256: &str) -> bool {
         self.folder(sha256).is_dir()
     }
 
-    /// Whether a path leads into the folder of an asset that is not there.
+    /// Returns whether a path is inside the folder of an asset that is not cached.
     pub fn awaits(&self, path: &Path) -> bool {
         let inside = path.strip_prefix(&self.0).ok().and_then(|rest| rest.components().next());
         inside.is_some_and(|folder| !self.0.join(folder).is_dir())
     }
 
-    /// How much of an asset has come in a download that is not done [bytes].
+    /// Returns the size of an unfinished download [bytes].
     pub fn part(&self, sha256: &str) -> Option<u64> {
         fs::metadata(self.file(sha256, ".part")).ok().map(|part| part.len())
     }
 
-    /// How much room an asset takes [bytes].
+    /// Returns the size of a cached asset [bytes].
     pub fn size(&self, sha256: &str) -> u64 {
         size_of(&self.folder(sha256))
     }
@@ -116,8 +116,8 @@ impl Cache {
         self.0.join(format!("{}{ending}", sha256.to_ascii_lowercase()))
     }
 
-    /// The folder of an asset, fetched if it is not there. Fails when it cannot be reached, is not what its check sum
-    /// says, or cannot be unpacked; what has come is kept, and the next try goes on from there.
+    /// Returns the folder of an asset, downloading it if necessary. Fails if it is unreachable, its checksum differs,
+    /// or it cannot be unpacked; a partial download is kept, and the next attempt resumes it.
     pub fn fetch(&self, asset: &Asset, progress: &mut dyn Progress) -> Result<PathBuf, AssetError> {
         let failed = |error: AssetError| error.of(asset);
         self.fetch_now(asset, progress).map_err(failed)
@@ -126,7 +126,7 @@ impl Cache {
     fn fetch_now(&self, asset: &Asset, progress: &mut dyn Progress) -> Result<PathBuf, AssetError> {
         let (folder, sum) = (self.folder(&asset.sha256), asset.sha256.to_ascii_lowercase());
         if sum.len() != 64 || !sum.bytes().all(|b| b.is_ascii_hexdigit()) {
-            return Err(AssetError::new("its SHA-256 has not 64 hexadecimal digits"));
+            return Err(AssetError::new("the SHA-256 does not have 64 hexadecimal digits"));
         }
         if folder.is_dir() {
             return Ok(folder);
@@ -143,8 +143,8 @@ impl Cache {
         if found != sum {
             fs::remove_file(&part).map_err(|e| AssetError::io(&part, &e))?;
             if resumed {
-                // The address may give another file than it did when this download began.
-                progress.note("what was left of an earlier download did not fit: it is fetched anew");
+                // The address may now return another file than when the download began.
+                progress.note("an earlier partial download does not match: downloading from scratch");
                 download::download(&asset.url, &part, progress)?;
             }
             if !resumed || sum_of(&part)? != sum {
@@ -165,20 +165,20 @@ impl Cache {
         Ok(folder)
     }
 
-    /// Removes an asset, and what there is of a download; whether there was anything. A process that fetches it just
-    /// now is waited for.
+    /// Removes an asset and its partial download; returns whether there was anything. Waits for a process that is
+    /// downloading it.
     pub fn remove(&self, asset: &Asset) -> Result<bool, AssetError> {
         let failed = |error: AssetError| error.of(asset);
         let (folder, part) = (self.folder(&asset.sha256), self.file(&asset.sha256, ".part"));
         if !folder.exists() && !part.exists() {
             return Ok(false);
         }
-        let _lock = self.lock(&asset.sha256, &mut Quiet).map_err(failed)?;
+        let _lock = self.lock(&asset.sha256, &mut NoProgress).map_err(failed)?;
         let gone = |path: &Path, result: io::Result<()>| match result {
             Err(e) if e.kind() != io::ErrorKind::NotFound => Err(AssetError::io(path, &e)),
             _ => Ok(()),
         };
-        // Never seen half removed: first out of its place.
+        // Rename first, so that it is never visible half removed.
         let old = self.file(&asset.sha256, ".new");
         let _ = fs::remove_dir_all(&old);
         gone(&folder, fs::rename(&folder, &old)).map_err(failed)?;
@@ -187,24 +187,24 @@ impl Cache {
         Ok(true)
     }
 
-    /// Keeps other processes from the same asset for as long as the file is open.
+    /// Locks an asset against other processes while the file is open.
     fn lock(&self, sha256: &str, progress: &mut dyn Progress) -> Result<File, AssetError> {
         let path = self.file(sha256, ".lock");
         let failed = |e: io::Error| AssetError::io(&path, &e);
-        // Never removed, so that all lock the same file.
+        // Never removed, so that all processes lock the same file.
         let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
-        let (file, began, mut told) = (open.map_err(failed)?, Instant::now(), false);
+        let (file, began, mut noted) = (open.map_err(failed)?, Instant::now(), false);
         loop {
             match file.try_lock() {
                 Ok(()) => return Ok(file),
-                Err(TryLockError::WouldBlock) if began.elapsed() < LONGEST_FETCH => {
-                    if !std::mem::replace(&mut told, true) {
-                        progress.note("another process fetches it: waiting");
+                Err(TryLockError::WouldBlock) if began.elapsed() < LOCK_TIMEOUT => {
+                    if !std::mem::replace(&mut noted, true) {
+                        progress.note("another process is downloading it: waiting");
                     }
-                    std::thread::sleep(LOOK);
+                    std::thread::sleep(POLL_PERIOD);
                 }
                 Err(TryLockError::WouldBlock) => {
-                    return Err(AssetError::new("another process has been fetching it for an hour"));
+                    return Err(AssetError::new("another process has been downloading it for an hour"));
                 }
                 Err(TryLockError::Error(e)) => return Err(failed(e)),
             }
@@ -237,7 +237,7 @@ fn size_of(folder: &Path) -> u64 {
         .sum()
 }
 
-/// What a plain file is called: the last part of its address.
+/// Returns the name of a plain file: the last part of its address.
 fn file_name(url: &str) -> String {
     let path = url.split(['?', '#']).next().unwrap_or_default();
     let last = path.rsplit('/').next().unwrap_or_default();
@@ -248,7 +248,7 @@ fn file_name(url: &str) -> String {
     }
 }
 
-/// An address's path with its `%20` resolved.
+/// Decodes `%20` in an address's path.
 fn percent_decoded(text: &str) -> String {
     percent_decode_str(text).decode_utf8().map_or_else(|_| text.to_owned(), Into::into)
 }

@@ -9,14 +9,14 @@ mod file_server;
 
 use file_server::{FileServer, Misdeed};
 
-/// Remembers what it was told.
+/// Records its progress and messages.
 #[derive(Default)]
-struct Told {
+struct ProgressLog {
     notes: Vec<String>,
     most: u64,
 }
 
-impl Progress for Told {
+impl Progress for ProgressLog {
     fn at(&mut self, bytes: u64, _: Option<u64>) {
         self.most = self.most.max(bytes);
     }
@@ -34,7 +34,7 @@ fn asset(url: &str, bytes: &[u8]) -> Asset {
     Asset { name: "arm".into(), url: url.into(), sha256: sum(bytes), place: "cell.yaml:3:5".into() }
 }
 
-/// Bytes that no compressor makes small.
+/// Incompressible bytes.
 fn noise(count: usize) -> Vec<u8> {
     let mut state = 1_u64;
     let mut next = || {
@@ -44,7 +44,7 @@ fn noise(count: usize) -> Vec<u8> {
     (0..count).map(|_| next()).collect()
 }
 
-/// A tar.gz of these entries: name, type, what is in it or where it leads.
+/// Returns a tar.gz of these entries: name, type, content or link target.
 fn tar_gz(entries: &[(&str, tar::EntryType, &str)]) -> Vec<u8> {
     let mut archive = tar::Builder::new(flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast()));
     for (name, kind, content) in entries {
@@ -56,7 +56,7 @@ fn tar_gz(entries: &[(&str, tar::EntryType, &str)]) -> Vec<u8> {
         if kind.is_symlink() || kind.is_hard_link() {
             header.set_link_name(content).unwrap();
         }
-        // The crate refuses to write some of the names that it must refuse to read.
+        // The crate refuses to write some of the names that it must reject when reading.
         let raw = &mut header.as_old_mut().name;
         raw[..name.len()].copy_from_slice(name.as_bytes());
         header.set_cksum();
@@ -96,26 +96,26 @@ fn names(folder: &Path) -> Vec<String> {
 const FILE: tar::EntryType = tar::EntryType::Regular;
 
 #[test]
-fn archives_are_unpacked_and_plain_files_are_put_there() {
+fn archives_are_unpacked_and_plain_files_are_copied() {
     let (folder, cache) = cache();
     let tar = tar_gz(&[("arm/", tar::EntryType::Directory, ""), ("./arm/arm.urdf", FILE, "<robot/>")]);
     let zip = zip_of(&[("arm/arm.urdf", "<robot/>"), ("arm-1.0.dist-info/RECORD", "")]);
     for (name, bytes) in [("a.tar.gz", tar), ("no ending", zip.clone()), ("arm-1.0-py3-none-any.whl", zip)] {
         let asset = asset(&put(folder.path(), name, &bytes).replace(' ', "%20"), &bytes);
-        let mut told = Told::default();
-        let at = cache.fetch(&asset, &mut told).unwrap();
-        assert_eq!(told.most, bytes.len() as u64, "{name}");
+        let mut log = ProgressLog::default();
+        let at = cache.fetch(&asset, &mut log).unwrap();
+        assert_eq!(log.most, bytes.len() as u64, "{name}");
         assert_eq!(fs::read_to_string(at.join("arm/arm.urdf")).unwrap(), "<robot/>", "{name}");
         assert!(cache.has(&asset.sha256.to_uppercase()) && cache.size(&asset.sha256) == 8, "{name}");
         assert_eq!(cache.remove(&asset), Ok(true));
         assert_eq!((cache.has(&asset.sha256), cache.remove(&asset)), (false, Ok(false)));
     }
-    // A compressed file that is no archive stays as it is.
+    // A compressed file that is not an archive is kept unchanged.
     let mut gz = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     gz.write_all(b"solid").unwrap();
     for (name, bytes) in [("hand.stl", b"solid".to_vec()), ("hand.stl.gz", gz.finish().unwrap())] {
         let asset = asset(&put(folder.path(), name, &bytes), &bytes);
-        let at = cache.fetch(&asset, &mut Quiet).unwrap();
+        let at = cache.fetch(&asset, &mut NoProgress).unwrap();
         assert_eq!((names(&at), fs::read(at.join(name)).unwrap()), (vec![name.to_owned()], bytes));
     }
     let left = names(&cache.0);
@@ -123,32 +123,32 @@ fn archives_are_unpacked_and_plain_files_are_put_there() {
 }
 
 #[test]
-fn what_is_there_is_not_fetched_again() {
+fn a_cached_asset_is_not_downloaded_again() {
     let (_folder, cache) = cache();
     let server = FileServer::new(b"<robot/>".to_vec(), &[]);
     let asset = asset(&server.url("a%20b.urdf?raw=1"), b"<robot/>");
     for _ in 0..3 {
-        assert!(cache.fetch(&asset, &mut Quiet).unwrap().join("a b.urdf").is_file());
+        assert!(cache.fetch(&asset, &mut NoProgress).unwrap().join("a b.urdf").is_file());
     }
     assert_eq!(server.ranges().len(), 1);
 }
 
 #[test]
-fn a_download_that_breaks_goes_on_where_it_was() {
+fn an_interrupted_download_resumes() {
     let (_folder, cache) = cache();
     let file = noise(300_000);
     let misdeeds = [Misdeed::Cut(100_000), Misdeed::Status(503), Misdeed::Cut(50_000)];
     let server = FileServer::new(file.clone(), &misdeeds);
     let asset = asset(&server.url("arm.bin"), &file);
-    let mut told = Told::default();
-    let at = cache.fetch(&asset, &mut told).unwrap();
+    let mut log = ProgressLog::default();
+    let at = cache.fetch(&asset, &mut log).unwrap();
     assert_eq!(fs::read(at.join("arm.bin")).unwrap(), file);
     assert_eq!(server.ranges(), ["", "bytes=100000-", "bytes=100000-", "bytes=150000-"]);
-    assert!(told.notes[0].contains("broke"), "{:?}", told.notes);
+    assert!(log.notes[0].contains("broke"), "{:?}", log.notes);
 }
 
 #[test]
-fn what_an_earlier_process_left_is_used_and_checked() {
+fn a_partial_download_of_an_earlier_process_is_used_and_checked() {
     let (_folder, cache) = cache();
     let file = noise(10_000);
     let fetch = |left: &[u8], misdeeds: &[Misdeed]| {
@@ -157,62 +157,62 @@ fn what_an_earlier_process_left_is_used_and_checked() {
         fs::create_dir_all(&cache.0).unwrap();
         fs::write(cache.file(&asset.sha256, ".part"), left).unwrap();
         assert_eq!(cache.part(&asset.sha256), Some(left.len() as u64));
-        let at = cache.fetch(&asset, &mut Quiet).unwrap();
+        let at = cache.fetch(&asset, &mut NoProgress).unwrap();
         assert_eq!(fs::read(at.join("arm.bin")).unwrap(), file);
         cache.remove(&asset).unwrap();
         server.ranges()
     };
     assert_eq!(fetch(&file[..4_000], &[]), ["bytes=4000-"]);
-    assert_eq!(fetch(&file, &[]), ["bytes=10000-"], "all was there");
-    assert_eq!(fetch(&file[..4_000], &[Misdeed::NoRanges]), ["bytes=4000-"], "begun anew by the server");
+    assert_eq!(fetch(&file, &[]), ["bytes=10000-"], "complete file");
+    assert_eq!(fetch(&file[..4_000], &[Misdeed::NoRanges]), ["bytes=4000-"], "restarted by the server");
     assert_eq!(fetch(&file[..4_000], &[Misdeed::WrongRange]), ["bytes=4000-", ""]);
     assert_eq!(fetch(&[7; 4_000], &[]), ["bytes=4000-", ""], "another file's beginning");
     assert_eq!(fetch(&[7; 20_000], &[]), ["bytes=20000-", ""], "another, longer file");
 }
 
 #[test]
-fn another_file_is_refused_and_nothing_of_it_is_kept() {
+fn a_file_with_another_checksum_is_rejected_and_discarded() {
     let (folder, cache) = cache();
     let mut asset = asset(&put(folder.path(), "arm.urdf", b"<robot/>"), b"another");
-    let error = cache.fetch(&asset, &mut Quiet).unwrap_err();
+    let error = cache.fetch(&asset, &mut NoProgress).unwrap_err();
     assert!(error.what.starts_with("cell.yaml:3:5: the asset `arm`: file://"), "{error}");
     assert!(error.what.contains(&sum(b"<robot/>")) && error.what.contains(&sum(b"another")), "{error}");
     assert!(!cache.has(&asset.sha256) && cache.part(&asset.sha256).is_none());
     asset.sha256 = "../../../etc".into();
-    assert!(cache.fetch(&asset, &mut Quiet).unwrap_err().what.contains("64 hexadecimal digits"));
+    assert!(cache.fetch(&asset, &mut NoProgress).unwrap_err().what.contains("64 hexadecimal digits"));
 }
 
 #[test]
-fn a_server_that_cannot_be_reached_or_has_no_file_is_said() {
+fn an_unreachable_server_or_a_missing_file_is_reported() {
     let (folder, cache) = cache();
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-    let error = cache.fetch(&asset(&format!("http://{nobody}/a.zip"), b""), &mut Quiet).unwrap_err();
+    let error = cache.fetch(&asset(&format!("http://{nobody}/a.zip"), b""), &mut NoProgress).unwrap_err();
     assert!(error.what.contains(&nobody.to_string()), "{error}");
     assert!(error.hint.unwrap().contains("dimos model assets fetch"));
 
     let server = FileServer::new(Vec::new(), &[Misdeed::Status(404)]);
-    let error = cache.fetch(&asset(&server.url("a.zip"), b""), &mut Quiet).unwrap_err();
+    let error = cache.fetch(&asset(&server.url("a.zip"), b""), &mut NoProgress).unwrap_err();
     assert!(error.what.contains("404"), "{error}");
-    assert_eq!(server.ranges().len(), 1, "no use to try again");
+    assert_eq!(server.ranges().len(), 1, "permanent error");
 
     let server =
         FileServer::new(noise(9_000), &[Misdeed::Cut(5_000), Misdeed::Cut(0), Misdeed::Cut(0), Misdeed::Cut(0)]);
     let broken = asset(&server.url("a.zip"), &noise(9_000));
-    let error = cache.fetch(&broken, &mut Quiet).unwrap_err();
+    let error = cache.fetch(&broken, &mut NoProgress).unwrap_err();
     assert!(error.what.contains("5000 bytes are kept"), "{error}");
-    assert!(cache.fetch(&broken, &mut Quiet).is_ok(), "the next try goes on");
+    assert!(cache.fetch(&broken, &mut NoProgress).is_ok(), "the next attempt resumes");
     assert_eq!(server.ranges().last().unwrap(), "bytes=5000-");
 
     for (url, what) in
-        [(format!("file://{}", folder.path().display()), "is no file"), ("file:///nowhere/a".into(), "No such file")]
+        [(format!("file://{}", folder.path().display()), "is not a file"), ("file:///nowhere/a".into(), "No such file")]
     {
-        let error = cache.fetch(&asset(&url, b""), &mut Quiet).unwrap_err();
+        let error = cache.fetch(&asset(&url, b""), &mut NoProgress).unwrap_err();
         assert!(error.what.contains(what), "{error}");
     }
 }
 
 #[test]
-fn archives_that_lead_out_of_their_folder_or_hold_links_are_refused() {
+fn archives_with_links_or_paths_outside_their_folder_are_rejected() {
     let (folder, cache) = cache();
     let link = tar::EntryType::Symlink;
     let long = "d/".repeat(49) + "f";
@@ -230,7 +230,7 @@ fn archives_that_lead_out_of_their_folder_or_hold_links_are_refused() {
         ("damaged", tar_gz(&[(&long, FILE, &"1".repeat(600_000))])[..900].to_vec()),
     ] {
         let asset = asset(&put(folder.path(), "evil.bin", &bytes), &bytes);
-        let error = cache.fetch(&asset, &mut Quiet).unwrap_err();
+        let error = cache.fetch(&asset, &mut NoProgress).unwrap_err();
         assert!(
             error.what.contains(what) || what == "damaged" && error.what.contains("cannot be unpacked"),
             "{what}: {error}"
@@ -243,12 +243,12 @@ fn archives_that_lead_out_of_their_folder_or_hold_links_are_refused() {
     let mut link = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
     link.add_symlink("a", "/etc/passwd", zip::write::SimpleFileOptions::default()).unwrap();
     let bytes = link.finish().unwrap().into_inner();
-    let error = cache.fetch(&asset(&put(folder.path(), "l.zip", &bytes), &bytes), &mut Quiet).unwrap_err();
+    let error = cache.fetch(&asset(&put(folder.path(), "l.zip", &bytes), &bytes), &mut NoProgress).unwrap_err();
     assert!(error.what.contains("is a link"), "{error}");
 }
 
 #[test]
-fn two_who_want_the_same_asset_fetch_it_once() {
+fn two_concurrent_requests_download_an_asset_once() {
     let (_folder, cache) = cache();
     let file = noise(200_000);
     let server = FileServer::new(file.clone(), &[]);
@@ -258,7 +258,7 @@ fn two_who_want_the_same_asset_fetch_it_once() {
         for _ in 0..4 {
             scope.spawn(|| {
                 start.wait();
-                let at = cache.fetch(&asset, &mut Quiet).unwrap();
+                let at = cache.fetch(&asset, &mut NoProgress).unwrap();
                 assert_eq!(fs::read(at.join("arm.bin")).unwrap(), file);
             });
         }

@@ -1,4 +1,4 @@
-//! Arguments that several verbs share, and how values are read.
+//! Arguments shared by several verbs, and parsers of their values.
 
 use std::time::Duration;
 
@@ -8,7 +8,7 @@ use super::exit::Result;
 use crate::rpc::client::{self, Client};
 use crate::rpc::place::{LiveRun, RunFolder};
 
-/// Which run to talk to, and how to print.
+/// Arguments that select a run and the output format.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Args)]
 pub struct Target {
     /// The run to talk to; needed only when several are live
@@ -25,7 +25,7 @@ impl Target {
         Ok(Client::find(&RunFolder::standard(), self.run.as_deref())?)
     }
 
-    /// The run named, or all that live.
+    /// Returns the named run, or all live runs.
     pub fn named_or_all(&self) -> Result<Vec<LiveRun>> {
         let folder = RunFolder::standard();
         Ok(match &self.run {
@@ -35,7 +35,7 @@ impl Target {
     }
 }
 
-/// A finite number.
+/// Parses a finite number.
 pub fn finite(text: &str) -> std::result::Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
@@ -44,30 +44,30 @@ pub fn finite(text: &str) -> std::result::Result<f64, String> {
     }
 }
 
-/// A fraction of the arm's limits.
+/// Parses a fraction of the arm's limits.
 pub fn speed(text: &str) -> std::result::Result<f64, String> {
     let lowest = crate::rpc::api::MIN_SPEED;
     let value = finite(text)?;
     if (lowest..=1.0).contains(&value) { Ok(value) } else { Err(format!("must be within {lowest}–1")) }
 }
 
-/// How often something is done, per second.
+/// Parses a rate per second.
 pub fn rate(text: &str) -> std::result::Result<f64, String> {
     let value = finite(text)?;
     if (0.1..=2000.0).contains(&value) { Ok(value) } else { Err("must be within 0.1–2000 Hz".into()) }
 }
 
-/// A span of time with its unit: `10s`, `500ms`, `1m 30s`.
+/// Parses a duration with its unit: `10s`, `500ms`, `1m 30s`.
 pub fn duration(text: &str) -> std::result::Result<Duration, String> {
     let hint = "give a unit: 10s, 500ms, 2m";
     let span: jiff::SignedDuration = text.parse().map_err(|_| hint.to_owned())?;
     match Duration::try_from(span) {
         Ok(duration) if !duration.is_zero() => Ok(duration),
-        _ => Err("must be longer than nothing".into()),
+        _ => Err("must be greater than zero".into()),
     }
 }
 
-/// `path=value`, as in `--set hardware.arm.address=192.168.1.100`.
+/// Parses `path=value`, as in `--set hardware.arm.address=192.168.1.100`.
 pub fn setting(text: &str) -> std::result::Result<(String, String), String> {
     match text.split_once('=') {
         Some((path, value)) if !path.trim().is_empty() => Ok((path.trim().to_owned(), value.to_owned())),

@@ -1,4 +1,4 @@
-//! `dimos arm enable|disable|reset|gripper ARM`: what an arm is ready for.
+//! `dimos arm enable|disable|reset|gripper ARM`: motors, latch and gripper of an arm.
 
 use clap::Subcommand;
 
@@ -18,23 +18,23 @@ pub struct Args {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// Enable the motors and make the arm ready for motion, where it is
-    Enable(Which),
-    /// Bring the arm to rest and disable the motors; an arm without brakes (`list-adapters`: HOLDS = no) drops unless
-    /// supported
+    /// Enable the motors at the current position and make the arm ready for motion
+    Enable(ArmArgs),
+    /// Decelerate the arm to rest and disable the motors; an arm without brakes (`list-adapters`: HOLDS = no) drops
+    /// unless supported
     Disable {
         #[command(flatten)]
-        which: Which,
-        /// Switch the motors off at once, also while the arm moves
+        which: ArmArgs,
+        /// Disable the motors at once, even while the arm moves
         #[arg(long)]
         now: bool,
     },
     /// Clear a latched hold or a fault; moves nothing, enables nothing
-    Reset(Which),
+    Reset(ArmArgs),
     /// Open or close the gripper
     Gripper {
         #[command(flatten)]
-        which: Which,
+        which: ArmArgs,
         /// Opening [m], or `open`, or `close`
         #[arg(value_name = "OPENING", value_parser = opening, allow_negative_numbers = true)]
         opening: Opening,
@@ -42,19 +42,19 @@ enum Action {
 }
 
 #[derive(Debug, clap::Args)]
-struct Which {
-    /// The arm's hardware_id
+struct ArmArgs {
+    /// Name of the arm (hardware_id)
     arm: String,
     #[command(flatten)]
     target_run: Target,
 }
 
-/// How far a gripper shall open.
+/// Requested opening of a gripper.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Opening {
-    /// So far [m].
+    /// This opening [m].
     Metres(f64),
-    /// As far as it goes.
+    /// Fully open.
     Open,
     /// Closed.
     Close,
@@ -69,7 +69,7 @@ fn opening(text: &str) -> std::result::Result<Opening, String> {
 }
 
 impl Opening {
-    /// In metres: the run knows how far the gripper of its arm goes.
+    /// Returns the opening in metres: the run knows the gripper's range.
     fn of(self, client: &mut Client, arm: &str) -> Result<f64> {
         if let Self::Metres(position) = self {
             return Ok(position);
@@ -79,10 +79,10 @@ impl Opening {
             Some(ArmReport { gripper_range: Some([closed, open]), .. }) => {
                 Ok(if self == Self::Open { open } else { closed })
             }
-            // The run says what is wrong with the name.
+            // The run reports a wrong name.
             None => Ok(0.0),
             Some(_) => {
-                let what = format!("{arm} has no gripper, or does not say how far it goes");
+                let what = format!("{arm} has no gripper, or does not report its range");
                 Err(Failure::new(Exit::Failed, what).hint(format!("give it in metres: dimos arm gripper {arm} 0.04")))
             }
         }
@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> Result {
             output::note(format_args!("{}: {note}", reply.arm));
         }
         if matches!(args.action, Action::Reset(_)) {
-            output::note(format_args!("next, when it may move again: dimos arm enable {}", reply.arm));
+            output::note(format_args!("to make it ready for motion: dimos arm enable {}", reply.arm));
         }
     }
     Ok(Exit::Ok)

@@ -1,5 +1,5 @@
-//! `dimos run` of a planner's blueprint beside a run that owns its arms: the planner attaches to that run and starts no
-//! hardware of its own. Ends by a signal, by its time, or by `dimos down` with its name; the run goes on.
+//! `dimos run` of a planner blueprint while a live run has its arms: the planner attaches to that run and starts no
+//! hardware. Ends by a signal, its duration, or `dimos down` with its name; the run continues.
 
 use std::path::Path;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
@@ -19,62 +19,62 @@ use crate::rpc::place::{Claim, LiveRun, RunFolder};
 use crate::rpc::report::StatusReport;
 use crate::runtime::{AttachedPlanner, Ending, Turn};
 
-/// A planner that is attached to a run, as a process of its own.
+/// A planner attached to a run, in its own process.
 pub struct Attached {
     name: String,
     blueprint: String,
     run: LiveRun,
     planner: AttachedPlanner,
-    /// Its name among the planners; given back when it ends.
+    /// Its name among the planners; released when it ends.
     _claim: Claim,
     ending: (Sender<Ending>, Receiver<Ending>),
 }
 
-/// The run that a blueprint's planner attaches to; none where it starts a run of its own.
+/// Returns the run that a blueprint's planner attaches to; `None` if it starts its own.
 pub fn chosen(args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
     let folder = RunFolder::standard();
     let run = match (&args.attach, &blueprint.planner) {
         (Some(_), None) => {
-            return Err(Failure::usage(format!("{} has no planner that could be attached", blueprint.name))
+            return Err(Failure::usage(format!("{} has no planner to attach", blueprint.name))
                 .hint("`dimos list-blueprints` shows those with planners"));
         }
-        (Some(name), _) => Some(insisted(client::find(&folder, Some(name))?, args, blueprint)?),
+        (Some(name), _) => Some(named_run(client::find(&folder, Some(name))?, args, blueprint)?),
         (None, None) => None,
         (None, Some(_)) if args.standalone => None,
-        (None, Some(_)) => fitting(folder.runs().map_err(ClientError::from)?, args, blueprint)?,
+        (None, Some(_)) => matching_run(folder.runs().map_err(ClientError::from)?, args, blueprint)?,
     };
     if run.is_some() && args.record.is_some() {
-        let failure = Failure::usage("an attached planner writes no log: the run that it attaches to does");
-        return Err(failure.hint("leave --record out, or start a run of its own with --standalone"));
+        let failure = Failure::usage("an attached planner writes no log; its run does");
+        return Err(failure.hint("omit --record, or start a separate run with --standalone"));
     }
     Ok(run)
 }
 
-fn insisted(run: LiveRun, args: &Args, blueprint: &Blueprint) -> Result<LiveRun> {
+fn named_run(run: LiveRun, args: &Args, blueprint: &Blueprint) -> Result<LiveRun> {
     let status = Client::connect(&run.name, &run.socket)?.call(Status {})?;
-    let Unfit { lacks, .. } = unfit(&status, args, blueprint);
-    if lacks.is_empty() {
+    let Mismatch { missing, .. } = mismatch(&status, args, blueprint);
+    if missing.is_empty() {
         return Ok(run);
     }
-    let what = format!("the planner of {} does not fit run {}: {}", blueprint.name, run.name, lacks.join("; "));
+    let what = format!("the planner of {} does not fit run {}: {}", blueprint.name, run.name, missing.join("; "));
     Err(Failure::new(Exit::Failed, what).hint(format!("`dimos status --run {}` shows what the run has", run.name)))
 }
 
-fn fitting(runs: Vec<LiveRun>, args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
+fn matching_run(runs: Vec<LiveRun>, args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
     let mut fit: Vec<(LiveRun, StatusReport)> = Vec::new();
     for run in runs {
-        // A run that does not answer is starting, or ending.
+        // A run that does not answer is starting or shutting down.
         let asked = Client::connect(&run.name, &run.socket).and_then(|mut client| client.call(Status {}));
         let Ok(status) = asked else { continue };
-        let Unfit { lacks, differs } = unfit(&status, args, blueprint);
-        if lacks.is_empty() && differs.is_empty() {
+        let Mismatch { missing, differs } = mismatch(&status, args, blueprint);
+        if missing.is_empty() && differs.is_empty() {
             fit.push((run, status));
         }
     }
     let names: Vec<&str> = fit.iter().map(|(run, _)| run.name.as_str()).collect();
     if fit.len() > 1 {
         return Err(Failure::usage(format!("several runs own the planner's arms: {}", names.join(", ")))
-            .hint("say which with --attach RUN, or start a run of its own with --standalone"));
+            .hint("select one with --attach RUN, or start a separate run with --standalone"));
     }
     let Some((run, status)) = fit.pop() else { return Ok(None) };
     match status.planner.and_then(|planner| planner.attached) {
@@ -82,22 +82,22 @@ fn fitting(runs: Vec<LiveRun>, args: &Args, blueprint: &Blueprint) -> Result<Opt
         Some(other) => {
             let process = other.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
             let what = format!("run {} has a planner already: {}{process}", run.name, other.name);
-            let hint = format!("`dimos down {}` ends that one; --standalone starts a run of its own", other.name);
+            let hint = format!("`dimos down {}` ends it; --standalone starts a separate run", other.name);
             Err(Failure::new(Exit::Failed, what).hint(hint))
         }
     }
 }
 
-/// Why a run is not the one for a planner.
-struct Unfit {
-    /// What it lacks.
-    lacks: Vec<String>,
-    /// What is there, but is something else. Who insists may attach all the same.
+/// Why a run does not match a planner.
+struct Mismatch {
+    /// Missing parts.
+    missing: Vec<String>,
+    /// Parts that differ; --attach accepts these.
     differs: Vec<String>,
 }
 
-fn unfit(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Unfit {
-    let mut unfit = Unfit { lacks: Vec::new(), differs: Vec::new() };
+fn mismatch(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Mismatch {
+    let mut mismatch = Mismatch { missing: Vec::new(), differs: Vec::new() };
     let robots = blueprint.planner.iter().flat_map(|planner| &planner.robots);
     let moved = |arm: &&crate::blueprint::Arm| {
         let joints = robots.clone().flat_map(|robot| &robot.coordinator_joints);
@@ -106,28 +106,28 @@ fn unfit(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Unfit {
     for arm in blueprint.arms.iter().filter(moved) {
         let id = &arm.hardware_id;
         match run.arms.iter().find(|a| a.hardware_id == *id) {
-            None => unfit.lacks.push(format!("it has no arm {id}")),
+            None => mismatch.missing.push(format!("no arm {id}")),
             Some(its) if its.adapter != arm.adapter_type => {
-                unfit.differs.push(format!("its {id} is of the type {}, not {}", its.adapter, arm.adapter_type));
+                mismatch.differs.push(format!("{id} is of type {}, not {}", its.adapter, arm.adapter_type));
             }
-            Some(its) if args.sim && !its.simulated => unfit.differs.push(format!("its {id} is not simulated")),
+            Some(its) if args.sim && !its.simulated => mismatch.differs.push(format!("{id} is not simulated")),
             Some(_) => {}
         }
     }
-    unfit.lacks.extend(robots.clone().filter_map(|robot| lacks_task(run, robot)));
+    mismatch.missing.extend(robots.clone().filter_map(|robot| missing_task(run, robot)));
     if run.planner.as_ref().is_some_and(|planner| planner.attached.is_none()) {
-        unfit.lacks.push("it has a planner of its own".to_owned());
+        mismatch.missing.push("it has its own planner".to_owned());
     }
-    unfit
+    mismatch
 }
 
-fn lacks_task(run: &StatusReport, robot: &RobotConfig) -> Option<String> {
+fn missing_task(run: &StatusReport, robot: &RobotConfig) -> Option<String> {
     let name = robot.task.as_ref()?;
     let Some(task) = run.tasks.iter().find(|task| task.name == *name && task.kind == "trajectory") else {
-        return Some(format!("it has no trajectory task {name}"));
+        return Some(format!("no trajectory task {name}"));
     };
     let missing = robot.coordinator_joints.iter().find(|joint| !task.joints.contains(joint))?;
-    Some(format!("its task {name} does not move {missing}"))
+    Some(format!("task {name} does not move {missing}"))
 }
 
 impl Attached {
@@ -138,13 +138,13 @@ impl Attached {
         let claim = claim.map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
         let config = blueprint.planner.clone().unwrap_or_default();
         let (terminal, json) = (terminal.clone(), args.json);
-        let told = {
+        let on_event = {
             let (name, run) = (name.clone(), run.name.clone());
             move |turn: Turn| {
                 let (event, line, why) = match turn {
                     Turn::Back => ("attached", format!("attached to run {run} again"), None),
                     Turn::Fault(why) => {
-                        let line = format!("planner {name}: FAULT: run {run}: {why}; it tries again until it can");
+                        let line = format!("planner {name}: FAULT: run {run}: {why}; retrying");
                         ("fault", line, Some(why))
                     }
                 };
@@ -154,12 +154,12 @@ impl Attached {
                 }
             }
         };
-        let planner = AttachedPlanner::start(&name, &config, &run.socket, told)
+        let planner = AttachedPlanner::start(&name, &config, &run.socket, on_event)
             .map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
         Ok(Self { name, blueprint: blueprint.name.clone(), run, planner, _claim: claim, ending: channel() })
     }
 
-    /// The planner as those know it who keep records of runs.
+    /// Returns the planner's status for run records.
     pub fn report(&self) -> StatusReport {
         StatusReport {
             run: self.name.clone(),
@@ -170,20 +170,20 @@ impl Attached {
         }
     }
 
-    /// The run that it attached to.
+    /// Returns the run that it is attached to.
     pub fn run(&self) -> &str {
         &self.run.name
     }
 
-    /// Lets other threads end it.
+    /// Returns a sender with which other threads end it.
     pub fn endings(&self) -> Sender<Ending> {
         self.ending.0.clone()
     }
 
-    /// Keeps it up until a signal or its time ends it.
+    /// Serves until a signal or the duration ends it.
     pub fn keep_up(self, terminal: &Terminal, args: &Args, text_log: Option<&Path>) -> Result {
         let record = RunRecord::begin(&self.report(), text_log);
-        self.say_hello(terminal, args.json && text_log.is_none());
+        self.print_banner(terminal, args.json && text_log.is_none());
         let ending = match args.duration {
             Some(limit) => self.ending.1.recv_timeout(limit),
             None => self.ending.1.recv().map_err(|_| RecvTimeoutError::Disconnected),
@@ -197,14 +197,15 @@ impl Attached {
         if args.json && text_log.is_none() {
             terminal.json(&json!({"event": "ended", "planner": self.name, "run": self.run.name, "why": why}));
         } else {
-            terminal.note(format_args!("{why}: planner {} ended; run {} goes on without it", self.name, self.run.name));
+            terminal
+                .note(format_args!("{why}: planner {} ended; run {} continues without it", self.name, self.run.name));
         }
         record.end(exit, why);
         terminal.flush();
         Ok(exit)
     }
 
-    fn say_hello(&self, terminal: &Terminal, json: bool) {
+    fn print_banner(&self, terminal: &Terminal, json: bool) {
         let pid = std::process::id();
         if json {
             let robots: Vec<&str> = self.planner.robots().iter().map(|robot| robot.name.as_str()).collect();
@@ -215,17 +216,17 @@ impl Attached {
         terminal.note(format_args!("planner {}  (pid {pid}, dimos {})", self.name, crate::VERSION));
         terminal.note(format_args!("  attached to run {}", self.run.name));
         for robot in self.planner.robots() {
-            let task = robot.task.as_deref().unwrap_or("whichever task has its joints");
+            let task = robot.task.as_deref().unwrap_or("the task that has its joints");
             terminal.note(format_args!("  robot      {}: {} joints, moved by {task}", robot.name, robot.joints.len()));
         }
-        terminal.note("Ctrl-C ends it; the run goes on. In another terminal: dimos plan");
+        terminal.note("Press Ctrl-C to detach; the run continues. In another terminal: dimos plan");
     }
 }
 
-/// How long a planner that is asked to end may take.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Maximum time for a planner to end after SIGTERM.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The planner of a name that is attached, or waits for its run; without a name, the only one.
+/// Returns the planner with this name, attached or waiting for its run; without a name, the only one.
 pub fn find(name: Option<&str>) -> Option<LiveRun> {
     let mut all = live();
     match name {
@@ -235,25 +236,25 @@ pub fn find(name: Option<&str>) -> Option<LiveRun> {
     }
 }
 
-/// The planners in processes of their own that live.
+/// Returns the live planners in their own processes.
 pub fn live() -> Vec<LiveRun> {
     RunFolder::standard().planners().runs().unwrap_or_default()
 }
 
-/// Ends a planner, as a signal from its terminal would.
+/// Ends a planner, like a signal from its terminal.
 pub fn end(planner: &LiveRun) -> Result {
     use rustix::process::{Pid, PidfdFlags, Signal, pidfd_open, pidfd_send_signal};
     let failed = |what: String| Failure::new(Exit::Failed, format!("planner {}: {what}", planner.name));
-    let pid = Pid::from_raw(planner.pid as i32).ok_or_else(|| failed("it is just starting".into()))?;
-    // A handle on the process first, then a look whether it still is the planner: a number may be used again.
+    let pid = Pid::from_raw(planner.pid as i32).ok_or_else(|| failed("it is still starting".into()))?;
+    // Open a handle on the process first, then check that it still is the planner: pids are reused.
     let process = pidfd_open(pid, PidfdFlags::empty()).map_err(|e| failed(e.to_string()))?;
     if live().contains(planner) {
         pidfd_send_signal(&process, Signal::TERM).map_err(|e| failed(e.to_string()))?;
     }
     let asked = std::time::Instant::now();
     while live().contains(planner) {
-        if asked.elapsed() > PATIENCE {
-            return Err(failed(format!("it was asked to end, but pid {} still lives", planner.pid)));
+        if asked.elapsed() > SHUTDOWN_TIMEOUT {
+            return Err(failed(format!("pid {} did not end after SIGTERM", planner.pid)));
         }
         std::thread::sleep(Duration::from_millis(20));
     }

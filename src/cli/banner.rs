@@ -1,4 +1,4 @@
-//! What a run says when it starts and when it has ended.
+//! Texts of a run at start-up and after its end.
 
 use std::path::Path;
 
@@ -7,11 +7,10 @@ use serde::Serialize;
 use super::text_log::Terminal;
 use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
 
-/// The last line of a banner: how to end a run that has a terminal.
-pub const IN_A_TERMINAL: &str = "Ctrl-C ends it, controlled. In a second terminal: dimos status";
+/// Last line of the banner of a run with a terminal.
+pub const IN_A_TERMINAL: &str = "Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
 
-/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout.
-/// `end` says how to end it.
+/// Prints the banner of a run that is up: to stderr, or as one line of JSON to stdout. `end` is its last line.
 pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, end: &str, json: bool) {
     #[derive(Serialize)]
     struct Started<'a> {
@@ -26,7 +25,7 @@ pub(super) fn print(terminal: &Terminal, report: &StatusReport, socket: &Path, e
     text(report, socket, end).iter().for_each(|line| terminal.note(line));
 }
 
-/// The banner's lines.
+/// Returns the banner's lines.
 pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
     let simulated = if report.simulated { "  SIMULATED" } else { "" };
     let mut lines = vec![format!("run {}{simulated}  (pid {}, dimos {})", report.run, report.pid, report.version)];
@@ -42,13 +41,13 @@ pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
     for (index, text) in report.realtime.iter().flat_map(realtime).enumerate() {
         row(if index == 0 { "real time" } else { "" }, text);
     }
-    row("log", report.log.clone().unwrap_or_else(|| "none is written".into()));
+    row("log", report.log.clone().unwrap_or_else(|| "none".into()));
     row("socket", socket.display().to_string());
     lines.push(end.into());
     lines
 }
 
-/// What happens to the arm's motor power when the run ends.
+/// Describes the motors after the end of the run.
 pub fn at_exit(arm: &ArmReport) -> &'static str {
     match (arm.on_exit.as_str(), arm.holds_when_disabled) {
         ("disable", true) => "motors off; it keeps its pose",
@@ -57,17 +56,17 @@ pub fn at_exit(arm: &ArmReport) -> &'static str {
     }
 }
 
-/// What became of the arm's motor power, now that the run is over. The report is the last one before its end.
+/// Describes the motors now that the run has ended, from its last report.
 pub fn after_exit(arm: &ArmReport) -> &'static str {
     match (arm.link.as_str(), arm.enabled, arm.holds_when_disabled) {
-        ("down" | "faulted", ..) => "it could not be reached: its motors are as they were",
+        ("down" | "faulted", ..) => "it could not be reached: its motors are unchanged",
         (_, false, true) => "motors are off; it keeps its pose",
         (_, false, false) => "motors are off; it does not hold its pose",
         (_, true, _) => at_exit(arm),
     }
 }
 
-/// One real-time measure; where it was not granted, a second line says how to get it.
+/// Returns one real-time measure; if it was refused, a second line gives the fix.
 pub fn realtime(measure: &RealtimeReport) -> Vec<String> {
     if measure.granted {
         return vec![format!("{}: granted", measure.what)];
@@ -81,7 +80,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_banner_tells_what_a_user_must_know() {
+    fn the_banner_shows_arms_motors_real_time_and_log() {
         let arm = |on_exit: &str, holds_when_disabled| ArmReport {
             hardware_id: "arm".into(),
             adapter: "yourarm".into(),
@@ -116,9 +115,9 @@ run coordinator-yourarm  SIMULATED  (pid 42, dimos 0.1.0)
   tick       100 Hz
   real time  SCHED_FIFO: NOT granted
              hint: ulimit -r 80
-  log        none is written
+  log        none
   socket     /run/dimos.sock
-Ctrl-C ends it, controlled. In a second terminal: dimos status";
+Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
         assert_eq!(text(&report, Path::new("/run/dimos.sock"), IN_A_TERMINAL).join("\n"), expected);
 
         assert_eq!(after_exit(&arm("hold", false)), "motors stay on and hold the pose");
@@ -126,6 +125,6 @@ Ctrl-C ends it, controlled. In a second terminal: dimos status";
         assert_eq!(off(false), "motors are off; it does not hold its pose", "as after its own E-stop");
         assert_eq!(off(true), "motors are off; it keeps its pose");
         let lost = ArmReport { link: "faulted".into(), ..arm("disable", true) };
-        assert_eq!(after_exit(&lost), "it could not be reached: its motors are as they were");
+        assert_eq!(after_exit(&lost), "it could not be reached: its motors are unchanged");
     }
 }

@@ -8,9 +8,9 @@ use crate::rpc::api::Cancel;
 /// Arguments of `cancel`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// End the motions of this arm only
+    /// Cancel motions of this arm only
     pub arm: Option<String>,
-    /// End the motion of this task only
+    /// Cancel the motion of this task only
     #[arg(long, conflicts_with = "arm")]
     pub task: Option<String>,
     /// Which run

@@ -1,4 +1,4 @@
-//! `dimos check NAME|PATH`: every mistake of a blueprint at once, or what it comes to. Connects to nothing.
+//! `dimos check NAME|PATH`: validates a blueprint and prints the resolved configuration. Connects to nothing.
 
 mod robots;
 
@@ -20,7 +20,7 @@ pub struct Args {
     /// Change a field of the blueprint first: hardware.arm.address=192.168.1.100 (repeatable)
     #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
-    /// Let emulators stand in for all arms
+    /// Simulate all arms
     #[arg(long)]
     pub sim: bool,
     /// Print JSON
@@ -34,13 +34,13 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     report(&args.blueprint, &Overrides { set, sim: args.sim }, registry, args.json)
 }
 
-/// Finds and reads a blueprint; what is wrong with it is in the result.
+/// Finds and reads a blueprint; its mistakes are in the result.
 pub fn load(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
     let found = blueprint::find(name).map_err(|e| Failure::usage(e.message).hint(e.hint))?;
     Ok(blueprint::load(&found, overrides, registry))
 }
 
-/// The same for a run: fetches what the blueprint uses and what is not here yet, and then checks that too.
+/// Same for a run: also downloads missing assets, and then checks what depends on them.
 pub fn load_to_run(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
     let loaded = load(name, overrides, registry)?;
     match &loaded.blueprint {
@@ -49,20 +49,20 @@ pub fn load_to_run(name: &str, overrides: &Overrides, registry: &Registry) -> Re
     }
 }
 
-/// Why a blueprint cannot be run: all its mistakes, shown.
+/// Returns the failure of a blueprint with mistakes, after printing them.
 pub fn refuse(loaded: &Loaded) -> Failure {
     output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
     Failure::usage("the blueprint has mistakes: nothing was connected")
 }
 
-/// Shows the warnings of a blueprint that can be run.
+/// Prints the warnings of a blueprint.
 pub fn print_warnings(loaded: &Loaded) {
     if loaded.warnings() > 0 {
         output::note(loaded.render(output::colour(&std::io::stderr())).trim_end());
     }
 }
 
-/// Checks and says what it found.
+/// Checks a blueprint and prints the result.
 pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: bool) -> Result {
     let loaded = load(name, overrides, registry)?;
     let summary = loaded.blueprint.as_ref().map(Summary::of);
@@ -84,7 +84,7 @@ pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: b
     robots.iter().for_each(robots::print);
     let awaited = loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets());
     for asset in awaited {
-        output::note(format_args!("{} is not fetched yet: what lies in it was not checked", asset.name));
+        output::note(format_args!("{} is not downloaded yet: its contents were not checked", asset.name));
     }
     output::line("");
     output::line("no mistakes");
@@ -133,7 +133,7 @@ fn print(summary: &Summary) {
     table.print();
 }
 
-/// Where a joint's limits come from, in the order of the columns; one word when it is the same for all.
+/// Returns the origins of a joint's limits, in the order of the columns; one word if they are equal.
 fn origins(limits: &[Option<Limit>]) -> String {
     let mut words: Vec<&str> = limits.iter().flatten().map(|l| l.from.name()).collect();
     if words.windows(2).all(|w| w[0] == w[1]) {

@@ -1,4 +1,4 @@
-//! `dimos completions SHELL`: what a shell needs to complete verbs and options.
+//! `dimos completions SHELL`: shell completions of verbs and options.
 
 use std::io::{self, Write};
 
@@ -22,7 +22,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result {
     let mut text = Vec::new();
     clap_complete::generate(args.shell, &mut super::Cli::command(), "dimos", &mut text);
-    // That nobody reads it is no error.
+    // A closed pipe is not an error.
     let _ = io::stdout().lock().write_all(&text);
     Ok(Exit::Ok)
 }

@@ -1,10 +1,10 @@
-//! `dimos run -d`: the run in a process of its own, without a terminal. The command returns when the arms are up, or
-//! with the reason why they are not.
+//! `dimos run -d`: the run in its own process, without a terminal. The command returns when the arms are up, or with
+//! the reason why they are not.
 //!
 //! ```text
 //! dimos run -d ──starts──▶ dimos run --text-log FILE     stdin: a socket, until the arms are up; then /dev/null
 //!      ▲                        │                        stdout, stderr: the text log
-//!      └──── one line: up, or why not                    a session of its own: no terminal can end it
+//!      └──── one line: up, or the error                  its own session: independent of terminals
 //! ```
 
 use std::collections::BTreeMap;
@@ -27,15 +27,15 @@ use crate::recording::files::{self, KEPT_LOGS};
 use crate::rpc::place;
 use crate::rpc::report::StatusReport;
 
-/// The last line of the banner of a run without a terminal.
-pub const HOW_TO_END: &str = "dimos down ends it, controlled.";
+/// Last line of the banner of a run without a terminal.
+pub const HOW_TO_END: &str = "Run `dimos down` for a controlled stop.";
 
-/// A run that is up, for whoever started it.
+/// A run that is up, as reported to the starting command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Up {
-    /// Its name.
+    /// Name.
     pub run: String,
-    /// Its process.
+    /// Process id.
     pub pid: u32,
     /// Whether any arm is simulated.
     pub simulated: bool,
@@ -47,47 +47,47 @@ pub struct Up {
     pub text_log: PathBuf,
     /// Its socket, if it has one.
     pub socket: Option<PathBuf>,
-    /// The run that it attached to, where it is a planner and no run.
+    /// The run it attached to, if it is a planner.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attached: Option<String>,
 }
 
-/// What the new process says when it is up, or cannot be.
+/// Message of the new process: up, or failed.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Word {
+enum StartMessage {
     Up(Up),
     Failed { exit: u8, what: String, hint: Option<String> },
 }
 
-/// Starts the run in a process of its own, and waits until it is up.
+/// Starts the run in its own process and waits until it is up.
 pub fn start(args: &Args, registry: &Registry) -> Result {
-    // Mistakes are shown here, where someone looks, with the colours of a terminal.
+    // Print mistakes here, on the user's terminal, in colour.
     let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let run = args.name.as_ref().unwrap_or(&blueprint.name);
     place::check_name(run).map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
     let text_log = new_text_log(run)?;
-    let failed = |e: io::Error| Failure::new(Exit::Failed, format!("the run's process cannot be started: {e}"));
+    let failed = |e: io::Error| Failure::new(Exit::Failed, format!("cannot start the run's process: {e}"));
     let (mut child, ours) = spawn(&text_log).map_err(failed)?;
     let mut line = String::new();
-    let word = match BufReader::new(ours).read_line(&mut line) {
+    let message = match BufReader::new(ours).read_line(&mut line) {
         Ok(_) => serde_json::from_str(&line).ok(),
         Err(_) => None,
     };
-    match word {
-        Some(Word::Up(up)) => {
+    match message {
+        Some(StartMessage::Up(up)) => {
             print(&up, args.json);
             Ok(Exit::Ok)
         }
-        Some(Word::Failed { exit, what, hint }) => {
+        Some(StartMessage::Failed { exit, what, hint }) => {
             let _ = child.wait();
-            // All that it could tell is told here.
+            // The reply already carries the error.
             let _ = std::fs::remove_file(&text_log);
             Err(Failure { exit: Exit::of(exit), what, hint })
         }
-        None => Err(died(run, &mut child, &text_log)),
+        None => Err(crash_failure(run, &mut child, &text_log)),
     }
 }
 
@@ -104,24 +104,24 @@ fn new_text_log(run: &str) -> Result<PathBuf> {
         files::retain_text_logs(&folder, KEPT_LOGS)
     };
     make().map_err(|e| {
-        let hint = "the folder must be writable; XDG_STATE_HOME may name another";
+        let hint = "make the folder writable, or set XDG_STATE_HOME to another";
         Failure::new(Exit::Failed, format!("{}: {e}", path.display())).hint(hint)
     })?;
     Ok(path)
 }
 
-/// Starts this program again, with the same arguments. Its stdin is one end of a socket; the other end is returned.
+/// Starts this program again with the same arguments. Its stdin is one end of a socket; returns the other end.
 fn spawn(text_log: &Path) -> io::Result<(Child, UnixStream)> {
     let (ours, theirs) = UnixStream::pair()?;
     let log = OpenOptions::new().append(true).open(text_log)?;
     let mut command = Command::new(std::env::current_exe()?);
     command.args(arguments(std::env::args_os(), text_log));
     command.stdin(Stdio::from(OwnedFd::from(theirs))).stdout(log.try_clone()?).stderr(log);
-    // The command keeps their end open, and with it hides that they are gone, until it is dropped here.
+    // The command holds the child's end open, which would hide its exit, until it is dropped here.
     Ok((command.spawn()?, ours))
 }
 
-/// The arguments that this program got, with the text log behind the verb.
+/// Returns this program's arguments, with the text log inserted after the verb.
 fn arguments(own: impl Iterator<Item = OsString>, text_log: &Path) -> Vec<OsString> {
     let mut arguments: Vec<OsString> = own.skip(1).collect();
     let behind_verb = arguments.len().min(1);
@@ -129,9 +129,9 @@ fn arguments(own: impl Iterator<Item = OsString>, text_log: &Path) -> Vec<OsStri
     arguments
 }
 
-fn died(run: &str, child: &mut Child, text_log: &Path) -> Failure {
+fn crash_failure(run: &str, child: &mut Child, text_log: &Path) -> Failure {
     let how = child.wait().map_or_else(|e| e.to_string(), |status| status.to_string());
-    let mut what = format!("{run} crashed while it started ({how})");
+    let mut what = format!("{run} crashed during startup ({how})");
     for line in last_lines(text_log) {
         what += &format!("\n  {line}");
     }
@@ -148,37 +148,38 @@ fn print(up: &Up, json: bool) {
     output::line(format_args!("pid       {}", up.pid));
     if let Some(run) = &up.attached {
         output::line(format_args!("text log  {}", up.text_log.display()));
-        return output::note(format_args!("attached to run {run}; dimos down {} ends it", up.run));
+        return output::note(format_args!("attached to run {run}; end it with: dimos down {}", up.run));
     }
     for (arm, phase) in &up.arms {
         output::line(format_args!("arm       {arm}: {phase}"));
     }
-    output::line(format_args!("log       {}", up.log.as_deref().unwrap_or("none is written")));
+    output::line(format_args!("log       {}", up.log.as_deref().unwrap_or("none")));
     output::line(format_args!("text log  {}", up.text_log.display()));
-    output::note(format_args!("dimos status shows it, dimos logs -f follows it, dimos down {} ends it", up.run));
+    output::note(format_args!("next: dimos status, dimos logs -f, dimos down {}", up.run));
 }
 
-/// The way back to the command that started this process.
-pub struct Starter {
+/// Connection to the command that started this process.
+pub struct StartingProcess {
     stream: UnixStream,
     text_log: PathBuf,
 }
 
-impl Starter {
-    /// Leaves the terminal: a session of its own, nothing on stdin.
+impl StartingProcess {
+    /// Leaves the terminal: a new session, stdin is /dev/null.
     pub fn detach(text_log: &Path) -> Result<Self> {
         let leave = || {
             let stream = UnixStream::from(rustix::io::fcntl_dupfd_cloexec(rustix::stdio::stdin(), 3)?);
             rustix::stdio::dup2_stdin(File::open("/dev/null")?)?;
-            // Fails for the leader of a process group only, which then has no terminal to lose.
+            // Fails only for the leader of a process group, which then has no terminal.
             let _ = rustix::process::setsid();
             io::Result::Ok(stream)
         };
-        let stream = leave().map_err(|e| Failure::new(Exit::Failed, format!("the terminal cannot be left: {e}")))?;
+        let stream =
+            leave().map_err(|e| Failure::new(Exit::Failed, format!("cannot detach from the terminal: {e}")))?;
         Ok(Self { stream, text_log: text_log.to_owned() })
     }
 
-    /// Says that the run is up, or the planner attached to that run; `false` when nobody waits for it any more.
+    /// Reports that the run is up, or the planner attached to that run; returns whether the command was still waiting.
     pub fn up(self, report: &StatusReport, socket: Option<&Path>, attached: Option<&str>) -> bool {
         let text_log = self.text_log.clone();
         let up = Up {
@@ -191,18 +192,18 @@ impl Starter {
             socket: socket.map(PathBuf::from),
             attached: attached.map(str::to_owned),
         };
-        self.say(&Word::Up(up)).is_ok()
+        self.send(&StartMessage::Up(up)).is_ok()
     }
 
-    /// Says why the run is not up.
+    /// Reports why the run is not up.
     pub fn failed(self, failure: &Failure) {
         let Failure { exit, what, hint } = failure.clone();
-        // Who has gone does not want to know.
-        let _ = self.say(&Word::Failed { exit: exit as u8, what, hint });
+        // Ignore a command that has exited.
+        let _ = self.send(&StartMessage::Failed { exit: exit as u8, what, hint });
     }
 
-    fn say(mut self, word: &Word) -> io::Result<()> {
-        let line = serde_json::to_string(word)? + "\n";
+    fn send(mut self, message: &StartMessage) -> io::Result<()> {
+        let line = serde_json::to_string(message)? + "\n";
         self.stream.write_all(line.as_bytes())
     }
 }

@@ -1,4 +1,4 @@
-//! `dimos doctor`: what this computer grants a run, and the command that changes what it does not.
+//! `dimos doctor`: checks the real-time setup, permissions and devices, and prints a fix for each problem.
 
 mod host;
 
@@ -10,34 +10,33 @@ use super::output::{self, Table, Tone, toned};
 /// Arguments of `doctor`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-warn: a run works without it, but keeps its time less well, or lacks something. Exit code 1 only where something
-prevents a run.")]
+warn: the run still works, with more timing jitter or without some feature. Exit code 1 only if runs cannot start.")]
 pub struct Args {
     /// Print JSON
     #[arg(long)]
     pub json: bool,
 }
 
-/// How grave a finding is.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 enum Level {
-    /// As it should be.
+    /// No problem.
     Ok,
-    /// A run works, but less well.
+    /// Runs work, but with more jitter or without some feature.
     Warn,
     /// No run can work.
     Bad,
 }
 
-/// One thing that was looked at.
+/// Result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 struct Finding {
     check: &'static str,
     level: Level,
-    /// What was found.
+    /// The observation.
     found: String,
-    /// The command that changes it.
+    /// The command that fixes it.
     fix: Option<String>,
 }
 
@@ -70,7 +69,7 @@ pub fn run(args: &Args) -> Result {
     match findings.iter().find(|finding| finding.level == Level::Bad) {
         None => Ok(Exit::Ok),
         Some(finding) => {
-            let failure = Failure::new(Exit::Failed, format!("no run can work: {}", finding.found));
+            let failure = Failure::new(Exit::Failed, format!("runs cannot start: {}", finding.found));
             Err(finding.fix.iter().fold(failure, |failure, fix| failure.hint(fix.clone())))
         }
     }

@@ -1,57 +1,55 @@
-//! `dimos down`: ends a run exactly like SIGTERM, or a planner that attached to one.
+//! `dimos down`: shuts down a run like SIGTERM, or a planner that is attached to one.
 
 use std::time::{Duration, Instant};
 
 use super::attach;
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use super::run_record::{Fate, RunRecord};
+use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Shutdown;
 use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::place::{LiveRun, RunFolder};
 
-/// How long a controlled end may take, and a little.
-const PATIENCE: Duration = Duration::from_secs(6);
-/// How often to look.
-const INTERVAL: Duration = Duration::from_millis(20);
+/// Maximum wait for a controlled stop, with some margin.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(6);
+/// Poll period.
+const POLL_PERIOD: Duration = Duration::from_millis(20);
 
 /// Arguments of `down`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The run to end, or the planner that attached to one; needed only when several runs are live
+    /// Run to end, or the planner attached to one; needed only when several runs are live
     pub name: Option<String>,
-    /// The same
+    /// Run to end (same as the positional NAME)
     #[arg(long, value_name = "NAME", conflicts_with = "name")]
     pub run: Option<String>,
 }
 
-/// Runs the verb: asks, waits until the run is gone, and says what became of it.
+/// Runs the verb: sends the request, waits until the run has ended, and prints the result.
 pub fn run(args: &Args) -> Result {
     let folder = RunFolder::standard();
     let name = args.name.as_deref().or(args.run.as_deref());
     let found = match find(&folder, name) {
         Ok(found) => found,
-        // A planner in a process of its own is no run, but has a name as well.
+        // A planner in its own process is not a run, but has a name as well.
         Err(failure) => return attach::find(name).map_or(Err(failure), |planner| attach::end(&planner)),
     };
     Client::connect(&found.name, &found.socket)?.call(Shutdown {})?;
     let asked = Instant::now();
-    // The name is free before the process has written its last words.
+    // The name is free before the process has written its last lines.
     let noted = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
-    let lives = || noted().is_some_and(|record| record.fate() == Fate::Lives);
+    let lives = || noted().is_some_and(|record| record.state() == RunState::Live);
     while folder.runs().map_err(ClientError::from)?.contains(&found) || lives() {
-        if asked.elapsed() > PATIENCE {
-            let what = format!("{} was asked to end, but pid {} still lives", found.name, found.pid);
-            return Err(
-                Failure::new(Exit::Failed, what).hint("its own terminal or `dimos logs` says what it waits for")
-            );
+        if asked.elapsed() > SHUTDOWN_TIMEOUT {
+            let what = format!("{} is still shutting down: pid {} has not exited", found.name, found.pid);
+            return Err(Failure::new(Exit::Failed, what).hint("its terminal or `dimos logs` shows the reason"));
         }
-        std::thread::sleep(INTERVAL);
+        std::thread::sleep(POLL_PERIOD);
     }
     match noted() {
-        Some(record) if record.fell() => {
-            let exit = if let Fate::Ended(end) = record.fate() { Exit::of(end.exit) } else { Exit::Failed };
-            Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it fell")) })
+        Some(record) if record.ended_abnormally() => {
+            let exit = if let RunState::Ended(end) = record.state() { Exit::of(end.exit) } else { Exit::Failed };
+            Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it ended abnormally")) })
         }
         Some(RunRecord { log: Some(log), .. }) => {
             output::note(format_args!("{} ended; its log: {}", found.name, log.display()));
@@ -64,7 +62,7 @@ pub fn run(args: &Args) -> Result {
     }
 }
 
-/// The run that is meant. One that is named, but dead: what became of it.
+/// Returns the selected run; for one that has ended, its failure.
 fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun> {
     client::find(folder, name).map_err(|error| {
         let dead = name.and_then(RunRecord::of).and_then(|record| record.failure());

@@ -1,4 +1,4 @@
-//! `dimos execute`: the newest plan, or a trajectory from a file.
+//! `dimos execute`: executes the newest plan, or a trajectory from a file.
 
 use std::path::PathBuf;
 
@@ -12,18 +12,18 @@ use crate::rpc::api::{Execute, ExecutePlan};
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 JSON: {\"joint_names\":[\"arm_joint1\"],\"points\":[{\"time_from_start\":0,\"positions\":[0],\"velocities\":[0]},…]}
-CSV:  a header `time,arm_joint1,…` and, if wanted, `arm_joint1_vel,…`; then one point per line. s, rad, rad/s.
-The first point must be where the arm is.")]
+CSV:  a header `time,arm_joint1,…` and optionally `arm_joint1_vel,…`; then one point per line. s, rad, rad/s.
+The first point must be the arm's position.")]
 pub struct Args {
-    /// The trajectory: .json or .csv; without it the newest plan is carried out
+    /// Trajectory file, .json or .csv; default: the newest plan
     pub file: Option<PathBuf>,
-    /// Carry out the plan of this number
+    /// Execute the plan with this number
     #[arg(long, value_name = "N", conflicts_with = "file")]
     pub plan: Option<u64>,
-    /// The trajectory task to use; without it the one whose joints cover the file's
+    /// Trajectory task to use; default: the one whose joints cover those of the file
     #[arg(long, requires = "file")]
     pub task: Option<String>,
-    /// Plan again and go on when the motion has to end before something that got in its way
+    /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["file", "no_wait"])]
     pub replan: bool,
     /// Return when the motion has begun

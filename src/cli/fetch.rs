@@ -1,4 +1,4 @@
-//! Fetching what a blueprint needs, with a progress bar where somebody can see one.
+//! Downloads a blueprint's assets, with a progress bar on a terminal.
 
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -7,7 +7,7 @@ use super::output;
 use crate::assets::{Asset, AssetError, Cache, Progress};
 use crate::blueprint::Blueprint;
 
-/// Fetches the assets that a blueprint uses and that are not there yet; whether there were any.
+/// Downloads missing assets of a blueprint; returns whether there were any.
 pub fn missing(blueprint: &Blueprint) -> Result<bool> {
     let awaited = blueprint.awaited_assets();
     for asset in &awaited {
@@ -16,7 +16,7 @@ pub fn missing(blueprint: &Blueprint) -> Result<bool> {
     Ok(!awaited.is_empty())
 }
 
-/// Fetches an asset.
+/// Downloads an asset.
 pub fn one(asset: &Asset) -> Result<std::path::PathBuf> {
     output::note(format_args!("fetching {} from {}", asset.name, asset.url));
     let mut bar = Bar::new(&asset.name);
@@ -25,12 +25,12 @@ pub fn one(asset: &Asset) -> Result<std::path::PathBuf> {
     fetched.map_err(failure)
 }
 
-/// A failure of a verb.
+/// Converts an error of an asset to a failure.
 pub fn failure(error: AssetError) -> Failure {
     Failure { exit: Exit::Failed, what: error.what, hint: error.hint }
 }
 
-/// Hidden where stderr is no terminal.
+/// Hidden if stderr is not a terminal.
 struct Bar(ProgressBar);
 
 impl Bar {

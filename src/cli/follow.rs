@@ -1,4 +1,4 @@
-//! Waiting for a motion's end: a progress bar, Ctrl-C ends the motion, and at the end how far off each joint is.
+//! Waits for the end of a motion: shows progress, cancels on Ctrl-C, and shows the final error of each joint.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -13,14 +13,14 @@ use crate::rpc::api::{Cancel, Motion};
 use crate::rpc::client::Client;
 use crate::rpc::report::{Deviation, MotionReport};
 
-/// How often the run is asked.
-const INTERVAL: Duration = Duration::from_millis(50);
-/// How long a cancelled motion may take to come to rest, as far as this program waits.
-const REST: Duration = Duration::from_secs(10);
-/// Ended this close to its target, a joint is shown as on it [rad].
-const CLOSE: f64 = 0.01;
+/// Poll period.
+const POLL_PERIOD: Duration = Duration::from_millis(50);
+/// Maximum wait for a cancelled motion to end.
+const REST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Final error below which a joint counts as on target [rad].
+const ON_TARGET: f64 = 0.01;
 
-/// The last signal received, while a verb watches for them; 0 = none.
+/// The last signal received while a verb watches for signals; 0 = none.
 pub struct Signals(Arc<AtomicUsize>);
 
 /// Waits for the end of a motion of `task` and prints it. A signal cancels the motion first.
@@ -36,7 +36,7 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
         let report = client.call(Motion { motion })?;
         if let Some(next) = report.next.filter(|_| report.done) {
             let why = report.error.unwrap_or_default();
-            bar.suspend(|| output::note(format_args!("motion {motion}: {why}; it goes on as motion {next}")));
+            bar.suspend(|| output::note(format_args!("motion {motion}: {why}; continued as motion {next}")));
             motion = next;
             continue;
         }
@@ -50,12 +50,12 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
             client.call(Cancel { task: Some(task.to_owned()), arm: None })?;
             cancelled = Some(Instant::now());
         }
-        if cancelled.is_some_and(|since| since.elapsed() > REST) {
+        if cancelled.is_some_and(|since| since.elapsed() > REST_TIMEOUT) {
             bar.finish_and_clear();
-            let what = format!("motion {motion} was cancelled, but has not ended after {} s", REST.as_secs());
+            let what = format!("motion {motion} was cancelled, but has not ended after {} s", REST_TIMEOUT.as_secs());
             return Err(Failure::new(Exit::Failed, what).hint("dimos stop holds the arm at once"));
         }
-        sleep(INTERVAL);
+        sleep(POLL_PERIOD);
     };
     bar.finish_and_clear();
     print(&report, json);
@@ -71,25 +71,24 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
 }
 
 impl Signals {
-    /// From now on SIGINT and SIGTERM do not end this program. Watched from before a motion begins, so that none
-    /// begins that a Ctrl-C meant to prevent.
+    /// Catches SIGINT and SIGTERM from now on. Call it before a motion begins, so that no motion begins after a Ctrl-C.
     pub fn watch() -> Self {
         let seen = Arc::new(AtomicUsize::new(0));
         for signal in [libc::SIGINT, libc::SIGTERM] {
-            // Where this fails, the signal ends this program as usual, and the motion goes on.
+            // If this fails, a signal ends the program as usual and the motion continues.
             let _ = signal_hook::flag::register_usize(signal, seen.clone(), signal as usize);
         }
         Self(seen)
     }
 
-    /// The same, and SIGHUP too: for a program whose end would be the end of a run.
+    /// Also catches SIGHUP: for a program whose exit ends a run.
     pub fn watch_with_hangup() -> Self {
         let signals = Self::watch();
         let _ = signal_hook::flag::register_usize(libc::SIGHUP, signals.0.clone(), libc::SIGHUP as usize);
         signals
     }
 
-    /// The last one received.
+    /// Returns the last signal received.
     pub fn last(&self) -> Option<i32> {
         Some(self.0.load(Ordering::Relaxed) as i32).filter(|signal| *signal != 0)
     }
@@ -103,15 +102,15 @@ fn print(report: &MotionReport, json: bool) {
     show_deviation(report.deviation.as_deref().unwrap_or_default());
 }
 
-/// Shows how far off joints ended.
+/// Prints the final errors of the joints.
 pub fn show_deviation(deviation: &[Deviation]) {
     if deviation.is_empty() {
         return;
     }
-    let mut table = Table::new(&["JOINT", ">TARGET rad", ">ENDED rad", ">OFF BY rad", ">OFF BY deg"]);
+    let mut table = Table::new(&["JOINT", ">TARGET rad", ">REACHED rad", ">OFF BY rad", ">OFF BY deg"]);
     for joint in deviation {
         let off = joint.error();
-        let tone = if off.abs() <= CLOSE { Tone::Good } else { Tone::Warning };
+        let tone = if off.abs() <= ON_TARGET { Tone::Good } else { Tone::Warning };
         table.row([
             joint.joint.as_str().into(),
             fixed(joint.target, 4).into(),

@@ -1,4 +1,4 @@
-//! Where a robot shall go, as it is typed, and planning the way there.
+//! Goals of motions as typed on the command line, and planning.
 
 use std::thread::sleep;
 use std::time::Duration;
@@ -13,35 +13,35 @@ use crate::rpc::api::{Cancel, DEFAULT_SPEED, Plan, PlanGoal, PlanSummary, Planne
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::{Code, RpcError};
 
-/// How often the run is asked while it plans.
-const INTERVAL: Duration = Duration::from_millis(20);
+/// Poll period while planning.
+const POLL_PERIOD: Duration = Duration::from_millis(20);
 
-/// Where a robot shall go.
+/// Goal of a motion.
 #[derive(Debug, Clone, clap::Args)]
 #[group(id = "goal", required = true, multiple = true)]
 pub struct Goal {
-    /// Where its joints shall go [rad], one value per joint
+    /// Target positions of its joints [rad], one per joint
     #[arg(value_name = "POSITION", value_parser = finite, allow_negative_numbers = true, conflicts_with_all = ["pose", "named"])]
     pub joints: Vec<f64>,
-    /// Where its end effector shall be: x, y, z [m] in the frame `map`; without --rpy or --quat in any orientation
+    /// Target position of the end effector in `map`: x, y, z [m]; orientation is free unless --rpy or --quat is given
     #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
     pub pose: Option<Vec<f64>>,
-    /// The end effector's roll, pitch, yaw about fixed axes [rad]
+    /// Target roll, pitch, yaw of the end effector about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true, requires = "pose")]
     pub rpy: Option<Vec<f64>>,
-    /// The end effector's orientation as a quaternion x, y, z, w
+    /// Target orientation of the end effector as a quaternion x, y, z, w
     #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, requires = "pose", conflicts_with = "rpy")]
     pub quat: Option<Vec<f64>>,
-    /// One of its named poses
+    /// Named pose
     #[arg(long, value_name = "NAME", conflicts_with = "pose")]
     pub named: Option<String>,
-    /// Where one robot of several shall go, all in one motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
+    /// Goal of one of several robots in a common motion (repeatable): left=0.1,-0.3,0.6,0,0.8,0 or left=named:home or
     /// left=pose:x,y,z or, with roll, pitch, yaw or a quaternion, left=pose:x,y,z,r,p,y or left=pose:x,y,z,qx,qy,qz,qw
     #[arg(long = "goal", value_name = "ROBOT=GOAL", value_parser = robot_goal, conflicts_with_all = ["joints", "pose", "named"])]
     pub several: Vec<PlanGoal>,
 }
 
-/// A robot and its goal, as `--goal` takes them.
+/// Parses a robot and its goal, as in `--goal`.
 fn robot_goal(text: &str) -> std::result::Result<PlanGoal, String> {
     let form = "must be ROBOT=GOAL, such as left=named:home or left=0.1,-0.3,0.6,0,0.8,0";
     let (robot, goal) =
@@ -74,7 +74,7 @@ fn robot_goal(text: &str) -> std::result::Result<PlanGoal, String> {
     Ok(planned)
 }
 
-/// How to search and how fast to go.
+/// Settings of the search and the speed.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Search {
     /// Fraction of the velocity and acceleration limits to use, 0.1–1
@@ -86,18 +86,18 @@ pub struct Search {
     /// Seed of the search: the same request with the same seed gives the same plan
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub seed: u64,
-    /// Longest time to search, such as 5s; default: the blueprint's planning_timeout
+    /// Maximum planning time, such as 5s; default: the blueprint's planning_timeout
     #[arg(long, value_name = "TIME", value_parser = super::arguments::duration)]
     pub timeout: Option<Duration>,
 }
 
 impl Goal {
-    /// The joint positions, where they are the goal.
+    /// Returns the joint positions, if they are the goal.
     pub fn joints(&self) -> Option<&[f64]> {
         (!self.joints.is_empty()).then_some(&self.joints)
     }
 
-    /// The goals, as the planner takes them; `robot` is whom positions, pose and name are for.
+    /// Returns the goals for the planner; `robot` is the robot of positions, pose and name.
     pub fn of(&self, robot: Option<&str>, search: &Search) -> Vec<PlanGoal> {
         let Some(robot) = robot else { return self.several.clone() };
         let pose = self.pose.as_deref().and_then(|xyz| xyz.try_into().ok()).map(|xyz| PoseSpec {
@@ -116,13 +116,13 @@ impl Goal {
 }
 
 impl Search {
-    /// A request for the planner.
+    /// Returns a planning request.
     pub fn plan(&self, goals: Vec<PlanGoal>) -> Plan {
         Plan { goals, speed: self.speed, seed: self.seed, timeout: self.timeout.map(|t| t.as_secs_f64()) }
     }
 }
 
-/// Whether the run has a planner. One that had a planner until it went away is an error.
+/// Returns whether the run has a planner. Fails if the planner has disconnected.
 pub fn has_planner(client: &mut Client) -> Result<bool> {
     match client.call(Planner {}) {
         Ok(_) => Ok(true),
@@ -131,17 +131,17 @@ pub fn has_planner(client: &mut Client) -> Result<bool> {
     }
 }
 
-/// A plan that was found, and its number.
+/// A plan and its number.
 pub struct Planned {
-    /// For `preview` and `execute_plan`.
+    /// Number for `preview` and `execute_plan`.
     pub plan: u64,
-    /// How long planning took [s].
+    /// Planning time [s].
     pub elapsed: f64,
-    /// The plan in figures.
+    /// Figures of the plan.
     pub summary: PlanSummary,
 }
 
-/// Plans and waits for it. A signal ends planning.
+/// Requests a plan and waits for it. A signal cancels planning.
 pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Planned> {
     let begun = client.call(request)?;
     let bar = ProgressBar::new_spinner();
@@ -159,7 +159,7 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
         if signals.last().is_some() && !std::mem::replace(&mut cancelled, true) {
             client.call(Cancel::default())?;
         }
-        sleep(INTERVAL);
+        sleep(POLL_PERIOD);
     };
     bar.finish_and_clear();
     if let Some(signal) = signals.last() {
@@ -176,7 +176,7 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
     }
 }
 
-/// Shows a plan's figures.
+/// Prints a plan's figures.
 pub fn show(planned: &Planned) {
     let s = &planned.summary;
     output::line(format_args!(
@@ -200,7 +200,7 @@ pub fn show(planned: &Planned) {
     }
     for given_up in &s.padding_given_up {
         let where_ = match given_up.near.as_str() {
-            "everywhere" => "in every pose".to_owned(),
+            "everywhere" => "in every configuration".to_owned(),
             near => format!("near the {near}"),
         };
         let (link, other, distance) = (&given_up.link, &given_up.other, fixed(given_up.distance * 1e3, 1));

@@ -1,15 +1,15 @@
-//! `dimos jog ARM`: drives an arm from the keyboard, at most for as long as a key is held.
+//! `dimos jog ARM`: drives an arm from the keyboard, only while a key is held.
 //!
 //! ```text
-//!  keys ─▶ hold (which motions are alive) ─▶ drive (the next target of a stream) ─rpc─▶ a task of the run
-//!                                            screen ◀─ watch (state and status, on a connection of its own)
+//!  keys ─▶ active_motions ─▶ drive (next target of a stream) ─rpc─▶ a task of the run
+//!                            screen ◀─ watch (state and status, on its own connection)
 //! ```
 //!
-//! Dead-man by design: jog sends targets while a motion is alive and nothing else keeps the arm moving, so that when jog
-//! dies, hangs, or loses its terminal or its run, the stream ends and the task's timeout brings the joints to rest.
+//! Dead-man by design: jog sends targets while a motion is active, and nothing else moves the arm. If jog crashes,
+//! hangs, or loses its terminal or its run, the stream ends and the task's timeout decelerates the joints to rest.
 
+mod active_motions;
 mod drive;
-mod hold;
 mod keys;
 mod screen;
 mod session;
@@ -31,27 +31,27 @@ use watch::Watch;
 /// Arguments of `jog`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-W/S A/D Q/E move the end effector along x, y, z, R/F T/G Y/H turn it about them (roll, pitch, yaw); B: axes of the base or
-of the tool. Tab: single joints: 1-9 choose one, +/- or the arrows move it. [ ] speed, Space rest now, X latched stop, Esc
-leave. A motion fades within 0.25 s after the last key, so that a key must be held; where the terminal tells when keys go
-up (kitty keyboard protocol), it ends then.
+W/S A/D Q/E move the end effector along x, y, z, R/F T/G Y/H rotate it about them (roll, pitch, yaw); B: axes of the base
+or of the tool. Tab: single joints: 1-9 select one, +/- or the arrows move it. [ ] speed, Space rest, X latched stop, Esc
+leave. Hold a key to move: the arm decelerates to rest within 0.25 s of the last key press, or at key-up if the terminal
+reports it (kitty keyboard protocol).
 
 Needs a task of type eef_twist, and one of type velocity (or servo) for single joints; the blueprints keyboard-teleop-…
 have both.
-Not collision-checked. An operational control and no safety function: keep the arm's own stop at hand.")]
+Not collision-checked. This is not a safety function: keep the arm's own stop within reach.")]
 pub struct Args {
-    /// The arm's name in the blueprint
+    /// Name of the arm (hardware_id)
     arm: String,
-    /// Begin with single joints
+    /// Start in joint mode
     #[arg(long)]
     joints: bool,
-    /// Begin along the axes of the tool
+    /// Start with the axes of the tool frame
     #[arg(long, conflicts_with = "joints")]
     tool: bool,
     /// Speed of the end effector at 100 % [m/s]
     #[arg(long, value_name = "M/S", default_value = "0.25", value_parser = above_zero)]
     linear: f64,
-    /// Turning speed of the end effector at 100 % [rad/s]
+    /// Angular speed of the end effector at 100 % [rad/s]
     #[arg(long, value_name = "RAD/S", default_value = "1", value_parser = above_zero)]
     angular: f64,
     /// Speed of a single joint at 100 % [rad/s]
@@ -65,15 +65,15 @@ pub struct Args {
 fn above_zero(text: &str) -> std::result::Result<f64, String> {
     match finite(text)? {
         value if value > 0.0 && value <= 10.0 => Ok(value),
-        _ => Err("must be above 0, and 10 at most".into()),
+        _ => Err("must be above 0 and at most 10".into()),
     }
 }
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     if !io::stdin().is_terminal() || !io::stdout().is_terminal() {
-        let failure = Failure::usage("jog reads keys from a terminal, and stdin or stdout is none");
-        return Err(failure.hint("`dimos task stream TASK` takes targets from stdin or a file"));
+        let failure = Failure::usage("jog needs a terminal: stdin or stdout is not one");
+        return Err(failure.hint("`dimos task stream TASK` reads targets from stdin or a file"));
     }
     let mut client = Target { run: args.run.clone(), json: false }.connect()?;
     let status = client.call(Status {})?;
@@ -87,13 +87,12 @@ pub fn run(args: &Args) -> Result {
     if drives == Drives::default() {
         return Err(Drives::missing(&args.arm));
     }
-    // Whoever else commands the arm is told before the screen is taken.
+    // Report other clients that command the arm before the screen is taken.
     client.call(Lease { arm: Some(args.arm.clone()) })?;
     let signals = Signals::watch_with_hangup();
     let watch = Watch::start(&status.run, &args.arm)?;
     let mut session = Session::new(client, watch, drives, setting(args, &status.run));
-    let terminal =
-        Terminal::open().map_err(|e| Failure::new(Exit::Failed, format!("the terminal cannot be used: {e}")))?;
+    let terminal = Terminal::open().map_err(|e| Failure::new(Exit::Failed, format!("cannot use the terminal: {e}")))?;
     session.run(terminal, &signals)
 }
 

@@ -1,4 +1,4 @@
-//! `dimos list-adapters`: the arms that this program can talk to.
+//! `dimos list-adapters`: the arms that this program supports.
 
 use serde_json::json;
 
@@ -29,7 +29,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     Ok(Exit::Ok)
 }
 
-/// The table, and a paragraph for each adapter.
+/// Returns the table, and a paragraph for each adapter.
 fn lines(registry: &Registry) -> Vec<String> {
     let mut table = Table::new(&["NAME", "LEVEL", "TRANSPORT", ">DOF", "UNITS", ">RATE Hz", "ADDRESS", "HOLDS"]);
     for row in registry.rows() {
@@ -77,7 +77,7 @@ fn modes(row: &AdapterSpec) -> Vec<&'static str> {
     row.modes.iter().map(|mode| mode.name()).collect()
 }
 
-/// The limits of the arm with the most joints and no options.
+/// Returns the limits for the most joints and no options.
 fn limits(row: &AdapterSpec) -> Option<(usize, JointLimits)> {
     let config = |dof| AdapterConfig {
         hardware_id: row.name.to_owned(),
@@ -88,7 +88,7 @@ fn limits(row: &AdapterSpec) -> Option<(usize, JointLimits)> {
     (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.fit)(&config(dof)).ok()?.limits)))
 }
 
-/// The names of its options.
+/// Returns the names of its options.
 fn options(row: &AdapterSpec) -> Vec<String> {
     let schema = (row.options.schema)(&mut schemars::SchemaGenerator::default());
     let properties = schema.get("properties").and_then(|properties| properties.as_object());
@@ -120,7 +120,7 @@ fn to_json(row: &AdapterSpec) -> serde_json::Value {
     })
 }
 
-/// An adapter that is not in this build has a way to get it, and nothing else.
+/// An adapter that is not in this build: only how to get it.
 fn lacking(absent: &Absent) -> serde_json::Value {
     json!({"name": absent.name, "about": absent.about, "in_this_build": false, "remedy": absent.remedy})
 }
@@ -130,13 +130,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_a_build_lacks_is_listed_with_the_way_to_get_it() {
+    fn an_adapter_missing_in_this_build_is_listed_with_its_remedy() {
         let absent = Absent { name: "servobot", about: "a serial arm", remedy: "build with --features servobot" };
         let lines = lines(&Registry::builtin().lacking(&[absent]));
         assert!(lines.iter().any(|line| line.starts_with("servobot  not in this build")), "{lines:?}");
         assert_eq!(lines.last().unwrap(), "  not in this build: build with --features servobot");
         let rows = Registry::builtin();
-        let told = |name: &str| lines.iter().any(|line| line.starts_with(&format!("{name}: ")));
-        assert!(rows.rows().iter().all(|row| told(row.name)) && told("servobot"), "{lines:?}");
+        let listed = |name: &str| lines.iter().any(|line| line.starts_with(&format!("{name}: ")));
+        assert!(rows.rows().iter().all(|row| listed(row.name)) && listed("servobot"), "{lines:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! `dimos list-blueprints`: what `dimos run` finds by name.
+//! `dimos list-blueprints`: the blueprints that `dimos run` finds by name.
 
 use serde_json::json;
 

@@ -1,4 +1,4 @@
-//! `dimos logs [RUN] [-f]`: the text log of a run without a terminal, live or dead.
+//! `dimos logs [RUN] [-f]`: the text log of a run without a terminal, live or ended.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -7,25 +7,25 @@ use std::time::Duration;
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use super::run_record::{Fate, RunRecord};
+use super::run_record::{RunRecord, RunState};
 use crate::rpc::client::{self, ClientError};
 use crate::rpc::place::RunFolder;
 
-/// How often a log that is followed is looked at.
-const INTERVAL: Duration = Duration::from_millis(100);
+/// Poll period of --follow.
+const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// Arguments of `logs`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The run; without it the only live one or, where none lives, the last that did
+    /// Run to show; default: the only live run, otherwise the most recent one
     pub name: Option<String>,
-    /// The same
+    /// Run to show (same as the positional NAME)
     #[arg(long, value_name = "NAME", conflicts_with = "name")]
     pub run: Option<String>,
-    /// Go on until the run has ended
+    /// Follow the log until the run ends
     #[arg(short, long)]
     pub follow: bool,
-    /// Print what is known of the run, and where its logs are, as JSON
+    /// Print the run's record and the paths of its logs as JSON
     #[arg(long, conflicts_with = "follow")]
     pub json: bool,
 }
@@ -46,12 +46,12 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// The record of a run, or of the one that is meant where none is named.
+/// Returns the record of the named run, or of the default one.
 fn find(name: Option<&str>) -> Result<RunRecord> {
     let mut live = RunFolder::standard().runs().map_err(ClientError::from)?;
     let unknown = |name: &str| {
-        let what = format!("nothing is known of a run named {name}");
-        Failure::usage(what).hint("`dimos status` shows the runs that live")
+        let what = format!("no record of a run named {name}");
+        Failure::usage(what).hint("`dimos status` shows the live runs")
     };
     match (name, live.len()) {
         (Some(name), _) => RunRecord::of(name).ok_or_else(|| unknown(name)),
@@ -68,19 +68,19 @@ fn find(name: Option<&str>) -> Result<RunRecord> {
 }
 
 impl RunRecord {
-    /// Whether it lives, as far as has been noted by now.
+    /// Returns whether it is live, according to its latest record.
     fn lives(&self) -> bool {
         let now = Self::of(&self.run).filter(|now| now.pid == self.pid && now.started == self.started);
-        now.is_some_and(|now| now.fate() == Fate::Lives)
+        now.is_some_and(|now| now.state() == RunState::Live)
     }
 }
 
-/// Prints a file, and what is added to it as long as it is expected to grow.
+/// Prints a file, and what is appended while it is expected to grow.
 fn show(path: &Path, grows: impl Fn() -> bool) -> io::Result<()> {
     let mut file = File::open(path)?;
     let mut buffer = vec![0; 64 * 1024];
     loop {
-        // Asked before reading: what was written before the end is then read.
+        // Check before reading, so that everything written before the end is read.
         let goes_on = grows();
         loop {
             let read = file.read(&mut buffer)?;
@@ -89,12 +89,12 @@ fn show(path: &Path, grows: impl Fn() -> bool) -> io::Result<()> {
             }
             let printed = io::stdout().lock().write_all(buffer.get(..read).unwrap_or_default());
             if printed.and_then(|()| io::stdout().flush()).is_err() {
-                return Ok(()); // Nobody reads it any more.
+                return Ok(()); // The pipe is closed.
             }
         }
         if !goes_on {
             return Ok(());
         }
-        std::thread::sleep(INTERVAL);
+        std::thread::sleep(POLL_PERIOD);
     }
 }

@@ -1,4 +1,4 @@
-//! `dimos man`: the manual, as pages for `man`.
+//! `dimos man`: the manual pages.
 
 use std::io::{self, Write};
 use std::path::PathBuf;
@@ -26,7 +26,7 @@ pub fn run(args: &Args) -> Result {
         let mut page = Vec::new();
         let rendered = clap_mangen::Man::new(command).render(&mut page);
         rendered.map_err(|e| Failure::new(Exit::Failed, e.to_string()))?;
-        // That nobody reads it is no error.
+        // A closed pipe is not an error.
         let _ = io::stdout().lock().write_all(&page);
         return Ok(Exit::Ok);
     };

@@ -22,7 +22,7 @@ pub mod list_blueprints;
 pub mod logs;
 pub mod man;
 pub mod model;
-pub mod move_to;
+pub mod motion;
 mod other_users;
 pub mod output;
 pub mod plan;
@@ -75,7 +75,7 @@ enum Command {
     /// Show the joints of a run, and gripper, pose, force where there are such
     State(state::Args),
     /// Move an arm to joint positions, and wait until it is there
-    Move(move_to::Args),
+    Move(motion::Args),
     /// Plan a collision-free motion of one robot or several and show it; moves nothing
     Plan(plan::Args),
     /// Show a plan moment by moment, or write its trajectory to a file
@@ -190,7 +190,7 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Run(args) => run::run(args, registry),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
-        Command::Move(args) => move_to::run(args),
+        Command::Move(args) => motion::run(args),
         Command::Plan(args) => plan::run(args),
         Command::Preview(args) => preview::run(args),
         Command::Execute(args) => execute::run(args),

@@ -1,4 +1,4 @@
-//! `dimos model …`: look into robot descriptions. Needs no run.
+//! `dimos model …`: inspect robot descriptions. Needs no run.
 
 mod assets;
 mod check;
@@ -27,34 +27,34 @@ enum Verb {
     Info(File),
     /// Draw the tree of links and joints
     Tree(File),
-    /// Report every mistake of a description and of the files it names
+    /// Report every mistake of a description and of its files
     Check(File),
-    /// Print the URDF that an xacro file comes to
+    /// Expand an xacro file to URDF
     Expand(File),
-    /// Where a link is at joint positions
+    /// Forward kinematics: pose of a link at joint positions
     Fk(fk::Args),
-    /// Joint positions for a pose of a link
+    /// Inverse kinematics: joint positions for a pose of a link
     Ik(ik::Args),
-    /// The files that a blueprint fetches on first use: list, fetch, clean
+    /// Assets of a blueprint: list, fetch, clean
     Assets(assets::Args),
 }
 
-/// A description, and what it needs.
+/// A description and its parameters.
 #[derive(Debug, clap::Args)]
 struct File {
-    /// A URDF or xacro file, or one in the box: builtin:xarm6
+    /// URDF or xacro file, or a built-in robot: builtin:xarm6
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// Where a package is (repeatable); ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are looked at too
+    /// Folder of a package (repeatable); ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are searched too
     #[arg(long, value_name = "NAME=DIR", value_parser = pair::<'='>)]
     package: Vec<(String, String)>,
-    /// The value of an xacro argument (repeatable)
+    /// Value of an xacro argument (repeatable)
     #[arg(long, value_name = "NAME:=VALUE", value_parser = xacro_arg)]
     xacro_arg: Vec<(String, String)>,
-    /// The robot's SRDF: groups, named poses, pairs of links that may touch
+    /// SRDF of the robot: groups, named poses, allowed collision pairs
     #[arg(long, value_name = "FILE")]
     srdf: Option<PathBuf>,
-    /// The robot's joint_limits.yaml: accelerations and jerks
+    /// joint_limits.yaml of the robot: accelerations and jerks
     #[arg(long, value_name = "FILE")]
     joint_limits: Option<PathBuf>,
     /// Print JSON
@@ -70,7 +70,7 @@ fn pair<const SIGN: char>(text: &str) -> std::result::Result<(String, String), S
     }
 }
 
-/// `NAME:=VALUE`, as ROS users type it; `NAME=VALUE` does as well.
+/// Parses `NAME:=VALUE`, as in ROS; `NAME=VALUE` works as well.
 fn xacro_arg(text: &str) -> std::result::Result<(String, String), String> {
     let (name, value) = pair::<'='>(text).map_err(|_| "must be NAME:=VALUE".to_owned())?;
     Ok((name.strip_suffix(':').unwrap_or(&name).to_owned(), value))
@@ -88,7 +88,7 @@ impl File {
         })
     }
 
-    /// The robot; its mistakes and warnings go to stderr.
+    /// Returns the robot; prints its mistakes and warnings to stderr.
     fn robot(&self, meshes: Meshes) -> Result<(RobotModel, Loaded)> {
         let mut loaded = self.load(meshes);
         let text = loaded.render(output::colour(&std::io::stderr()));
@@ -115,7 +115,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
 }
 
-/// Prints the URDF even of a robot that has mistakes: it helps to find them.
+/// Prints the URDF even of a robot with mistakes: it helps to find them.
 fn expand(file: &File) -> Result {
     let loaded = file.load(Meshes::Ignore);
     let text = loaded.render(output::colour(&std::io::stderr()));

@@ -1,4 +1,4 @@
-//! Runs that belong to other users: they can be seen, because the kernel lists every socket, but not talked to.
+//! Runs of other users: visible, because the kernel lists every socket, but not accessible.
 
 use std::fmt;
 use std::os::unix::fs::MetadataExt;
@@ -6,15 +6,15 @@ use std::path::{Path, PathBuf};
 
 /// The kernel's list of sockets.
 const SOCKETS: &str = "/proc/net/unix";
-/// How it marks a socket that takes connections.
+/// Flag of a listening socket in that list.
 const LISTENING: &str = "00010000";
 
 /// A live run of another user.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct OtherRun {
-    /// Its name.
+    /// Name.
     pub name: String,
-    /// The user: a name where there is one, else a number.
+    /// The user's name, or number if there is no name.
     pub user: String,
 }
 
@@ -24,7 +24,7 @@ impl fmt::Display for OtherRun {
     }
 }
 
-/// The live runs of all other users. None where the system does not show them.
+/// Returns the live runs of all other users; empty if the system does not show them.
 pub fn runs() -> Vec<OtherRun> {
     let us = rustix::process::geteuid().as_raw();
     let sockets = std::fs::read_to_string(SOCKETS).unwrap_or_default();
@@ -39,7 +39,7 @@ pub fn runs() -> Vec<OtherRun> {
     others
 }
 
-/// The path of a socket that takes connections, from a line of the list.
+/// Returns the path of a listening socket, from a line of the list.
 fn listening(line: &str) -> Option<PathBuf> {
     // Num RefCount Protocol Flags Type St Inode Path
     let mut columns = line.split_ascii_whitespace();
@@ -48,7 +48,7 @@ fn listening(line: &str) -> Option<PathBuf> {
     (flags == LISTENING && path.starts_with('/')).then(|| PathBuf::from(path))
 }
 
-/// The run's name, if a socket is that of a run.
+/// Returns the run's name, if a socket belongs to a run.
 fn run_of(path: &Path) -> Option<String> {
     let folder = path.parent()?.file_name()?.to_str()?;
     let ours = folder == "dimos" || folder.strip_prefix("dimos-").is_some_and(|uid| uid.parse::<u32>().is_ok());
@@ -56,7 +56,7 @@ fn run_of(path: &Path) -> Option<String> {
     is_run.then(|| path.file_stem()?.to_str().map(str::to_owned)).flatten()
 }
 
-/// Who owns a path, as far as it can be seen: others see a closed folder, and not what is in it.
+/// Returns the owner of a path, as far as visible: others see a closed folder, but not its contents.
 fn owner(path: &Path) -> Option<u32> {
     path.ancestors().find_map(|visible| std::fs::symlink_metadata(visible).ok()).map(|found| found.uid())
 }
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sockets_of_runs_are_told_from_others() {
+    fn sockets_of_runs_are_recognized() {
         let line =
             |flags: &str, path: &str| format!("0000000000000000: 00000002 00000000 {flags} 0001 01 47110 {path}");
         let run = |path: &str| listening(&line(LISTENING, path)).and_then(|path| run_of(&path));

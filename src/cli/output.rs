@@ -1,4 +1,4 @@
-//! Printing: data to stdout, diagnostics to stderr, tables that align, colour only for eyes.
+//! Output: data to stdout, diagnostics to stderr, aligned tables, colour on terminals only.
 
 use std::fmt::Display;
 use std::io::{self, IsTerminal, Write};
@@ -10,10 +10,10 @@ use serde::Serialize;
 
 use super::exit::Failure;
 
-/// In fewer columns than these a table is not squeezed: the terminal breaks its lines.
-const NARROWEST: u16 = 40;
+/// Minimum width of a squeezed table [columns]; below, the terminal wraps the lines.
+const MIN_COLUMNS: u16 = 40;
 
-/// Prints a line of data to stdout. That nobody reads it any more (`| head`) is no error.
+/// Prints a line of data to stdout. A closed pipe (`| head`) is not an error.
 pub fn line(text: impl Display) {
     let _ = writeln!(io::stdout().lock(), "{text}");
 }
@@ -38,23 +38,23 @@ pub fn failure(failure: &Failure) {
     }
 }
 
-/// Whether to colour what goes to `stream`: only on a terminal, and not where `NO_COLOR` is set.
+/// Returns whether to colour `stream`: only on a terminal, unless `NO_COLOR` is set.
 pub fn colour(stream: &impl IsTerminal) -> bool {
     stream.is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
 }
 
-/// How a word strikes the eye.
+/// Tone of a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tone {
-    /// As it should be.
+    /// Good.
     Good,
-    /// Worth a look.
+    /// Warning.
     Warning,
-    /// Wrong.
+    /// Error.
     Bad,
 }
 
-/// A cell with a tone.
+/// Returns a cell with a tone.
 pub fn toned(text: impl Display, tone: Tone) -> Cell {
     let colour = match tone {
         Tone::Good => Color::Green,
@@ -64,22 +64,22 @@ pub fn toned(text: impl Display, tone: Tone) -> Cell {
     Cell::new(text).fg(colour)
 }
 
-/// Whether it is a terminal that says how wide it is, and is not too narrow for columns. One that a program has opened
-/// (`script`, a container) may say 0.
+/// Returns whether it is a terminal that reports its width and is wide enough for columns. Pseudo-terminals (`script`,
+/// a container) may report 0.
 fn has_width(out: impl AsFd) -> bool {
-    rustix::termios::tcgetwinsize(out).is_ok_and(|size| size.ws_col >= NARROWEST)
+    rustix::termios::tcgetwinsize(out).is_ok_and(|size| size.ws_col >= MIN_COLUMNS)
 }
 
-/// A table without lines: columns aligned, two spaces apart.
+/// A table without borders: aligned columns, two spaces apart.
 pub struct Table(comfy_table::Table);
 
 impl Table {
-    /// A table with these headings. One that starts with `>` heads a column of numbers, aligned to the right.
+    /// Creates a table with these headings. A leading `>` aligns the column to the right.
     pub fn new(headings: &[&str]) -> Self {
         let mut table = comfy_table::Table::new();
         table.load_style(NOTHING);
         if has_width(io::stdout()) {
-            // What does not fit goes on below, in its own column.
+            // Long cells wrap within their column.
             table.set_content_arrangement(ContentArrangement::Dynamic);
         }
         if !colour(&io::stdout()) {
@@ -101,7 +101,7 @@ impl Table {
         self.0.add_row(cells.into_iter().map(Into::into).collect::<Vec<Cell>>());
     }
 
-    /// Its lines, as they are printed.
+    /// Returns its lines as printed.
     pub fn lines(&self) -> Vec<String> {
         self.0.lines().map(|row| row.trim_end().to_owned()).collect()
     }
@@ -112,12 +112,12 @@ impl Table {
     }
 }
 
-/// A number with so many decimals, or `-` where there is none.
+/// Formats a number with this many decimals, or `-` if there is none.
 pub fn number(value: Option<f64>, decimals: usize) -> String {
     value.map_or_else(|| "-".into(), |v| fixed(v, decimals))
 }
 
-/// A number with so many decimals; never `-0.00`.
+/// Formats a number with this many decimals; never `-0.00`.
 pub fn fixed(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
     match text.strip_prefix('-') {
@@ -126,7 +126,7 @@ pub fn fixed(value: f64, decimals: usize) -> String {
     }
 }
 
-/// A span of time as people say it: `2 h 5 min`, `12.3 s`.
+/// Formats a duration: `2 h 5 min`, `12.3 s`.
 pub fn span(seconds: f64) -> String {
     let whole = seconds as u64;
     match whole {

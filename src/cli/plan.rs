@@ -1,4 +1,4 @@
-//! `dimos plan ROBOT …`: a collision-free motion of one robot or several, planned and shown, not carried out.
+//! `dimos plan ARM …`: plans and shows a collision-free motion of one arm or several, without executing it.
 
 use super::arguments::Target;
 use super::exit::{Exit, Result};
@@ -9,19 +9,19 @@ use super::output;
 /// Arguments of `plan`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-Then `dimos preview` shows the plan and `dimos execute` carries it out. `dimos move` does all in one go.
+Next: `dimos preview` shows the plan, `dimos execute` executes it. `dimos move` plans and executes in one step.
   dimos plan arm 0.3 -0.2 0.5 0 0.4 0
   dimos plan arm --pose 0.3 0.1 0.4 --rpy 0 1.57 0
   dimos plan arm --named home
-  dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0     both at once, in one motion")]
+  dimos plan --goal left=named:home --goal right=0.5,-0.3,0.6,0,0.8,0     both arms in one motion")]
 pub struct Args {
-    /// The robot's name in the planner; several have --goal each
+    /// Name of the arm in the planner; with several arms use --goal for each
     #[arg(required_unless_present = "several", conflicts_with = "several")]
     pub robot: Option<String>,
-    /// Where it shall go
+    /// Goal of the motion
     #[command(flatten)]
     pub goal: Goal,
-    /// How to search
+    /// Settings of the search
     #[command(flatten)]
     pub search: Search,
     /// Which run
@@ -41,7 +41,7 @@ pub fn run(args: &Args) -> Result {
         }));
     } else {
         show(&planned);
-        output::note("nothing has moved: `dimos execute` carries it out");
+        output::note("nothing has moved: `dimos execute` executes the plan");
     }
     Ok(Exit::Ok)
 }

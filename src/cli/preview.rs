@@ -1,4 +1,4 @@
-//! `dimos preview`: a plan as a table of moments, or as a trajectory file.
+//! `dimos preview`: a plan as a table of samples, or as a trajectory file.
 
 use std::path::PathBuf;
 
@@ -14,9 +14,9 @@ const ROWS: usize = 12;
 /// Arguments of `preview`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The plan's number; without it the newest
+    /// Number of the plan; default: the newest
     pub plan: Option<u64>,
-    /// Write the trajectory to a JSON file, which `dimos execute FILE` takes
+    /// Write the trajectory to a JSON file for `dimos execute FILE`
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
     /// Which run
@@ -43,7 +43,7 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Some moments of the motion, its ends included.
+/// Returns samples of the motion, its ends included.
 fn table(reply: &PreviewReply) -> Table {
     let names = reply.trajectory.joint_names.iter().map(|name| format!(">{name}"));
     let ends = reply.end_effectors.keys().map(|robot| format!(">{robot} x y z [m]"));

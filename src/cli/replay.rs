@@ -1,4 +1,5 @@
-//! `dimos replay`: plays a log back to the terminal, in the time it took, runs it again and compares, or drives arms by it.
+//! `dimos replay`: plays a log on the terminal in real time, replays it through the control code, or drives arms with
+//! it.
 
 mod onto;
 mod player;
@@ -21,25 +22,26 @@ use crate::replay::recorded::RecordedError;
 use player::{Part, RealTime, play};
 use view::{JsonLines, Live, Plain, View};
 
-/// Exit code: the log comes out differently when it is run again.
+/// Exit code: the replayed outputs differ from the log.
 const DIFFERENT: u8 = 1;
-/// Exit code: the log is not there, not a log, or does not have what was asked for.
+/// Exit code: the log does not exist, is not a log, or lacks the requested part.
 const USAGE: u8 = 2;
-/// Exit code: data was lost while recording, or the log was cut.
+/// Exit code: samples were lost while recording, or the log is truncated.
 const DATA_LOST: u8 = 3;
 
-/// Play a log back to the terminal, verify it, or let arms follow it
+/// Play a log on the terminal, verify it, or drive arms with it
 ///
-/// In the time it took: a joint table and a progress bar on a terminal, a line a second elsewhere, a JSON object per
-/// message with --json. Exits with 3 if the log was cut, or if the recorder lost data.
+/// Plays in real time: a joint table and a progress bar on a terminal, one line per second elsewhere, one JSON object
+/// per message with --json. Exits with 3 if the log is truncated, or if the recorder lost samples.
 ///
-/// With --verify nothing is played: what every tick read and was told goes through the same control code again, and
-/// every command has to come out the same, bit for bit. Exits with 1 and the first difference if not; with 3 if a part
-/// is missing in the log, up to which it came out the same.
+/// With --verify the inputs and requests of every tick pass through the same control code again, and every command must
+/// be identical, bit for bit. Otherwise exits with 1 and prints the first difference; exits with 3 if a part is missing
+/// in the log, up to which all commands are identical.
 ///
-/// With --onto the arms of a blueprint follow the recorded motion, joint by joint of the same name, in a run of their
-/// own: a slow approach to where it begins, then the motion through the blueprint's trajectory tasks, within all limits.
-/// Where one would be broken it is refused before anything moves. It is not collision-checked. Ctrl-C decelerates.
+/// With --onto the arms of a blueprint follow the recorded motion, matched by joint names, in a separate run: first a
+/// slow approach to its start, then the motion through the blueprint's trajectory tasks, within all limits. A motion
+/// that exceeds a limit is rejected before anything moves. It is not collision-checked. Ctrl-C decelerates the arms to
+/// rest.
 #[derive(Debug, Clone, Args)]
 pub struct ReplayArgs {
     /// Log file (.mcap)
@@ -48,25 +50,25 @@ pub struct ReplayArgs {
     /// Play the newest log
     #[arg(long)]
     pub last: bool,
-    /// Play or move faster or slower: 2 is twice as fast
+    /// Speed factor: 2 plays or moves twice as fast
     #[arg(short, long, value_name = "FACTOR", default_value = "1", value_parser = rate)]
     pub rate: f64,
-    /// Begin again at the end
+    /// Repeat from the start
     #[arg(short, long = "loop")]
     pub looping: bool,
-    /// Begin this long after the first message, e.g. 1.5, 10s or 2m
+    /// Start this long after the first message, e.g. 1.5, 10s or 2m
     #[arg(long, value_name = "TIME", default_value = "0", value_parser = duration)]
     pub start_offset: Duration,
-    /// Play this much of it, e.g. 1.5, 10s or 2m
+    /// Play this much of the log, e.g. 1.5, 10s or 2m
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub duration: Option<Duration>,
-    /// Play these topics only, separated by commas
+    /// Play only these topics, separated by commas
     #[arg(long, value_name = "TOPIC", value_delimiter = ',')]
     pub topics: Vec<String>,
-    /// Run all of the log through the control code again, and compare its commands bit for bit
+    /// Replay the whole log through the control code and compare its commands bit for bit
     #[arg(long, conflicts_with_all = ["rate", "looping", "start_offset", "duration", "topics"])]
     pub verify: bool,
-    /// Where to drive arms by it
+    /// Arguments of --onto
     #[command(flatten)]
     pub onto: OntoArgs,
     /// Print JSON
@@ -74,22 +76,22 @@ pub struct ReplayArgs {
     pub json: bool,
 }
 
-/// Arguments that drive arms.
+/// Arguments of --onto.
 #[derive(Debug, Clone, Args)]
 pub struct OntoArgs {
     /// Let the arms of this blueprint follow the recorded motion
     #[arg(long = "onto", value_name = "BLUEPRINT", conflicts_with_all = ["verify", "looping", "topics"])]
     pub blueprint: Option<String>,
-    /// Let real arms move; without this only simulated ones do
+    /// Allow real arms to move; by default only simulated arms do
     #[arg(long, requires = "blueprint")]
     pub allow_motion: bool,
     /// Change a field of the blueprint: hardware.arm.address=192.168.1.100 (repeatable)
     #[arg(long, value_name = "PATH=VALUE", value_parser = setting, requires = "blueprint")]
     pub set: Vec<(String, String)>,
-    /// Let emulators stand in for all arms of the blueprint
+    /// Simulate all arms of the blueprint
     #[arg(long, requires = "blueprint")]
     pub sim: bool,
-    /// Name of the run; without it the blueprint's name
+    /// Name of the run; default: the blueprint's name
     #[arg(long, value_name = "RUN", requires = "blueprint")]
     pub name: Option<String>,
     /// Write the log of the run to this file
@@ -105,25 +107,25 @@ fn rate(text: &str) -> Result<f64, String> {
     if (1e-3..=1e6).contains(&rate) { Ok(rate) } else { Err("must be between 0.001 and 1000000".into()) }
 }
 
-/// A time in seconds, or with a unit.
+/// Parses a time in seconds, or with a unit.
 fn duration(text: &str) -> Result<Duration, String> {
-    let wrong = || "not a time: say 1.5, 500ms, 10s or 2m".to_owned();
+    let wrong = || "not a duration: write 1.5, 500ms, 10s or 2m".to_owned();
     match text.parse::<f64>() {
         Ok(seconds) => Duration::try_from_secs_f64(seconds).map_err(|_| wrong()),
         Err(_) => text.parse::<jiff::SignedDuration>().ok().and_then(|d| d.try_into().ok()).ok_or_else(wrong),
     }
 }
 
-/// What is asked of a log that does not have it.
+/// Why a log cannot be played as requested.
 #[derive(Debug, Error)]
-enum NotThere {
-    #[error("there is no log yet{}\nhint: `dimos run` makes one unless told not to", folder_text(.0))]
+enum SelectionError {
+    #[error("there is no log yet{}\nhint: `dimos run` writes one unless --no-record is given", folder_text(.0))]
     NoLogs(Option<PathBuf>),
     #[error("the log {path} has no topic {topic}\nhint: it has {topics}")]
     NoTopic { path: PathBuf, topic: String, topics: String },
     #[error("the log {path} has no messages\nhint: its run ended before the first tick")]
     Empty { path: PathBuf },
-    #[error("the log {path} is only {length:.3} s long\nhint: choose a shorter --start-offset")]
+    #[error("the log {path} is only {length:.3} s long\nhint: use a shorter --start-offset")]
     TooShort { path: PathBuf, length: f64 },
 }
 
@@ -131,12 +133,12 @@ fn folder_text(folder: &Option<PathBuf>) -> String {
     folder.as_ref().map_or_else(String::new, |f| format!(" in {}", f.display()))
 }
 
-/// Plays a log as the arguments say. Gives the exit code.
+/// Plays a log as requested. Returns the exit code.
 pub fn run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
     match try_run(args, registry) {
         Ok(code) => Ok(code),
         Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(0),
-        Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
+        Err(e) if e.is::<SelectionError>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
             eprintln!("error: {e}");
             Ok(USAGE)
         }
@@ -175,7 +177,7 @@ fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
         eprintln!("warning: {} samples are missing in this log: the recorder fell behind", end.lost);
     }
     if end.damaged > 0 {
-        eprintln!("warning: {} messages are not what their schema says", end.damaged);
+        eprintln!("warning: {} messages do not match their schema", end.damaged);
     }
     Ok(if end.cut.is_some() || end.lost > 0 || end.damaged > 0 { DATA_LOST } else { 0 })
 }
@@ -186,26 +188,26 @@ fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
     }
     let folder = files::log_folder();
     let newest = folder.as_deref().map(files::newest).transpose()?.flatten();
-    Ok(newest.ok_or(NotThere::NoLogs(folder))?)
+    Ok(newest.ok_or(SelectionError::NoLogs(folder))?)
 }
 
-fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> Result<Part, NotThere> {
+fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> Result<Part, SelectionError> {
     let path = path.to_owned();
     if let Some(topic) = args.topics.iter().find(|t| !info.topics.contains_key(*t)) {
         let topics = info.topics.keys().cloned().collect::<Vec<_>>().join(", ");
-        return Err(NotThere::NoTopic { path, topic: topic.clone(), topics });
+        return Err(SelectionError::NoTopic { path, topic: topic.clone(), topics });
     }
-    let Some((start, end)) = info.span else { return Err(NotThere::Empty { path }) };
+    let Some((start, end)) = info.span else { return Err(SelectionError::Empty { path }) };
     let nanoseconds = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
     let from = start.saturating_add(nanoseconds(args.start_offset));
     if from > end {
-        return Err(NotThere::TooShort { path, length: (end - start) as f64 * 1e-9 });
+        return Err(SelectionError::TooShort { path, length: (end - start) as f64 * 1e-9 });
     }
     let to = args.duration.map_or(end, |d| from.saturating_add(nanoseconds(d)).min(end));
     Ok(Part { topics: args.topics.clone(), from, to, rate: args.rate, looping: args.looping })
 }
 
-/// One line about the log, before it plays.
+/// Returns a line about the log, before it plays.
 fn headline(path: &Path, info: &LogInfo) -> String {
     let run = info.metadata.get("run").map_or_else(String::new, |run| format!(", run {run}"));
     let length = info.span.map_or(0.0, |(start, end)| (end - start) as f64 * 1e-9);

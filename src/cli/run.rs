@@ -1,6 +1,6 @@
-//! `dimos run NAME|PATH`: starts a run and keeps it up until a signal, its time, `dimos down` or a fault ends it. A
-//! planner whose arms are in a run already attaches to that one ([`attach`]).
-//! With `--daemon` a process of its own does that ([`daemon`]).
+//! `dimos run NAME|PATH`: starts a run and keeps it up until a signal, its duration, `dimos down` or a fault ends it. A
+//! planner whose arms belong to a live run attaches to that run ([`attach`]). With `--daemon` a separate process does
+//! that ([`daemon`]).
 
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Sender;
@@ -12,7 +12,7 @@ use signal_hook::iterator::Signals;
 
 use super::arguments::{duration, setting};
 use super::attach::{self, Attached};
-use super::daemon::Starter;
+use super::daemon::StartingProcess;
 use super::exit::{Exit, Failure, Result};
 use super::run_record::RunRecord;
 use super::text_log::Terminal;
@@ -31,10 +31,10 @@ pub struct Args {
     /// Change a field of the blueprint: hardware.arm.address=192.168.1.100 (repeatable)
     #[arg(long, value_name = "PATH=VALUE", value_parser = setting)]
     pub set: Vec<(String, String)>,
-    /// Let emulators stand in for all arms
+    /// Simulate all arms
     #[arg(long)]
     pub sim: bool,
-    /// End by itself after this time: 10s, 2m
+    /// Stop the run after this time: 10s, 2m
     #[arg(long, value_name = "TIME", value_parser = duration)]
     pub duration: Option<Duration>,
     /// Write the log to this file
@@ -43,19 +43,19 @@ pub struct Args {
     /// Write no log
     #[arg(long)]
     pub no_record: bool,
-    /// Name of the run; without it the blueprint's name
+    /// Name of the run; default: the blueprint's name
     #[arg(long, value_name = "RUN")]
     pub name: Option<String>,
-    /// Start a run of its own, even if a live run has the planner's arms
+    /// Start a separate run, even if a live run has the planner's arms
     #[arg(long, conflicts_with = "attach")]
     pub standalone: bool,
-    /// Attach the blueprint's planner to this live run; without it, to the one that has its arms and tasks, if there is one
+    /// Attach the blueprint's planner to this live run; default: the run that has its arms and tasks, if there is one
     #[arg(long, value_name = "RUN")]
     pub attach: Option<String>,
-    /// Start the run in the background, without this terminal; return when the arms are up
+    /// Start the run in the background; return when the arms are up
     #[arg(short, long)]
     pub daemon: bool,
-    /// What the process in the background is started with
+    /// Text log of the background process
     #[arg(long, value_name = "FILE", hide = true)]
     pub text_log: Option<PathBuf>,
     /// Only check the blueprint; connect to nothing
@@ -67,7 +67,7 @@ pub struct Args {
 }
 
 impl Args {
-    /// What the arguments change in the blueprint.
+    /// Returns the changes of the blueprint by arguments.
     pub fn overrides(&self) -> Overrides {
         Overrides { set: self.set.iter().map(|(path, value)| format!("{path}={value}")).collect(), sim: self.sim }
     }
@@ -103,9 +103,9 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
 }
 
-/// What a run in the background does: it tells whoever started it that it is up, or why not.
+/// Runs in the background: reports to the starting process that the run is up, or why not.
 fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
-    let starter = Starter::detach(text_log)?;
+    let starter = StartingProcess::detach(text_log)?;
     let (up, signals, terminal) = match bring_up(args, registry) {
         Ok(up) => up,
         Err(failure) => {
@@ -113,12 +113,12 @@ fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
             return Err(failure);
         }
     };
-    let (endings, told) = match &up {
+    let (endings, notified) = match &up {
         Up::Run(run) => (run.endings(), starter.up(&run.status(), run.socket(), None)),
         Up::Planner(planner) => (planner.endings(), starter.up(&planner.report(), None, Some(planner.run()))),
     };
-    if !told {
-        terminal.note("whoever started this run has gone before it was up");
+    if !notified {
+        terminal.note("the starting process exited before the run was ready");
         let _ = endings.send(Ending::Asked);
     }
     let run = match up {
@@ -136,7 +136,7 @@ fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
 enum Up {
     /// A run.
     Run(Box<Run>),
-    /// A planner that is attached to one.
+    /// An attached planner.
     Planner(Box<Attached>),
 }
 
@@ -144,7 +144,7 @@ fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)>
     let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
-    // Taken before anything is connected: a signal during the start ends the run as soon as it is up, controlled.
+    // Watched before anything is connected: a signal during startup ends the run, controlled, as soon as it is up.
     let signals = signals()?;
     let terminal = terminal()?;
     if let Some(run) = attach::chosen(args, blueprint)? {
@@ -162,19 +162,19 @@ fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)>
     Ok((Up::Run(Box::new(run)), signals, terminal))
 }
 
-/// Keeps a run up until a signal, its time, `dimos down` or a fault ends it, and stops it: what `dimos run` does with
-/// a run that has started. Tells about it on the terminal.
+/// Keeps a started run up until a signal, its duration, `dimos down` or a fault ends it, and stops it. Reports on the
+/// terminal.
 pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result {
     keep_up(run, signals()?, &terminal()?, duration, json, None)
 }
 
 fn signals() -> Result<Signals> {
     Signals::new([SIGINT, SIGTERM, SIGHUP])
-        .map_err(|e| Failure::new(Exit::Failed, format!("signals cannot be watched: {e}")))
+        .map_err(|e| Failure::new(Exit::Failed, format!("cannot watch signals: {e}")))
 }
 
 fn terminal() -> Result<Terminal> {
-    Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the terminal: {e}")))
+    Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("cannot start the thread of the terminal: {e}")))
 }
 
 fn keep_up(
@@ -192,11 +192,11 @@ fn keep_up(
     banner::print(terminal, &report, run.socket().unwrap_or_else(|| Path::new("none")), how_to_end, json);
     let ending = run.wait_for_end(duration);
     if !json {
-        terminal.note(format_args!("{}: coming to rest, then releasing the arms", why(&ending)));
+        terminal.note(format_args!("{}: decelerating to rest, then releasing the arms", why(&ending)));
     }
     let report = run.status();
     let ended = run.stop();
-    say_goodbye(terminal, &report, &ending, &ended, json);
+    print_summary(terminal, &report, &ending, &ended, json);
     let exit = match &ending {
         Ending::Fault(_) => Exit::Fault,
         Ending::Log(_) => Exit::Log,
@@ -212,17 +212,17 @@ fn keep_up(
     Ok(exit)
 }
 
-/// Hands signals to what is up for as long as the process lives: a second one is taken note of and changes nothing.
+/// Forwards signals for the lifetime of the process: a second signal is logged and changes nothing.
 fn watch(mut signals: Signals, endings: Sender<Ending>) -> Result<()> {
     let watching = std::thread::Builder::new().name("signals".into()).spawn(move || {
         for signal in signals.forever() {
             let _ = endings.send(Ending::Signal(signal));
         }
     });
-    watching.map(|_| ()).map_err(|e| Failure::new(Exit::Failed, format!("no thread for signals: {e}")))
+    watching.map(|_| ()).map_err(|e| Failure::new(Exit::Failed, format!("cannot start the thread of signals: {e}")))
 }
 
-/// Why something ended, in a word or a few.
+/// Returns why something ended, in a few words.
 pub(super) fn why(ending: &Ending) -> String {
     match ending {
         Ending::Signal(signal) => match *signal {
@@ -231,14 +231,14 @@ pub(super) fn why(ending: &Ending) -> String {
             SIGHUP => "SIGHUP".to_owned(),
             other => format!("signal {other}"),
         },
-        Ending::Duration => "its time is over".to_owned(),
-        Ending::Asked => "asked to end".to_owned(),
+        Ending::Duration => "duration reached".to_owned(),
+        Ending::Asked => "shutdown requested".to_owned(),
         Ending::Log(what) => what.clone(),
         Ending::Fault(what) => format!("FAULT: {what}"),
     }
 }
 
-fn say_goodbye(terminal: &Terminal, report: &StatusReport, ending: &Ending, ended: &Ended, json: bool) {
+fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, ended: &Ended, json: bool) {
     #[derive(Serialize)]
     struct Line<'a> {
         event: &'static str,
@@ -268,8 +268,8 @@ fn say_goodbye(terminal: &Terminal, report: &StatusReport, ending: &Ending, ende
         terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
     }
     match (&ended.log, &ended.log_cut) {
-        (Some(_), Some(cut)) => terminal.note(format_args!("run {} ended; its log is incomplete: {cut}", report.run)),
-        (Some(log), None) => terminal.note(format_args!("run {} ended; its log: {}", report.run, log.display())),
+        (Some(_), Some(cut)) => terminal.note(format_args!("run {} ended; the log is incomplete: {cut}", report.run)),
+        (Some(log), None) => terminal.note(format_args!("run {} ended; log: {}", report.run, log.display())),
         (None, _) => terminal.note(format_args!("run {} ended; no log was written", report.run)),
     }
 }

@@ -1,5 +1,5 @@
-//! What is kept of a run for those who come later: `<run>.json` beside the logs, written when the run is up and again
-//! when it has ended. A record without an end whose process is gone is that of a run that crashed.
+//! Record of the latest run of a name: `<run>.json` beside the logs, written when the run is up and again when it has
+//! ended. A record without an end whose process is gone belongs to a crashed run.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -11,56 +11,56 @@ use super::exit::{Exit, Failure};
 use crate::recording::files;
 use crate::rpc::report::StatusReport;
 
-/// How much of the end of a text log is looked at for last words [bytes].
+/// Size of the tail of a text log that is searched for its last lines [bytes].
 const TAIL: u64 = 8192;
-/// So many lines are last words.
+/// Maximum number of last lines.
 const LAST_LINES: usize = 6;
 
 /// The latest run of a name.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
-    /// The run's name.
+    /// Name of the run.
     pub run: String,
-    /// Its process.
+    /// Process id.
     pub pid: u32,
-    /// When the process began, as the kernel counts: a number is used again for another process some day.
+    /// Start time of the process by the kernel's clock: process ids are reused.
     process_began: u64,
     /// When it was up (UTC): `2026-11-21T14:16:30.123Z`.
     pub started: String,
-    /// The blueprint's name.
+    /// Name of the blueprint.
     pub blueprint: String,
     /// Its log.
     pub log: Option<PathBuf>,
-    /// Its text log; without one its text went to its terminal.
+    /// Its text log; `None` if it wrote to its terminal.
     pub text_log: Option<PathBuf>,
     /// How it ended.
     pub end: Option<End>,
 }
 
-/// How a run ended.
+/// The end of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct End {
-    /// When (UTC), written like `started`.
+    /// Time (UTC), in the format of `started`.
     pub at: String,
     /// Its exit code.
     pub exit: u8,
-    /// Why.
+    /// Reason.
     pub why: String,
 }
 
-/// What became of a run.
+/// State of a recorded run.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Fate<'a> {
-    /// It lives.
-    Lives,
-    /// It ended and said so.
+pub enum RunState<'a> {
+    /// It is live.
+    Live,
+    /// It ended and recorded its end.
     Ended(&'a End),
-    /// It is gone without a word.
+    /// Its process is gone without a recorded end.
     Crashed,
 }
 
 impl RunRecord {
-    /// Notes that a run is up, in this process.
+    /// Records that a run of this process is up.
     pub fn begin(report: &StatusReport, text_log: Option<&Path>) -> Self {
         let pid = std::process::id();
         let record = Self {
@@ -77,7 +77,7 @@ impl RunRecord {
         record
     }
 
-    /// Notes how it ended.
+    /// Records its end.
     pub fn end(mut self, exit: Exit, why: String) {
         self.end = Some(End { at: now(), exit: exit as u8, why });
         self.keep();
@@ -87,24 +87,24 @@ impl RunRecord {
         let Some(folder) = files::log_folder() else { return };
         let write = || {
             std::fs::create_dir_all(&folder)?;
-            // Whoever reads finds the old record or the new one, never half of one.
+            // Readers find the old record or the new one, never a partial one.
             let fresh = folder.join(format!(".{}.json.{}", self.run, self.pid));
             std::fs::write(&fresh, serde_json::to_vec_pretty(self)?)?;
             std::fs::rename(&fresh, path_in(&folder, &self.run))?;
             io::Result::Ok(())
         };
         if let Err(error) = write() {
-            tracing::info!("what became of the run is not noted: {}: {error}", folder.display());
+            tracing::info!("cannot write the run's record: {}: {error}", folder.display());
         }
     }
 
-    /// The record of a name.
+    /// Returns the record of a name.
     pub fn of(run: &str) -> Option<Self> {
         crate::rpc::place::check_name(run).ok()?;
         read(&path_in(&files::log_folder()?, run))
     }
 
-    /// All records, the oldest run first.
+    /// Returns all records, the oldest run first.
     pub fn all() -> Vec<Self> {
         let entries = files::log_folder().and_then(|folder| std::fs::read_dir(folder).ok());
         let mut all: Vec<Self> =
@@ -113,43 +113,43 @@ impl RunRecord {
         all
     }
 
-    /// What became of it.
-    pub fn fate(&self) -> Fate<'_> {
+    /// Returns its state.
+    pub fn state(&self) -> RunState<'_> {
         match &self.end {
-            Some(end) => Fate::Ended(end),
-            None if process_began(self.pid) == Some(self.process_began) => Fate::Lives,
-            None => Fate::Crashed,
+            Some(end) => RunState::Ended(end),
+            None if process_began(self.pid) == Some(self.process_began) => RunState::Live,
+            None => RunState::Crashed,
         }
     }
 
-    /// Whether it came to an end that nobody wanted: it crashed, or a fault or the end of its log ended it.
-    pub fn fell(&self) -> bool {
-        match self.fate() {
-            Fate::Lives => false,
-            Fate::Ended(end) => [Exit::Fault as u8, Exit::Log as u8].contains(&end.exit),
-            Fate::Crashed => true,
+    /// Returns whether it ended abnormally: by a crash, a fault or the end of its log.
+    pub fn ended_abnormally(&self) -> bool {
+        match self.state() {
+            RunState::Live => false,
+            RunState::Ended(end) => [Exit::Fault as u8, Exit::Log as u8].contains(&end.exit),
+            RunState::Crashed => true,
         }
     }
 
-    /// What became of it, in a sentence without full stop; `None` while it lives.
-    pub fn obituary(&self) -> Option<String> {
+    /// Describes its end in a sentence without full stop; `None` if it is live.
+    pub fn describe_end(&self) -> Option<String> {
         let (run, pid) = (&self.run, self.pid);
-        match self.fate() {
-            Fate::Lives => None,
-            Fate::Ended(end) => Some(format!("{run} (pid {pid}) ended {}: {}", end.at, end.why)),
-            Fate::Crashed => Some(format!("{run} (pid {pid}), up since {}, crashed", self.started)),
+        match self.state() {
+            RunState::Live => None,
+            RunState::Ended(end) => Some(format!("{run} (pid {pid}) ended {}: {}", end.at, end.why)),
+            RunState::Crashed => Some(format!("{run} (pid {pid}), up since {}, crashed", self.started)),
         }
     }
 
-    /// The last lines of its text log.
+    /// Returns the last lines of its text log.
     pub fn last_words(&self) -> Vec<String> {
         self.text_log.as_deref().map(last_lines).unwrap_or_default()
     }
 
-    /// Why a verb cannot talk to it; `None` while it lives.
+    /// Returns why a verb cannot reach it; `None` if it is live.
     pub fn failure(&self) -> Option<Failure> {
-        let mut what = format!("no live run is named {}: {}", self.run, self.obituary()?);
-        for line in self.last_words().iter().filter(|_| self.fell()) {
+        let mut what = format!("no live run is named {}: {}", self.run, self.describe_end()?);
+        for line in self.last_words().iter().filter(|_| self.ended_abnormally()) {
             what += &format!("\n  {line}");
         }
         let hint = match &self.text_log {
@@ -160,12 +160,12 @@ impl RunRecord {
     }
 }
 
-/// A path for readers who are in another folder.
+/// Returns an absolute path, for readers in another folder.
 fn absolute(path: impl AsRef<Path>) -> PathBuf {
     std::path::absolute(path.as_ref()).unwrap_or_else(|_| path.as_ref().to_owned())
 }
 
-/// The time, written so that later times sort behind earlier ones.
+/// Returns the current time in a format that sorts chronologically.
 fn now() -> String {
     format!("{:.3}", Timestamp::now())
 }
@@ -174,13 +174,13 @@ fn path_in(folder: &Path, run: &str) -> PathBuf {
     folder.join(format!("{run}.json"))
 }
 
-/// The record in a file; `None` where there is none, or it is something else.
+/// Reads a record; `None` if there is none or it is not valid.
 fn read(path: &Path) -> Option<RunRecord> {
     path.extension().filter(|ending| *ending == "json")?;
     serde_json::from_slice(&std::fs::read(path).ok()?).ok()
 }
 
-/// The last lines of a text file; none where it cannot be read.
+/// Returns the last lines of a text file; empty if it cannot be read.
 pub fn last_lines(path: &Path) -> Vec<String> {
     use std::io::{Read, Seek, SeekFrom};
     let tail = || {
@@ -196,10 +196,10 @@ pub fn last_lines(path: &Path) -> Vec<String> {
     lines.iter().skip(lines.len().saturating_sub(LAST_LINES)).map(|&line| line.to_owned()).collect()
 }
 
-/// When a process began, in ticks since the machine did; `None` when there is no such process, or only its remains.
+/// Returns the start time of a process in ticks since boot; `None` if there is no such process, or only a zombie.
 fn process_began(pid: u32) -> Option<u64> {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // The name of the program stands in parentheses and may contain anything.
+    // The program's name is in parentheses and may contain anything.
     let mut fields = stat.rsplit_once(')')?.1.split_whitespace();
     if matches!(fields.next()?, "Z" | "X") {
         return None;
@@ -225,11 +225,11 @@ mod tests {
     }
 
     #[test]
-    fn a_process_is_known_by_its_number_and_when_it_began() {
+    fn a_process_is_identified_by_its_pid_and_start_time() {
         let us = std::process::id();
         let began = process_began(us).unwrap();
-        assert_eq!(record(us, began).fate(), Fate::Lives);
-        assert_eq!(record(us, began + 1).fate(), Fate::Crashed, "another process has the number now");
+        assert_eq!(record(us, began).state(), RunState::Live);
+        assert_eq!(record(us, began + 1).state(), RunState::Crashed, "another process has the pid now");
         let mut child = std::process::Command::new("true").spawn().unwrap();
         let pid = child.id();
         child.wait().unwrap();
@@ -237,18 +237,22 @@ mod tests {
     }
 
     #[test]
-    fn only_an_end_that_nobody_wanted_is_a_fall() {
+    fn only_abnormal_ends_count_as_failed() {
         let ended = |exit: Exit| {
             let end = End { at: "1970-01-01T00:00:00.000Z".into(), exit: exit as u8, why: "w".into() };
             RunRecord { end: Some(end), ..record(1, 0) }
         };
-        assert!(ended(Exit::Fault).fell() && !ended(Exit::Terminated).fell() && !ended(Exit::Ok).fell());
-        assert_eq!(ended(Exit::Ok).obituary().unwrap(), "r (pid 1) ended 1970-01-01T00:00:00.000Z: w");
+        assert!(
+            ended(Exit::Fault).ended_abnormally()
+                && !ended(Exit::Terminated).ended_abnormally()
+                && !ended(Exit::Ok).ended_abnormally()
+        );
+        assert_eq!(ended(Exit::Ok).describe_end().unwrap(), "r (pid 1) ended 1970-01-01T00:00:00.000Z: w");
         assert!(record(std::process::id(), 0).failure().unwrap().what.contains("crashed"));
     }
 
     #[test]
-    fn last_words_are_the_last_lines_that_say_something() {
+    fn last_lines_skips_blank_lines() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let text: String = (0..2000).map(|n| format!("line {n}\n\n")).collect();
         std::fs::write(file.path(), text).unwrap();

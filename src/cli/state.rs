@@ -1,4 +1,4 @@
-//! `dimos state [--watch]`: where the joints are, once or again and again.
+//! `dimos state [--watch]`: joint states, once or repeatedly.
 
 use std::io::{self, IsTerminal, Write};
 use std::thread::sleep;
@@ -13,10 +13,10 @@ use crate::rpc::report::{ArmStateReport, JointReport, StateReport};
 /// Arguments of `state`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// Show it again and again, until Ctrl-C or the run's end: a live table; with --json one line per state
+    /// Repeat until Ctrl-C or the run's end: a live table; with --json one line per state
     #[arg(long)]
     pub watch: bool,
-    /// How often to show it [Hz]
+    /// Rate of --watch [Hz]
     #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = rate, requires = "watch")]
     pub rate: f64,
     /// Which run
@@ -36,7 +36,7 @@ pub fn run(args: &Args) -> Result {
             true => vec![serde_json::to_string(&report).unwrap_or_default()],
             false => table(&report),
         };
-        // Nobody reads it any more (`| head`): done.
+        // The pipe is closed (`| head`).
         if screen.show(&lines).is_err() || !args.watch {
             return Ok(Exit::Ok);
         }
@@ -45,7 +45,7 @@ pub fn run(args: &Args) -> Result {
     }
 }
 
-/// What is shown: drawn anew over itself on a terminal, one after the other elsewhere.
+/// Output of --watch: redrawn in place on a terminal, appended elsewhere.
 struct Screen {
     live: bool,
     drawn: usize,
@@ -113,7 +113,7 @@ fn of_arm(arm: &ArmStateReport) -> Vec<String> {
     lines
 }
 
-/// Only what is not measured is worth a word.
+/// Returns the source of a velocity unless it is measured.
 fn source(joint: &JointReport) -> &str {
     if joint.velocity_source == "estimated" { "estimated" } else { "" }
 }

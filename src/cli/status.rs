@@ -1,4 +1,4 @@
-//! `dimos status`: all runs in a line each, or one in full.
+//! `dimos status`: all runs in one line each, or one in full.
 
 use serde::Serialize;
 
@@ -7,7 +7,7 @@ use super::attach;
 use super::banner::at_exit;
 use super::exit::{Exit, Result};
 use super::output::{self, Table, Tone, number, span, toned};
-use super::run_record::{Fate, RunRecord};
+use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::LiveRun;
@@ -21,37 +21,38 @@ pub struct Args {
     pub target_run: Target,
 }
 
-/// A run in the overview: it may not answer.
+/// A run in the overview; it may not answer.
 #[derive(Serialize)]
 #[serde(untagged)]
-enum Found {
+enum RunEntry {
     Answered(Box<StatusReport>),
     Silent {
         run: String,
         pid: u32,
         error: String,
     },
-    Fallen(Fallen),
-    /// A planner in a process of its own whose run is gone.
+    FailedRun(FailedRun),
+    /// A planner in its own process without its run.
     Waits {
         planner: String,
         pid: u32,
     },
 }
 
-/// A run that crashed or that a fault ended, and that nobody has started again since.
+/// A run that crashed or ended by a fault, and has not been started again.
 #[derive(Serialize)]
-struct Fallen {
-    /// What it was, and how it ended.
+struct FailedRun {
+    /// The run and its end.
     #[serde(flatten)]
     record: RunRecord,
-    /// Whether it left no word of its end.
+    /// Whether it crashed without recording its end.
     crashed: bool,
     /// The last lines of its text log.
     last_words: Vec<String>,
 }
 
-/// Runs the verb: the run named, or the only one, in full; several as a list. `--json` without `--run` is a list always.
+/// Runs the verb: the named run, or the only one, in full; several as a list. `--json` without `--run` always prints a
+/// list.
 pub fn run(args: &Args) -> Result {
     let mut runs = args.target_run.named_or_all().map_err(|failure| {
         let dead = args.target_run.run.as_deref().and_then(RunRecord::of).and_then(|record| record.failure());
@@ -66,7 +67,7 @@ pub fn run(args: &Args) -> Result {
         }
         print(&report);
         if args.target_run.run.is_none() {
-            fallen(&[run]).iter().for_each(print_fallen);
+            failed_runs(&[run]).iter().for_each(print_failed);
         }
     } else {
         overview(runs, args.target_run.json);
@@ -74,17 +75,21 @@ pub fn run(args: &Args) -> Result {
     Ok(Exit::Ok)
 }
 
-/// The runs that fell since they were started last.
-fn fallen(live: &[LiveRun]) -> Vec<Fallen> {
-    let dead = RunRecord::all().into_iter().filter(|r| !live.iter().any(|l| l.name == r.run) && r.fell());
-    dead.map(|record| Fallen { crashed: record.fate() == Fate::Crashed, last_words: record.last_words(), record })
-        .collect()
+/// Returns the runs that failed and have not been started again.
+fn failed_runs(live: &[LiveRun]) -> Vec<FailedRun> {
+    let dead = RunRecord::all().into_iter().filter(|r| !live.iter().any(|l| l.name == r.run) && r.ended_abnormally());
+    dead.map(|record| FailedRun {
+        crashed: record.state() == RunState::Crashed,
+        last_words: record.last_words(),
+        record,
+    })
+    .collect()
 }
 
-fn print_fallen(fallen: &Fallen) {
+fn print_failed(failed_runs: &FailedRun) {
     output::line("");
-    output::line(fallen.record.obituary().unwrap_or_default());
-    fallen.last_words.iter().for_each(|words| output::line(format_args!("  {words}")));
+    output::line(failed_runs.record.describe_end().unwrap_or_default());
+    failed_runs.last_words.iter().for_each(|words| output::line(format_args!("  {words}")));
 }
 
 fn ask(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
@@ -92,15 +97,15 @@ fn ask(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
 }
 
 fn overview(runs: Vec<LiveRun>, json: bool) {
-    let fallen = fallen(&runs);
+    let failed_runs = failed_runs(&runs);
     let answers = runs.into_iter().map(|run| match ask(&run) {
-        Ok(report) => Found::Answered(Box::new(report)),
-        Err(error) => Found::Silent { run: run.name, pid: run.pid, error: error.to_string() },
+        Ok(report) => RunEntry::Answered(Box::new(report)),
+        Err(error) => RunEntry::Silent { run: run.name, pid: run.pid, error: error.to_string() },
     });
-    let mut found: Vec<Found> = answers.chain(fallen.into_iter().map(Found::Fallen)).collect();
+    let mut found: Vec<RunEntry> = answers.chain(failed_runs.into_iter().map(RunEntry::FailedRun)).collect();
     let waiting =
-        waiting(found.iter().filter_map(|found| if let Found::Answered(r) = found { Some(&**r) } else { None }));
-    found.extend(waiting.into_iter().map(|p| Found::Waits { planner: p.name, pid: p.pid }));
+        waiting(found.iter().filter_map(|found| if let RunEntry::Answered(r) = found { Some(&**r) } else { None }));
+    found.extend(waiting.into_iter().map(|p| RunEntry::Waits { planner: p.name, pid: p.pid }));
     if json {
         return output::json(&found);
     }
@@ -110,39 +115,39 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
     let mut table = Table::new(&["RUN", ">PID", "UP", "BLUEPRINT", "ARMS", "LOG"]);
     for found in &found {
         match found {
-            Found::Answered(r) => {
+            RunEntry::Answered(r) => {
                 let arms: Vec<String> = r.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
                 let log = r.log.clone().unwrap_or_else(|| "-".into());
                 let simulated = if r.simulated { " SIMULATED" } else { "" };
                 let arms = arms.join(", ") + simulated;
                 table.row([r.run.clone(), r.pid.to_string(), span(r.uptime), r.blueprint.clone(), arms, log]);
             }
-            Found::Silent { run, pid, error } => {
+            RunEntry::Silent { run, pid, error } => {
                 let [pid, error] = [pid.to_string(), error.clone()];
                 table.row([run.as_str(), &pid, "-", "-", &error, "-"]);
             }
-            Found::Fallen(Fallen { record, crashed, .. }) => {
+            RunEntry::FailedRun(FailedRun { record, crashed, .. }) => {
                 let how = toned(if *crashed { "CRASHED" } else { "FAULT" }, Tone::Bad);
                 let log = record.log.as_ref().map_or_else(|| "-".into(), |log| log.display().to_string());
                 let [run, pid, blueprint] = [record.run.clone(), record.pid.to_string(), record.blueprint.clone()];
                 table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how, log.into()]);
             }
-            Found::Waits { planner, pid } => {
+            RunEntry::Waits { planner, pid } => {
                 let pid = pid.to_string();
-                table.row([planner.as_str(), &pid, "-", "-", "a planner that waits for its run", "-"]);
+                table.row([planner.as_str(), &pid, "-", "-", "a planner waiting for its run", "-"]);
             }
         }
     }
     table.print();
-    let answered = found.iter().filter_map(|found| if let Found::Answered(r) = found { Some(r) } else { None });
+    let answered = found.iter().filter_map(|found| if let RunEntry::Answered(r) = found { Some(r) } else { None });
     let planners: Vec<_> = answered.filter_map(|r| Some((r.run.as_str(), r.planner.as_ref()?))).collect();
     if !planners.is_empty() {
         output::line("");
         print_planners(planners.into_iter());
     }
     for found in &found {
-        if let Found::Fallen(fallen) = found {
-            print_fallen(fallen);
+        if let RunEntry::FailedRun(failed_runs) = found {
+            print_failed(failed_runs);
         }
     }
 }
@@ -159,7 +164,7 @@ fn print(r: &StatusReport) {
             output::line(format_args!("  log {log}"));
             output::line(format_args!("  {messages} messages logged, {dropped} dropped{cut}"));
         }
-        _ => output::line("  no log is written"),
+        _ => output::line("  no log"),
     }
     output::line("");
     print_arms(&r.arms);
@@ -173,13 +178,13 @@ fn print(r: &StatusReport) {
     print_timing(r);
 }
 
-/// The planners in processes of their own that are attached to none of these runs.
+/// Returns the planners in their own processes that are attached to none of these runs.
 fn waiting<'r>(runs: impl Iterator<Item = &'r StatusReport>) -> Vec<LiveRun> {
     let attached = runs.filter_map(|run| run.planner.as_ref()?.attached.as_ref()?.pid).collect::<Vec<_>>();
     attach::live().into_iter().filter(|planner| !attached.contains(&(planner.pid as i32))).collect()
 }
 
-/// The planners of runs in a table, which run's if there are several.
+/// Prints the planners of runs as a table, with the run if there are several.
 fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus)>) {
     let mut table = Table::new(&["PLANNER", "STATE", "RUN", "ROBOTS"]);
     let mut errors = Vec::new();
@@ -190,7 +195,7 @@ fn print_planners<'r>(planners: impl Iterator<Item = (&'r str, &'r PlannerStatus
             _ => Tone::Good,
         };
         let name = planner.attached.as_ref().map_or_else(
-            || "the run's own".to_owned(),
+            || "built-in".to_owned(),
             |process| process.pid.map_or(process.name.clone(), |pid| format!("{} (pid {pid})", process.name)),
         );
         table.row([name.into(), toned(&planner.state, tone), run.into(), planner.robots.join(", ").into()]);
@@ -230,13 +235,13 @@ fn print_arms(arms: &[ArmReport]) {
             output::line(format_args!("  {name} is {}: {}", arm.phase, cause.text));
         }
         if arm.stop_pending {
-            output::line(format_args!("  {name}: a stop was not sent yet; it is delivered after the reconnect"));
+            output::line(format_args!("  {name}: a stop is pending; it is sent after the reconnect"));
         }
         if let Some(error) = &arm.error {
             output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));
         }
         for fault in &arm.faults {
-            let over = if fault.over { "over" } else { "still so" };
+            let over = if fault.over { "over" } else { "active" };
             let (ago, count) = (span(fault.since), fault.count);
             output::line(format_args!("  {name} {ago} ago, {count}×, {over}: {}", fault.text));
         }
@@ -257,7 +262,7 @@ fn print_arms(arms: &[ArmReport]) {
     }
 }
 
-/// The tasks in a table.
+/// Prints the tasks as a table.
 pub(super) fn print_tasks(tasks: &[TaskReport]) {
     let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "STATE", ">DONE", "JOINTS"]);
     for task in tasks {
@@ -281,12 +286,12 @@ pub(super) fn print_tasks(tasks: &[TaskReport]) {
             output::line(format_args!("  {} is {}: {reason}", task.name, task.state));
         }
         if let Some(bound) = &task.bound {
-            output::line(format_args!("  {} is held back by {bound}", task.name));
+            output::line(format_args!("  {} is limited by {bound}", task.name));
         }
     }
 }
 
-/// The first and the end of the last joint's name stand for all between.
+/// Shortens joint names: the first, and the end of the last.
 fn joints(names: &[String]) -> String {
     match names {
         [first, _, .., last] => {

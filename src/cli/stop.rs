@@ -16,7 +16,7 @@ use crate::rpc::place::LiveRun;
 #[command(after_help = "\
 Stops every arm of every live run of this user, unless ARM or --run narrows it.
 The arms stay powered and held; no task moves them until `dimos arm reset ARM` and `dimos arm enable ARM`.
-Exit code 0 only when every arm confirmed. This is an operational stop and no safety function.")]
+Exit code 0 only if every arm confirmed. This is an operational stop, not a safety function.")]
 pub struct Args {
     /// Stop only the arm with this hardware_id, in every run that has it
     pub arm: Option<String>,
@@ -33,7 +33,7 @@ type Result<T = Exit, E = Failure> = std::result::Result<T, E>;
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let runs = args.target_run.named_or_all()?;
-    // One run that does not answer must not keep the others moving.
+    // A run that does not answer must not delay the stop of the others.
     let replies: Vec<(&LiveRun, Result<StopReply, ClientError>)> = std::thread::scope(|scope| {
         let asked: Vec<_> = runs.iter().map(|run| (run, scope.spawn(|| stop(run, args)))).collect();
         asked.into_iter().filter_map(|(run, answer)| Some((run, answer.join().ok()?))).collect()
@@ -55,7 +55,7 @@ pub fn run(args: &Args) -> Result {
     }
     let confirmed = done.values().flat_map(|r| r.arms.values()).all(|c| *c == Confirmation::Confirmed);
     let stopped_any = !done.is_empty();
-    // A run without the arm is no failure as long as another one has it.
+    // A run without the arm is not a failure as long as another one has it.
     let is_elsewhere = |e: &ClientError| matches!(e, ClientError::Refused(e) if e.code == Code::UnknownArm);
     let failures = replies.into_iter().filter_map(|(_, reply)| reply.err());
     let mut failures = failures.filter(|e| !(stopped_any && is_elsewhere(e))).map(Failure::from);
@@ -64,8 +64,8 @@ pub fn run(args: &Args) -> Result {
         return Err(first);
     }
     if !confirmed {
-        let what = "not every arm confirmed that it stops";
-        return Err(Failure::new(Exit::Failed, what).hint("watch the arm; `dimos state` shows whether it moves"));
+        let what = "not every arm confirmed its stop";
+        return Err(Failure::new(Exit::Failed, what).hint("watch the arm; `dimos state` shows whether it is moving"));
     }
     Ok(Exit::Ok)
 }

@@ -1,4 +1,4 @@
-//! Targets of a stream, one per line, from a file or stdin; every mistake is told with its line.
+//! Targets of a stream, one per line, from a file or stdin; mistakes are reported with their line.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
@@ -8,19 +8,19 @@ use std::time::Duration;
 
 use super::exit::{Failure, Result};
 
-/// Longest line [bytes].
+/// Maximum length of a line [bytes].
 const MAX_LINE: u64 = 64 * 1024;
-/// Lines that wait to be sent: who writes faster is made to wait.
-const AHEAD: usize = 1;
+/// Lines queued ahead; a faster writer blocks.
+const QUEUE: usize = 1;
 
-/// How many numbers a target has.
+/// Number of values of a target.
 #[derive(Debug, Clone, Copy)]
 pub enum Width {
-    /// One for each of so many joints.
+    /// One per joint.
     Joints(usize),
     /// Six: linear and angular velocity.
     Twist,
-    /// Six, or seven: position, and roll, pitch, yaw or a quaternion.
+    /// Six or seven: position, and roll, pitch, yaw or a quaternion.
     Pose,
 }
 
@@ -35,28 +35,28 @@ impl Width {
     }
 }
 
-/// Where targets come from.
+/// A source of targets.
 pub struct Source {
     lines: Receiver<Result<Vec<f64>>>,
     over: bool,
 }
 
 impl Source {
-    /// A file. It is read to its end first, so that a mistake in its last line moves nothing.
+    /// Opens a file. Reads all of it first, so that a mistake in its last line moves nothing.
     pub fn file(path: &Path, width: Width) -> Result<Self> {
         let open = || File::open(path).map_err(|e| Failure::usage(format!("{}: {e}", path.display())));
         Lines::new(open()?, path.display().to_string(), width).try_for_each(|target| target.map(|_| ()))?;
         Ok(Self::read(Lines::new(open()?, path.display().to_string(), width)))
     }
 
-    /// stdin, as it comes.
+    /// Opens stdin, read line by line.
     pub fn stdin(width: Width) -> Self {
         Self::read(Lines::new(io::stdin(), "stdin".into(), width))
     }
 
-    /// Reads on a thread of its own, so that a wait for the next line can be given up.
+    /// Reads on a separate thread, so that a wait for the next line can be abandoned.
     fn read(lines: impl Iterator<Item = Result<Vec<f64>>> + Send + 'static) -> Self {
-        let (sender, receiver) = sync_channel(AHEAD);
+        let (sender, receiver) = sync_channel(QUEUE);
         std::thread::spawn(move || {
             for line in lines {
                 if sender.send(line).is_err() {
@@ -67,9 +67,9 @@ impl Source {
         Self { lines: receiver, over: false }
     }
 
-    /// The next target; `None` when none came within `patience`, or there are no more.
-    pub fn next(&mut self, patience: Duration) -> Result<Option<Vec<f64>>> {
-        match self.lines.recv_timeout(patience) {
+    /// Returns the next target; `None` if none arrived within `timeout`, or at the end.
+    pub fn next(&mut self, timeout: Duration) -> Result<Option<Vec<f64>>> {
+        match self.lines.recv_timeout(timeout) {
             Ok(target) => target.map(Some),
             Err(RecvTimeoutError::Timeout) => Ok(None),
             Err(RecvTimeoutError::Disconnected) => {
@@ -79,13 +79,13 @@ impl Source {
         }
     }
 
-    /// Whether there are no more.
+    /// Returns whether the source has ended.
     pub fn is_over(&self) -> bool {
         self.over
     }
 }
 
-/// The targets in a text.
+/// Parser of the targets in a text.
 struct Lines<R> {
     from: BufReader<R>,
     name: String,
@@ -128,7 +128,7 @@ impl<R: Read> Iterator for Lines<R> {
     }
 }
 
-/// The numbers of a line: a JSON array, or numbers between blanks or commas.
+/// Parses the numbers of a line: a JSON array, or numbers separated by blanks or commas.
 fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
     if text.starts_with('[') {
         return serde_json::from_str(text).map_err(|e| e.to_string());

@@ -1,4 +1,4 @@
-//! `dimos task list|invoke|stream`: the tasks of a run, one by one.
+//! `dimos task list|invoke|stream`: single tasks of a run.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -15,9 +15,9 @@ use crate::rpc::client::Client;
 use crate::rpc::report::TaskReport;
 use crate::rpc::{Code, RpcError};
 
-/// How often a wait for the next target looks for Ctrl-C.
-const LOOK: Duration = Duration::from_millis(50);
-/// Targets per second from a file, when none are given [Hz].
+/// Poll period for Ctrl-C while waiting for the next target.
+const POLL_PERIOD: Duration = Duration::from_millis(50);
+/// Default rate of targets from a file [Hz].
 const FILE_RATE: f64 = 50.0;
 
 /// Arguments of `task`.
@@ -29,33 +29,33 @@ pub struct Args {
 
 #[derive(Debug, Subcommand)]
 enum Action {
-    /// List the tasks of a run: what they do just now, and their joints
+    /// List the tasks of a run: state and joints
     List {
         #[command(flatten)]
         target_run: Target,
     },
-    /// Ask something of one task
+    /// Query or cancel one task
     Invoke {
-        /// The task's name
+        /// Name of the task
         task: String,
-        /// What to ask
+        /// What to do
         method: Method,
         #[command(flatten)]
         target_run: Target,
     },
-    /// Stream targets to a task that follows them, one per line, from a file or stdin
+    /// Stream targets to a task, one per line, from a file or stdin
     #[command(after_help = "\
-A line is a JSON array or numbers between blanks or commas: one per joint of the task, rad for a servo task, rad/s for a
-velocity task; for an eef_twist task x y z [m/s] and the angular velocity about x y z [rad/s], in the base's axes; for a
+A line is a JSON array, or numbers separated by blanks or commas: one per joint of the task, rad for a servo task, rad/s for a
+velocity task; for an eef_twist task x y z [m/s] and the angular velocity about x y z [rad/s], in the base frame; for a
 cartesian_ik task x y z [m] and roll pitch yaw [rad] or a quaternion x y z w. Empty lines and those that begin with # are
 skipped. At most one target per tick takes effect. At the end of the stream a servo task holds the last target, all others
-slow down to rest.")]
+decelerate to rest.")]
     Stream {
-        /// The task's name
+        /// Name of the task
         task: String,
-        /// Where the targets are; without it, or with -, stdin
+        /// File with the targets; default, or with -: stdin
         file: Option<PathBuf>,
-        /// Targets per second [Hz]; without it 50 from a file, and from stdin as they come
+        /// Targets per second [Hz]; default: 50 from a file, as they arrive from stdin
         #[arg(long, value_name = "HZ", value_parser = rate)]
         rate: Option<f64>,
         #[command(flatten)]
@@ -63,12 +63,12 @@ slow down to rest.")]
     },
 }
 
-/// What can be asked of a task.
+/// Method of `task invoke`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Method {
-    /// What it does, and why
+    /// State of the task and its reason
     State,
-    /// End what it does, by decelerating
+    /// Cancel its motion by decelerating
     Cancel,
 }
 
@@ -136,10 +136,10 @@ fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Sends targets until they end or a signal comes.
+/// Sends targets until they end or a signal arrives.
 fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Option<f64>, json: bool) -> Result {
     if task.kind == "trajectory" {
-        let text = format!("{} is a trajectory task, and follows no stream", task.name);
+        let text = format!("{} is a trajectory task and does not follow streams", task.name);
         return Err(refusal(RpcError::new(Code::WrongTask, text).hint("`dimos task list` shows the types")));
     }
     let signals = Signals::watch();
@@ -151,10 +151,10 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
         }
         let wait = beat.saturating_duration_since(Instant::now());
         if !wait.is_zero() {
-            std::thread::sleep(wait.min(LOOK));
+            std::thread::sleep(wait.min(POLL_PERIOD));
             continue;
         }
-        let target = match source.next(LOOK) {
+        let target = match source.next(POLL_PERIOD) {
             Ok(Some(target)) => target,
             Ok(None) if source.is_over() => break None,
             Ok(None) => continue,
@@ -171,7 +171,7 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
     };
     let now = find(client, &task.name)?;
     if matches!(now.state.as_str(), "FAULT" | "ABORTED") {
-        let why = now.reason.unwrap_or_else(|| "no reason is known".into());
+        let why = now.reason.unwrap_or_else(|| "unknown reason".into());
         let failure = Failure::new(Exit::Failed, format!("{}: {} after {sent} targets: {why}", now.name, now.state));
         return Err(failure.hint("`dimos status` shows what the arm waits for"));
     }
@@ -187,7 +187,7 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
     Ok(ended.map_or(Exit::Ok, Exit::by_signal))
 }
 
-/// Sends a target of the width that fits the task's type.
+/// Sends a target in the form of the task's type.
 fn send(client: &mut Client, task: &TaskReport, target: Vec<f64>) -> Result<()> {
     let name = task.name.clone();
     let three = |from: usize| std::array::from_fn(|i| target.get(from + i).copied().unwrap_or_default());
@@ -206,7 +206,7 @@ fn send(client: &mut Client, task: &TaskReport, target: Vec<f64>) -> Result<()> 
     Ok(())
 }
 
-/// Ends the stream's task at once; without that it would go on until its timeout, or keep its joints at zero.
+/// Ends the stream's task at once; otherwise it would continue until its timeout, or hold its joints at zero velocity.
 fn end(client: &mut Client, task: &TaskReport) -> Result<()> {
     client.call(Cancel { task: Some(task.name.clone()), arm: None })?;
     Ok(())

@@ -1,6 +1,6 @@
-//! What a run says on its terminal: its own words and its text log, written by a thread of its own, so that a terminal
-//! that stands still (Ctrl-S, a pipe that nobody reads) holds up nobody, least of all the stop. Lines that find the
-//! queue full are dropped and counted.
+//! Output of a run on its terminal: messages and text log, written by a separate thread, so that a blocked terminal
+//! (Ctrl-S, a full pipe) delays nothing, least of all a stop. Lines that do not fit in the queue are dropped and
+//! counted.
 
 use std::fmt::Display;
 use std::io::{self, Write};
@@ -14,19 +14,19 @@ use tracing_subscriber::filter::LevelFilter;
 use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::layer::SubscriberExt;
 
-/// Lines on their way to the terminal.
+/// Capacity of the queue [lines].
 const QUEUE: usize = 1024;
-/// How long the last lines are waited for.
-const LAST_LINES: Duration = Duration::from_millis(500);
+/// Maximum wait for the last lines.
+const FLUSH_TIMEOUT: Duration = Duration::from_millis(500);
 
 enum Item {
     Note(Vec<u8>),
     Data(Vec<u8>),
-    /// Answered when all before it is written.
+    /// Answered when everything before it is written.
     Flush(SyncSender<()>),
 }
 
-/// The way to the terminal. Nothing here waits for it.
+/// Sender of lines to the terminal. Never blocks.
 #[derive(Clone)]
 pub struct Terminal {
     items: SyncSender<Item>,
@@ -34,7 +34,7 @@ pub struct Terminal {
 }
 
 impl Terminal {
-    /// Starts the thread and the text log. `DIMOS_LOG` sets its level: error, warn (without it), info, debug.
+    /// Starts the thread and the text log. `DIMOS_LOG` sets its level: error, warn (default), info, debug.
     pub fn start() -> io::Result<Self> {
         let level = std::env::var("DIMOS_LOG").ok().and_then(|l| l.parse::<LevelFilter>().ok());
         let (items, received) = sync_channel(QUEUE);
@@ -47,17 +47,17 @@ impl Terminal {
             .with_target(false)
             .with_writer(terminal.clone());
         let subscriber = tracing_subscriber::registry().with(level.unwrap_or(LevelFilter::WARN)).with(layer);
-        // A program that embeds this one may have a log of its own; then that one is used.
+        // A program that embeds this one may have its own log; then that one is used.
         let _ = tracing::subscriber::set_global_default(subscriber);
         Ok(terminal)
     }
 
-    /// A line for people, to stderr.
+    /// Prints a line for people, to stderr.
     pub fn note(&self, text: impl Display) {
         self.send(Item::Note(format!("{text}\n").into_bytes()));
     }
 
-    /// A line of JSON, to stdout.
+    /// Prints a line of JSON, to stdout.
     pub fn json(&self, value: &impl Serialize) {
         // The types printed have string keys only, so encoding cannot fail.
         let mut line = serde_json::to_vec(value).unwrap_or_default();
@@ -65,12 +65,12 @@ impl Terminal {
         self.send(Item::Data(line));
     }
 
-    /// Waits a moment for what was said to be written.
+    /// Waits until all lines are written, at most [`FLUSH_TIMEOUT`].
     pub fn flush(&self) {
         let (done, written) = sync_channel(1);
         if self.items.try_send(Item::Flush(done)).is_ok() {
-            // Who has not read by then does not look.
-            let _ = written.recv_timeout(LAST_LINES);
+            // A reader that is slower than that is not reading.
+            let _ = written.recv_timeout(FLUSH_TIMEOUT);
         }
     }
 
@@ -83,7 +83,7 @@ impl Terminal {
 
 fn write(items: &Receiver<Item>, lost: &AtomicU64) {
     for item in items {
-        // That nobody reads any more is no error.
+        // A closed pipe is not an error.
         let _ = match item {
             Item::Note(line) => io::stderr().write_all(&line),
             Item::Data(line) => io::stdout().write_all(&line),

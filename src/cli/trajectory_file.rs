@@ -1,4 +1,4 @@
-//! Reads a trajectory from JSON or CSV; every mistake is told with its file, line and column.
+//! Reads a trajectory from JSON or CSV; mistakes are reported with file, line and column.
 
 use std::fmt::Display;
 use std::fs::File;
@@ -9,12 +9,12 @@ use super::exit::{Failure, Result};
 use crate::rpc::api::{Point, Trajectory};
 use crate::trajectory::MAX_DURATION;
 
-/// Largest file that is read [bytes].
+/// Maximum file size [bytes].
 const MAX_FILE: u64 = 16 << 20;
-/// Ends the name of a CSV column of velocities.
+/// Suffix of a CSV column of velocities.
 const VELOCITY: &str = "_vel";
 
-/// Reads the file; its extension tells the format.
+/// Reads a file; its extension decides the format.
 pub fn read(path: &Path) -> Result<Trajectory> {
     let unreadable = |what: &dyn Display| Failure::usage(format!("{}: {what}", path.display()));
     let mut text = String::new();
@@ -26,16 +26,16 @@ pub fn read(path: &Path) -> Result<Trajectory> {
     let parsed = match path.extension().and_then(|e| e.to_str()) {
         Some("json") => json(&text),
         Some("csv") => csv(&text),
-        _ => return Err(unreadable(&"neither .json nor .csv").hint("the extension tells the format")),
+        _ => return Err(unreadable(&"neither .json nor .csv").hint("the extension decides the format")),
     };
     let trajectory = parsed.map_err(|e| unreadable_at(path, &e))?;
     if trajectory.points.len() < 2 {
-        return Err(unreadable(&"a trajectory has two points or more"));
+        return Err(unreadable(&"a trajectory needs at least two points"));
     }
     Ok(trajectory)
 }
 
-/// A mistake and where it is; lines and columns count from 1.
+/// A mistake and its position; lines and columns count from 1.
 #[derive(Debug, PartialEq)]
 struct Mistake {
     line: usize,
@@ -51,7 +51,7 @@ fn unreadable_at(path: &Path, mistake: &Mistake) -> Failure {
 fn json(text: &str) -> std::result::Result<Trajectory, Mistake> {
     serde_json::from_str(text).map_err(|e| {
         let what = e.to_string();
-        // The place is in front already.
+        // The position is in front already.
         let what = what.rsplit_once(" at line ").map_or(what.as_str(), |(what, _)| what).to_owned();
         Mistake { line: e.line(), column: e.column(), what }
     })
@@ -77,7 +77,7 @@ fn csv(text: &str) -> std::result::Result<Trajectory, Mistake> {
             return Err(Mistake { line, column: 1, what });
         }
         if let Some(time) = values.first().filter(|time| **time > MAX_DURATION) {
-            let what = format!("{time} s, and a trajectory may take {} h at most", MAX_DURATION / 3600.0);
+            let what = format!("{time} s exceeds the maximum duration of {} h", MAX_DURATION / 3600.0);
             return Err(Mistake { line, column: 1, what });
         }
         let pick = |columns: &[usize]| columns.iter().filter_map(|c| values.get(*c).copied()).collect::<Vec<_>>();
@@ -91,7 +91,7 @@ fn csv(text: &str) -> std::result::Result<Trajectory, Mistake> {
     Ok(Trajectory { joint_names: header.joints, points })
 }
 
-/// Which column holds what.
+/// Columns of a file.
 struct Header {
     joints: Vec<String>,
     positions: Vec<usize>,
@@ -109,11 +109,11 @@ impl Header {
         }
         for (index, (column, name)) in names.iter().enumerate() {
             if name.is_empty() || names.iter().take(index).any(|(_, other)| other == name) {
-                return mistake(*column, format!("a column named {name:?} is missing its name or comes twice"));
+                return mistake(*column, format!("the column {name:?} has no name or is a duplicate"));
             }
         }
         let of = |name: &str| names.iter().position(|(_, n)| *n == name);
-        // `x_vel` is a velocity where there is a joint `x`; otherwise it is a joint's name.
+        // `x_vel` is a velocity if there is a joint `x`; otherwise it is a joint's name.
         let is_velocity = |name: &str| name.strip_suffix(VELOCITY).is_some_and(|joint| of(joint).is_some());
         let (mut joints, mut positions, mut velocities) = (Vec::new(), Vec::new(), Vec::new());
         for (index, (_, name)) in names.iter().enumerate().skip(1).filter(|(_, (_, name))| !is_velocity(name)) {
@@ -122,7 +122,7 @@ impl Header {
             velocities.extend(of(&format!("{name}{VELOCITY}")));
         }
         if joints.is_empty() {
-            return mistake(1, "there is no joint beside `time`".into());
+            return mistake(1, "no joint columns besides `time`".into());
         }
         if !velocities.is_empty() && velocities.len() != joints.len() {
             return mistake(1, format!("velocities of {} of {} joints: all or none", velocities.len(), joints.len()));
@@ -131,7 +131,7 @@ impl Header {
     }
 }
 
-/// The cells of a line, each with its column in the text.
+/// Returns the cells of a line, each with its column in the text.
 fn cells(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let mut start = 1;
     text.split(',').map(move |cell| {

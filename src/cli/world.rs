@@ -1,4 +1,4 @@
-//! `dimos world`: the obstacles that the planner keeps clear of, and what the robots hold.
+//! `dimos world`: the planner's obstacles, and the objects that robots hold.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -21,7 +21,7 @@ pub struct Args {
     pub command: Command,
 }
 
-/// What can be done with the world.
+/// Verbs of `world`.
 #[derive(Debug, clap::Subcommand)]
 pub enum Command {
     /// List the objects
@@ -34,9 +34,9 @@ pub enum Command {
     Remove(RemoveArgs),
     /// Add the objects of a YAML file: a map of names as under `planner.world`
     Load(LoadArgs),
-    /// Let a robot hold an object, where it is now
+    /// Attach an object to a robot at its current pose
     Attach(AttachArgs),
-    /// Let go of an object: it stays where it is
+    /// Detach an object; it stays at its current pose
     Detach(DetachArgs),
 }
 
@@ -48,18 +48,18 @@ pub struct ListArgs {
     pub target_run: Target,
 }
 
-/// A pose as it is typed.
+/// A pose on the command line.
 #[derive(Debug, Clone, clap::Args)]
-pub struct At {
-    /// Where it is: x, y, z [m] in the frame `map`
+pub struct PoseArgs {
+    /// Position in the frame `map`: x, y, z [m]
     #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
     pub at: Vec<f64>,
-    /// Its roll, pitch, yaw about fixed axes [rad]
+    /// Roll, pitch, yaw about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
     pub rpy: Option<Vec<f64>>,
 }
 
-impl At {
+impl PoseArgs {
     fn pose(&self) -> PoseSpec {
         let rpy = self.rpy.as_deref().and_then(|rpy| rpy.try_into().ok());
         PoseSpec { xyz: self.at.as_slice().try_into().unwrap_or_default(), rpy, quat: None }
@@ -70,7 +70,7 @@ impl At {
 #[derive(Debug, clap::Args)]
 #[command(group = clap::ArgGroup::new("shape").required(true).args(["cuboid", "sphere", "cylinder", "mesh", "cloud"]))]
 pub struct AddArgs {
-    /// A name for it; an object of the same name is replaced
+    /// Name of the object; replaces an object of the same name
     pub name: String,
     /// A box: edge lengths [m]
     #[arg(long = "box", value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
@@ -87,10 +87,10 @@ pub struct AddArgs {
     /// A point cloud file: PLY
     #[arg(long, value_name = "FILE")]
     pub cloud: Option<PathBuf>,
-    /// Where it is
+    /// Pose
     #[command(flatten)]
-    pub at: At,
-    /// How much it is thickened all around [m]
+    pub at: PoseArgs,
+    /// Padding on all sides [m]
     #[arg(long, value_name = "METRES", value_parser = finite, allow_negative_numbers = true, default_value_t = 0.0)]
     pub padding: f64,
     /// Which run
@@ -101,11 +101,11 @@ pub struct AddArgs {
 /// Arguments of `world move`.
 #[derive(Debug, clap::Args)]
 pub struct MoveArgs {
-    /// The object's name
+    /// Name of the object
     pub name: String,
-    /// Where it is from now on
+    /// New pose
     #[command(flatten)]
-    pub at: At,
+    pub at: PoseArgs,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
@@ -114,7 +114,7 @@ pub struct MoveArgs {
 /// Arguments of `world remove`.
 #[derive(Debug, clap::Args)]
 pub struct RemoveArgs {
-    /// The object's name
+    /// Name of the object
     #[arg(required_unless_present = "all")]
     pub name: Option<String>,
     /// Remove all objects
@@ -138,14 +138,14 @@ pub struct LoadArgs {
 /// Arguments of `world attach`.
 #[derive(Debug, clap::Args)]
 pub struct AttachArgs {
-    /// The object's name
+    /// Name of the object
     pub name: String,
-    /// The robot that holds it
+    /// Robot that holds it
     pub robot: String,
-    /// The link that holds it; default: the end effector's
+    /// Link that holds it; default: the end-effector link
     #[arg(long)]
     pub link: Option<String>,
-    /// Links that may touch it, beside that one
+    /// Further links that may touch it
     #[arg(long, value_name = "LINK")]
     pub touch: Vec<String>,
     /// Which run
@@ -156,7 +156,7 @@ pub struct AttachArgs {
 /// Arguments of `world detach`.
 #[derive(Debug, clap::Args)]
 pub struct DetachArgs {
-    /// The object's name
+    /// Name of the object
     pub name: String,
     /// Which run
     #[command(flatten)]
@@ -187,7 +187,7 @@ pub fn run(args: &Args) -> Result {
             done(format_args!("{} removed", a.name.as_deref().unwrap_or("all objects")), a.target_run.json);
         }
         Command::Load(a) => {
-            // The whole file is read first: a mistake in its last object changes nothing.
+            // Reads the whole file first: a mistake in its last object changes nothing.
             let objects = load(&a.file)?;
             let mut client = a.target_run.connect()?;
             for object in &objects {
@@ -202,7 +202,7 @@ pub fn run(args: &Args) -> Result {
         }
         Command::Detach(a) => {
             a.target_run.connect()?.call(Detach { name: a.name.clone() })?;
-            done(format_args!("{} stays where it is", a.name), a.target_run.json);
+            done(format_args!("{} detached", a.name), a.target_run.json);
         }
     }
     Ok(Exit::Ok)
@@ -226,18 +226,18 @@ fn shape(args: &AddArgs) -> Result<ShapeSpec> {
     })
 }
 
-/// The run may have another working folder.
+/// Returns an absolute path: the run may have another working directory.
 fn full_path(file: &Path) -> Result<String> {
     let path = file.canonicalize().map_err(|e| Failure::usage(format!("{}: {e}", file.display())))?;
     Ok(path.display().to_string())
 }
 
-/// The objects of a file. Paths in it are relative to its folder.
+/// Returns the objects of a file. Paths in it are relative to its folder.
 fn load(file: &Path) -> Result<Vec<WorldObject>> {
     let wrong = |what: String| Failure::usage(format!("{}: {what}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|e| wrong(e.to_string()))?;
     let folder = file.parent().unwrap_or(Path::new(""));
-    // By way of JSON: a shape is written as in a blueprint, `shape: {box: […]}`.
+    // Converted to JSON: a shape is written as in a blueprint, `shape: {box: […]}`.
     let typed: BTreeMap<String, Value> = serde_yaml::from_str(&text).map_err(|e| wrong(e.to_string()))?;
     let entry = |(name, value)| match serde_json::from_value::<WorldEntry>(value) {
         Ok(entry) => Ok((name, entry)),
@@ -273,7 +273,7 @@ fn list(client: &mut Client, json: bool) -> Result<()> {
         table.row([object.name.clone(), kind.into(), size, x, y, z, fixed(object.padding, 3), held]);
     }
     if world.objects.is_empty() {
-        output::note("the world is empty: `dimos world add` puts something into it");
+        output::note("the world is empty: add an object with `dimos world add`");
     } else {
         table.print();
     }

@@ -1,4 +1,4 @@
-//! The solids of a robot's links, from its description.
+//! Collision solids of a robot's links, from its description.
 
 use std::sync::Arc;
 
@@ -13,31 +13,31 @@ use crate::robot::model::{Geometry, RobotModel};
 
 use super::shape::{Mesh, ShapeError, Solid};
 
-/// How links that are given as meshes are checked.
+/// Collision geometry of links that are described by meshes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum MeshMode {
-    /// As the convex hull of each mesh: holds all of the mesh, and is faster.
+    /// The convex hull of each mesh: contains the mesh, fast.
     #[default]
     Hull,
-    /// As the convex hulls of parts of each mesh, which hold all of it together, and leave out what a hull fills: the
-    /// space between fingers. Takes a moment to find, and is slower the more parts there are.
+    /// Convex hulls of parts of each mesh: together they contain the mesh, but not the space between fingers, which a
+    /// single hull fills. The decomposition takes a moment; more parts are slower.
     Decomposition,
     /// Triangle by triangle.
     Triangles,
 }
 
-/// Why a robot has no solids.
+/// Why a robot's collision solids cannot be built.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum BodyError {
-    /// A shape cannot be used.
+    /// A shape is not usable.
     #[error("collision shape {number} of link {link:?}: {error}")]
     Shape {
         /// The link.
         link: String,
-        /// Which of its shapes, from 1.
+        /// Number of the shape, from 1.
         number: usize,
-        /// What is wrong.
+        /// Its error.
         error: ShapeError,
     },
     /// A mesh file cannot be read.
@@ -47,18 +47,18 @@ pub enum BodyError {
         link: String,
         /// The mesh as the description names it.
         uri: String,
-        /// What is wrong.
+        /// The reading error.
         error: String,
     },
 }
 
-/// The collision solids of every link of a model, in the links' frames, all in one mode. Reads the mesh files.
+/// Returns the collision solids of every link, in the links' frames, all in one mode. Reads the mesh files.
 pub fn solids(model: &RobotModel, mode: MeshMode) -> Result<Vec<Vec<Solid>>, BodyError> {
     solids_of(model, |_| mode)
 }
 
-/// The collision solids of every link of a model, in the links' frames: `mode` says how a link, by its name, is checked.
-/// Reads the mesh files.
+/// Returns the collision solids of every link, in the links' frames; `mode` gives the mode of a link by its name. Reads
+/// the mesh files.
 pub fn solids_of(model: &RobotModel, mode: impl Fn(&str) -> MeshMode) -> Result<Vec<Vec<Solid>>, BodyError> {
     let link = |link: &crate::robot::model::Link| {
         let solid = |(i, shape): (usize, &crate::robot::model::Shape)| {
@@ -83,7 +83,7 @@ pub fn solids_of(model: &RobotModel, mode: impl Fn(&str) -> MeshMode) -> Result<
     model.links.iter().map(link).collect()
 }
 
-/// The solids of a mesh: one, but for a decomposition.
+/// Returns the solids of a mesh: one, unless it is decomposed.
 pub fn of_mesh(mesh: &mesh::Mesh, mode: MeshMode, frame: DAffine3) -> Result<Vec<Solid>, ShapeError> {
     match mode {
         MeshMode::Hull => Ok(vec![Solid::hull(&vertices(mesh), frame)?]),
@@ -92,7 +92,7 @@ pub fn of_mesh(mesh: &mesh::Mesh, mode: MeshMode, frame: DAffine3) -> Result<Vec
     }
 }
 
-/// A mesh as it is, triangle by triangle.
+/// Returns a mesh as triangles.
 pub fn surface(mesh: &mesh::Mesh, frame: DAffine3) -> Result<Solid, ShapeError> {
     Solid::mesh(Arc::new(Mesh::new(vertices(mesh), mesh.triangles.clone())?), frame)
 }
@@ -101,10 +101,10 @@ fn vertices(mesh: &mesh::Mesh) -> Vec<DVec3> {
     mesh.vertices.iter().map(|v| DVec3::new(v.x, v.y, v.z)).collect()
 }
 
-/// Convex parts that hold all of a mesh together (V-HACD: K. Mamou, "Volumetric Hierarchical Approximate Convex
-/// Decomposition", 2016), each the hull of the surface it covers. A mesh that has no such parts is taken as its hull.
+/// Returns convex parts that together contain a mesh (V-HACD: K. Mamou, "Volumetric Hierarchical Approximate Convex
+/// Decomposition", 2016), each the hull of the surface it covers. Falls back to the hull of the whole mesh.
 fn decomposed(vertices: &[DVec3], triangles: &[[u32; 3]], frame: DAffine3) -> Result<Vec<Solid>, ShapeError> {
-    // Refuses what cannot be used at all.
+    // Rejects meshes that are not usable at all.
     let whole = Solid::hull(vertices, frame)?;
     let parts = VHACD::decompose(&VHACDParameters::default(), vertices, triangles, true);
     let hulls = parts.compute_exact_convex_hulls(vertices, triangles);

@@ -1,4 +1,4 @@
-//! What planners ask about configurations and the motions between them.
+//! Collision checks of configurations and of the motions between them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -8,7 +8,7 @@ use crate::robot::model::Limits;
 
 use super::report::{Contact, Pair};
 
-/// When to give up: at a time, or when somebody asks. Asked about at every configuration that is checked.
+/// Stop condition of a computation: a deadline or a cancel flag, tested at every collision check.
 #[derive(Debug, Clone, Default)]
 pub struct Stop {
     deadline: Option<Instant>,
@@ -16,32 +16,32 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Never.
+    /// Creates one that never stops.
     pub fn never() -> Self {
         Self::default()
     }
 
-    /// At a time, and as soon as the flag is set.
+    /// Creates one that stops at a deadline, or when the flag is set.
     pub fn new(deadline: Option<Instant>, cancelled: Option<Arc<AtomicBool>>) -> Self {
         Self { deadline, cancelled }
     }
 
-    /// Whether somebody has asked to give up.
+    /// Returns whether the flag is set.
     pub fn is_cancelled(&self) -> bool {
         self.cancelled.as_ref().is_some_and(|flag| flag.load(Ordering::Relaxed))
     }
 
-    /// Whether it is time to give up.
+    /// Returns whether to stop.
     pub fn is_over(&self) -> bool {
         self.is_cancelled() || self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
     }
 }
 
-/// How finely motions are checked.
+/// Resolution of motion checks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Resolution {
-    /// A motion is free when nothing touches anywhere on it; that may leave out of account what happens while no point
-    /// of the robots moves by more than this [m].
+    /// Maximum motion of any point of the robots between checked configurations [m]: a motion counts as free if nothing
+    /// touches at this resolution.
     pub motion: f64,
 }
 
@@ -51,37 +51,37 @@ impl Default for Resolution {
     }
 }
 
-/// Tells where a robot, or several, can be. A configuration holds the joints of all robots, one after the other.
+/// Checks collisions of one or more robots. A configuration holds the joints of all robots, one after the other.
 pub trait CollisionChecker {
-    /// Number of joints in a configuration.
+    /// Returns the number of joints in a configuration.
     fn dof(&self) -> usize;
 
-    /// Limits of the joints.
+    /// Returns the limits of the joints.
     fn limits(&self) -> &[Limits];
 
-    /// Which joints turn without end: what is free at a position is free one turn farther.
+    /// Returns which joints are continuous: a whole turn does not change what is free.
     fn turns(&self) -> &[bool];
 
-    /// How finely motions are checked.
+    /// Returns the resolution of motion checks.
     fn resolution(&self) -> Resolution;
 
-    /// Whether nothing touches at configuration `q` [rad or m].
+    /// Returns whether nothing touches at configuration `q` [rad or m].
     fn is_free(&mut self, q: &[f64]) -> bool;
 
-    /// Whether nothing touches on the straight line between two configurations, ends included, at the resolution.
-    /// `false` when it was stopped.
+    /// Returns whether nothing touches on the straight line between two configurations, ends included, at the
+    /// resolution; `false` if stopped.
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool;
 
-    /// What touches first, of those that are quickly found.
+    /// Returns the first contact found, in no particular order.
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair>;
 
-    /// The least distance between things that must not touch and that can move relative to each other, and the pair;
-    /// `None` when there is nothing to touch.
+    /// Returns the smallest distance between two things that can collide and move relative to each other; `None` if
+    /// there is no such pair.
     fn clearance(&mut self, q: &[f64]) -> Option<Contact>;
 
-    /// Everything that touches at a configuration, the deepest first.
+    /// Returns all contacts at a configuration, the deepest first.
     fn contacts(&mut self, q: &[f64]) -> Vec<Contact>;
 
-    /// Configurations that were looked at so far.
-    fn looks(&self) -> u64;
+    /// Returns the number of configurations checked so far.
+    fn checks(&self) -> u64;
 }

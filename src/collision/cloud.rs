@@ -1,10 +1,10 @@
-//! A point cloud as a tree of boxes around points: an obstacle of many small balls.
+//! Point cloud as a tree of bounding boxes: an obstacle of many small balls.
 
 use glamx::{DAffine3, DVec3};
 
 use super::pairs::point::local;
 
-/// Points in a leaf.
+/// Points per leaf.
 const LEAF: usize = 8;
 
 /// Points, sorted so that each node of the tree is a range of them.
@@ -17,7 +17,7 @@ pub struct Cloud {
 }
 
 impl Cloud {
-    /// A tree of points [m]; points that are not finite are left out, `None` when none remain.
+    /// Builds a tree of points [m]; drops points that are not finite, returns `None` if none remain.
     pub fn new(points: impl IntoIterator<Item = DVec3>) -> Option<Self> {
         let mut points: Vec<DVec3> = points.into_iter().filter(|p| p.is_finite()).collect();
         if points.is_empty() {
@@ -29,27 +29,27 @@ impl Cloud {
         Some(Self { points, boxes, depth })
     }
 
-    /// Number of points.
+    /// Returns the number of points.
     pub fn len(&self) -> usize {
         self.points.len()
     }
 
-    /// Whether there are no points: never.
+    /// Returns whether there are no points: never.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()
     }
 
-    /// The points [m], in the cloud's frame.
+    /// Returns the points [m], in the cloud's frame.
     pub fn points(&self) -> &[DVec3] {
         &self.points
     }
 
-    /// Lowest and highest corner of the box around all points.
+    /// Returns the lowest and highest corner of the bounding box.
     pub fn bounds(&self) -> (DVec3, DVec3) {
         self.boxes[0]
     }
 
-    /// Whether `test` holds for any point within `reach` of a ball; points are given in the common frame.
+    /// Returns whether `test` holds for any point within `reach` of a ball; points are passed in the common frame.
     pub fn any_within(
         &self,
         frame: &DAffine3,
@@ -68,7 +68,8 @@ impl Cloud {
         })
     }
 
-    /// The least `distance` of a point, and the point, in the common frame. The other thing lies within a ball.
+    /// Returns the smallest `distance` of a point, and the point, in the common frame. The other solid is inside the
+    /// ball.
     pub fn nearest(
         &self,
         frame: &DAffine3,
@@ -96,7 +97,7 @@ impl Cloud {
         best
     }
 
-    /// Walks the tree: `see` is asked about each box whether to go in, and about each leaf's points whether to end.
+    /// Walks the tree: `see` decides for each box whether to descend, and for each leaf whether to end.
     fn visit(
         &self,
         node: usize,

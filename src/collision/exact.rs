@@ -1,4 +1,5 @@
-//! The exact checker: every solid against every other, in double precision, with balls around links to rule out most.
+//! The exact checker: every solid against every other, in double precision, with bounding balls of links to exclude
+//! most.
 
 use std::sync::Arc;
 
@@ -14,7 +15,7 @@ use super::report::{Contact, Pair};
 use super::scene::{LinkShape, Scene};
 use super::shape::Core;
 
-/// What there is to say about two things and a margin.
+/// Distance of a pair compared to a margin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Gap {
     /// Farther apart than the margin.
@@ -25,30 +26,30 @@ pub(super) enum Gap {
     Touch,
 }
 
-/// Checks configurations and motions of one scene. Once its buffers have grown it allocates nothing.
+/// Checks configurations and motions of one scene. Does not allocate once its buffers have grown.
 #[derive(Debug, Clone)]
 pub struct ExactChecker {
     pub(super) scene: Arc<Scene>,
     pub(super) resolution: Resolution,
     frames: Vec<DAffine3>,
-    /// The pairs that are checked, those of the links that move most first. Indices of pairs are indices in here.
+    /// Checked pairs, those of the links that move most first. Pair indices refer to this list.
     pub(super) pairs: Vec<Pair>,
-    /// Index of a pair of links among the scene's, beside `pairs`.
+    /// Index of a pair of links in the scene, parallel to `pairs`.
     pub(super) link_pairs: Vec<usize>,
-    /// Pairs of things that never move and touch: no configuration is free.
+    /// Pairs that never move and touch: no configuration is free.
     pub(super) always: Option<Pair>,
-    /// What touched last: likely to touch again.
+    /// The pair that touched last: likely to touch again.
     pub(super) witness: Option<usize>,
     pub(super) pieces: Pieces,
-    pub(super) looks: u64,
-    /// Distance that each pair keeps [m], beside `pairs`: closer counts as touching.
+    pub(super) checks: u64,
+    /// Padding of each pair [m], parallel to `pairs`: closer counts as touching.
     pub(super) pads: Vec<f64>,
-    /// Pairs of things that never move relative to the world.
+    /// Pairs that never move relative to the world.
     still: Vec<Pair>,
 }
 
 impl ExactChecker {
-    /// A checker of a scene.
+    /// Creates a checker of a scene.
     pub fn new(scene: Arc<Scene>, resolution: Resolution) -> Self {
         let frames = scene.frames();
         let moves = |pair: &Pair| match *pair {
@@ -60,7 +61,7 @@ impl ExactChecker {
             Pair::Links(a, b) => scene.pairs.iter().position(|p| (p.a, p.b) == (a, b)).unwrap_or_default(),
             Pair::Obstacle(..) => 0,
         };
-        // Links far from the base move most; obstacles are met more often than other links.
+        // Links far from the base move most; contacts with obstacles are more frequent than between links.
         let order = |pair: &Pair| match *pair {
             Pair::Obstacle(link, o) => (0, usize::MAX - link, o),
             Pair::Links(a, b) => (1, usize::MAX - b, a),
@@ -79,7 +80,7 @@ impl ExactChecker {
             always: None,
             witness: None,
             pieces,
-            looks: 0,
+            checks: 0,
             scene: scene.clone(),
         };
         made.place(&vec![0.0; scene.dof()]);
@@ -87,18 +88,18 @@ impl ExactChecker {
         made
     }
 
-    /// The scene it checks.
+    /// Returns the scene.
     pub fn scene(&self) -> &Arc<Scene> {
         &self.scene
     }
 
     /// Moves all frames to a configuration.
     pub(super) fn place(&mut self, q: &[f64]) {
-        self.looks += 1;
+        self.checks += 1;
         self.scene.forward(q, &mut self.frames);
     }
 
-    /// How far the two of a pair, by index, are apart where they stand now, beyond the distance that they keep.
+    /// Returns the current distance of a pair, by index, beyond its padding.
     pub(super) fn gap(&self, pair: usize, margin: f64) -> Gap {
         self.gap_of(self.pairs[pair], self.pads[pair], margin)
     }
@@ -127,7 +128,7 @@ impl ExactChecker {
         for solid in &link.solids {
             let radii = solid.radius + standing.solid.radius + pad;
             if let Core::Point = solid.core {
-                // The obstacle's box first: it is all there is to know about most obstacles, and about all that are far.
+                // The obstacle's bounding box first: that decides most cases, and all distant ones.
                 let center = frame.transform_point3(solid.frame.translation);
                 let squared = outside(center, guard, *half);
                 if squared > radii * radii {
@@ -140,7 +141,7 @@ impl ExactChecker {
                 }
             }
             let placed = solid.place(frame);
-            match tell(&placed, &standing.placed(), radii, margin) {
+            match gap_of_cores(&placed, &standing.placed(), radii, margin) {
                 Gap::Touch => return Gap::Touch,
                 Gap::Close => worst = Gap::Close,
                 Gap::Far => {}
@@ -177,7 +178,7 @@ impl ExactChecker {
                     worst = if squared <= reach * reach { Gap::Close } else { worst };
                     continue;
                 }
-                match tell(&placed, &two.place(g), one.radius + two.radius + pad, margin) {
+                match gap_of_cores(&placed, &two.place(g), one.radius + two.radius + pad, margin) {
                     Gap::Touch => return Gap::Touch,
                     Gap::Close => worst = Gap::Close,
                     Gap::Far => {}
@@ -217,7 +218,7 @@ impl ExactChecker {
         best
     }
 
-    /// A lower bound of a pair's distance, from the balls around the links.
+    /// Returns a lower bound of a pair's distance, from the links' bounding balls.
     fn least_distance(&self, pair: Pair) -> f64 {
         let ball = |l: usize| (self.center(&self.scene.links[l]), self.scene.links[l].ball.1);
         match pair {
@@ -230,8 +231,8 @@ impl ExactChecker {
     }
 }
 
-/// How far two cores are apart beyond their radii.
-fn tell(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
+/// Returns the distance of two cores beyond their radii.
+fn gap_of_cores(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
     use Placed::{Cylinder, Point, Segment};
     let closed_form = matches!(
         (a, b),
@@ -258,13 +259,13 @@ fn tell(a: &Placed, b: &Placed, radii: f64, margin: f64) -> Gap {
     }
 }
 
-/// Squared distance of a point from a box.
+/// Returns the squared distance of a point from a box.
 fn outside(p: DVec3, frame: &DAffine3, half: DVec3) -> f64 {
     (point::local(p, frame).abs() - half).max(DVec3::ZERO).length_squared()
 }
 
 impl Scene {
-    /// Every pair that must not touch.
+    /// Returns every pair that must not touch.
     pub fn all_pairs(&self) -> impl Iterator<Item = Pair> + '_ {
         let obstacle = move |l: usize| {
             let checked = move |o: &usize| !self.allowed[l][*o];
@@ -297,7 +298,7 @@ impl CollisionChecker for ExactChecker {
     }
 
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        self.prove(from, to, stop)
+        self.check_motion(from, to, stop)
     }
 
     fn first_contact(&mut self, q: &[f64]) -> Option<Pair> {
@@ -314,7 +315,7 @@ impl CollisionChecker for ExactChecker {
     fn clearance(&mut self, q: &[f64]) -> Option<Contact> {
         self.place(q);
         let mut best: Option<Contact> = None;
-        // Only of what a motion can change: a base on its table is always as close.
+        // Only pairs that a motion can change: a base on its table keeps its distance.
         for pair in self.pairs.clone() {
             if best.as_ref().is_none_or(|b| self.least_distance(pair) < b.distance)
                 && let Some(contact) = self.contact(pair)
@@ -336,7 +337,7 @@ impl CollisionChecker for ExactChecker {
         contacts
     }
 
-    fn looks(&self) -> u64 {
-        self.looks
+    fn checks(&self) -> u64 {
+        self.checks
     }
 }

@@ -1,13 +1,13 @@
-//! What touches what: robots and obstacles as solids, immutable snapshots of a world, and checkers that planners ask.
+//! Collision checking: robots and obstacles as solids, immutable snapshots of a world, and checkers for planners.
 //!
 //! ```text
 //!  RobotModel ─▶ body ─┐
 //!  obstacles ──────────┴▶ World ──snapshot──▶ Arc<Scene> ──▶ ExactChecker: CollisionChecker
 //! ```
 //!
-//! A snapshot never changes, so perception, planning and a view each keep the one they work with, and nobody waits.
+//! A snapshot never changes: perception, planning and a viewer each keep their own, without locks.
 
-pub mod always;
+pub mod allowed_pairs;
 pub mod body;
 pub mod checker;
 pub mod cloud;

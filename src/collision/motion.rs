@@ -1,15 +1,15 @@
-//! Motions with proof. At the middle of a piece of the motion each pair is looked at with a margin: the most that its
-//! two can come closer on the way to either end of the piece (a bound from the joints' lever arms). A pair that keeps
-//! more distance is done with for the whole piece; for those that do not, the piece is cut in two. So most pairs are
-//! looked at a few times only, and what is called free is free between the samples as well.
+//! Continuous collision checks. At the middle of a piece of the motion, each pair is checked with a margin: the most
+//! that its members can approach each other on the way to either end of the piece (a bound from the joints' lever
+//! arms). A pair farther apart than its margin is free on the whole piece; for the other pairs, the piece is split in
+//! two. So most pairs need few checks, and a motion that passes is also free between the samples.
 //!
-//! The pieces of one size are done before those of half the size: what touches is found early.
+//! All pieces of one size are checked before those of half the size, which finds contacts early.
 
 use super::checker::Stop;
 use super::exact::{ExactChecker, Gap};
 use super::report::Pair;
 
-/// A piece of a motion, and the pairs that are not done with.
+/// A piece of a motion, and its unproven pairs.
 #[derive(Debug, Clone, Copy)]
 struct Piece {
     start: f64,
@@ -17,18 +17,18 @@ struct Piece {
     last: u32,
 }
 
-/// Buffers of a proof.
+/// Buffers of a motion check.
 #[derive(Debug, Clone)]
 pub(super) struct Pieces {
     q: Vec<f64>,
-    /// For each pair, how much closer its two can come on the whole motion [m].
+    /// For each pair, the most that it can approach on the whole motion [m].
     reach: Vec<f64>,
     now: Vec<Piece>,
     next: Vec<Piece>,
-    /// The pairs of the pieces.
+    /// Pairs of the pieces.
     pairs_now: Vec<u32>,
     pairs_next: Vec<u32>,
-    /// Farthest motion of each link [m].
+    /// Maximum motion of each link [m].
     links: Vec<f64>,
 }
 
@@ -49,25 +49,25 @@ impl Pieces {
 }
 
 impl ExactChecker {
-    /// Whether nothing touches on a motion, as `CollisionChecker::motion_is_free` states it.
-    pub(super) fn prove(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        // Whoever asks on after the time is up gets his answers at once.
+    /// Returns whether nothing touches on a motion, as defined by `CollisionChecker::motion_is_free`.
+    pub(super) fn check_motion(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+        // After the deadline, every call returns at once.
         if stop.is_over() || self.always.is_some() || !self.is_clear(to) || !self.is_clear(from) {
             return false;
         }
         let mut pieces = std::mem::replace(&mut self.pieces, Pieces::new(0, 0));
-        let free = self.prove_with(&mut pieces, from, to, stop);
+        let free = self.check_motion_with(&mut pieces, from, to, stop);
         self.pieces = pieces;
         free
     }
 
-    /// Whether nothing touches at a configuration.
+    /// Returns whether nothing touches at a configuration.
     fn is_clear(&mut self, q: &[f64]) -> bool {
         use super::checker::CollisionChecker;
         self.is_free(q)
     }
 
-    fn prove_with(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], stop: &Stop) -> bool {
+    fn check_motion_with(&mut self, p: &mut Pieces, from: &[f64], to: &[f64], stop: &Stop) -> bool {
         let most = self.measure(p, from, to);
         p.now.clear();
         p.pairs_now.clear();
@@ -75,7 +75,7 @@ impl ExactChecker {
         p.now.push(Piece { start: 0.0, first: 0, last: p.pairs_now.len() as u32 });
         let mut size = 1.0;
         while !p.now.is_empty() {
-            // The last pieces are so short that what happens on them is left out of account.
+            // The last pieces are below the resolution.
             let last = most * size <= self.resolution.motion;
             p.next.clear();
             p.pairs_next.clear();
@@ -119,7 +119,7 @@ impl ExactChecker {
         true
     }
 
-    /// Fills in how much closer each pair can come on a motion; returns the most.
+    /// Computes how much each pair can approach on a motion; returns the maximum.
     fn measure(&self, p: &mut Pieces, from: &[f64], to: &[f64]) -> f64 {
         let reach = |levers: &[f64]| {
             levers.iter().zip(from.iter().zip(to)).map(|(lever, (a, b))| lever * (b - a).abs()).sum::<f64>()

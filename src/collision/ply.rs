@@ -1,11 +1,11 @@
-//! Point clouds from PLY files: ASCII, and binary of either byte order; anything besides vertices is passed over.
+//! Point clouds from PLY files: ASCII, and binary of either byte order; skips everything but vertices.
 
 use glamx::DVec3;
 
-/// Most points that are read.
+/// Maximum number of points.
 pub const MAX_POINTS: usize = 20_000_000;
 
-/// Why a file is no point cloud.
+/// Why a file is not a usable point cloud.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("not a PLY point cloud: {0}")]
 pub struct PlyError(String);
@@ -21,7 +21,7 @@ enum Format {
     Big,
 }
 
-/// The vertices of a PLY file [m]; those that are not finite are left out.
+/// Reads the vertices of a PLY file [m]; drops those that are not finite.
 pub fn read(data: &[u8]) -> Result<Vec<DVec3>, PlyError> {
     let (header, body) = header(data)?;
     let fields: Vec<(usize, char)> = header.properties.iter().map(|(_, kind)| *kind).collect();
@@ -55,26 +55,26 @@ fn header(data: &[u8]) -> Result<(Header, &[u8]), PlyError> {
         rest = &rest[end + 1..];
         match words.as_slice() {
             ["ply"] if number == 0 => {}
-            _ if number == 0 => return bad("it does not begin with \"ply\""),
+            _ if number == 0 => return bad("does not begin with \"ply\""),
             ["format", name, _] => {
                 format = Some(match *name {
                     "ascii" => Format::Ascii,
                     "binary_little_endian" => Format::Little,
                     "binary_big_endian" => Format::Big,
-                    other => return bad(format!("format {other:?} is unknown")),
+                    other => return bad(format!("format {other:?} is not supported")),
                 });
             }
             ["element", name, count] => {
                 elements += 1;
                 if *name == "vertex" {
                     if elements > 1 {
-                        return bad("vertices must be its first element");
+                        return bad("the first element is not `vertex`");
                     }
-                    header.count = count.parse().map_err(|_| PlyError(format!("{count:?} is no count")))?;
+                    header.count = count.parse().map_err(|_| PlyError(format!("{count:?} is not a count")))?;
                 }
                 element = (*name).to_owned();
             }
-            ["property", "list", ..] if element == "vertex" => return bad("a vertex has a list"),
+            ["property", "list", ..] if element == "vertex" => return bad("a vertex has a list property"),
             ["property", kind, name] if element == "vertex" => {
                 let kind = match *kind {
                     "char" | "int8" => (1, 'i'),
@@ -85,14 +85,14 @@ fn header(data: &[u8]) -> Result<(Header, &[u8]), PlyError> {
                     "uint" | "uint32" => (4, 'u'),
                     "float" | "float32" => (4, 'f'),
                     "double" | "float64" => (8, 'f'),
-                    other => return bad(format!("type {other:?} is unknown")),
+                    other => return bad(format!("type {other:?} is not supported")),
                 };
                 header.properties.push(((*name).to_owned(), kind));
             }
             ["end_header"] => {
-                let Some(format) = format else { return bad("no format is named") };
+                let Some(format) = format else { return bad("no format line") };
                 if header.count > MAX_POINTS {
-                    return bad(format!("{} points are more than {MAX_POINTS}", header.count));
+                    return bad(format!("{} points (limit {MAX_POINTS})", header.count));
                 }
                 return Ok((Header { format, ..header }, rest));
             }
@@ -107,12 +107,12 @@ fn ascii(body: &[u8], count: usize, fields: usize, wanted: [usize; 3]) -> Result
     let mut lines = text.lines().filter(|l| !l.trim().is_empty());
     let mut points = Vec::with_capacity(count.min(body.len()));
     for number in 0..count {
-        let Some(line) = lines.next() else { return bad(format!("it ends after {number} of {count} points")) };
+        let Some(line) = lines.next() else { return bad(format!("the file ends after {number} of {count} points")) };
         let words: Vec<&str> = line.split_whitespace().collect();
         let value = |i: usize| words.get(i).and_then(|w| w.parse::<f64>().ok());
         match (words.len() >= fields, value(wanted[0]), value(wanted[1]), value(wanted[2])) {
             (true, Some(x), Some(y), Some(z)) => points.push(DVec3::new(x, y, z)),
-            _ => return bad(format!("point {number} is no point: {:?}", line.chars().take(60).collect::<String>())),
+            _ => return bad(format!("point {number} is not a point: {:?}", line.chars().take(60).collect::<String>())),
         }
     }
     Ok(points)
@@ -127,7 +127,7 @@ fn binary(
 ) -> Result<Vec<DVec3>, PlyError> {
     let size: usize = fields.iter().map(|f| f.0).sum();
     if body.len() / size.max(1) < count {
-        return bad(format!("it ends after {} of {count} points", body.len() / size.max(1)));
+        return bad(format!("the file ends after {} of {count} points", body.len() / size.max(1)));
     }
     let offset = |field: usize| fields[..field].iter().map(|f| f.0).sum::<usize>();
     let value = |record: &[u8], field: usize| {
@@ -180,13 +180,13 @@ mod tests {
     }
 
     #[test]
-    fn damage_is_said_and_never_panics() {
+    fn a_damaged_file_gives_an_error() {
         let whole = format!("ply\nformat ascii 1.0\n{HEADER}0.5 -0.25 200 4\n1.5 2 0 -8\n");
         for end in 0..whole.len() - 8 {
             assert!(read(&whole.as_bytes()[..end]).is_err(), "{end}");
         }
         let many = "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n";
-        assert!(read(many.as_bytes()).unwrap_err().to_string().contains("more than"));
+        assert!(read(many.as_bytes()).unwrap_err().to_string().contains("limit"));
         assert!(read(b"solid cube\n").unwrap_err().to_string().contains("begin"));
     }
 }

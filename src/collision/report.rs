@@ -1,10 +1,10 @@
-//! What touches, by name.
+//! Contacts, by name.
 
 use std::fmt;
 
 use glamx::DVec3;
 
-/// Two things that touch, by index in the scene.
+/// Two things in contact, by index in the scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Pair {
     /// Two links (indices of [`super::Scene::links`]).
@@ -13,20 +13,20 @@ pub enum Pair {
     Obstacle(usize, usize),
 }
 
-/// Two things, how far apart they are and where.
+/// A pair, its distance and closest points.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Contact {
-    /// Which, by index.
+    /// The pair, by index.
     pub pair: Pair,
     /// Name of the link.
     pub link: String,
-    /// Name of what it is close to: another link or an obstacle.
+    /// Name of the other link or obstacle.
     pub other: String,
-    /// Distance of their surfaces, padding included [m]; negative: how deep they overlap.
+    /// Distance of their surfaces, less the padding [m]; negative: penetration depth.
     pub distance: f64,
-    /// The closest point on the link, in the world's frame [m].
+    /// Closest point on the link, in the world's frame [m].
     pub on_link: DVec3,
-    /// The closest point on the other.
+    /// Closest point on the other.
     pub on_other: DVec3,
 }
 

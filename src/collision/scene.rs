@@ -1,5 +1,5 @@
-//! A snapshot of a world, laid out for checking: links as solids on moving frames, the pairs that matter, obstacles
-//! where they stand. Never changes.
+//! Snapshot of a world, laid out for collision checks: links as solids on moving frames, the pairs to check, obstacles
+//! at their poses. Immutable.
 
 use std::sync::Arc;
 
@@ -11,22 +11,22 @@ use crate::robot::model::{Limits, RobotModel};
 use super::shape::{Core, Placed, Solid};
 use super::world::{Robot, World};
 
-/// A link, or an object that is held, with what it needs to be checked.
+/// A link or a held object, with its data for collision checks.
 #[derive(Debug, Clone)]
 pub struct LinkShape {
-    /// Its name; with its robot's before it where that has one.
+    /// Name, prefixed with the robot's name if it has one.
     pub name: String,
-    /// Index of the robot that it belongs to, or that holds it.
+    /// Index of its robot, or of the robot that holds it.
     pub(super) robot: usize,
-    /// Index of the frame that carries it.
+    /// Index of its frame.
     pub(super) frame: usize,
-    /// Its solids in that frame, padding included in their radii.
+    /// Solids in that frame, padding included in their radii.
     pub(super) solids: Vec<Solid>,
-    /// A ball around all of them, in that frame.
+    /// Bounding ball in that frame.
     pub(super) ball: (DVec3, f64),
     /// Whether it moves at all.
     pub(super) moves: bool,
-    /// For each joint, how far a point of it moves at most [m/rad or m/m].
+    /// For each joint, the maximum motion of any of its points [m/rad or m/m].
     pub(super) levers: Vec<f64>,
 }
 
@@ -37,24 +37,24 @@ pub struct LinkPair {
     pub a: usize,
     /// Index of the second.
     pub b: usize,
-    /// For each joint, how far they move relative to each other at most [m/rad or m/m].
+    /// For each joint, their maximum relative motion [m/rad or m/m].
     pub(super) levers: Vec<f64>,
 }
 
-/// An obstacle where it stands.
+/// An obstacle at its pose.
 #[derive(Debug, Clone)]
-pub struct StandingObstacle {
+pub struct PlacedObstacle {
     /// Its name.
     pub name: String,
-    /// What and where it is; padding is included in its radius.
+    /// Geometry and pose; padding is included in its radius.
     pub(super) solid: Solid,
-    /// A box around its core.
+    /// Bounding box of its core.
     pub(super) guard: (DAffine3, DVec3),
-    /// Whether that box is the core itself: for boxes, capsules and spheres.
+    /// Whether the core equals that box: for boxes, capsules and spheres.
     pub(super) boxy: bool,
 }
 
-impl StandingObstacle {
+impl PlacedObstacle {
     pub(super) fn placed(&self) -> Placed<'_> {
         let frame = self.solid.frame;
         match &self.solid.core {
@@ -72,29 +72,29 @@ impl StandingObstacle {
     }
 }
 
-/// A robot of a scene: where its joints and frames stand among those of all.
+/// A robot of a scene: indices of its joints and frames among those of all robots.
 #[derive(Debug, Clone)]
 pub struct SceneRobot {
     /// Its name.
     pub name: String,
-    /// Its description.
+    /// Its model.
     pub model: Arc<RobotModel>,
     /// Its joints.
     pub kinematics: Arc<Kinematics>,
-    /// Where its root stands in the world.
+    /// Pose of its root in the world.
     pub base: DAffine3,
     /// Index of its first joint in a configuration.
     pub first_joint: usize,
     pub(super) first_frame: usize,
 }
 
-/// A world as it was when the snapshot was taken.
+/// A world at the time of the snapshot.
 #[derive(Debug, Clone, Default)]
 pub struct Scene {
     pub(super) robots: Vec<SceneRobot>,
     pub(super) links: Vec<LinkShape>,
     pub(super) pairs: Vec<LinkPair>,
-    pub(super) obstacles: Vec<StandingObstacle>,
+    pub(super) obstacles: Vec<PlacedObstacle>,
     /// `allowed[link][obstacle]`
     pub(super) allowed: Vec<Vec<bool>>,
     pub(super) limits: Vec<Limits>,
@@ -103,7 +103,7 @@ pub struct Scene {
     pub(super) frames: usize,
 }
 
-/// What tells links apart while pairs are made: robot, link index in its model, body, and whether it is held.
+/// Data to decide which pairs to check: robot, link index in its model, body, and whether it is held.
 struct Origin {
     robot: usize,
     link: usize,
@@ -144,7 +144,7 @@ impl Scene {
             scene.add_link(&mut origins, &held.name, (held.robot, link), robot, &held.solids, padding, Some(h));
         }
         scene.make_pairs(world, &origins);
-        scene.obstacles = world.obstacles().iter().map(stand).collect();
+        scene.obstacles = world.obstacles().iter().map(place).collect();
         let names: Vec<&str> = scene.obstacles.iter().map(|o| o.name.as_str()).collect();
         let row = |link: &LinkShape| names.iter().map(|o| world.is_allowed(&link.name, o)).collect();
         scene.allowed = scene.links.iter().map(row).collect();
@@ -164,7 +164,7 @@ impl Scene {
     ) {
         let Some(own) = self.robots.get(r).filter(|_| !solids.is_empty()) else { return };
         let kinematics = &robot.kinematics;
-        let (body, place) = (kinematics.body_of(link), kinematics.place_of(link));
+        let (body, place) = (kinematics.body_of(link), kinematics.offset_of(link));
         let carry = |s: &Solid| Solid { core: s.core.clone(), radius: s.radius + padding, frame: place * s.frame };
         let solids: Vec<Solid> = solids.iter().map(carry).collect();
         let ball = ball_around(&solids);
@@ -186,7 +186,7 @@ impl Scene {
                 let mut levers = vec![0.0; self.limits.len()];
                 for (one, other) in [(first, second), (second, first)] {
                     let Some(robot) = self.robots.get(one.robot) else { continue };
-                    // What carries both does not move them relative to each other.
+                    // Joints that carry both do not move them relative to each other.
                     let both = |body: usize| {
                         one.robot == other.robot && robot.kinematics.ancestors(other.body).any(|o| o == body)
                     };
@@ -199,52 +199,52 @@ impl Scene {
         }
     }
 
-    /// Number of joints in a configuration.
+    /// Returns the number of joints in a configuration.
     pub fn dof(&self) -> usize {
         self.limits.len()
     }
 
-    /// Limits of the joints.
+    /// Returns the limits of the joints.
     pub fn limits(&self) -> &[Limits] {
         &self.limits
     }
 
-    /// Which joints turn without end.
+    /// Returns which joints are continuous.
     pub fn turns(&self) -> &[bool] {
         &self.turns
     }
 
-    /// Names of the joints, with their robot's before them where that has one.
+    /// Returns the names of the joints, prefixed with the robot's name if it has one.
     pub fn joint_names(&self) -> &[String] {
         &self.joint_names
     }
 
-    /// The robots.
+    /// Returns the robots.
     pub fn robots(&self) -> &[SceneRobot] {
         &self.robots
     }
 
-    /// Links with solids, and held objects.
+    /// Returns the links with solids, and held objects.
     pub fn links(&self) -> &[LinkShape] {
         &self.links
     }
 
-    /// The pairs of links that must not touch.
+    /// Returns the pairs of links that must not touch.
     pub fn pairs(&self) -> &[LinkPair] {
         &self.pairs
     }
 
-    /// The obstacles.
-    pub fn obstacles(&self) -> &[StandingObstacle] {
+    /// Returns the obstacles.
+    pub fn obstacles(&self) -> &[PlacedObstacle] {
         &self.obstacles
     }
 
-    /// A buffer for [`Scene::forward`].
+    /// Returns a buffer for [`Scene::forward`].
     pub fn frames(&self) -> Vec<DAffine3> {
         vec![DAffine3::IDENTITY; self.frames]
     }
 
-    /// Fills in the frames of all bodies of all robots, in the world's frame.
+    /// Computes the frames of all bodies of all robots, in the world's frame.
     pub fn forward(&self, q: &[f64], frames: &mut [DAffine3]) {
         for robot in &self.robots {
             let own = q.get(robot.first_joint..).unwrap_or_default();
@@ -266,7 +266,8 @@ fn add_levers(kinematics: &Kinematics, first_joint: usize, own: Vec<(usize, f64)
     }
 }
 
-/// Whether two links are never checked against each other: welded together, neighbours, allowed by name, or held.
+/// Returns whether two links are never checked against each other: welded together, neighbours, an allowed pair, or
+/// held.
 fn may_touch(world: &World, a: &Origin, b: &Origin) -> bool {
     if a.robot != b.robot {
         return false;
@@ -284,24 +285,24 @@ fn may_touch(world: &World, a: &Origin, b: &Origin) -> bool {
     a.body == b.body || neighbours || robot.allowed.iter().any(is)
 }
 
-fn stand(obstacle: &super::world::Obstacle) -> StandingObstacle {
+fn place(obstacle: &super::world::Obstacle) -> PlacedObstacle {
     let mut solid = obstacle.solid.clone();
     solid.radius += obstacle.padding;
-    let mut standing =
-        StandingObstacle { name: obstacle.name.clone(), guard: (solid.frame, DVec3::ZERO), boxy: true, solid };
-    standing.guard = match &standing.solid.core {
-        Core::Point => (standing.solid.frame, DVec3::ZERO),
-        Core::Segment { half } => (standing.solid.frame, DVec3::new(0.0, 0.0, *half)),
-        Core::Box { half } => (standing.solid.frame, *half),
+    let mut placed =
+        PlacedObstacle { name: obstacle.name.clone(), guard: (solid.frame, DVec3::ZERO), boxy: true, solid };
+    placed.guard = match &placed.solid.core {
+        Core::Point => (placed.solid.frame, DVec3::ZERO),
+        Core::Segment { half } => (placed.solid.frame, DVec3::new(0.0, 0.0, *half)),
+        Core::Box { half } => (placed.solid.frame, *half),
         _ => {
-            standing.boxy = false;
-            standing.placed().guard().unwrap_or(standing.guard)
+            placed.boxy = false;
+            placed.placed().guard().unwrap_or(placed.guard)
         }
     };
-    standing
+    placed
 }
 
-/// A small ball around solids (Ritter's way: from two far points, grown where needed).
+/// Returns a small bounding ball of solids (Ritter's method: from two far points, grown as needed).
 fn ball_around(solids: &[Solid]) -> (DVec3, f64) {
     let mut balls: Vec<(DVec3, f64)> = Vec::new();
     for solid in solids {
@@ -330,7 +331,7 @@ fn ball_around(solids: &[Solid]) -> (DVec3, f64) {
     let b = farthest(a.0);
     let direction = (b.0 - a.0).normalize_or_zero();
     let (mut center, mut radius) = ((a.0 - direction * a.1 + b.0 + direction * b.1) * 0.5, 0.0);
-    // Move towards the farthest one in ever smaller steps: close to the smallest ball, and always around all.
+    // Moves towards the farthest solid in shrinking steps: close to the smallest ball, always containing all.
     for k in 1..=64 {
         let far = farthest(center);
         center += (far.0 - center) * (1.0 / f64::from(k + 1)).min(0.3);

@@ -1,5 +1,5 @@
-//! Solids: everything within a radius of a core. A sphere is a point with a radius, a capsule a segment with one, and
-//! padding is more radius: so a few pairs of cores are all that needs a distance.
+//! Solids: everything within a radius of a core. A sphere is a point with a radius, a capsule a segment with a radius,
+//! and padding enlarges the radius, so only distances between a few kinds of cores are needed.
 
 use std::sync::Arc;
 
@@ -8,14 +8,14 @@ use parry3d_f64::shape::{ConvexPolyhedron, TriMesh, TriMeshFlags};
 
 use super::cloud::Cloud;
 
-/// Why a shape cannot be used.
+/// Why a shape is not usable.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ShapeError {
     /// A length is zero, negative or not finite.
     #[error("{0} must be positive and finite, not {1}")]
     Length(&'static str, f64),
-    /// A mesh has no triangles, or names vertices that it does not have.
-    #[error("the mesh cannot be used: {0}")]
+    /// A mesh has no triangles, or refers to missing vertices.
+    #[error("the mesh is not usable: {0}")]
     Mesh(String),
     /// The points span no volume.
     #[error("{0} points span no volume: no convex hull")]
@@ -25,12 +25,12 @@ pub enum ShapeError {
     Pose,
 }
 
-/// What a solid is within a radius of, in its own frame.
+/// Core of a solid, in its own frame.
 #[derive(Debug, Clone)]
 pub enum Core {
     /// The origin.
     Point,
-    /// A piece of the z axis, from -half to half [m].
+    /// A segment of the z axis, from -half to half [m].
     Segment {
         /// Half length [m].
         half: f64,
@@ -49,13 +49,13 @@ pub enum Core {
     },
     /// The convex hull of points.
     Hull(Arc<Hull>),
-    /// A surface of triangles; solid when it is closed.
+    /// A triangle mesh; solid if it is closed.
     Mesh(Arc<Mesh>),
-    /// Points.
+    /// A point cloud.
     Cloud(Arc<Cloud>),
 }
 
-/// A convex hull with the box around it.
+/// A convex hull with its bounding box.
 #[derive(Debug, Clone)]
 pub struct Hull {
     polyhedron: ConvexPolyhedron,
@@ -64,7 +64,7 @@ pub struct Hull {
 }
 
 impl Hull {
-    /// The hull of points [m].
+    /// Creates the hull of points [m].
     pub fn new(points: &[DVec3]) -> Result<Self, ShapeError> {
         let flat = ShapeError::Flat(points.len());
         if points.iter().any(|p| !p.is_finite()) {
@@ -75,13 +75,13 @@ impl Hull {
         Ok(Self { polyhedron, middle, half })
     }
 
-    /// What parry computes with.
+    /// Returns parry's representation.
     pub fn polyhedron(&self) -> &ConvexPolyhedron {
         &self.polyhedron
     }
 }
 
-/// A triangle mesh with the box around it.
+/// A triangle mesh with its bounding box.
 #[derive(Debug, Clone)]
 pub struct Mesh {
     surface: TriMesh,
@@ -91,14 +91,14 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// A surface from vertices [m] and triangles.
+    /// Creates a mesh from vertices [m] and triangles.
     pub fn new(vertices: Vec<DVec3>, triangles: Vec<[u32; 3]>) -> Result<Self, ShapeError> {
         let bad = |why: &str| ShapeError::Mesh(why.to_owned());
         if vertices.iter().any(|v| !v.is_finite()) {
             return Err(bad("a vertex is not finite"));
         }
         if triangles.iter().flatten().any(|&i| i as usize >= vertices.len()) {
-            return Err(bad("a triangle names a vertex that does not exist"));
+            return Err(bad("a triangle refers to a missing vertex"));
         }
         let (middle, half) = bounds(vertices.iter().copied());
         let merge = TriMeshFlags::MERGE_DUPLICATE_VERTICES | TriMeshFlags::DELETE_DEGENERATE_TRIANGLES;
@@ -108,17 +108,17 @@ impl Mesh {
         Ok(Self { surface, closed, middle, half })
     }
 
-    /// What parry computes with.
+    /// Returns parry's representation.
     pub fn surface(&self) -> &TriMesh {
         &self.surface
     }
 
-    /// Whether it has an inside: every edge has one triangle on each side.
+    /// Returns whether it is closed: every edge has one triangle on each side.
     pub fn is_closed(&self) -> bool {
         self.closed
     }
 
-    /// Whether a point in its own frame is inside.
+    /// Returns whether a point in its own frame is inside.
     pub fn holds(&self, p: DVec3) -> bool {
         use parry3d_f64::query::PointQuery;
         (p - self.middle).abs().cmple(self.half).all() && self.surface.contains_local_point(p)
@@ -132,17 +132,17 @@ fn is_closed(triangles: &[[u32; 3]]) -> bool {
     !twice && edges.iter().all(|&(a, b)| edges.binary_search(&(b, a)).is_ok())
 }
 
-/// Middle and half extents of the box around points.
+/// Returns the centre and half extents of the bounding box of points.
 pub fn bounds(points: impl Iterator<Item = DVec3>) -> (DVec3, DVec3) {
     let start = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (low, high) = points.fold(start, |(low, high), p| (low.min(p), high.max(p)));
     ((low + high) * 0.5, (high - low) * 0.5)
 }
 
-/// Everything within `radius` of a core that stands at `frame`.
+/// Everything within `radius` of a core at `frame`.
 #[derive(Debug, Clone)]
 pub struct Solid {
-    /// What it is within a radius of.
+    /// The core.
     pub core: Core,
     /// Distance from the core to the surface [m].
     pub radius: f64,
@@ -159,7 +159,7 @@ impl Solid {
         if frame.is_finite() { Ok(Self { core, radius, frame }) } else { Err(ShapeError::Pose) }
     }
 
-    /// A box with these full extents [m].
+    /// Creates a box with these full extents [m].
     pub fn cuboid(size: DVec3, frame: DAffine3) -> Result<Self, ShapeError> {
         for x in size.to_array() {
             positive("each side of a box", x)?;
@@ -167,39 +167,39 @@ impl Solid {
         Self::of(Core::Box { half: size * 0.5 }, 0.0, frame)
     }
 
-    /// A sphere [m].
+    /// Creates a sphere [m].
     pub fn sphere(radius: f64, frame: DAffine3) -> Result<Self, ShapeError> {
         Self::of(Core::Point, positive("the radius of a sphere", radius)?, frame)
     }
 
-    /// A cylinder along z with this full length [m].
+    /// Creates a cylinder along z with this full length [m].
     pub fn cylinder(radius: f64, length: f64, frame: DAffine3) -> Result<Self, ShapeError> {
         let radius = positive("the radius of a cylinder", radius)?;
         Self::of(Core::Cylinder { half: positive("the length of a cylinder", length)? * 0.5, radius }, 0.0, frame)
     }
 
-    /// A capsule along z; `length` is that between the middles of its half spheres [m].
+    /// Creates a capsule along z; `length` is the distance between the centres of its half spheres [m].
     pub fn capsule(radius: f64, length: f64, frame: DAffine3) -> Result<Self, ShapeError> {
         let half = positive("the length of a capsule", length)? * 0.5;
         Self::of(Core::Segment { half }, positive("the radius of a capsule", radius)?, frame)
     }
 
-    /// The convex hull of points [m].
+    /// Creates the convex hull of points [m].
     pub fn hull(points: &[DVec3], frame: DAffine3) -> Result<Self, ShapeError> {
         Self::of(Core::Hull(Arc::new(Hull::new(points)?)), 0.0, frame)
     }
 
-    /// A mesh.
+    /// Creates a solid from a mesh.
     pub fn mesh(mesh: Arc<Mesh>, frame: DAffine3) -> Result<Self, ShapeError> {
         Self::of(Core::Mesh(mesh), 0.0, frame)
     }
 
-    /// A cloud of balls of one radius [m].
+    /// Creates a cloud of balls of one radius [m].
     pub fn cloud(cloud: Arc<Cloud>, radius: f64, frame: DAffine3) -> Result<Self, ShapeError> {
         Self::of(Core::Cloud(cloud), positive("the radius of a cloud's points", radius)?, frame)
     }
 
-    /// The core where it stands when the frame that carries it stands at `carrier`.
+    /// Returns the core's pose if its carrier frame is at `carrier`.
     pub fn place(&self, carrier: &DAffine3) -> Placed<'_> {
         let frame = || *carrier * self.frame;
         match &self.core {
@@ -217,14 +217,14 @@ impl Solid {
         }
     }
 
-    /// A ball around it, in the frame that carries it: middle and radius [m].
+    /// Returns a bounding ball in the carrier frame: centre and radius [m].
     pub fn ball(&self) -> (DVec3, f64) {
         let (middle, radius) = self.place(&DAffine3::IDENTITY).ball();
         (middle, radius + self.radius)
     }
 }
 
-/// A core where it stands, in the frame of the query.
+/// A core at its pose, in the common frame of a query.
 #[derive(Debug, Clone, Copy)]
 pub enum Placed<'a> {
     /// A point.
@@ -244,7 +244,7 @@ pub enum Placed<'a> {
 }
 
 impl Placed<'_> {
-    /// A box around it, for all that have a frame of their own: its frame and half extents.
+    /// Returns a bounding box, for cores that have a frame: its frame and half extents.
     pub fn guard(&self) -> Option<(DAffine3, DVec3)> {
         let around = |f: &DAffine3, middle: DVec3, half: DVec3| {
             let frame = DAffine3 { matrix3: f.matrix3, translation: f.transform_point3(middle) };
@@ -263,7 +263,7 @@ impl Placed<'_> {
         }
     }
 
-    /// A ball around it: middle and radius [m].
+    /// Returns a bounding ball: centre and radius [m].
     pub fn ball(&self) -> (DVec3, f64) {
         match self {
             Self::Point(p) => (*p, 0.0),

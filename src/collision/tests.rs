@@ -1,10 +1,10 @@
-//! Worlds and the exact checker.
+//! Tests of worlds and the exact checker.
 
 use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
 
-use super::always::always_touching;
+use super::allowed_pairs::always_touching;
 use super::body::{MeshMode, of_mesh, solids};
 use super::checker::{CollisionChecker, Resolution, Stop};
 use super::exact::ExactChecker;
@@ -57,7 +57,7 @@ fn one_arm(obstacles: &[Obstacle]) -> World {
 }
 
 #[test]
-fn contacts_say_who_and_how_deep() {
+fn contacts_report_names_and_depth() {
     let world = one_arm(&[ball("post", DVec3::new(0.95, 0.08, 0.1), 0.05)]);
     let mut checker = checker(&world);
     let contacts = checker.contacts(&[0.0; 3]);
@@ -66,7 +66,7 @@ fn contacts_say_who_and_how_deep() {
     assert!((contacts[0].distance + 0.02).abs() < 1e-9);
     assert_eq!(contacts[0].to_string(), "link \"l3\" is 20.0 mm deep in obstacle \"post\"");
     assert!(!checker.is_free(&[0.0; 3]) && checker.is_free(&[-1.0, 0.0, 0.0]));
-    // The other links are farther from it than this one.
+    // The other links are farther away than this one.
     let near = checker.clearance(&[-0.1, 0.0, 0.0]).unwrap();
     assert!(near.distance > 0.0 && near.other == "post", "{near}");
     assert!((near.on_link.distance(near.on_other) - near.distance).abs() < 1e-9);
@@ -94,7 +94,7 @@ fn padding_allowance_and_snapshots_hold() {
 fn neighbours_may_touch_and_others_may_not() {
     let mut checker = checker(&one_arm(&[]));
     assert!(checker.is_free(&[0.0; 3]));
-    // Folded back onto itself: the end over the first link.
+    // Folded back onto itself: the end-effector link over the first link.
     assert_eq!(checker.first_contact(&[0.0, 3.05, 3.05]), Some(Pair::Links(1, 3)));
     let mut world = World::new();
     world
@@ -123,7 +123,7 @@ fn two_robots_see_each_other() {
 }
 
 #[test]
-fn held_objects_move_along_and_touch_what_they_may() {
+fn held_objects_move_with_the_arm_and_keep_their_allowed_pairs() {
     let mut world = one_arm(&[ball("post", DVec3::new(1.2, 0.0, 0.1), 0.05)]);
     assert!(checker(&world).is_free(&[0.0; 3]));
     let rod =
@@ -145,7 +145,7 @@ fn held_objects_move_along_and_touch_what_they_may() {
 }
 
 #[test]
-fn what_always_touches_is_named() {
+fn pairs_that_always_touch_are_reported_by_name() {
     let mut robot = arm("", DVec3::ZERO);
     robot.solids[2].push(Solid::sphere(0.2, DAffine3::from_translation(DVec3::new(-0.4, 0.0, 0.0))).unwrap());
     let mut world = World::new();
@@ -157,30 +157,30 @@ fn what_always_touches_is_named() {
     assert!(always_touching(&one_arm(&[]).snapshot(), &[0.0; 3], 200, 7).is_empty());
 }
 
-/// A motion that is called free is free at ten times any sampling's density; one that is called blocked touches.
+/// A motion reported as free is free at ten times any sampling density; a blocked one touches.
 #[test]
-fn what_is_proven_free_is_free_between_samples() {
+fn a_free_motion_is_free_between_samples() {
     let mut random = Random::new(21);
     let (mut free, mut blocked) = (0, 0);
     for round in 0..12 {
         let mut balls = Vec::new();
         for i in 0..6 {
             let at = DVec3::new(random.between(-0.9, 0.9), random.between(-0.9, 0.9), 0.1);
-            // Thin posts slip between the samples of a coarse check.
+            // Thin posts fit between the samples of a coarse check.
             balls.push(ball(&format!("post{i}"), at, random.between(0.002, 0.03)));
         }
         let mut checker = checker(&one_arm(&balls));
         for _ in 0..40 {
             let mut q = || -> Vec<f64> { (0..3).map(|_| random.between(-3.0, 3.0)).collect() };
             let (a, b) = (q(), q());
-            let said = checker.motion_is_free(&a, &b, &Stop::never());
+            let free = checker.motion_is_free(&a, &b, &Stop::never());
             let steps = 1500;
             let mut touches = (0..=steps).filter(|k| {
                 let t = f64::from(*k) / f64::from(steps);
                 let at: Vec<f64> = a.iter().zip(&b).map(|(a, b)| a + (b - a) * t).collect();
                 !checker.is_free(&at)
             });
-            if said {
+            if free {
                 free += 1;
                 assert_eq!(touches.next(), None, "round {round}: {a:?} {b:?}");
             } else {
@@ -193,7 +193,7 @@ fn what_is_proven_free_is_free_between_samples() {
 }
 
 #[test]
-fn a_stop_ends_a_proof() {
+fn a_stop_ends_a_motion_check() {
     let mut checker = checker(&one_arm(&[ball("post", DVec3::new(0.95, 0.5, 0.1), 0.05)]));
     let flag = Arc::new(std::sync::atomic::AtomicBool::new(true));
     let stop = Stop::new(None, Some(flag));
@@ -220,7 +220,7 @@ fn fork() -> Mesh {
 }
 
 #[test]
-fn a_decomposition_holds_the_mesh_and_leaves_its_hollow_free() {
+fn a_decomposition_contains_the_mesh_and_leaves_its_gap_free() {
     let touched = |mode: MeshMode, at: DVec3| {
         let mut robot = arm("", DVec3::ZERO);
         robot.solids = vec![of_mesh(&fork(), mode, DAffine3::IDENTITY).unwrap(), vec![], vec![], vec![]];
@@ -230,10 +230,10 @@ fn a_decomposition_holds_the_mesh_and_leaves_its_hollow_free() {
         !checker(&world).contacts(&[0.0; 3]).is_empty()
     };
     let between = DVec3::new(0.2, 0.25, 0.0);
-    assert!(touched(MeshMode::Hull, between), "a hull fills it");
+    assert!(touched(MeshMode::Hull, between), "a hull fills the gap");
     for mode in [MeshMode::Decomposition, MeshMode::Triangles] {
         assert!(!touched(mode, between), "{mode:?}");
-        // All over the surface, and within a finger.
+        // Over the whole surface, and inside a finger.
         let mut random = Random::new(7);
         let mesh = fork();
         for [a, b, c] in &mesh.triangles {

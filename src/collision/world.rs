@@ -1,4 +1,4 @@
-//! The world that can be changed: robots, obstacles, held objects, allowed pairs. Planning works on its snapshots.
+//! A world that can change: robots, obstacles, held objects, allowed pairs. Planning uses its snapshots.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -14,60 +14,60 @@ use super::shape::Solid;
 /// A robot in a world.
 #[derive(Debug, Clone)]
 pub struct Robot {
-    /// Its name: empty for the only robot of a world.
+    /// Name; empty for the only robot of a world.
     pub name: String,
-    /// Its description.
+    /// Model.
     pub model: Arc<RobotModel>,
-    /// The joints that are planned; the others stand still.
+    /// Planned joints; the others are fixed.
     pub kinematics: Arc<Kinematics>,
-    /// The solids of every link, in the links' frames (see [`super::body::solids`]).
+    /// Solids of every link, in the links' frames (see [`super::body::solids`]).
     pub solids: Vec<Vec<Solid>>,
-    /// Where its root link stands in the world.
+    /// Pose of the root link in the world.
     pub base: DAffine3,
-    /// More distance that its links keep from obstacles and each other [m].
+    /// Additional padding of its links [m].
     pub padding: f64,
-    /// Pairs of links that may touch, by name: exclusion pairs and those of the SRDF.
+    /// Allowed collision pairs, by link name: exclusion pairs and those of the SRDF.
     pub allowed: Vec<(String, String)>,
 }
 
-/// Something in the robots' way.
+/// An obstacle.
 #[derive(Debug, Clone)]
 pub struct Obstacle {
-    /// Its name, unique in the world.
+    /// Name, unique in the world.
     pub name: String,
-    /// What and where it is, in the world's frame.
+    /// Geometry and pose, in the world's frame.
     pub solid: Solid,
-    /// Distance to keep from it [m].
+    /// Padding [m].
     pub padding: f64,
 }
 
-/// Something that a robot holds.
+/// An object held by a robot.
 #[derive(Debug, Clone)]
 pub struct Attached {
-    /// Its name, unique among links and obstacles.
+    /// Name, unique among links and obstacles.
     pub name: String,
-    /// The robot's index.
+    /// Index of the robot.
     pub robot: usize,
-    /// The link that holds it, by name.
+    /// Name of the link that holds it.
     pub link: String,
-    /// Its solids, in that link's frame.
+    /// Solids, in that link's frame.
     pub solids: Vec<Solid>,
-    /// Links that it may touch besides the one that holds it.
+    /// Links that it may touch, besides the one that holds it.
     pub touch_links: Vec<String>,
-    /// Distance to keep from it [m].
+    /// Padding [m].
     pub padding: f64,
 }
 
-/// Why a world cannot be changed so.
+/// Why a change of the world is rejected.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum WorldError {
-    /// The name is taken.
+    /// The name is in use.
     #[error("{0:?} is already in the world")]
     Taken(String),
-    /// There is no such thing.
+    /// The object does not exist.
     #[error("{0:?} is not in the world")]
     Unknown(String),
-    /// A robot has no such link.
+    /// The robot has no such link.
     #[error("robot {robot:?} has no link {link:?}")]
     NoLink {
         /// The robot.
@@ -75,21 +75,21 @@ pub enum WorldError {
         /// The link.
         link: String,
     },
-    /// There is no such robot.
-    #[error("there is no robot number {0}")]
+    /// The robot does not exist.
+    #[error("no robot with index {0}")]
     NoRobot(usize),
     /// Padding is negative or not finite.
     #[error("padding must be finite and not negative, not {0}")]
     Padding(f64),
 }
 
-/// Robots and what is around them.
+/// Robots and the objects around them.
 #[derive(Debug, Clone, Default)]
 pub struct World {
     robots: Vec<Robot>,
     obstacles: Vec<Obstacle>,
     attached: Vec<Attached>,
-    /// Links and obstacles that may touch, by name.
+    /// Allowed pairs of a link and an obstacle, by name.
     allowed: BTreeSet<(String, String)>,
 }
 
@@ -98,12 +98,12 @@ fn check_padding(padding: f64) -> Result<(), WorldError> {
 }
 
 impl World {
-    /// An empty world.
+    /// Creates an empty world.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Puts a robot in. Its joints follow those of the robots before it in a configuration.
+    /// Adds a robot. In a configuration, its joints follow those of the robots before it.
     pub fn add_robot(&mut self, robot: Robot) -> Result<(), WorldError> {
         check_padding(robot.padding)?;
         if self.robots.iter().any(|r| r.name == robot.name) {
@@ -118,7 +118,7 @@ impl World {
         Ok(())
     }
 
-    /// Puts an obstacle in.
+    /// Adds an obstacle.
     pub fn add(&mut self, obstacle: Obstacle) -> Result<(), WorldError> {
         check_padding(obstacle.padding)?;
         if self.obstacles.iter().any(|o| o.name == obstacle.name) || self.attached(&obstacle.name).is_some() {
@@ -128,7 +128,7 @@ impl World {
         Ok(())
     }
 
-    /// Puts an obstacle in place of the one with its name, or adds it.
+    /// Replaces the obstacle of the same name, or adds it.
     pub fn put(&mut self, obstacle: Obstacle) -> Result<(), WorldError> {
         match self.obstacles.iter().position(|o| o.name == obstacle.name) {
             Some(at) => {
@@ -148,33 +148,33 @@ impl World {
         Ok(())
     }
 
-    /// Takes an obstacle out.
+    /// Removes an obstacle.
     pub fn remove(&mut self, name: &str) -> Result<Obstacle, WorldError> {
         let at = self.obstacles.iter().position(|o| o.name == name);
         at.map(|at| self.obstacles.remove(at)).ok_or_else(|| WorldError::Unknown(name.to_owned()))
     }
 
-    /// Takes all obstacles out.
+    /// Removes all obstacles.
     pub fn clear(&mut self) {
         self.obstacles.clear();
     }
 
-    /// The obstacles, in the order they were put in.
+    /// Returns the obstacles, in the order of addition.
     pub fn obstacles(&self) -> &[Obstacle] {
         &self.obstacles
     }
 
-    /// The same world with other robots in it, one in place of each.
+    /// Returns the same world with its robots replaced one by one.
     pub fn with_robots(&self, robots: Vec<Robot>) -> Self {
         Self { robots, ..self.clone() }
     }
 
-    /// The robots.
+    /// Returns the robots.
     pub fn robots(&self) -> &[Robot] {
         &self.robots
     }
 
-    /// What the robots hold.
+    /// Returns the held objects.
     pub fn held(&self) -> &[Attached] {
         &self.attached
     }
@@ -183,7 +183,7 @@ impl World {
         self.attached.iter().position(|a| a.name == name)
     }
 
-    /// Fixes an object to a link.
+    /// Attaches an object to a link.
     pub fn attach(&mut self, object: Attached) -> Result<(), WorldError> {
         check_padding(object.padding)?;
         let robot = self.robots.get(object.robot).ok_or(WorldError::NoRobot(object.robot))?;
@@ -202,23 +202,23 @@ impl World {
         Ok(())
     }
 
-    /// Takes a held object away from its robot, and returns it.
+    /// Detaches a held object and returns it.
     pub fn detach(&mut self, name: &str) -> Result<Attached, WorldError> {
         let at = self.attached(name).ok_or_else(|| WorldError::Unknown(name.to_owned()))?;
         Ok(self.attached.remove(at))
     }
 
-    /// Lets a link, or a held object, and an obstacle touch.
+    /// Allows a link or a held object to touch an obstacle.
     pub fn allow(&mut self, link: &str, obstacle: &str) {
         self.allowed.insert((link.to_owned(), obstacle.to_owned()));
     }
 
-    /// Whether a link and an obstacle may touch.
+    /// Returns whether a link may touch an obstacle.
     pub fn is_allowed(&self, link: &str, obstacle: &str) -> bool {
         self.allowed.contains(&(link.to_owned(), obstacle.to_owned()))
     }
 
-    /// The world as it is now; what changes later does not change it.
+    /// Returns an immutable snapshot of the current world.
     pub fn snapshot(&self) -> Arc<Scene> {
         Arc::new(Scene::of(self))
     }

@@ -10,8 +10,8 @@ use super::coordinator::{Coordinator, TickTime};
 use super::request::{Envelope, Motion};
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::{Clock, Mono};
-use crate::rt::beat::Beat;
 use crate::rt::due::Due;
+use crate::rt::heartbeat::Heartbeat;
 use crate::rt::histogram::Histogram;
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, SlotWriter};
@@ -22,7 +22,7 @@ use crate::telemetry::{ArmSample, Event, Outcome, Sample, TaskView, TickSample};
 #[derive(Debug, Default)]
 pub struct Pulse {
     /// The thread's heartbeat.
-    pub beat: Arc<Beat>,
+    pub beat: Arc<Heartbeat>,
     /// Ticks made.
     pub ticks: AtomicU64,
     /// Ticks that began a period or more too late.

@@ -1,62 +1,62 @@
-//! What is in the way of a motion under way, in a world that has changed since it was planned, and where the motion
-//! comes to rest when it is cancelled.
+//! Checks the rest of a running motion against a world that has changed since it was planned, and predicts where the
+//! motion stops after a cancel.
 
-use super::leaving::passes;
 use super::path::between;
-use super::setup::Setup;
-use super::solve::{Failure, Found, stage};
+use super::pipeline::{PlanFailure, PlannedMotion, stage};
+use super::planning_scene::PlanningScene;
+use super::start_contact::passes;
 use crate::collision::report::Contact;
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, Stop};
 use crate::trajectory::{Cursor, Sample, Spline};
 
-/// Length of the pieces of the motion that are looked at [s]: between their ends it hardly leaves the straight line.
+/// Length of the time slices that are checked [s]; within one, the motion is almost straight.
 const PIECE: f64 = 0.02;
-/// A stretch this close to the line between its ends is straight [rad].
+/// Largest deviation from the chord for a slice to count as straight [rad].
 const STRAIGHT: f64 = 5e-5;
-/// Looks for the contact on a piece that is not free.
-const LOOKS: u32 = 32;
-/// How long a cancel may take to reach the tick, with two ticks more: as much later the motion slows down [s].
+/// Collision checks along a blocked slice to find its contact.
+const SAMPLES: u32 = 32;
+/// Delay of a cancel on its way to the tick, besides two ticks: deceleration begins this much later [s].
 const DELAY: f64 = 0.03;
-/// Slowest joint that counts when the motion slows down [rad/s], as the trajectory task has it.
+/// Slowest joint that counts during deceleration [rad/s]; same value as in the trajectory task.
 const SLOWEST: f64 = 1e-3;
-/// Part of the acceleration limit that slowing down may always use, as the trajectory task has it.
+/// Part of the acceleration limit that deceleration may always use; same value as in the trajectory task.
 const LEAST: f64 = 0.1;
 
-/// What is in the way of a motion.
+/// Where a running motion is blocked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Blocked {
-    /// Up to here it keeps its distance [s since the motion's start].
+    /// The motion keeps its distance until here [s since its start].
     pub free_until: f64,
-    /// What is in the way, with names and distances.
+    /// Contact that blocks it: names and distance.
     pub what: String,
 }
 
-/// Looks at the rest of a motion, from `elapsed` [s] on, in the world as it is now, with all robots where they are now
-/// [rad]. `None`: nothing is in the way. An error: that was not found out, or not in time.
+/// Checks the rest of a motion, from `elapsed` [s] on, against the current world and the current positions of all
+/// robots [rad]. Returns `None` if it is free, and an error if the check failed or ran out of time.
 pub fn look_ahead(
-    setup: &Setup,
+    setup: &PlanningScene,
     world: &World,
-    found: &Found,
+    found: &PlannedMotion,
     positions: &[Vec<f64>],
     elapsed: f64,
     stop: &Stop,
-) -> Result<Option<Blocked>, Failure> {
-    let spline = Spline::new(&found.trajectory).map_err(|e| Failure::new(e.to_string()))?;
+) -> Result<Option<Blocked>, PlanFailure> {
+    let spline = Spline::new(&found.trajectory).map_err(|e| PlanFailure::new(e.to_string()))?;
     let mut stage = stage(setup, world, &found.robots, positions, setup.padding)?;
     let checker = &mut stage.checker;
     checker.give_up_again(&found.given_up);
     let way = samples(&spline, elapsed);
     let last = way.len() - 1;
-    // Stretches that are not looked at yet, the earliest last. One that is not straight or not free is cut in two.
+    // Slices still to check, the earliest last. A slice that is bent or blocked is split in two.
     let mut stretches = vec![(0, last)];
     while let Some((first, end)) = stretches.pop() {
         let ((time, from), (_, to)) = (&way[first], &way[end]);
-        if is_straight(&way[first..=end]) && passes(checker, found.leaving.as_ref(), from, to, stop) {
+        if is_straight(&way[first..=end]) && passes(checker, found.escape_path.as_ref(), from, to, stop) {
             continue;
         }
         if stop.is_over() {
-            return Err(Failure::new("whether its way is still free was not found out in time"));
+            return Err(PlanFailure::new("no time left to check the rest of the motion"));
         }
         if end - first > 1 {
             let middle = first + (end - first) / 2;
@@ -64,17 +64,18 @@ pub fn look_ahead(
             continue;
         }
         let mut q = from.clone();
-        let contact = (0..=LOOKS).find_map(|k| {
-            between(from, to, f64::from(k) / f64::from(LOOKS), &mut q);
+        let contact = (0..=SAMPLES).find_map(|k| {
+            between(from, to, f64::from(k) / f64::from(SAMPLES), &mut q);
             checker.contacts(&q).into_iter().next()
         });
-        let what = contact.map_or_else(|| "its way is no longer free".to_owned(), |c| in_the_way(&c, setup.padding));
+        let what = contact
+            .map_or_else(|| "the rest of the motion is blocked".to_owned(), |c| describe_contact(&c, setup.padding));
         return Ok(Some(Blocked { free_until: *time, what }));
     }
     Ok(None)
 }
 
-/// Where a motion is at times from `elapsed` to its end [s, rad].
+/// Samples a motion from `elapsed` to its end [s, rad].
 fn samples(spline: &Spline, elapsed: f64) -> Vec<(f64, Vec<f64>)> {
     let mut cursor = Cursor::default();
     let mut samples = vec![Sample::default(); spline.joints()];
@@ -89,7 +90,7 @@ fn samples(spline: &Spline, elapsed: f64) -> Vec<(f64, Vec<f64>)> {
     (0..=pieces).map(&mut at).collect()
 }
 
-/// Whether a stretch of a motion is a straight line from its first to its last configuration.
+/// Returns whether a slice of a motion is a straight line between its first and its last configuration.
 fn is_straight(way: &[(f64, Vec<f64>)]) -> bool {
     let (Some((_, a)), Some((_, b))) = (way.first(), way.last()) else { return true };
     let along: Vec<f64> = a.iter().zip(b).map(|(a, b)| b - a).collect();
@@ -102,20 +103,20 @@ fn is_straight(way: &[(f64, Vec<f64>)]) -> bool {
     })
 }
 
-/// A contact in words; where nothing touches yet, with the distance that is kept.
-pub(super) fn in_the_way(contact: &Contact, padding: f64) -> String {
+/// Describes a contact; if nothing touches, adds the padding that is violated.
+pub(super) fn describe_contact(contact: &Contact, padding: f64) -> String {
     let kept = format!(", closer than the padding of {:.1} mm", padding * 1e3);
     format!("{contact}{}", if contact.distance > 0.0 { kept } else { String::new() })
 }
 
-/// Whether a motion that is cancelled now, at `elapsed` [s], rests before `free_until` [s], with what a request needs to
-/// reach the tick. The other parameters are those of [`rest_after_cancel`].
+/// Returns whether a motion cancelled at `elapsed` [s] stops before `free_until` [s], including the delay of
+/// the request. The other parameters are those of [`rest_after_cancel`].
 pub fn rests_before(free_until: f64, spline: &Spline, acceleration: &[f64], elapsed: f64, dt: f64) -> bool {
     rest_after_cancel(spline, acceleration, elapsed + DELAY + 2.0 * dt, dt) <= free_until
 }
 
-/// When a motion that is cancelled at `elapsed` [s] is at rest, in its own time [s]: it slows down along its path as
-/// the trajectory task does in ticks of `dt` [s]. `acceleration`: the limits of its joints [rad/s²].
+/// Returns when a motion cancelled at `elapsed` [s] is at rest, in the motion's own time [s]. It decelerates along
+/// its path as the trajectory task does, in ticks of `dt` [s]; `acceleration` holds the limits of its joints [rad/s²].
 pub fn rest_after_cancel(spline: &Spline, acceleration: &[f64], elapsed: f64, dt: f64) -> f64 {
     let mut cursor = Cursor::default();
     let mut samples = vec![Sample::default(); acceleration.len()];

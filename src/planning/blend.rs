@@ -1,5 +1,5 @@
-//! A joint path with rounded corners: a curve `q(s)` with continuous curvature that stays within a stated deviation of
-//! the straight path.
+//! Corner blending: turns a joint path into a curve `q(s)` with continuous curvature within a given deviation of the
+//! straight path.
 //!
 //! Between straight pieces the direction turns by a smooth step `σ(x) = 3x² − 2x³`: `q'(s) = u₁ + (u₂ − u₁)·σ`, for
 //! `s` from `−L` to `L` around the corner. So `q` is of fourth degree, meets both lines with equal position, direction
@@ -7,24 +7,24 @@
 
 use super::path::distance;
 
-/// A piece of a curve: a line, or a corner.
+/// A piece of a curve: a line or a blended corner.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Piece {
-    /// Length of its parameter [rad].
+    /// Length of its parameter interval [rad].
     pub length: f64,
-    /// Where it starts [rad].
+    /// Start configuration [rad].
     pub start: Vec<f64>,
-    /// Its direction there, of length 1.
+    /// Direction at the start, of length 1.
     pub direction: Vec<f64>,
-    /// What a corner adds to the direction until its end; of a line, nothing.
+    /// Change of direction over the piece; zero for a line.
     pub turn: Vec<f64>,
-    /// Whether it is a corner.
+    /// Whether the piece is a corner.
     pub bends: bool,
-    /// The corner's index in the path; of a line, that of its end.
+    /// Index of the corner in the path; for a line, that of its end point.
     pub corner: usize,
 }
 
-/// A point of a curve: position, and its first three derivatives by the parameter.
+/// A point of a curve: position and its first three derivatives with respect to the parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Jet {
     /// Position [rad].
@@ -37,10 +37,9 @@ pub struct Jet {
     pub d3: f64,
 }
 
-/// How far a corner has turned: the integral of `σ` by the parameter, `σ`, and its first two derivatives. What is the
-/// same for all joints.
+/// Progress of a corner: the integral of `σ`, `σ`, and its first two derivatives. Common to all joints.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Turned {
+pub struct CornerProgress {
     /// ∫σ ds [rad].
     pub area: f64,
     /// σ, from 0 to 1.
@@ -52,14 +51,14 @@ pub struct Turned {
 }
 
 impl Piece {
-    /// How far it has turned at parameter `s` from its start [rad].
-    pub fn turned(&self, s: f64) -> Turned {
+    /// Returns the progress at parameter `s` from the piece's start [rad].
+    pub fn progress(&self, s: f64) -> CornerProgress {
         if !self.bends {
-            return Turned::default();
+            return CornerProgress::default();
         }
         let inverse = 1.0 / self.length;
         let x = s * inverse;
-        Turned {
+        CornerProgress {
             area: s * x * x * (1.0 - 0.5 * x),
             part: x * x * (3.0 - 2.0 * x),
             d1: 6.0 * x * (1.0 - x) * inverse,
@@ -67,9 +66,9 @@ impl Piece {
         }
     }
 
-    /// All joints at parameter `s` from the piece's start [rad].
+    /// Returns all joints at parameter `s` from the piece's start [rad].
     pub fn jets(&self, s: f64) -> impl Iterator<Item = Jet> + '_ {
-        let t = self.turned(s);
+        let t = self.progress(s);
         self.start.iter().zip(&self.direction).zip(&self.turn).map(move |((start, direction), turn)| Jet {
             q: start + direction * s + turn * t.area,
             d1: direction + turn * t.part,
@@ -79,15 +78,15 @@ impl Piece {
     }
 }
 
-/// A run of pieces between two rests.
+/// Consecutive pieces between two rests.
 pub type Curve = Vec<Piece>;
 
-/// The curves of a path. At corner `i` (an inner configuration) the curve stays within `deviation[i]` [rad, Euclidean]
-/// of the path; a corner with none is reached exactly and rested at, which ends one curve and begins the next.
+/// Builds the curves of a path. At corner `i` (an inner configuration) the curve stays within `deviation[i]` [rad,
+/// Euclidean] of the path. At a corner with deviation 0 the motion rests: one curve ends, the next begins.
 pub fn curves(path: &[Vec<f64>], deviation: &[f64]) -> Vec<Curve> {
     let mut curves = Vec::new();
     let mut curve: Curve = Vec::new();
-    // What the last corner has taken of the line at hand.
+    // Part of the current line that the previous corner uses.
     let mut taken = 0.0;
     for (i, line) in path.windows(2).enumerate() {
         let (a, b) = (&line[0], &line[1]);
@@ -118,7 +117,7 @@ pub fn curves(path: &[Vec<f64>], deviation: &[f64]) -> Vec<Curve> {
 struct Corner {
     u1: Vec<f64>,
     u2: Vec<f64>,
-    /// What it takes of the lines on both sides [rad].
+    /// Length used on each of the two lines [rad].
     half: f64,
 }
 
@@ -127,7 +126,7 @@ impl Corner {
         let (u1, u2) = (direction(a, b), direction(b, c));
         let turn = distance(&u1, &u2);
         let room = 0.5 * distance(a, b).min(distance(b, c));
-        // A reversal cannot be rounded: the curve would stand still in it.
+        // A reversal cannot be blended: the curve would have zero speed there.
         let half =
             if turn > 1.99 || deviation <= 0.0 { 0.0 } else { (16.0 * deviation / (3.0 * turn.max(1e-9))).min(room) };
         Self { u1, u2, half }
@@ -182,7 +181,7 @@ mod tests {
         let path = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![1.0, 1.0]];
         assert_eq!(curves(&path, &[0.0; 3]).len(), 2);
         assert_eq!(curves(&path, &[0.1; 3]).len(), 1);
-        // So is a reversal.
+        // A reversal is a rest too.
         let back = vec![vec![0.0, 0.0], vec![1.0, 0.0], vec![0.5, 0.0]];
         assert_eq!(curves(&back, &[0.1; 3]).len(), 2);
     }

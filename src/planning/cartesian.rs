@@ -1,4 +1,4 @@
-//! Straight lines of a link: configurations along the line, close enough that the link keeps to it between them.
+//! Straight lines of a link: configurations along the line, dense enough that the link stays on it in between.
 
 use glamx::{DAffine3, DQuat};
 
@@ -7,18 +7,18 @@ use crate::robot::kinematics::Kinematics;
 use super::ik::{Ik, IkSettings};
 use super::path::Path;
 
-/// How a line is followed.
+/// Settings for following a line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineSettings {
     /// Distance between configurations [m].
     pub step: f64,
-    /// Turn between configurations [rad].
+    /// Rotation between configurations [rad].
     pub turn: f64,
-    /// How far the link may be off the line between configurations [m].
+    /// Maximum position error of the link between configurations [m].
     pub deviation: f64,
-    /// How far its orientation may be off [rad].
+    /// Maximum orientation error [rad].
     pub tilt: f64,
-    /// How far a joint may go between configurations [rad or m]: farther is a jump.
+    /// Maximum step of a joint between configurations [rad or m]; a larger one counts as a jump.
     pub jump: f64,
 }
 
@@ -28,42 +28,41 @@ impl Default for LineSettings {
     }
 }
 
-/// Why a line ends before its end.
+/// Why a line could not be followed to its end.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Shortfall {
-    /// A joint is at its limit.
-    #[error("joint {1:?} is at its limit")]
+    /// A joint reached its limit.
+    #[error("joint {1:?} reached its limit")]
     Limit(usize, String),
-    /// The arm cannot go on in this direction: it is out of reach or singular.
-    #[error("the arm can reach no farther in this direction, or is singular")]
+    /// The target is out of reach in this direction, or the arm is singular.
+    #[error("out of reach in this direction, or singular")]
     Unreachable,
-    /// A joint would have to jump.
-    #[error("joint {joint:?} would have to turn by {by:.2} rad at once: the arm is close to a singularity")]
+    /// A joint would jump.
+    #[error("joint {joint:?} would jump by {by:.2} rad: the arm is close to a singularity")]
     Jump {
         /// The joint.
         joint: String,
-        /// How far [rad or m].
+        /// Size of the jump [rad or m].
         by: f64,
     },
-    /// The way is not free.
-    #[error("the motion there is not free")]
+    /// The motion would collide.
+    #[error("the motion beyond that point would collide")]
     NotFree,
 }
 
-/// How far a line was followed.
+/// The part of a line that was followed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Line {
-    /// The configurations, from the start.
+    /// Configurations from the start.
     pub path: Path,
-    /// The part of the line that was reached, 0–1.
+    /// Part of the line that was followed, 0–1.
     pub fraction: f64,
-    /// Why not more.
+    /// Why it ends early.
     pub shortfall: Option<Shortfall>,
 }
 
-/// Follows the straight line from where a link (index in the model) stands at `start` to `target`, in the root's
-/// frame: position in a straight line, orientation about one axis. `free` says whether the straight way between two
-/// configurations is.
+/// Follows the straight line of a link (index in the model) from its pose at `start` to `target`, in the root's frame:
+/// position on a straight line, rotation about one axis. `free` tests the straight motion between two configurations.
 pub fn straight_line(
     kinematics: &Kinematics,
     link: usize,
@@ -83,7 +82,7 @@ pub fn straight_line(
     let length = from.translation.distance(target.translation);
     let steps = (length / settings.step).max(angle / settings.turn).ceil().max(1.0);
     let mut line = Line { path: vec![start.to_vec()], fraction: 0.0, shortfall: None };
-    // The line is cut finer where the arm bends away from it between configurations.
+    // Refines the step where the link leaves the line between configurations.
     let (whole, smallest) = (1.0 / steps, 1.0 / steps / 64.0);
     let mut step: f64 = whole;
     while line.fraction < 1.0 && line.shortfall.is_none() {
@@ -103,7 +102,7 @@ pub fn straight_line(
     line
 }
 
-/// The configuration at one part of the line, from that at another.
+/// Returns the configuration at one part of the line, from that at another.
 fn next(
     ik: &mut Ik,
     kinematics: &Kinematics,
@@ -114,7 +113,7 @@ fn next(
 ) -> Result<Vec<f64>, Shortfall> {
     let tight = IkSettings::default();
     let Some(q) = ik.follow(&at(b), last, &tight) else {
-        let limit = ik.limit_in_the_way(&at(b), last, &tight);
+        let limit = ik.limiting_joint(&at(b), last, &tight);
         return Err(limit.map_or(Shortfall::Unreachable, |(j, name)| Shortfall::Limit(j, name)));
     };
     let jumps = q.iter().zip(last).map(|(x, y)| (x - y).abs()).enumerate();

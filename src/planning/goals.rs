@@ -1,33 +1,33 @@
-//! From what robots shall do to configurations that do it.
+//! From a request's goals to goal configurations.
 
 use super::cartesian::{LineSettings, straight_line};
 use super::ik::{Ik, IkSettings};
-use super::padded::Place;
+use super::padded::Near;
 use super::path::Path;
-use super::setup::PlannedRobot;
-use super::solve::{Failure, Goal, Stage, late};
+use super::pipeline::{Goal, PlanFailure, Stage, late};
+use super::planning_scene::PlannedRobot;
 use crate::collision::{CollisionChecker, Stop};
 use crate::robot::kinematics::frame;
 use crate::robot::model::JointKind;
 use glamx::DAffine3;
 
-/// Different solutions that are looked for when one robot goes to a pose.
+/// Number of IK solutions to look for when one robot moves to a pose.
 const SOLUTIONS: usize = 8;
 /// Attempts to find them.
 const ATTEMPTS: usize = 200;
-/// How closely a pose goal is reached [m, rad].
-const CLOSE: f64 = 1e-5;
-/// A straight line that ends so close to its end is whole.
-const WHOLE: f64 = 1.0 - 1e-9;
+/// Tolerance of a pose goal [m, rad].
+const POSE_TOLERANCE: f64 = 1e-5;
+/// Part of a straight line that counts as complete.
+const COMPLETE: f64 = 1.0 - 1e-9;
 
-/// Configurations of all moving robots that are goals of the search. Where a robot goes to a pose there are several. Of
-/// one robot they are free, where any is; else the search says what touches.
+/// Returns goal configurations of all moving robots, several for a pose goal. Those of a single robot are
+/// collision-free if any is; otherwise the search reports what touches.
 pub(super) fn configurations(
     stage: &mut Stage<'_>,
     wanted: &[(usize, Goal)],
     seed: u64,
     stop: &Stop,
-) -> Result<Path, Failure> {
+) -> Result<Path, PlanFailure> {
     // One list of configurations per robot; a combination of one from each is a goal of all.
     let mut all: Path = vec![Vec::new()];
     let mut first = 0;
@@ -41,7 +41,7 @@ pub(super) fn configurations(
             |q: &[f64], padded: bool| !alone || if padded { checker.is_free(q) } else { checker.touches_nothing(q) };
         let several = match goal {
             Some(Goal::Joints(values)) => {
-                // Where the model lets a joint turn without end, but the arm does not, whole turns are the same goal.
+                // If the model's joint is continuous but the arm's range is limited, whole turns are the same goal.
                 let mut near = values.clone();
                 robot.body.kinematics.unwind(&mut near, &own, |kind| kind == JointKind::Continuous);
                 vec![near]
@@ -50,7 +50,7 @@ pub(super) fn configurations(
                 let settings = IkSettings { seed, ..reach() };
                 reached(robot, &frame(pose), &own, &settings, &mut free, stop)?
             }
-            Some(Goal::Place(place)) => {
+            Some(Goal::Position(place)) => {
                 let target = DAffine3::from_translation(glamx::DVec3::new(place.x, place.y, place.z));
                 let settings = IkSettings { seed, position_only: true, ..reach() };
                 reached(robot, &target, &own, &settings, &mut free, stop)?
@@ -64,7 +64,13 @@ pub(super) fn configurations(
 }
 
 fn reach() -> IkSettings {
-    IkSettings { position: CLOSE, rotation: CLOSE, attempts: ATTEMPTS, solutions: SOLUTIONS, ..IkSettings::default() }
+    IkSettings {
+        position: POSE_TOLERANCE,
+        rotation: POSE_TOLERANCE,
+        attempts: ATTEMPTS,
+        solutions: SOLUTIONS,
+        ..IkSettings::default()
+    }
 }
 
 fn reached(
@@ -74,10 +80,10 @@ fn reached(
     settings: &IkSettings,
     free: &mut impl FnMut(&[f64], bool) -> bool,
     stop: &Stop,
-) -> Result<Path, Failure> {
+) -> Result<Path, PlanFailure> {
     let in_root = robot.body.base.inverse() * *target;
     let mut ik = Ik::new(&robot.body.kinematics, robot.end_effector);
-    // Those that keep the padding, else those that touch nothing.
+    // Those that keep the padding; otherwise those that touch nothing.
     for padded in [true, false] {
         if let Ok(several) = ik.solve(&in_root, near, settings, |q| free(q, padded), stop) {
             return Ok(several);
@@ -85,33 +91,34 @@ fn reached(
     }
     ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
         if stop.is_cancelled() {
-            return Failure { cancelled: true, ..Failure::new("cancelled") };
+            return PlanFailure { cancelled: true, ..PlanFailure::new("cancelled") };
         }
-        Failure::new(format!("{}: {failure}", robot.config.name))
-            .hint("poses are of the link `end_effector_link`, in metres and radians, in the frame `map`")
+        PlanFailure::new(format!("{}: {failure}", robot.config.name))
+            .hint("poses are those of `end_effector_link` in the frame `map` [m, rad]")
     })
 }
 
-/// The straight line of the only moving robot's end effector, as far as it goes; the part that it is of the whole.
-pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Result<(Path, f64), Failure> {
-    let Some(robot) = stage.robots.first().copied() else { return Err(Failure::new("no robot moves")) };
+/// Follows the straight line of the only moving robot's end effector as far as possible; returns the path and the part
+/// followed.
+pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Result<(Path, f64), PlanFailure> {
+    let Some(robot) = stage.robots.first().copied() else { return Err(PlanFailure::new("no robot moves")) };
     let in_root = robot.body.base.inverse() * *target;
     let kinematics = robot.body.kinematics.clone();
     let (checker, start) = (&mut stage.checker, stage.start.clone());
     let contacts = checker.contacts(&start);
     if let Some(contact) = contacts.first() {
-        return Err(Failure::new(format!("the start collides: {contact}")));
+        return Err(PlanFailure::new(format!("the start collides: {contact}")));
     }
-    // Where it ends is known once it has been followed.
+    // The end is known only after following the line.
     let settings = LineSettings::default();
     let ahead = straight_line(&kinematics, robot.end_effector, &start, &in_root, &settings, |_, _| true);
-    if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= WHOLE) {
-        checker.give_up(Place::Goal, goal);
+    if let Some(goal) = ahead.path.last().filter(|_| ahead.fraction >= COMPLETE) {
+        checker.give_up(Near::Goal, goal);
     }
     let line = straight_line(&kinematics, robot.end_effector, &start, &in_root, &settings, |a, b| {
         checker.motion_is_free(a, b, stop)
     });
-    if line.fraction >= WHOLE {
+    if line.fraction >= COMPLETE {
         return Ok((line.path, 1.0));
     }
     if let Some(failure) = late(stop) {
@@ -119,6 +126,6 @@ pub(super) fn line(stage: &mut Stage<'_>, target: &DAffine3, stop: &Stop) -> Res
     }
     let reason = line.shortfall.map_or_else(String::new, |shortfall| format!(": {shortfall}"));
     let part = 100.0 * line.fraction;
-    Err(Failure::new(format!("only {part:.1} % of the straight line can be done{reason}"))
-        .hint("leave --linear out to go there any way that is free, or choose a nearer pose"))
+    Err(PlanFailure::new(format!("only {part:.1} % of the straight line is possible{reason}"))
+        .hint("omit --linear for any collision-free path, or choose a closer pose"))
 }

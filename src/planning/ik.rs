@@ -1,7 +1,6 @@
-//! Inverse kinematics: joints for a pose of a link. Damped least squares from a seed, then from random
-//! configurations, until enough solutions are found. Never gives a configuration that is not one: what it returns
-//! reaches the pose to the tolerances, inside the limits, and is valid as the caller says; if not, it says what was
-//! missing.
+//! Inverse kinematics: joint positions for a pose of a link. Damped least squares from a seed, then from random
+//! configurations, until enough solutions are found. Every returned configuration reaches the pose within the
+//! tolerances, is inside the limits, and passes the caller's test; otherwise the failure says what is missing.
 
 use glamx::{DAffine3, DVec3};
 
@@ -13,22 +12,22 @@ use crate::robot::random::Random;
 
 use super::path::distance;
 
-/// How solutions are looked for.
+/// Settings of the search for solutions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IkSettings {
-    /// Largest distance from the position asked for [m].
+    /// Position tolerance [m].
     pub position: f64,
-    /// Largest angle from the orientation asked for [rad].
+    /// Orientation tolerance [rad].
     pub rotation: f64,
-    /// Whether any orientation will do.
+    /// Whether the orientation is free.
     pub position_only: bool,
-    /// Attempts: the first from the seed, the others from random configurations.
+    /// Maximum attempts: the first from the seed, the others from random configurations.
     pub attempts: usize,
-    /// Steps of an attempt.
+    /// Maximum steps per attempt.
     pub steps: usize,
-    /// Different solutions to look for: more cost more, and the nearest of them comes first.
+    /// Number of distinct solutions to look for, nearest first; more take longer.
     pub solutions: usize,
-    /// What all randomness comes from.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
@@ -40,41 +39,41 @@ impl Default for IkSettings {
 
 /// Why no solution was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{}", self.said())]
+#[error("{}", self.message())]
 pub struct IkFailure {
-    /// Distance from the position asked for, of the best attempt [m].
+    /// Position error of the best attempt [m].
     pub position: f64,
-    /// Angle from the orientation asked for, of the best attempt [rad].
+    /// Orientation error of the best attempt [rad].
     pub rotation: f64,
-    /// The best attempt's configuration.
+    /// Configuration of the best attempt.
     pub best: Vec<f64>,
-    /// The joint whose limit kept it from coming closer, by index and name.
+    /// The joint limit that kept it from coming closer: index and name.
     pub limit: Option<(usize, String)>,
-    /// Solutions that reach the pose, but that the caller did not accept.
+    /// Solutions that the caller rejected.
     pub rejected: usize,
-    /// Attempts that were made.
+    /// Attempts made.
     pub attempts: usize,
     /// Whether it was stopped before all attempts were made.
     pub stopped: bool,
 }
 
 impl IkFailure {
-    fn said(&self) -> String {
+    fn message(&self) -> String {
         let n = self.attempts;
         if self.rejected > 0 {
-            return format!("{} configurations reach the pose, but every one collides ({n} attempts)", self.rejected);
+            return format!("all {} configurations that reach the pose collide ({n} attempts)", self.rejected);
         }
         let missing = format!("{:.1} mm and {:.2}°", self.position * 1e3, self.rotation.to_degrees());
-        let limit = self.limit.as_ref().map(|(_, joint)| format!("; the limit of joint {joint:?} is in the way"));
-        let stopped = if self.stopped { ", then it was stopped" } else { "" };
+        let limit = self.limit.as_ref().map(|(_, joint)| format!("; limited by joint {joint:?}"));
+        let stopped = if self.stopped { ", stopped early" } else { "" };
         format!(
-            "the pose is not reached: {missing} are missing after {n} attempts{stopped}{}",
+            "no IK solution after {n} attempts: the closest pose is {missing} away{stopped}{}",
             limit.unwrap_or_default()
         )
     }
 }
 
-/// Solves for poses of one link; keeps its buffers.
+/// Solver for poses of one link; reuses its buffers.
 #[derive(Debug, Clone)]
 pub struct Ik<'a> {
     kinematics: &'a Kinematics,
@@ -85,29 +84,29 @@ pub struct Ik<'a> {
     motion: Vec<f64>,
 }
 
-/// How far a configuration is from a pose.
+/// Distance of a configuration from a pose.
 #[derive(Debug, Clone, Copy)]
-struct Miss {
+struct PoseError {
     linear: DVec3,
     angular: DVec3,
 }
 
-impl Miss {
+impl PoseError {
     fn squared(&self) -> f64 {
         self.linear.length_squared() + self.angular.length_squared()
     }
 }
 
 impl<'a> Ik<'a> {
-    /// For a link (index in the model).
+    /// Creates a solver for a link (index in the model).
     pub fn new(kinematics: &'a Kinematics, link: usize) -> Self {
         let n = kinematics.dof();
         let (frames, columns) = (kinematics.frames(), vec![[0.0; 6]; n]);
         Self { kinematics, link, frames, columns, q: vec![0.0; n], motion: vec![0.0; n] }
     }
 
-    /// Configurations in which the link stands at `target` (in the root's frame), the nearest to `near` first. Those
-    /// that are not `valid` are passed over. The same settings give the same solutions.
+    /// Returns configurations in which the link is at `target` (in the root's frame), the nearest to `near` first;
+    /// skips those that are not `valid`. The same settings give the same solutions.
     pub fn solve(
         &mut self,
         target: &DAffine3,
@@ -135,8 +134,8 @@ impl<'a> Ik<'a> {
             }
             self.start(near, failure.attempts > 0, &mut random);
             failure.attempts += 1;
-            let miss = self.descend(target, settings);
-            if settings_met(&miss, settings) {
+            let error = self.descend(target, settings);
+            if settings_met(&error, settings) {
                 self.kinematics.unwind(&mut self.q, near, |_| true);
                 let new = !found.iter().any(|q| distance(q, &self.q) < 1e-3);
                 if new && valid(&self.q) {
@@ -144,40 +143,40 @@ impl<'a> Ik<'a> {
                 } else if new {
                     failure.rejected += 1;
                 }
-            } else if miss.squared() < best {
-                best = miss.squared();
-                (failure.position, failure.rotation) = (miss.linear.length(), miss.angular.length());
+            } else if error.squared() < best {
+                best = error.squared();
+                (failure.position, failure.rotation) = (error.linear.length(), error.angular.length());
                 failure.best.clone_from(&self.q);
             }
         }
         if found.is_empty() {
-            failure.limit = self.limit_in_the_way(target, &failure.best, settings);
+            failure.limit = self.limiting_joint(target, &failure.best, settings);
             return Err(failure);
         }
         found.sort_by(|a, b| distance(near, a).total_cmp(&distance(near, b)));
         Ok(found)
     }
 
-    /// One attempt from a configuration that is near a solution; `None` when it does not come to one.
+    /// Makes one attempt from a configuration near a solution; `None` if it does not converge.
     pub fn follow(&mut self, target: &DAffine3, from: &[f64], settings: &IkSettings) -> Option<Vec<f64>> {
         self.q.clear();
         self.q.extend_from_slice(from);
-        let miss = self.descend(target, settings);
-        settings_met(&miss, settings).then(|| self.q.clone())
+        let error = self.descend(target, settings);
+        settings_met(&error, settings).then(|| self.q.clone())
     }
 
-    /// The link's frame at a configuration.
+    /// Returns the link's pose at a configuration.
     pub fn pose(&mut self, q: &[f64]) -> DAffine3 {
         self.kinematics.forward(q, &mut self.frames);
         self.kinematics.link_frame(self.link, &self.frames)
     }
 
-    /// The joint that stands at its limit and would go farthest beyond it to come closer to a pose.
-    pub fn limit_in_the_way(&mut self, target: &DAffine3, q: &[f64], settings: &IkSettings) -> Option<(usize, String)> {
+    /// Returns the joint at its limit that would have to exceed it most to come closer to a pose.
+    pub fn limiting_joint(&mut self, target: &DAffine3, q: &[f64], settings: &IkSettings) -> Option<(usize, String)> {
         self.q.clear();
         self.q.extend_from_slice(q);
-        let miss = self.miss(target, settings);
-        self.aim(&miss, 1e-4, settings);
+        let error = self.error(target, settings);
+        self.aim(&error, 1e-4, settings);
         let limits = self.kinematics.limits();
         let beyond = |j: usize| (q[j] + self.motion[j] - limits[j].upper).max(limits[j].lower - q[j] - self.motion[j]);
         let at_limit = |j: &usize| q[*j] >= limits[*j].upper - 1e-6 || q[*j] <= limits[*j].lower + 1e-6;
@@ -189,55 +188,55 @@ impl<'a> Ik<'a> {
         self.q.resize(near.len(), 0.0);
         for ((q, l), near) in self.q.iter_mut().zip(self.kinematics.limits()).zip(near) {
             *q = match random_start {
-                true => crate::collision::always::sample(l.lower, l.upper, random),
+                true => crate::collision::allowed_pairs::sample(l.lower, l.upper, random),
                 false => near.max(l.lower).min(l.upper),
             };
         }
     }
 
-    fn miss(&mut self, target: &DAffine3, settings: &IkSettings) -> Miss {
+    fn error(&mut self, target: &DAffine3, settings: &IkSettings) -> PoseError {
         self.kinematics.forward(&self.q, &mut self.frames);
         let at = self.kinematics.link_frame(self.link, &self.frames);
         let angular = if settings.position_only { DVec3::ZERO } else { rotation_between(&at.matrix3, &target.matrix3) };
-        Miss { linear: target.translation - at.translation, angular }
+        PoseError { linear: target.translation - at.translation, angular }
     }
 
-    /// The damped step towards a pose, into `motion`; frames must be those of `q`.
-    fn aim(&mut self, miss: &Miss, damping: f64, settings: &IkSettings) {
+    /// Computes the damped step towards a pose, into `motion`; frames must be those of `q`.
+    fn aim(&mut self, error: &PoseError, damping: f64, settings: &IkSettings) {
         self.kinematics.jacobian(self.link, &self.frames, &mut self.columns);
         if settings.position_only {
             self.columns.iter_mut().for_each(|c| c[3..].fill(0.0));
         }
-        let (l, a) = (miss.linear, miss.angular);
+        let (l, a) = (error.linear, error.angular);
         let x = cholesky(&gram(&self.columns, damping)).map(|c| solve_gram(&c, &[l.x, l.y, l.z, a.x, a.y, a.z]));
         for (motion, column) in self.motion.iter_mut().zip(&self.columns) {
             *motion = x.map_or(0.0, |x| column.iter().zip(&x).map(|(a, b)| a * b).sum());
         }
     }
 
-    /// Goes down from `q` until the pose is reached or there is no progress; returns what is missing.
-    fn descend(&mut self, target: &DAffine3, settings: &IkSettings) -> Miss {
-        let mut miss = self.miss(target, settings);
-        let (mut best, mut idle) = (miss.squared(), 0);
+    /// Descends from `q` until the pose is reached or progress ends; returns the remaining error.
+    fn descend(&mut self, target: &DAffine3, settings: &IkSettings) -> PoseError {
+        let mut error = self.error(target, settings);
+        let (mut best, mut idle) = (error.squared(), 0);
         for _ in 0..settings.steps {
-            if settings_met(&miss, settings) || idle > 6 {
+            if settings_met(&error, settings) || idle > 6 {
                 break;
             }
-            // Much damping far away, none to speak of close by: there the last digits come at once.
-            self.aim(&miss, 0.02 * miss.squared() + 1e-9, settings);
+            // Much damping far away, almost none close by, where the last digits converge quickly.
+            self.aim(&error, 0.02 * error.squared() + 1e-9, settings);
             let longest = self.motion.iter().fold(0.0, |most: f64, m| most.max(m.abs()));
             let scale = if longest > 0.7 { 0.7 / longest } else { 1.0 };
             for ((q, m), l) in self.q.iter_mut().zip(&self.motion).zip(self.kinematics.limits()) {
                 *q = (*q + m * scale).max(l.lower).min(l.upper);
             }
-            miss = self.miss(target, settings);
-            idle = if miss.squared() < 0.9 * best { 0 } else { idle + 1 };
-            best = best.min(miss.squared());
+            error = self.error(target, settings);
+            idle = if error.squared() < 0.9 * best { 0 } else { idle + 1 };
+            best = best.min(error.squared());
         }
-        miss
+        error
     }
 }
 
-fn settings_met(miss: &Miss, settings: &IkSettings) -> bool {
-    miss.linear.length() <= settings.position && miss.angular.length() <= settings.rotation
+fn settings_met(error: &PoseError, settings: &IkSettings) -> bool {
+    error.linear.length() <= settings.position && error.angular.length() <= settings.rotation
 }

@@ -1,35 +1,35 @@
-//! From a start and a goal to a motion: search, shortening, timing. Pure computation: no thread, no clock besides the
-//! deadline it is given, the same seed gives the same path.
+//! From a start and a goal to a motion: search, shortcutting, time parameterization. Pure computation: no threads
+//! outside `planner_thread`, no clock besides the given deadline; the same seed gives the same path.
 //!
 //! ```text
-//!  pose ─▶ ik ─▶ goals ─▶ planner: straight line │ rrt_connect ─▶ shortcut ─▶ path
-//!                                                                             │
-//!                                 JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
+//!  pose ─▶ ik ─▶ goals ─▶ path_planner: straight line │ rrt_connect ─▶ shortcut ─▶ path
+//!                                                                                    │
+//!                                    JointTrajectory ◀─ verify ◀─ timing (topp) ◀─ blend ◀─┘
 //! ```
 
 pub mod ahead;
 pub mod blend;
 pub mod cartesian;
 pub mod config;
-pub mod desk;
+mod constant_corner_speed;
 mod goals;
-pub mod idle;
 pub mod ik;
-pub mod leaving;
+mod jerk_limit;
 pub mod nearest;
 pub mod padded;
 pub mod path;
-pub mod planner;
-pub mod review;
+pub mod path_planner;
+pub mod pipeline;
+pub mod planner_thread;
+pub mod planning_scene;
+pub mod revalidate;
 pub mod rrt_connect;
 pub mod sampler;
-pub mod setup;
 pub mod shortcut;
-mod smooth;
-pub mod solve;
-mod steady;
+pub mod start_contact;
 pub mod timing;
 pub mod topp;
+pub mod unplanned_joints;
 pub mod verify;
 
 #[cfg(test)]

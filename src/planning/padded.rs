@@ -1,6 +1,6 @@
-//! The distance that plans keep from obstacles and other arms (`planner.padding`), and where they give it up: near a
-//! start or goal that is closer itself, for the pairs that are closer there, and for pairs that no pose keeps apart.
-//! Nothing touches anywhere.
+//! Padding: the distance that plans keep from obstacles and other arms (`planner.padding`), and its exceptions: pairs
+//! that are closer at the start or goal, near that configuration, and pairs that are closer in every configuration.
+//! Contact is never allowed.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
@@ -11,29 +11,31 @@ use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
-/// How far around a start or goal the padding is given up [rad]: the first that leads to a pose that keeps it.
+/// Candidate radii of an exception around a start or goal [rad]: the first that contains a configuration with the full
+/// padding is used.
 const RADII: [f64; 3] = [0.1, 0.3, 1.0];
-/// Poses that are tried for each of these.
+/// Configurations tried per candidate radius.
 const TRIES: usize = 100;
-/// A pair that is closer in this many poses, of all joints' ranges, is closer in every pose.
+/// Samples over all joints' ranges: a pair closer than the padding in every one of them counts as always closer.
 const POSES: usize = 32;
-/// Part of its distance at the start or goal that a pair keeps around it, and when the motion is looked at again.
-const KEPT: f64 = 0.5;
-const KEPT_AGAIN: f64 = 0.4;
+/// Part of its distance at the start or goal that a pair keeps around it: while planning, and when the plan is checked
+/// again.
+const DISTANCE_RATIO: f64 = 0.5;
+const REVALIDATION_RATIO: f64 = 0.4;
 
-/// Where the padding is given up.
+/// Where an exception from the padding applies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Place {
+pub enum Near {
     /// Near the start.
     Start,
     /// Near the goal.
     Goal,
-    /// In every pose: the two are closer whatever the arm does.
+    /// In every configuration: the pair is always closer than the padding.
     Everywhere,
 }
 
-impl Place {
-    /// Its name in rpc.
+impl Near {
+    /// Returns its name in rpc.
     pub fn name(self) -> &'static str {
         match self {
             Self::Start => "start",
@@ -43,24 +45,24 @@ impl Place {
     }
 }
 
-/// A pair that does not keep the padding, and where.
+/// An exception from the padding: a pair and where it applies.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GivenUp {
-    /// Where.
-    pub place: Place,
-    /// The start or goal [rad].
+    /// Where it applies.
+    pub near: Near,
+    /// The start or goal configuration [rad].
     pub center: Vec<f64>,
-    /// How far around it [rad, Euclidean over all joints].
+    /// Radius around it [rad, Euclidean over all joints].
     pub radius: f64,
     /// The link.
     pub link: String,
-    /// What it is close to.
+    /// The link or obstacle close to it.
     pub other: String,
-    /// Their distance at the start or goal [m]; negative: they touch there.
+    /// Distance at the start or goal [m]; negative: penetration depth.
     pub distance: f64,
 }
 
-/// Configurations around a start or goal, where some pairs keep less.
+/// A ball of configurations around a start or goal in which some pairs may be closer.
 #[derive(Debug, Clone)]
 struct Zone {
     center: Vec<f64>,
@@ -68,7 +70,7 @@ struct Zone {
     checker: ExactChecker,
 }
 
-/// A checker that keeps a padding. Contacts have true distances: within the padding they are above 0.
+/// A collision checker with padding. Contacts report true distances: above 0 within the padding.
 #[derive(Debug, Clone)]
 pub struct Padded {
     padding: f64,
@@ -79,38 +81,38 @@ pub struct Padded {
 }
 
 impl Padded {
-    /// A checker of a scene that keeps `padding` [m] everywhere.
+    /// Creates a checker of a scene with `padding` [m] everywhere.
     pub fn new(scene: Arc<Scene>, padding: f64) -> Self {
         let bare = ExactChecker::new(scene, Resolution::default());
         Self { padding, full: bare.clone().with_padding(padding), bare, zones: Vec::new(), given_up: Vec::new() }
     }
 
-    /// The padding [m].
+    /// Returns the padding [m].
     pub fn padding(&self) -> f64 {
         self.padding
     }
 
-    /// Where it was given up.
+    /// Returns the exceptions.
     pub fn given_up(&self) -> &[GivenUp] {
         &self.given_up
     }
 
-    /// Whether nothing touches, with or without distance.
+    /// Returns whether nothing touches, regardless of the padding.
     pub fn touches_nothing(&mut self, q: &[f64]) -> bool {
         self.bare.is_free(q)
     }
 
-    /// Gives the padding up around a start or goal, for the pairs that are closer there.
-    pub fn give_up(&mut self, place: Place, center: &[f64]) {
-        let near = self.full.closer_than_padding(center);
-        let near: Vec<_> = near.into_iter().filter(|(pair, _)| self.full.pad(*pair) > 0.0).collect();
-        if near.is_empty() || self.zones.iter().any(|zone| zone.center == center) {
+    /// Adds exceptions around a start or goal for the pairs that are closer there.
+    pub fn give_up(&mut self, near: Near, center: &[f64]) {
+        let closer = self.full.closer_than_padding(center);
+        let closer: Vec<_> = closer.into_iter().filter(|(pair, _)| self.full.pad(*pair) > 0.0).collect();
+        if closer.is_empty() || self.zones.iter().any(|zone| zone.center == center) {
             return;
         }
-        let (always, here): (Vec<_>, Vec<_>) = near.into_iter().partition(|(pair, _)| self.is_always_closer(*pair));
+        let (always, here): (Vec<_>, Vec<_>) = closer.into_iter().partition(|(pair, _)| self.is_always_closer(*pair));
         for (pair, contact) in always {
             let radius = f64::INFINITY;
-            self.given_up.push(given_up(Place::Everywhere, Vec::new(), radius, &contact));
+            self.given_up.push(given_up(Near::Everywhere, Vec::new(), radius, &contact));
             self.relax(pair, 0.0);
         }
         if here.is_empty() {
@@ -118,22 +120,22 @@ impl Padded {
         }
         let mut zone = Zone { center: center.to_vec(), radius: 0.0, checker: self.full.clone() };
         for (pair, contact) in &here {
-            zone.checker.set_pad(*pair, KEPT * contact.distance.max(0.0));
+            zone.checker.set_pad(*pair, DISTANCE_RATIO * contact.distance.max(0.0));
         }
         zone.radius = self.reach(&mut zone);
-        let noted = here.iter().map(|(_, contact)| given_up(place, center.to_vec(), zone.radius, contact));
+        let noted = here.iter().map(|(_, contact)| given_up(near, center.to_vec(), zone.radius, contact));
         self.given_up.extend(noted);
         self.zones.push(zone);
     }
 
-    /// Gives it up where it was given up before, in what may be another world: pairs that came later keep all of it.
+    /// Repeats earlier exceptions in a world that may have changed; pairs added since keep the full padding.
     pub fn give_up_again(&mut self, before: &[GivenUp]) {
-        for given_up in before.iter().filter(|given_up| given_up.place == Place::Everywhere) {
+        for given_up in before.iter().filter(|given_up| given_up.near == Near::Everywhere) {
             if let Some(pair) = self.full.pair_index(&given_up.link, &given_up.other) {
                 self.relax(pair, 0.0);
             }
         }
-        for given_up in before.iter().filter(|given_up| given_up.place != Place::Everywhere) {
+        for given_up in before.iter().filter(|given_up| given_up.near != Near::Everywhere) {
             let Some(pair) = self.full.pair_index(&given_up.link, &given_up.other) else { continue };
             let at = self.zones.iter().position(|zone| zone.center == given_up.center).unwrap_or(self.zones.len());
             if at == self.zones.len() {
@@ -141,7 +143,7 @@ impl Padded {
                 self.zones.push(Zone { center, radius, checker: self.full.clone() });
             }
             if let Some(zone) = self.zones.get_mut(at) {
-                zone.checker.set_pad(pair, KEPT_AGAIN * given_up.distance.max(0.0));
+                zone.checker.set_pad(pair, REVALIDATION_RATIO * given_up.distance.max(0.0));
             }
         }
         self.given_up = before.to_vec();
@@ -152,7 +154,7 @@ impl Padded {
         self.zones.iter_mut().for_each(|zone| zone.checker.set_pad(pair, pad));
     }
 
-    /// Whether a pair is closer than the padding in all of a few poses, from all over the joints' ranges.
+    /// Returns whether a pair is closer than the padding in all sampled configurations.
     fn is_always_closer(&mut self, pair: usize) -> bool {
         let mut random = Random::new(0);
         let limits = self.full.limits().to_vec();
@@ -162,7 +164,7 @@ impl Padded {
         })
     }
 
-    /// How far around its center a zone must go to a pose that keeps the padding.
+    /// Returns the radius at which a zone contains a configuration with the full padding.
     fn reach(&mut self, zone: &mut Zone) -> f64 {
         let mut random = Random::new(0);
         let limits = self.full.limits().to_vec();
@@ -181,7 +183,7 @@ impl Padded {
         RADII[RADII.len() - 1]
     }
 
-    /// The parts of a motion between which it enters or leaves a zone; none where it meets no zone.
+    /// Returns the parts of a motion at which it enters or leaves a zone.
     fn cuts(&self, from: &[f64], to: &[f64]) -> Vec<f64> {
         let mut cuts = Vec::new();
         let mut met = false;
@@ -209,7 +211,7 @@ impl Padded {
 }
 
 impl Zone {
-    /// Where a configuration is as seen from the center, the short way round for joints that turn without end.
+    /// Returns the offset of a configuration from the center, the short way round for continuous joints.
     fn away(&self, q: &[f64], turns: &[bool]) -> Vec<f64> {
         let apart = |((q, center), turns): ((&f64, &f64), &bool)| {
             let d = q - center;
@@ -223,9 +225,9 @@ impl Zone {
     }
 }
 
-fn given_up(place: Place, center: Vec<f64>, radius: f64, contact: &Contact) -> GivenUp {
+fn given_up(near: Near, center: Vec<f64>, radius: f64, contact: &Contact) -> GivenUp {
     let (link, other, distance) = (contact.link.clone(), contact.other.clone(), contact.distance);
-    GivenUp { place, center, radius, link, other, distance }
+    GivenUp { near, center, radius, link, other, distance }
 }
 
 impl CollisionChecker for Padded {
@@ -281,8 +283,8 @@ impl CollisionChecker for Padded {
         zone.map_or_else(|| full.contacts(q), |zone| zone.checker.contacts(q))
     }
 
-    fn looks(&self) -> u64 {
+    fn checks(&self) -> u64 {
         let own = [&self.full, &self.bare].into_iter().chain(self.zones.iter().map(|zone| &zone.checker));
-        own.map(CollisionChecker::looks).sum()
+        own.map(CollisionChecker::checks).sum()
     }
 }

@@ -1,9 +1,10 @@
-//! RRT-Connect (Kuffner and LaValle, 2000): two trees, from the start and from the goals, that grow towards random
-//! configurations and towards each other. Nodes that fail to grow draw fewer samples (dynamic domain: Yershova,
-//! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is checked, the joining one as well.
+//! RRT-Connect (Kuffner and LaValle, 2000): two trees, one from the start and one from the goals, grow towards random
+//! configurations and towards each other. Nodes that fail to grow attract fewer samples (dynamic domain: Yershova,
+//! Jaillet, Siméon and LaValle, 2005), and the smaller tree grows first. Every edge is checked, including the joining
+//! one.
 //!
-//! Joints that turn without end are taken the short way round: a node follows its parent without a jump, and where the
-//! trees meet, the goal's half of the path is turned to where the start's half has come to.
+//! Continuous joints move the short way round: a node follows its parent without a jump, and where the trees meet, the
+//! goal's half of the path is shifted by whole turns to match the start's half.
 
 use crate::collision::checker::{CollisionChecker, Stop};
 
@@ -11,39 +12,39 @@ use super::nearest::Tree;
 use super::path::{Path, between, distance, unwind, unwind_all};
 use super::sampler::Sampler;
 
-/// How the search goes.
+/// Settings of the search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RrtSettings {
-    /// Longest edge [rad].
+    /// Maximum edge length [rad].
     pub range: f64,
     /// Radius of a node's domain after its first failure [rad].
     pub radius: f64,
-    /// By which part the radius shrinks with each further failure.
-    pub shrink: f64,
-    /// Smallest radius [rad].
-    pub smallest: f64,
-    /// Most samples.
+    /// α: relative growth of the radius with each success, and reduction with each further failure.
+    pub alpha: f64,
+    /// Minimum radius [rad].
+    pub min_radius: f64,
+    /// Maximum number of samples.
     pub max_samples: u64,
-    /// Most nodes in both trees.
+    /// Maximum number of nodes in both trees.
     pub max_nodes: usize,
 }
 
 impl Default for RrtSettings {
     fn default() -> Self {
-        Self { range: 1.0, radius: 4.0, shrink: 1e-4, smallest: 1.0, max_samples: 10_000_000, max_nodes: 1_000_000 }
+        Self { range: 1.0, radius: 4.0, alpha: 1e-4, min_radius: 1.0, max_samples: 10_000_000, max_nodes: 1_000_000 }
     }
 }
 
 /// Why a search ended without a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {
-    /// It was stopped: by its deadline or by somebody.
+    /// Stopped by its deadline or a cancel.
     Stopped,
-    /// It took more samples or nodes than it may.
+    /// Reached its maximum number of samples or nodes.
     Exhausted,
 }
 
-/// What a search did.
+/// Statistics of a search.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct SearchCount {
     /// Samples drawn.
@@ -52,7 +53,7 @@ pub struct SearchCount {
     pub nodes: usize,
 }
 
-/// Searches a path from `start` to any of `goals`, all of them free. The same sampler gives the same path.
+/// Searches a path from `start` to any of `goals`; all of them must be free. The same sampler gives the same path.
 pub fn search<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
@@ -68,7 +69,7 @@ pub fn search<C: CollisionChecker>(
     for goal in goals {
         trees[1].add(goal, None);
     }
-    let mut grow = Grow { checker, settings, turns: &turns, stop };
+    let mut grow = TreeGrower { checker, settings, turns: &turns, stop };
     let mut count = SearchCount::default();
     let mut sample = vec![0.0; dof];
     let mut at = vec![0.0; dof];
@@ -81,7 +82,7 @@ pub fn search<C: CollisionChecker>(
         if count.samples >= settings.max_samples || count.nodes >= settings.max_nodes {
             return (Err(Ended::Exhausted), count);
         }
-        // The smaller tree grows; equal ones take turns.
+        // The smaller tree grows; trees of equal size alternate.
         side = match trees[side].len().cmp(&trees[1 - side].len()) {
             std::cmp::Ordering::Less => side,
             _ => 1 - side,
@@ -112,32 +113,31 @@ pub fn search<C: CollisionChecker>(
     }
 }
 
-struct Grow<'a, C> {
+struct TreeGrower<'a, C> {
     checker: &'a mut C,
     settings: &'a RrtSettings,
     turns: &'a [bool],
     stop: &'a Stop,
 }
 
-impl<C: CollisionChecker> Grow<'_, C> {
-    /// Whether a node reaches a configuration; its domain shrinks if not.
+impl<C: CollisionChecker> TreeGrower<'_, C> {
+    /// Tries to connect a node to a configuration; shrinks the node's domain on failure.
     fn reaches(&mut self, tree: &mut Tree, node: usize, to: &[f64]) -> bool {
         let free = self.checker.motion_is_free(tree.node(node), to, self.stop);
         let radius = tree.radius(node);
         if free {
             if radius.is_finite() {
-                tree.set_radius(node, radius * (1.0 + self.settings.shrink));
+                tree.set_radius(node, radius * (1.0 + self.settings.alpha));
             }
         } else if radius.is_finite() {
-            tree.set_radius(node, (radius * (1.0 - self.settings.shrink)).max(self.settings.smallest));
+            tree.set_radius(node, (radius * (1.0 - self.settings.alpha)).max(self.settings.min_radius));
         } else {
             tree.set_radius(node, self.settings.radius);
         }
         free
     }
 
-    /// Grows a tree in equal steps towards a configuration of the other, up to touching it: then the index of the node
-    /// that stands there.
+    /// Grows a tree in equal steps towards a configuration of the other tree. Returns the index of the connecting node.
     fn join(&mut self, tree: &mut Tree, to: &[f64]) -> Option<usize> {
         let (mut node, far) = tree.nearest(to);
         if far < 1e-9 {

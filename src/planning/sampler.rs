@@ -1,4 +1,4 @@
-//! Where to look next: a sequence that fills the space evenly, shifted by a seed.
+//! Sampling of configurations: a low-discrepancy sequence, shifted by a seed.
 
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
@@ -8,8 +8,8 @@ const PRIMES: [u64; 40] = [
     113, 127, 131, 137, 139, 149, 151, 157, 163, 167, 173, 179,
 ];
 
-/// Halton's sequence (one prime per joint), moved by a random shift (Cranley and Patterson, 1976): even, and different
-/// for every seed. Joints past the table's end are plainly random.
+/// Halton sequence (one prime per joint) with a random shift (Cranley and Patterson, 1976): evenly spread and different
+/// for every seed. Joints beyond the table of primes get pseudo-random values.
 #[derive(Debug, Clone)]
 pub struct Sampler {
     low: Vec<f64>,
@@ -20,7 +20,7 @@ pub struct Sampler {
 }
 
 impl Sampler {
-    /// Samples between limits; joints without limits within one turn around `middle`.
+    /// Creates a sampler between limits; joints without limits are sampled within one turn around `middle`.
     pub fn new(limits: &[Limits], middle: &[f64], seed: u64) -> Self {
         let mut random = Random::new(seed);
         let turn = std::f64::consts::PI;
@@ -32,7 +32,7 @@ impl Sampler {
             .collect();
         let high = |(j, l): (usize, &Limits)| if l.upper.is_finite() { l.upper } else { around(j) + turn };
         let width = limits.iter().enumerate().map(high).zip(&low).map(|(h, l)| (h - l).max(0.0)).collect();
-        // Seed 0 is the sequence itself.
+        // Seed 0 is the unshifted sequence.
         let shift = limits.iter().map(|_| if seed == 0 { 0.0 } else { random.unit() }).collect();
         Self { low, width, shift, index: 0, random }
     }
@@ -50,7 +50,7 @@ impl Sampler {
     }
 }
 
-/// The digits of `index` mirrored behind the point.
+/// Returns the digits of `index` mirrored at the radix point.
 fn radical_inverse(base: u64, mut index: u64) -> f64 {
     let (mut value, mut scale) = (0.0, 1.0 / base as f64);
     while index > 0 {

@@ -1,18 +1,18 @@
-//! Shorter paths: corners are left out where the straight way is free, then cut between random points.
+//! Shortcutting: removes corners where the straight line is free, then cuts between random points.
 
 use crate::collision::checker::{CollisionChecker, Stop};
 use crate::robot::random::Random;
 
 use super::path::{Path, between, distance, length, tidy, unwind, unwind_all};
 
-/// How much is tried.
+/// Settings of the shortcutting.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ShortcutSettings {
-    /// Random cuts that are tried.
+    /// Number of random cuts.
     pub tries: usize,
-    /// Ends after this many tries in a row without a gain.
+    /// Maximum consecutive cuts without a gain.
     pub patience: usize,
-    /// A cut must save at least this part of the path.
+    /// Minimum part of the path that a cut must save.
     pub gain: f64,
 }
 
@@ -22,8 +22,8 @@ impl Default for ShortcutSettings {
     }
 }
 
-/// Shortens a path; every new edge is checked. Edges that stay are as they were. The same seed
-/// gives the same path; when it is stopped, what was reached so far is returned.
+/// Shortens a path; every new edge is checked, the other edges stay unchanged. The same seed gives the same path. When
+/// stopped, returns the path found so far.
 pub fn shorten<C: CollisionChecker>(
     checker: &mut C,
     path: &[Vec<f64>],
@@ -59,7 +59,7 @@ pub fn shorten<C: CollisionChecker>(
     leave_out(checker, &path, &turns, stop)
 }
 
-/// From each configuration on, goes straight to the farthest one that can be reached so.
+/// From each configuration, connects straight to the farthest one that is reachable.
 fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], turns: &[bool], stop: &Stop) -> Path {
     let mut path = path.to_vec();
     let mut kept: Path = path.first().cloned().into_iter().collect();
@@ -79,7 +79,7 @@ fn leave_out<C: CollisionChecker>(checker: &mut C, path: &[Vec<f64>], turns: &[b
     kept
 }
 
-/// The point at a length along a path, and the edge it lies on.
+/// Returns the point at a length along a path, and its edge.
 fn point_at(path: &[Vec<f64>], at: f64) -> (usize, Vec<f64>) {
     let mut rest = at;
     for (edge, pair) in path.windows(2).enumerate() {

@@ -1,11 +1,11 @@
-//! The planner on a point in the plane, written against the checker's trait alone, and on an arm that starts touching.
+//! The planner with a point in the plane, against the checker's trait alone, and with an arm that starts in contact.
 
 use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
 
 use super::path::{distance, length};
-use super::planner::{PlanError, PlanSettings, plan};
+use super::path_planner::{PlanError, PlanSettings, plan};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Resolution, Stop};
 use crate::collision::report::{Contact, Pair};
@@ -16,16 +16,16 @@ use crate::robot::model::Limits;
 use crate::robot::random::Random;
 use crate::robot::urdf::from_text;
 
-/// A point among round obstacles: middle and radius each.
+/// A point among round obstacles: centre and radius each.
 struct Plane {
     limits: [Limits; 2],
     posts: Vec<([f64; 2], f64)>,
-    looks: u64,
+    checks: u64,
 }
 
 impl Plane {
     fn new(posts: Vec<([f64; 2], f64)>) -> Self {
-        Self { limits: [Limits { lower: -1.0, upper: 1.0, ..Limits::NONE }; 2], posts, looks: 0 }
+        Self { limits: [Limits { lower: -1.0, upper: 1.0, ..Limits::NONE }; 2], posts, checks: 0 }
     }
 }
 
@@ -43,11 +43,11 @@ impl CollisionChecker for Plane {
         Resolution::default()
     }
     fn is_free(&mut self, q: &[f64]) -> bool {
-        self.looks += 1;
+        self.checks += 1;
         self.posts.iter().all(|(c, r)| distance(c, q) > *r)
     }
     fn motion_is_free(&mut self, from: &[f64], to: &[f64], stop: &Stop) -> bool {
-        self.looks += 1;
+        self.checks += 1;
         let near = |c: &[f64; 2]| {
             let d = [to[0] - from[0], to[1] - from[1]];
             let t = ((c[0] - from[0]) * d[0] + (c[1] - from[1]) * d[1]) / (d[0] * d[0] + d[1] * d[1]).max(1e-300);
@@ -65,13 +65,13 @@ impl CollisionChecker for Plane {
     fn contacts(&mut self, _: &[f64]) -> Vec<Contact> {
         Vec::new()
     }
-    fn looks(&self) -> u64 {
-        self.looks
+    fn checks(&self) -> u64 {
+        self.checks
     }
 }
 
 #[test]
-fn every_edge_of_every_plan_is_free_the_joining_one_too() {
+fn every_edge_of_every_plan_is_free() {
     let mut random = Random::new(1);
     let mut searched = 0;
     for seed in 0..200 {
@@ -90,8 +90,8 @@ fn every_edge_of_every_plan_is_free_the_joining_one_too() {
 }
 
 #[test]
-fn a_search_without_a_way_ends_at_its_caps() {
-    // The goal is walled in by a ring of posts that overlap.
+fn a_search_without_a_path_ends_at_its_maximum_counts() {
+    // The goal is enclosed by a ring of overlapping posts.
     let ring = (0..40).map(|k| f64::from(k) * std::f64::consts::TAU / 40.0);
     let mut plane = Plane::new(ring.map(|a| ([0.3 * a.cos(), 0.3 * a.sin()], 0.04)).collect());
     let mut settings = PlanSettings::default();
@@ -107,7 +107,7 @@ fn a_search_without_a_way_ends_at_its_caps() {
 }
 
 #[test]
-fn a_start_that_touches_a_little_is_left_and_a_deep_one_is_said() {
+fn a_start_in_slight_contact_is_escaped_and_a_deep_one_is_reported() {
     let text = r#"<robot name="r"><link name="base"/><link name="l"><collision><origin xyz="0.5 0 0"/>
 <geometry><sphere radius="0.05"/></geometry></collision></link><joint name="j" type="revolute"><parent link="base"/>
 <child link="l"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1" effort="1"/></joint></robot>"#;

@@ -1,25 +1,24 @@
-//! From a path to a trajectory: rounded corners, the fastest speeds that the limits allow, and a check of what comes
-//! out.
+//! Time parameterization: blended corners, the highest speeds that the limits allow, and a check of the result.
 //!
-//! Without jerk limits the trajectory's points are those of the grid the speeds were found on: on lines the cubic
-//! between two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a window of
-//! time, which keeps the curve and bounds the jerk, and the points are where the jerk changes.
+//! Without jerk limits the trajectory's points are the grid points of the speed profile: on lines, the cubic between
+//! two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a time window,
+//! which keeps the curve and limits the jerk; the points are where the jerk changes.
 
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 
 use super::blend::{Curve, curves};
+use super::jerk_limit::averaged;
 use super::path::{Path, tidy};
-use super::smooth::averaged;
 use super::topp::{GridPoint, JointBound, parameterize};
 use super::verify::{Excess, excess};
 
-/// How a path becomes a trajectory.
+/// Settings of the time parameterization.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TimingSettings {
-    /// How far corners may be cut [rad, Euclidean over all joints]; 0: the motion rests at every corner.
+    /// Maximum deviation at corners [rad, Euclidean over all joints]; 0: the motion rests at every corner.
     pub deviation: f64,
-    /// Part of the full speed, above 0 and at most 1: the same motion, so much slower.
+    /// Part of the full speed, above 0 and at most 1: scales the motion in time.
     pub speed: f64,
 }
 
@@ -29,46 +28,47 @@ impl Default for TimingSettings {
     }
 }
 
-/// Acceleration of joints that state none [rad/s² or m/s²].
+/// Acceleration limit of joints without one [rad/s² or m/s²].
 pub const DEFAULT_ACCELERATION: f64 = 2.0;
 
-/// A trajectory, and what it came to.
+/// A trajectory and its figures.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Timed {
     /// The trajectory.
     pub trajectory: JointTrajectory,
-    /// Its length in time [s].
+    /// Its duration [s].
     pub duration: f64,
-    /// How far each corner was cut [rad]; 0 where the motion rests.
+    /// Deviation at each corner [rad]; 0 where the motion rests.
     pub deviation: Vec<f64>,
-    /// How much of its limits the motion uses at most, measured on the trajectory's spline.
+    /// Largest part of its limits that the motion uses, measured on the trajectory's spline.
     pub excess: Excess,
 }
 
-/// Why a path has no timing.
+/// Why a path has no time parameterization.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum TimingError {
-    /// There is no motion.
+    /// The path has no length.
     #[error("the path does not move")]
     NoMotion,
     /// A value is not finite, or a configuration has the wrong number of joints.
-    #[error("configuration {0} of the path is no configuration of {1} joints with finite positions")]
+    #[error("configuration {0} of the path is not a configuration of {1} joints with finite positions")]
     Shape(usize, usize),
-    /// A joint has no usable limit.
+    /// A joint has no positive finite limit.
     #[error("joint {0:?} needs a positive and finite limit of {1}")]
     Limit(String, &'static str),
-    /// The part of the speed is out of range.
+    /// The speed is out of range.
     #[error("the speed must be above 0 and at most 1, not {0}")]
     Speed(f64),
-    /// The motion would touch something.
-    #[error("the timed motion is not free between {0:.3} s and {1:.3} s")]
+    /// The motion would collide.
+    #[error("the timed motion collides between {0:.3} s and {1:.3} s")]
     NotFree(f64, f64),
-    /// What came out is no trajectory.
+    /// The result is not a valid trajectory.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),
 }
 
-/// The bounds of joints: those stated, [`DEFAULT_ACCELERATION`] where no acceleration is, no jerk limit where none is.
+/// Returns the bounds of joints: the given limits, [`DEFAULT_ACCELERATION`] if there is no acceleration limit, an
+/// infinite jerk if there is no jerk limit.
 pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, TimingError> {
     let bound = |(name, l): (&String, &Limits)| {
         let acceleration = l.acceleration.unwrap_or(DEFAULT_ACCELERATION);
@@ -86,8 +86,8 @@ pub fn bounds(names: &[String], limits: &[Limits]) -> Result<Vec<JointBound>, Ti
     names.iter().zip(limits).map(bound).collect()
 }
 
-/// Times a path. `free` says whether the straight line between two configurations is free: rounded corners that are
-/// not are rounded less, at last not at all, and the whole timed motion is asked about at the end.
+/// Times a path. `free` tests the straight motion between two configurations: corners that collide are blended less, at
+/// last not at all, and the complete trajectory is checked at the end.
 pub fn time(
     names: &[String],
     path: &[Vec<f64>],
@@ -111,7 +111,7 @@ pub fn time(
     let rounded = round_corners(&path, &mut deviation, &mut free);
     let mut timed = emit(names, &path, bounds, &rounded, deviation, settings.speed)?;
     if free_throughout(&timed.trajectory, &mut free).is_err() {
-        // Between the points the trajectory is not exactly the curve. Without rounding it is.
+        // Between its points the trajectory deviates slightly from a blended curve. Without blending it does not.
         let sharp = vec![0.0; path.len()];
         timed = emit(names, &path, bounds, &curves(&path, &sharp), sharp, settings.speed)?;
         free_throughout(&timed.trajectory, &mut free)?;
@@ -119,7 +119,7 @@ pub fn time(
     Ok(timed)
 }
 
-/// The curves with rounded corners, which get sharper until they are free.
+/// Returns the curves with blended corners, sharpened until they are free.
 fn round_corners(path: &Path, deviation: &mut [f64], free: &mut impl FnMut(&[f64], &[f64]) -> bool) -> Vec<Curve> {
     let (mut from, mut to) = (path[0].clone(), path[0].clone());
     let mut rounded = curves(path, deviation);
@@ -168,7 +168,7 @@ fn emit(
             p
         }));
     }
-    // The ends are those of the path, to the last bit.
+    // The ends are exactly those of the path.
     if let (Some(first), Some(last)) = (points.first_mut(), path.first()) {
         first.positions.clone_from(last);
     }
@@ -183,12 +183,12 @@ fn emit(
     Ok(Timed { trajectory, duration, deviation, excess })
 }
 
-/// The points of the grid itself.
+/// Returns the grid points themselves.
 fn on_grid(curve: &Curve, grid: &[GridPoint]) -> Vec<TrajectoryPoint> {
     let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(grid.len());
     let last = grid.len().saturating_sub(1);
     for (i, g) in grid.iter().enumerate() {
-        // Points closer than this say nothing that their neighbours do not.
+        // Points closer than this add no information.
         let near = |p: &TrajectoryPoint| g.time - p.time_from_start < 2e-4;
         if points.len() > 1 && points.last().is_some_and(near) {
             if i < last {
@@ -203,7 +203,7 @@ fn on_grid(curve: &Curve, grid: &[GridPoint]) -> Vec<TrajectoryPoint> {
     points
 }
 
-/// Stretches points in time so that their spline keeps all bounds; returns what it then uses of them.
+/// Stretches points in time until their spline keeps all bounds; returns the use of the limits afterwards.
 fn slow_down(points: &mut [TrajectoryPoint], bounds: &[JointBound]) -> Excess {
     let found = excess(points, bounds);
     let factor = match found.slower() {
@@ -214,7 +214,7 @@ fn slow_down(points: &mut [TrajectoryPoint], bounds: &[JointBound]) -> Excess {
     found.stretched(factor)
 }
 
-/// The same motion, slower by a factor.
+/// Stretches the same motion in time by a factor.
 fn stretch(points: &mut [TrajectoryPoint], factor: f64) {
     if factor == 1.0 {
         return;
@@ -227,7 +227,7 @@ fn stretch(points: &mut [TrajectoryPoint], factor: f64) {
     }
 }
 
-/// Asks about the motion as it will be sampled: from each point to the middle of its segment, and on to the next.
+/// Checks the motion as it will be sampled: from each point to the middle of its segment, and on to the next.
 fn free_throughout(
     trajectory: &JointTrajectory,
     free: &mut impl FnMut(&[f64], &[f64]) -> bool,
@@ -236,7 +236,7 @@ fn free_throughout(
     for pair in trajectory.points.windows(2) {
         let (a, b) = (&pair[0], &pair[1]);
         let h = b.time_from_start - a.time_from_start;
-        // Of a quintic, or of a cubic.
+        // Cubic or quintic segment.
         let (first, second) = if a.accelerations.is_empty() { (h / 8.0, 0.0) } else { (h * 5.0 / 32.0, h * h / 64.0) };
         for (j, q) in middle.iter_mut().enumerate() {
             let sum = |p: &TrajectoryPoint| p.accelerations.get(j).copied().unwrap_or(0.0);

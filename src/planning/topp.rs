@@ -1,25 +1,25 @@
-//! The fastest way along a curve within velocity and acceleration limits: time-optimal path parameterization by
+//! Time-optimal motion along a curve within velocity and acceleration limits: time-optimal path parameterization by
 //! reachability analysis (Pham and Pham, "A new approach to time-optimal path parameterization based on reachability
 //! analysis", 2018), on a grid along the curve.
 //!
-//! At each grid point `x = ṡ²` and `u = s̈` must keep `|q'·u + q''·x| ≤ a` for every joint, here and, because `u` holds
-//! up to the next point, there as well. Backwards: the fastest `x` from which rest can be reached. Forwards: the
-//! hardest `u` that stays below it.
+//! At each grid point `x = ṡ²` and `u = s̈` must keep `|q'·u + q''·x| ≤ a` for every joint, here and at the next point,
+//! because `u` is constant in between. Backward pass: the highest `x` from which rest is reachable. Forward pass: the
+//! highest `u` that stays below it.
 
 use super::blend::{Curve, Piece};
 
-/// Limits of one joint along the way.
+/// Limits of one joint along the path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JointBound {
-    /// Highest speed [rad/s].
+    /// Maximum speed [rad/s].
     pub velocity: f64,
-    /// Highest acceleration [rad/s²].
+    /// Maximum acceleration [rad/s²].
     pub acceleration: f64,
-    /// Highest jerk [rad/s³]; infinite where none is given.
+    /// Maximum jerk [rad/s³]; infinite without a limit.
     pub jerk: f64,
 }
 
-/// A point of the grid: where on the curve, and how fast.
+/// A grid point: position on the curve, and speed.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GridPoint {
     /// Index of the piece.
@@ -28,96 +28,104 @@ pub struct GridPoint {
     pub at: f64,
     /// Parameter from the curve's start [rad].
     pub s: f64,
-    /// Square of the parameter's speed [rad²/s²].
+    /// Squared speed of the parameter [rad²/s²].
     pub x: f64,
     /// Time from the curve's start [s].
     pub time: f64,
 }
 
-/// What a piece may use of the limits, 0–1.
+/// Part of the limits that a piece may use, 0–1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Pace {
-    /// Part of the highest `x`.
+    /// Part of the maximum `x`.
     pub x: f64,
-    /// Part of the accelerations.
+    /// Part of the acceleration limits.
     pub acceleration: f64,
 }
 
 impl Pace {
-    /// All of them.
+    /// The full limits.
     pub const FULL: Self = Self { x: 1.0, acceleration: 1.0 };
 }
 
-/// Grid intervals of a corner. A line is one interval: on it `u` has the same bounds everywhere, so the fastest way
-/// is to speed up, go on, and brake.
-const BEND: usize = 8;
+/// Grid intervals of a corner. A line is one interval: the bounds of `u` are the same all along it, so the time-optimal
+/// motion accelerates, cruises and decelerates.
+const CORNER_INTERVALS: usize = 8;
 
-/// The grid of a curve with speeds and times, from rest to rest.
+/// Returns the grid of a curve with speeds and times, from rest to rest.
 pub fn parameterize(curve: &Curve, bounds: &[JointBound]) -> Vec<GridPoint> {
-    let (walls, course) = course(curve, bounds);
+    let (constraints, speed_grid) = speed_grid(curve, bounds);
     let paces = vec![Pace::FULL; curve.len()];
-    let speeds = course.fastest(&walls, &paces);
-    course.timed(&speeds, &paces)
+    let speeds = speed_grid.fastest(&constraints, &paces);
+    speed_grid.timed(&speeds, &paces)
 }
 
-/// Keeps `u` within `width` of `slope·x`.
+/// A constraint: `u` stays within `width` of `slope·x`.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Wall {
+pub(super) struct Constraint {
     slope: f64,
     width: f64,
 }
 
 /// An interval of the grid.
 #[derive(Debug, Clone, Copy)]
-enum Way {
-    /// A line, with the highest `u` and the highest `x` on it.
+enum Interval {
+    /// A line, with the maximum `u` and `x` on it.
     Line { push: f64, most: f64 },
-    /// A part of a corner, with its first wall and the one after its last.
-    Bend { first: usize, end: usize },
+    /// A part of a corner, with the index of its first constraint and one past its last.
+    Corner { first: usize, end: usize },
 }
 
 /// The grid along a curve.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Course {
-    /// Its points, with the highest `x` at each.
+pub(super) struct SpeedGrid {
+    /// Grid points, with the maximum `x` at each.
     points: Vec<GridPoint>,
-    /// The way from each point to the next.
-    ways: Vec<Way>,
+    /// The interval from each point to the next.
+    intervals: Vec<Interval>,
 }
 
-/// The grid along a curve, and the bounds of `u` on its corners.
-pub(super) fn course(curve: &Curve, bounds: &[JointBound]) -> (Vec<Wall>, Course) {
+/// Returns the grid along a curve, and the constraints on `u` in its corners.
+pub(super) fn speed_grid(curve: &Curve, bounds: &[JointBound]) -> (Vec<Constraint>, SpeedGrid) {
     let corners = curve.iter().filter(|piece| piece.bends).count();
-    let intervals = corners * BEND + curve.len() - corners;
-    let mut walls = Vec::with_capacity(corners * BEND * bounds.len() * 2);
-    let mut course = Course { points: Vec::with_capacity(intervals + 1), ways: Vec::with_capacity(intervals) };
+    let intervals = corners * CORNER_INTERVALS + curve.len() - corners;
+    let mut constraints = Vec::with_capacity(corners * CORNER_INTERVALS * bounds.len() * 2);
+    let mut speed_grid =
+        SpeedGrid { points: Vec::with_capacity(intervals + 1), intervals: Vec::with_capacity(intervals) };
     let mut start = 0.0;
     for (p, piece) in curve.iter().enumerate() {
         let entry = highest(piece, 0.0, bounds);
-        match course.points.last_mut() {
+        match speed_grid.points.last_mut() {
             Some(point) => point.x = point.x.min(entry),
-            None => course.points.push(GridPoint { x: entry, ..GridPoint::default() }),
+            None => speed_grid.points.push(GridPoint { x: entry, ..GridPoint::default() }),
         }
         if piece.bends {
-            course.bend(p, piece, start, bounds, &mut walls);
+            speed_grid.add_corner(p, piece, start, bounds, &mut constraints);
         } else {
             let (at, most) = (piece.length, fastest(piece, bounds));
-            course.ways.push(Way::Line { push: hardest(piece, bounds), most });
-            course.points.push(GridPoint { piece: p, at, s: start + at, x: most, time: 0.0 });
+            speed_grid.intervals.push(Interval::Line { push: hardest(piece, bounds), most });
+            speed_grid.points.push(GridPoint { piece: p, at, s: start + at, x: most, time: 0.0 });
         }
         start += piece.length;
     }
-    (walls, course)
+    (constraints, speed_grid)
 }
 
-impl Course {
-    fn bend(&mut self, p: usize, piece: &Piece, start: f64, bounds: &[JointBound], walls: &mut Vec<Wall>) {
-        let step = piece.length / BEND as f64;
-        let mut here = piece.turned(0.0);
-        for k in 1..=BEND {
+impl SpeedGrid {
+    fn add_corner(
+        &mut self,
+        p: usize,
+        piece: &Piece,
+        start: f64,
+        bounds: &[JointBound],
+        constraints: &mut Vec<Constraint>,
+    ) {
+        let step = piece.length / CORNER_INTERVALS as f64;
+        let mut here = piece.progress(0.0);
+        for k in 1..=CORNER_INTERVALS {
             let at = step * k as f64;
-            let there = piece.turned(at);
-            let first = walls.len();
+            let there = piece.progress(at);
+            let first = constraints.len();
             for ((direction, turn), bound) in piece.direction.iter().zip(&piece.turn).zip(bounds) {
                 // q'·u + q''·x here; q'·u + q''·(x + 2·step·u) there.
                 let ahead = turn * there.d1;
@@ -127,40 +135,42 @@ impl Course {
                 ] {
                     if a.abs() >= 1e-9 {
                         let inverse = 1.0 / a;
-                        walls.push(Wall { slope: -b * inverse, width: bound.acceleration * inverse.abs() });
+                        constraints.push(Constraint { slope: -b * inverse, width: bound.acceleration * inverse.abs() });
                     }
                 }
             }
-            self.ways.push(Way::Bend { first, end: walls.len() });
+            self.intervals.push(Interval::Corner { first, end: constraints.len() });
             let x = highest(piece, at, bounds);
             self.points.push(GridPoint { piece: p, at, s: start + at, x, time: 0.0 });
             here = there;
         }
     }
 
-    /// The highest `x` at each point with each piece at its pace, from rest to rest.
-    pub fn fastest(&self, walls: &[Wall], paces: &[Pace]) -> Vec<f64> {
+    /// Returns the maximum `x` at each point with each piece at its pace, from rest to rest.
+    pub fn fastest(&self, constraints: &[Constraint], paces: &[Pace]) -> Vec<f64> {
         let (points, n) = (&self.points, self.points.len());
         let mut speeds = vec![0.0; n];
-        // Backwards: from where the next point can be reached.
+        // Backward pass: from where the next point is reachable.
         for i in (1..n - 1).rev() {
             let (step, next) = (points[i + 1].s - points[i].s, speeds[i + 1]);
             let pace = paces[points[i + 1].piece];
-            // The first point of a piece is the last one of the piece before.
+            // The first point of a piece is the last one of the previous piece.
             let most = points[i].x * pace.x.min(paces[points[i].piece].x);
-            speeds[i] = match self.ways[i] {
-                Way::Line { push, .. } => most.min(next + 2.0 * step * push * pace.acceleration),
-                Way::Bend { first, end } => controllable(&walls[first..end], pace.acceleration, step, most, next),
+            speeds[i] = match self.intervals[i] {
+                Interval::Line { push, .. } => most.min(next + 2.0 * step * push * pace.acceleration),
+                Interval::Corner { first, end } => {
+                    controllable(&constraints[first..end], pace.acceleration, step, most, next)
+                }
             };
         }
-        // Forwards: as fast as can be, up to that.
+        // Forward pass: as fast as possible, up to that.
         let mut x: f64 = 0.0;
-        for (i, way) in self.ways.iter().enumerate() {
+        for (i, way) in self.intervals.iter().enumerate() {
             let step = points[i + 1].s - points[i].s;
             let pace = paces[points[i + 1].piece].acceleration;
             let high = match *way {
-                Way::Line { push, .. } => push * pace,
-                Way::Bend { first, end } => accelerations(&walls[first..end], pace, x).1.0,
+                Interval::Line { push, .. } => push * pace,
+                Interval::Corner { first, end } => accelerations(&constraints[first..end], pace, x).1.0,
             };
             x = (x + 2.0 * step * high).clamp(0.0, speeds[i + 1]);
             speeds[i + 1] = x;
@@ -168,12 +178,15 @@ impl Course {
         speeds
     }
 
-    /// The points with these speeds and their times, and on lines those where speeding up ends and braking begins.
+    /// Returns the points with these speeds and their times, plus the points on lines where acceleration ends and
+    /// deceleration begins.
     pub fn timed(&self, speeds: &[f64], paces: &[Pace]) -> Vec<GridPoint> {
         let mut full: Vec<GridPoint> = Vec::with_capacity(3 * self.points.len());
         for (i, (point, &x)) in self.points.iter().zip(speeds).enumerate() {
             let to = GridPoint { x, ..*point };
-            if let (Some(&from), Some(Way::Line { push, most })) = (full.last(), self.ways.get(i.wrapping_sub(1))) {
+            if let (Some(&from), Some(Interval::Line { push, most })) =
+                (full.last(), self.intervals.get(i.wrapping_sub(1)))
+            {
                 let pace = paces[to.piece];
                 switches(&from, &to, push * pace.acceleration, most * pace.x, 0.0, &mut full);
             }
@@ -184,7 +197,7 @@ impl Course {
     }
 }
 
-/// Fills in the times of points from their speeds.
+/// Computes the times of points from their speeds.
 pub(super) fn set_times(points: &mut [GridPoint]) {
     let mut last = GridPoint::default();
     for point in points {
@@ -196,8 +209,8 @@ pub(super) fn set_times(points: &mut [GridPoint]) {
     }
 }
 
-/// The points of a line where speeding up ends and braking begins; in between it goes on for `cruise` [s], or does not
-/// get faster than at its faster end.
+/// Returns the points of a line where acceleration ends and deceleration begins; in between it cruises for `cruise`
+/// [s], or does not exceed the speed of its faster end.
 pub(super) fn switches(
     from: &GridPoint,
     to: &GridPoint,
@@ -208,7 +221,7 @@ pub(super) fn switches(
 ) {
     let length = to.s - from.s;
     let free = 0.5 * (from.x + to.x) + push * length;
-    // p² + push·cruise·p = free, for the speed p that leaves that time.
+    // p² + push·cruise·p = free, for the speed p that leaves this time.
     let lost = 0.5 * push * cruise;
     let peak = ((lost * lost + free).sqrt() - lost).powi(2).max(from.x).max(to.x).min(fastest);
     let (up, down) = ((peak - from.x) / (2.0 * push), (peak - to.x) / (2.0 * push));
@@ -223,30 +236,30 @@ pub(super) fn switches(
     add(length - down);
 }
 
-/// The hardest `u` on a line.
+/// Returns the maximum `u` on a line.
 pub(super) fn hardest(line: &Piece, bounds: &[JointBound]) -> f64 {
     let u = line.direction.iter().zip(bounds).map(|(d1, b)| b.acceleration / d1.abs().max(1e-12));
     u.fold(f64::INFINITY, f64::min)
 }
 
-/// The highest `x` on a line.
+/// Returns the maximum `x` on a line.
 pub(super) fn fastest(line: &Piece, bounds: &[JointBound]) -> f64 {
     let speed = line.direction.iter().zip(bounds).map(|(d1, b)| b.velocity / d1.abs().max(1e-12));
     speed.fold(f64::INFINITY, f64::min).powi(2)
 }
 
-/// The highest `x` at a point of a piece, by the speeds of the joints and by what no `u` can make up for.
+/// Returns the maximum `x` at a point of a piece, from the joint speeds and from what no `u` can compensate.
 fn highest(piece: &Piece, at: f64, bounds: &[JointBound]) -> f64 {
-    let t = piece.turned(at);
+    let t = piece.progress(at);
     let (mut speed, mut x, mut cube) = (f64::INFINITY, f64::INFINITY, f64::INFINITY);
     for ((direction, turn), bound) in piece.direction.iter().zip(&piece.turn).zip(bounds) {
         let d1 = (direction + turn * t.part).abs();
         speed = speed.min(bound.velocity / d1.max(1e-12));
-        // Where a joint turns round, curvature takes all its acceleration.
+        // Where a joint reverses, curvature uses all its acceleration.
         if d1 < 1e-6 {
             x = x.min(bound.acceleration / (turn * t.d1).abs().max(1e-12));
         }
-        // The rate at which curvature changes takes jerk.
+        // The change of curvature uses jerk.
         cube = cube.min(0.5 * bound.jerk / (turn * t.d2).abs().max(1e-12));
     }
     if cube.is_finite() {
@@ -255,33 +268,33 @@ fn highest(piece: &Piece, at: f64, bounds: &[JointBound]) -> f64 {
     x.min(speed * speed)
 }
 
-/// A bound of `u` at some `x`, and how fast it changes with `x`.
+/// A bound of `u` at some `x`, and its derivative with respect to `x`.
 type Edge = (f64, f64);
 
-/// The lowest and highest `u` at `x` that keep all accelerations, here and one step on; lowest above highest where
-/// there is none.
-fn accelerations(walls: &[Wall], pace: f64, x: f64) -> (Edge, Edge) {
+/// Returns the lowest and highest `u` at `x` that keep all acceleration limits, here and one step on; the lowest
+/// exceeds the highest if there is none.
+fn accelerations(constraints: &[Constraint], pace: f64, x: f64) -> (Edge, Edge) {
     let (mut low, mut high) = ((f64::NEG_INFINITY, 0.0), (f64::INFINITY, 0.0));
-    for wall in walls {
-        let (middle, width) = (wall.slope * x, wall.width * pace);
+    for constraint in constraints {
+        let (middle, width) = (constraint.slope * x, constraint.width * pace);
         if middle - width > low.0 {
-            low = (middle - width, wall.slope);
+            low = (middle - width, constraint.slope);
         }
         if middle + width < high.0 {
-            high = (middle + width, wall.slope);
+            high = (middle + width, constraint.slope);
         }
     }
     (low, high)
 }
 
-/// The highest `x`, at most `most`, from which some allowed `u` leads to at most `next`.
+/// Returns the highest `x`, at most `most`, from which an allowed `u` leads to at most `next`.
 ///
-/// What is missing for that is a convex function of `x`, made of straight pieces, and not positive at 0: Newton's way
-/// from the right comes to its root in a few steps, piece by piece, and never passes it.
-fn controllable(walls: &[Wall], pace: f64, step: f64, most: f64, next: f64) -> f64 {
+/// The violation is a convex, piecewise linear function of `x`, not positive at 0: Newton's method from the right
+/// reaches its root in a few steps, piece by piece, without overshoot.
+fn controllable(constraints: &[Constraint], pace: f64, step: f64, most: f64, next: f64) -> f64 {
     let mut x = most;
     for _ in 0..50 {
-        let (low, mut high) = accelerations(walls, pace, x);
+        let (low, mut high) = accelerations(constraints, pace, x);
         let braked = (next - x) / (2.0 * step);
         if braked < high.0 {
             high = (braked, -0.5 / step);

@@ -1,4 +1,4 @@
-//! Joints that turn without end: the short way round, wherever the counting of turns began.
+//! Continuous joints: the short way round, wherever their turn count starts.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use glamx::{DAffine3, DVec3};
 
 use super::ik::{Ik, IkSettings};
 use super::path::{length, unwind};
-use super::planner::{Plan, PlanError, PlanSettings, plan};
+use super::path_planner::{Plan, PlanError, PlanSettings, plan};
 use super::timing::{TimingSettings, bounds, time};
 use crate::collision::body::{MeshMode, solids};
 use crate::collision::checker::{CollisionChecker, Resolution, Stop};
@@ -18,7 +18,7 @@ use crate::robot::kinematics::Kinematics;
 use crate::robot::random::Random;
 use crate::robot::urdf::from_text;
 
-/// Two links in a plane that turn without end about z, and a slide with a ball at the end.
+/// A planar arm of two continuous joints about z, and a slide with a ball at its end.
 fn model(second: &str) -> RobotModel {
     let text = format!(
         r#"<robot name="r"><link name="base"/>
@@ -66,7 +66,7 @@ fn planned(checker: &mut ExactChecker, start: &[f64], goal: &[f64], seed: u64) -
     plan(checker, start, &[goal.to_vec()], &settings, &Stop::never())
 }
 
-/// The same angle, but for whole turns.
+/// Returns whether two angles are the same except for whole turns.
 fn same(a: f64, b: f64) -> bool {
     let d = a - b;
     (d - (d / TAU).round() * TAU).abs() < 1e-9
@@ -81,27 +81,27 @@ fn the_short_way_round_is_taken() {
         let found = planned(&mut free, &[from, 0.0, 0.1], &[to, 0.3, 0.1], 0).unwrap();
         assert!(found.straight && (found.path[1][0] - end).abs() < 1e-12, "{from} to {to}: {:?}", found.path);
     }
-    // What is there already is left as it is, to the last bit.
+    // A goal that is already nearest keeps its exact value.
     assert_eq!(planned(&mut free, &[0.1, 0.0, 0.1], &[0.3, 0.7, 0.1], 0).unwrap().path[1], [0.3, 0.7, 0.1]);
 }
 
 #[test]
 fn the_long_way_round_is_found_where_the_short_one_is_blocked() {
-    // A post on the circle of the inner link, just where it would pass.
+    // A post on the circle of the inner link, right in its way.
     let mut blocked = checker(&[(-0.3, 0.0)]);
     let (start, goal) = ([2.8, 0.0, 0.1], [-2.8, 0.0, 0.1]);
     let found = planned(&mut blocked, &start, &goal, 1).unwrap();
     let end = found.path.last().unwrap();
     assert!((end[0] + 2.8).abs() < 1e-9, "{:?}", found.path);
     assert!(found.path.windows(2).all(|pair| (pair[1][0] - pair[0][0]).abs() < TAU));
-    // The same two turns farther.
+    // The same, two turns farther.
     let start = [2.8 + 2.0 * TAU, 0.0, 0.1];
     let end = planned(&mut blocked, &start, &goal, 1).unwrap().path.pop().unwrap();
     assert!((end[0] - (2.0 * TAU - 2.8)).abs() < 1e-9, "{end:?}");
 }
 
 #[test]
-fn plans_do_not_depend_on_where_the_counting_of_turns_began() {
+fn plans_do_not_depend_on_the_initial_turn_count() {
     let mut random = Random::new(3);
     let (mut straight, mut searched) = (0, 0);
     for seed in 0..40 {
@@ -138,7 +138,7 @@ fn plans_do_not_depend_on_where_the_counting_of_turns_began() {
     assert!(straight > 5 && searched > 5, "{straight} straight, {searched} searched");
 }
 
-/// The motion starts where the arm is and goes on without jumps.
+/// The motion starts at the arm's position and continues without jumps.
 fn no_jumps(found: &Plan) {
     let names: Vec<String> = ["j1", "j2", "j3"].map(str::to_owned).into();
     let limits = bounds(&names, Kinematics::whole(&model(ENDLESS)).unwrap().limits()).unwrap();
@@ -175,7 +175,7 @@ fn solutions_of_a_pose_are_those_near_the_seed() {
 }
 
 #[test]
-fn a_follower_that_does_not_come_round_keeps_its_leader_from_turning_without_end() {
+fn a_mimic_joint_that_does_not_repeat_limits_its_continuous_leader() {
     let gear = |factor: &str| {
         let text = format!(
             r#"<robot name="r"><link name="a"/><link name="b"/><link name="c"/>

@@ -1,22 +1,22 @@
-//! What a trajectory really does, measured on the curve between its points: the part of each limit that it uses.
+//! Measures how much of each limit a trajectory uses, on the curve between its points.
 
 use crate::trajectory::TrajectoryPoint;
 
 use super::topp::JointBound;
 
-/// The largest parts of the limits that a trajectory uses: above 1 it exceeds them.
+/// The largest part of each limit that a trajectory uses: above 1 it exceeds the limit.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Excess {
     /// Part of the velocity limit.
     pub velocity: f64,
     /// Part of the acceleration limit.
     pub acceleration: f64,
-    /// Part of the jerk limit; 0 where there is none.
+    /// Part of the jerk limit; 0 without a limit.
     pub jerk: f64,
 }
 
 impl Excess {
-    /// By which factor the motion must be slower to keep all limits; at least 1.
+    /// Returns the factor by which the motion must be slowed down to keep all limits; at least 1.
     pub fn slower(&self) -> f64 {
         if self.velocity <= 1.0 && self.acceleration <= 1.0 && self.jerk <= 1.0 {
             return 1.0;
@@ -24,7 +24,7 @@ impl Excess {
         self.velocity.max(self.acceleration.sqrt()).max(self.jerk.cbrt())
     }
 
-    /// What it is when the motion takes `factor` times as long.
+    /// Returns the values after stretching the motion in time by `factor`.
     pub fn stretched(self, factor: f64) -> Self {
         Self {
             velocity: self.velocity / factor,
@@ -33,7 +33,7 @@ impl Excess {
         }
     }
 
-    /// The larger of each.
+    /// Returns the larger of each.
     pub fn max(self, other: Self) -> Self {
         Self {
             velocity: self.velocity.max(other.velocity),
@@ -43,11 +43,11 @@ impl Excess {
     }
 }
 
-/// Measures the curve through points that state velocities and, all or none, accelerations: as `Spline` has it, cubic
-/// or quintic. The extremes of cubics are known; quintics are looked at in quarters of each segment.
+/// Measures the curve through points with velocities and, all or none, accelerations: cubic or quintic, as in `Spline`.
+/// The extremes of cubics are exact; quintics are sampled in quarters of each segment.
 pub fn excess(points: &[TrajectoryPoint], bounds: &[JointBound]) -> Excess {
     let quintic = points.iter().all(|p| !p.accelerations.is_empty());
-    // Per joint, the highest speed, acceleration and jerk.
+    // Maximum speed, acceleration and jerk per joint.
     let mut most = vec![[0.0; 3]; bounds.len()];
     for pair in points.windows(2) {
         let (a, b) = (&pair[0], &pair[1]);
@@ -77,9 +77,9 @@ fn larger(a: f64, b: f64) -> f64 {
     if b > a { b } else { a }
 }
 
-/// The highest speed, acceleration and jerk of a cubic with mean speed `d` over `h`.
+/// Returns the maximum speed, acceleration and jerk of a cubic with mean speed `d` over `h`.
 fn of_cubic(d: f64, (v0, v1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
-    // Acceleration goes from a0 to a1 in a straight line; velocity has its extreme where it is zero.
+    // Acceleration is linear from a0 to a1; velocity has its extreme where it is zero.
     let (a0, a1) = ((6.0 * d - 4.0 * v0 - 2.0 * v1) * inverse, (2.0 * v0 + 4.0 * v1 - 6.0 * d) * inverse);
     let mut speed = larger(v0.abs(), v1.abs());
     if a0 * a1 < 0.0 {
@@ -88,7 +88,7 @@ fn of_cubic(d: f64, (v0, v1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
     [speed, larger(a0.abs(), a1.abs()), (a1 - a0).abs() * inverse]
 }
 
-/// The highest speed, acceleration and jerk of a quintic with mean speed `d` over `h`.
+/// Returns the maximum speed, acceleration and jerk of a quintic with mean speed `d` over `h`.
 fn of_quintic(d: f64, (v0, v1): (f64, f64), (a0, a1): (f64, f64), h: f64, inverse: f64) -> [f64; 3] {
     // Speed is v0 + x·(c1 + x·(c2 + x·(c3 + x·c4))), with x from 0 to 1.
     let (c1, b1) = (a0 * h, a1 * h);

@@ -6,7 +6,8 @@ use crate::joint::ControlMode;
 use crate::telemetry::describe::cause_text;
 use crate::telemetry::{ArmSample, TickSample};
 
-/// Whether two states differ in what `ArmInput` says. NaN differs from itself: rather once too often than lost.
+/// Returns whether two states differ in the fields of `ArmInput`. NaN differs from itself: a superfluous message is
+/// better than a lost one.
 pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     let values = |s: &ArmState| (s.gripper, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
@@ -14,13 +15,13 @@ pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b)
 }
 
-/// Whether two commands differ in what `ArmOutput` says, other than its counters that go on by themselves.
+/// Returns whether two commands differ in the fields of `ArmOutput`, except for counters that change on their own.
 pub(super) fn output_differs(a: &ArmCommand, b: &ArmCommand) -> bool {
     let parts = |c: &ArmCommand| (c.mode, c.gripper.to_bits(), c.gripper_seq, c.stop_seq, c.start_seq);
     parts(a) != parts(b)
 }
 
-/// What a tick read of an arm, besides joint values.
+/// Returns what a tick read of an arm, except joint values.
 pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
     ArmInput {
         header: header.clone(),
@@ -43,7 +44,7 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
     }
 }
 
-/// What a tick wants of an arm, besides joint values.
+/// Returns what a tick commands an arm, except joint values.
 pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
     ArmOutput {
         header: header.clone(),
@@ -58,7 +59,7 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
     }
 }
 
-/// How an arm is.
+/// Returns the status of an arm.
 pub(super) fn status(header: Header, tick: &TickSample, sample: &ArmSample, error_text: &str) -> ArmStatus {
     let s = &sample.state;
     ArmStatus {

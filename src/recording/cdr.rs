@@ -6,7 +6,7 @@ use thiserror::Error;
 /// Header of plain little-endian CDR; alignment is counted from its end.
 const HEADER: [u8; 4] = [0, 1, 0, 0];
 
-/// Why bytes are not the message they should be.
+/// Why bytes are not a valid message.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum CdrError {
     /// The message ends inside a field.
@@ -20,7 +20,7 @@ pub enum CdrError {
     Text(usize),
 }
 
-/// Writes one message. Its buffer is kept from message to message.
+/// Encodes messages one at a time; reuses its buffer.
 #[derive(Debug, Clone)]
 pub struct Encoder {
     buffer: Vec<u8>,
@@ -38,12 +38,12 @@ impl Encoder {
         self.buffer.truncate(HEADER.len());
     }
 
-    /// The message so far.
+    /// Returns the message so far.
     pub fn bytes(&self) -> &[u8] {
         &self.buffer
     }
 
-    /// A number as its little-endian bytes, aligned to its size.
+    /// Appends a number as its little-endian bytes, aligned to its size.
     pub fn number<const N: usize>(&mut self, bytes: [u8; N]) {
         while !(self.buffer.len() - HEADER.len()).is_multiple_of(N) {
             self.buffer.push(0);
@@ -51,12 +51,12 @@ impl Encoder {
         self.buffer.extend_from_slice(&bytes);
     }
 
-    /// Length of a sequence. A message of 4 GiB is out of reach of anything that is logged.
+    /// Appends the length of a sequence. No logged message comes near 4 GiB.
     pub fn length(&mut self, length: usize) {
         self.number((length as u32).to_le_bytes());
     }
 
-    /// A string, with its closing zero.
+    /// Appends a string with its closing zero.
     pub fn text(&mut self, text: &str) {
         self.length(text.len() + 1);
         self.buffer.extend_from_slice(text.as_bytes());
@@ -64,7 +64,7 @@ impl Encoder {
     }
 }
 
-/// Reads one message. Never panics and never allocates more than the message is long, whatever the bytes are.
+/// Decodes one message. For any input it neither panics nor allocates more than the message's length.
 #[derive(Debug, Clone)]
 pub struct Decoder<'a> {
     bytes: &'a [u8],
@@ -72,22 +72,22 @@ pub struct Decoder<'a> {
 }
 
 impl<'a> Decoder<'a> {
-    /// Checks the header.
+    /// Creates a decoder and checks the header.
     pub fn new(bytes: &'a [u8]) -> Result<Self, CdrError> {
-        // The last two header bytes are options, which plain CDR leaves unused.
+        // The last two header bytes are options, unused in plain CDR.
         if bytes.len() < HEADER.len() || !bytes.starts_with(&HEADER[..2]) {
             return Err(CdrError::Header);
         }
         Ok(Self { bytes: &bytes[HEADER.len()..], at: 0 })
     }
 
-    /// Passes over bytes that are known already.
+    /// Skips bytes.
     pub fn skip(&mut self, bytes: usize) -> Result<(), CdrError> {
         self.at = self.at.saturating_add(bytes).min(self.bytes.len());
         if self.at == self.bytes.len() { Err(self.short()) } else { Ok(()) }
     }
 
-    /// The little-endian bytes of a number, aligned to its size.
+    /// Reads the little-endian bytes of a number, aligned to its size.
     pub fn number<const N: usize>(&mut self) -> Result<[u8; N], CdrError> {
         self.at = self.at.next_multiple_of(N);
         let found = self.bytes.get(self.at..).and_then(|rest| rest.first_chunk()).copied();
@@ -96,14 +96,14 @@ impl<'a> Decoder<'a> {
         Ok(number)
     }
 
-    /// Length of a sequence of elements of at least `element` bytes each.
+    /// Reads the length of a sequence of elements of at least `element` bytes each.
     pub fn length(&mut self, element: usize) -> Result<usize, CdrError> {
         let length = u32::from_le_bytes(self.number()?) as usize;
         let left = self.bytes.len() - self.at;
         if length.saturating_mul(element) > left { Err(self.short()) } else { Ok(length) }
     }
 
-    /// A string, without its closing zero.
+    /// Reads a string without its closing zero.
     pub fn text(&mut self) -> Result<&'a str, CdrError> {
         let length = self.length(1)?;
         let bytes = self.bytes.get(self.at..self.at + length).ok_or_else(|| self.short())?;
@@ -139,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restarted_encoder_begins_anew() {
+    fn a_restarted_encoder_begins_a_new_message() {
         let mut e = Encoder::default();
         e.text("left over");
         e.restart();
@@ -148,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn lengths_beyond_the_message_are_refused_before_anything_is_allocated() {
+    fn lengths_beyond_the_message_are_rejected_before_anything_is_allocated() {
         let bytes = [0, 1, 0, 0, 0xff, 0xff, 0xff, 0xff, 1, 2];
         assert_eq!(Decoder::new(&bytes).unwrap().length(8), Err(CdrError::Short(8)));
         assert_eq!(Decoder::new(&bytes).unwrap().text(), Err(CdrError::Short(8)));

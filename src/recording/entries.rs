@@ -1,4 +1,4 @@
-//! Messages of a log, decoded, and the channels they come on.
+//! Decoded messages of a log, and their channels.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 
@@ -10,23 +10,23 @@ use super::messages::{ArmInput, ArmOutput, ArmStatus, Event, JointState, Log, Te
 use super::replay::Selection;
 use super::wire::Message;
 
-/// Longest topic or schema name that is kept [bytes].
-const LONGEST_NAME: usize = 1024;
+/// Maximum length of a topic or schema name [bytes].
+const MAX_NAME: usize = 1024;
 
 /// A message of a log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Entry {
-    /// Its topic.
+    /// Topic.
     pub topic: String,
-    /// Its Unix time [ns].
+    /// Unix time [ns].
     pub log_time: u64,
-    /// What it says.
+    /// Contents.
     pub data: Payload,
 }
 
 macro_rules! payloads {
     ($($name:ident)*) => {
-        /// What a message says, for the types that logs of a run contain.
+        /// Contents of a message, for the types in logs of a run.
         #[derive(Debug, Clone, PartialEq, Serialize)]
         #[serde(untagged)]
         pub enum Payload {
@@ -34,18 +34,18 @@ macro_rules! payloads {
                 #[doc = concat!("A [`", stringify!($name), "`](super::messages::", stringify!($name), ").")]
                 $name($name),
             )*
-            /// A type that is not known here.
+            /// A type unknown here.
             Unknown {
                 /// Name of its schema.
                 schema: String,
-                /// Its length.
+                /// Length.
                 bytes: usize,
             },
-            /// Not what its schema says.
+            /// A message that does not match its schema.
             Damaged {
                 /// Name of its schema.
                 schema: String,
-                /// What is wrong.
+                /// The error.
                 error: String,
             },
         }
@@ -61,7 +61,7 @@ macro_rules! payloads {
 }
 payloads! { JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput }
 
-/// Header and bytes of a message record; `None` for other records.
+/// Returns the header and bytes of a message record; `None` for other records.
 pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])> {
     if opcode != op::MESSAGE {
         return None;
@@ -70,7 +70,7 @@ pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])>
     Some((header, body.get(22..)?))
 }
 
-/// What is known about the channels of a log so far.
+/// The channels of a log read so far.
 #[derive(Default)]
 pub(super) struct Channels {
     /// Name and encoding of each schema.
@@ -86,19 +86,19 @@ struct KnownChannel {
 }
 
 impl Channels {
-    /// Takes schema and channel records. What cannot be one is passed over: its messages are passed over as well.
+    /// Takes schema and channel records. Skips invalid ones, and with them their messages.
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) {
         match opcode {
             op::SCHEMA => {
                 if let Ok(Record::Schema { header, .. }) = parse_record(opcode, body)
-                    && header.name.len() <= LONGEST_NAME
+                    && header.name.len() <= MAX_NAME
                 {
                     self.schemas.insert(header.id, (header.name, header.encoding == "ros2msg"));
                 }
             }
             op::CHANNEL => {
                 if let Ok(Record::Channel(channel)) = parse_record(opcode, body)
-                    && channel.topic.len() <= LONGEST_NAME
+                    && channel.topic.len() <= MAX_NAME
                 {
                     self.add(channel);
                 }
@@ -113,7 +113,7 @@ impl Channels {
         self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, readable });
     }
 
-    /// Takes a record, and puts its message among those that are ready, if it is wanted.
+    /// Takes a record; queues its message if it is selected.
     pub(super) fn take(
         &mut self,
         opcode: u8,
@@ -145,7 +145,7 @@ impl Channels {
         }
     }
 
-    /// Topics and their schemas.
+    /// Returns the topics and their schemas.
     pub(super) fn topics(&self) -> BTreeMap<String, String> {
         self.channels.values().map(|c| (c.topic.clone(), c.schema.clone())).collect()
     }

@@ -1,4 +1,4 @@
-//! Where logs are kept, what they are called, and how many of them.
+//! Log files: folder, names, and retention.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,23 +6,23 @@ use std::path::{Path, PathBuf};
 use jiff::Timestamp;
 use jiff::fmt::strtime;
 
-/// How the time in a log's file name is written: `20261121T141630Z`.
+/// Format of the time in a log's file name: `20261121T141630Z`.
 const STAMP: &str = "%Y%m%dT%H%M%SZ";
-/// The ending of a log's name.
+/// Extension of a log.
 const LOG: &str = "mcap";
-/// The ending of the name of a text log, which is kept beside it.
+/// Extension of a text log, stored beside it.
 const TEXT_LOG: &str = "log";
-/// Logs kept by default.
+/// Number of logs kept by default.
 pub const KEPT_LOGS: usize = 20;
 
-/// The folder logs go to: `$XDG_STATE_HOME/dimos`, else `~/.local/state/dimos`. `None` if neither is known.
+/// Returns the folder of logs: `$XDG_STATE_HOME/dimos`, otherwise `~/.local/state/dimos`; `None` if neither is known.
 pub fn log_folder() -> Option<PathBuf> {
     let absolute = |name| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let state = absolute("XDG_STATE_HOME").or_else(|| Some(absolute("HOME")?.join(".local/state")))?;
     Some(state.join("dimos"))
 }
 
-/// The file name of a log that begins at a Unix time [ns]: `<run>-20261121T141630Z.mcap`.
+/// Returns the file name of a log that begins at a Unix time [ns]: `<run>-20261121T141630Z.mcap`.
 pub fn log_file_name(run: &str, wall_ns: u64) -> String {
     file_name(run, wall_ns, LOG)
 }
@@ -32,13 +32,13 @@ fn file_name(run: &str, wall_ns: u64, ending: &str) -> String {
     format!("{run}-{}.{ending}", time.strftime(STAMP))
 }
 
-/// A path in `folder` for a log that begins at a Unix time [ns]. A second log of the same run within a second gets
-/// `-2` after its time, and so on.
+/// Returns an unused path in `folder` for a log that begins at a Unix time [ns]. A second log of the same run within a
+/// second gets `-2` after its time, and so on.
 pub fn new_log_path(folder: &Path, run: &str, wall_ns: u64) -> PathBuf {
     new_path(folder, run, wall_ns, LOG)
 }
 
-/// The same for a text log: `<run>-20261121T141630Z.log`.
+/// Same for a text log: `<run>-20261121T141630Z.log`.
 pub fn new_text_log_path(folder: &Path, run: &str, wall_ns: u64) -> PathBuf {
     new_path(folder, run, wall_ns, TEXT_LOG)
 }
@@ -50,18 +50,18 @@ fn new_path(folder: &Path, run: &str, wall_ns: u64, ending: &str) -> PathBuf {
     std::iter::once(first.clone()).chain(others).find(|path| !path.exists()).unwrap_or(first)
 }
 
-/// The newest log in `folder`, by the time in its name.
+/// Returns the newest log in `folder`, by the time in its name.
 pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
     Ok(logs(folder, LOG)?.pop())
 }
 
-/// Removes all but the newest `keep` logs from `folder`, and nothing that is not named like a log. A log that cannot
-/// be removed is left. Gives the paths it removed.
+/// Removes all but the newest `keep` logs from `folder`, and no other files. Skips logs that cannot be removed. Returns
+/// the removed paths.
 pub fn retain(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
     retain_newest(folder, LOG, keep)
 }
 
-/// The same for text logs.
+/// Same for text logs.
 pub fn retain_text_logs(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
     retain_newest(folder, TEXT_LOG, keep)
 }
@@ -73,7 +73,7 @@ fn retain_newest(folder: &Path, ending: &str, keep: usize) -> io::Result<Vec<Pat
     Ok(old)
 }
 
-/// All logs in `folder` with that ending, oldest first.
+/// Returns all logs in `folder` with that extension, oldest first.
 fn logs(folder: &Path, ending: &str) -> io::Result<Vec<PathBuf>> {
     let entries = match std::fs::read_dir(folder) {
         Ok(entries) => entries,
@@ -92,7 +92,7 @@ fn logs(folder: &Path, ending: &str) -> io::Result<Vec<PathBuf>> {
     Ok(found.into_iter().map(|(_, path)| path).collect())
 }
 
-/// Time in the name of a log, and its number within that second; `None` if it is not named like a log.
+/// Returns the time in a log's name, and its number within that second; `None` for other names.
 fn log_time(name: &str, ending: &str) -> Option<(jiff::civil::DateTime, u32)> {
     let stem = name.strip_suffix(ending)?.strip_suffix('.')?;
     let (run_and_time, last) = stem.rsplit_once('-')?;

@@ -1,6 +1,6 @@
-//! Writes typed messages into an MCAP file, with the profile that strict readers want.
+//! Writes typed messages to an MCAP file, with the profile that strict readers expect.
 //!
-//! The file only ever grows at its end: what was flushed stays readable whatever happens afterwards.
+//! The file only grows at its end: whatever was flushed remains readable.
 
 use std::collections::{BTreeMap, HashMap};
 use std::io::{Seek, Write};
@@ -13,12 +13,12 @@ use super::cdr::Encoder;
 use super::wire::Message;
 use crate::clock::Mono;
 
-/// Longest time that messages wait for the file.
+/// Maximum time that messages are buffered.
 pub const FLUSH_EVERY: Duration = Duration::from_millis(100);
-/// A chunk is closed when it is this long, even before it is time to flush [bytes].
+/// A chunk of this length is closed before the next flush is due [bytes].
 const CHUNK_SIZE: u64 = 768 * 1024;
 
-/// QoS of every channel, as rosbag2 writes it: keep last 10, reliable, volatile. `ros2 bag play` offers this.
+/// QoS of every channel, as written by rosbag2: keep last 10, reliable, volatile. `ros2 bag play` offers this.
 const QOS: &str = "- history: 1
   depth: 10
   reliability: 1
@@ -36,7 +36,7 @@ const QOS: &str = "- history: 1
   avoid_ros_namespace_conventions: false
 ";
 
-/// A file that goes along with a log, e.g. the blueprint.
+/// A file attached to a log, such as the blueprint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogAttachment {
     /// File name.
@@ -47,7 +47,7 @@ pub struct LogAttachment {
     pub data: Vec<u8>,
 }
 
-/// An open log. Dropping it closes it as `finish` does, without telling of errors.
+/// An open log. Dropping it closes it like `finish`, but ignores errors.
 pub struct LogWriter<W: Write + Seek> {
     mcap: Writer<W>,
     channels: HashMap<String, Channel>,
@@ -62,8 +62,8 @@ struct Channel {
 }
 
 impl<W: Write + Seek> LogWriter<W> {
-    /// Begins a log: header, attachments and metadata (under the name `dimos`) come first, so that they survive a
-    /// crash. `now` is in Unix time [ns].
+    /// Creates a log. Header, attachments and metadata (named `dimos`) come first, so that they survive a crash. `now`
+    /// is in Unix time [ns].
     pub fn create(
         sink: W,
         now: u64,
@@ -74,9 +74,9 @@ impl<W: Write + Seek> LogWriter<W> {
             .profile("ros2")
             .library(concat!("dimos/", env!("CARGO_PKG_VERSION")))
             .chunk_size(Some(CHUNK_SIZE))
-            // Chunks of 100 ms are too short for the higher levels to make them any shorter.
+            // Chunks of 100 ms are too short for higher compression levels to help.
             .compression_level(1)
-            // Worker threads would compete with the tick, and seeking back would leave half a chunk after a crash.
+            // Worker threads would compete with the tick; seeking back would leave half a chunk after a crash.
             .compression_threads(0)
             .disable_seeking(true)
             .create(sink)?;
@@ -100,7 +100,7 @@ impl<W: Write + Seek> LogWriter<W> {
         })
     }
 
-    /// Makes a topic known, so that it is listed even if nothing is ever said on it.
+    /// Declares a topic, so that it is listed even without messages.
     pub fn announce<M: Message>(&mut self, topic: &str) -> McapResult<()> {
         if !self.channels.contains_key(topic) {
             let schema = self.mcap.add_schema(M::SCHEMA, "ros2msg", M::schema_text().as_bytes())?;
@@ -111,7 +111,7 @@ impl<W: Write + Seek> LogWriter<W> {
         Ok(())
     }
 
-    /// Logs a message at a Unix time [ns].
+    /// Writes a message at a Unix time [ns].
     pub fn publish<M: Message>(&mut self, topic: &str, time: u64, message: &M) -> McapResult<()> {
         self.announce::<M>(topic)?;
         let Some(channel) = self.channels.get_mut(topic) else { return Ok(()) };
@@ -119,7 +119,7 @@ impl<W: Write + Seek> LogWriter<W> {
         message.put(&mut self.encoder);
         let header =
             MessageHeader { channel_id: channel.id, sequence: channel.sequence, log_time: time, publish_time: time };
-        // The first word on a topic does not wait.
+        // The first message on a topic is flushed at once.
         self.flush.urgent |= channel.sequence == 0;
         channel.sequence = channel.sequence.wrapping_add(1);
         self.mcap.write_to_known_channel(&header, self.encoder.bytes())?;
@@ -128,8 +128,8 @@ impl<W: Write + Seek> LogWriter<W> {
         Ok(())
     }
 
-    /// Hands everything to the operating system if it is time to: what it has survives the end of this process.
-    /// Says whether it did.
+    /// Passes everything to the operating system if a flush is due, so that it survives the end of this process.
+    /// Returns whether it flushed.
     pub fn flush_if_due(&mut self, now: Mono) -> McapResult<bool> {
         let due = self.flush.due(now);
         if due {
@@ -138,17 +138,17 @@ impl<W: Write + Seek> LogWriter<W> {
         Ok(due)
     }
 
-    /// Makes the next `flush_if_due` flush, whatever the time: what is logged now matters.
-    pub fn do_not_wait(&mut self) {
+    /// Makes the next `flush_if_due` flush: the current messages are important.
+    pub fn flush_soon(&mut self) {
         self.flush.urgent = true;
     }
 
-    /// Messages logged so far.
+    /// Returns the number of messages written.
     pub fn written(&self) -> u64 {
         self.written
     }
 
-    /// Closes the log: indexes, statistics, summary. Gives the sink back.
+    /// Closes the log: indexes, statistics, summary. Returns the sink.
     pub fn finish(mut self) -> McapResult<W> {
         self.mcap.finish()?;
         let mut sink = self.mcap.into_inner();
@@ -157,7 +157,7 @@ impl<W: Write + Seek> LogWriter<W> {
     }
 }
 
-/// When to flush: at once if it is urgent, else every [`FLUSH_EVERY`], and only if there is anything to flush.
+/// Decides when to flush: at once if urgent, otherwise every [`FLUSH_EVERY`], and only if there is something to flush.
 #[derive(Debug, Default)]
 struct FlushTimer {
     last: Mono,
@@ -182,7 +182,7 @@ mod tests {
     use std::io::Cursor;
     use std::sync::{Arc, Mutex};
 
-    /// Memory that stays visible while the writer has it: what the operating system would hold after a crash.
+    /// A sink that remains visible while the writer owns it: what the operating system would hold after a crash.
     #[derive(Clone, Default)]
     struct Shared(Arc<Mutex<Cursor<Vec<u8>>>>);
 
@@ -224,7 +224,7 @@ mod tests {
         assert!(log.flush_if_due(at(1111)).unwrap());
         say(&mut log, "/b");
         assert!(!log.flush_if_due(at(1112)).unwrap());
-        log.do_not_wait();
+        log.flush_soon();
         assert!(log.flush_if_due(at(1113)).unwrap());
         assert_eq!(readable(&sink), 4);
         assert!(!log.flush_if_due(at(5000)).unwrap(), "nothing new");

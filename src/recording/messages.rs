@@ -1,6 +1,6 @@
-//! The messages of a log: ROS 2's own where there is one, `dimos_msgs` where there is none.
+//! The messages of a log: ROS 2's own types where they exist, otherwise `dimos_msgs`.
 //!
-//! What is not known is absent: an empty list, or NaN where a list needs a value for every joint. Never zero.
+//! Unknown values are absent: an empty list, or NaN where a list needs a value for every joint. Never zero.
 
 use super::wire::message;
 
@@ -9,13 +9,13 @@ message! {
     "builtin_interfaces/msg/Time" "builtin_interfaces/Time" Time {
         /// Whole seconds since the Unix epoch.
         sec: i32,
-        /// The rest of the time [ns].
+        /// Nanoseconds within the second [ns].
         nanosec: u32,
     }
 }
 
 impl Time {
-    /// From nanoseconds since the Unix epoch. ROS 2 counts seconds in 32 bits: this type ends in January 2038.
+    /// Converts from nanoseconds since the Unix epoch. ROS 2 counts seconds in 32 bits: this type ends in January 2038.
     pub fn of(ns: u64) -> Self {
         let sec = i32::try_from(ns / 1_000_000_000).unwrap_or(i32::MAX);
         Self { sec, nanosec: (ns % 1_000_000_000) as u32 }
@@ -23,11 +23,11 @@ impl Time {
 }
 
 message! {
-    /// When and in which frame.
+    /// Time and frame.
     "std_msgs/msg/Header" "std_msgs/Header" Header {
-        /// When: the deadline of the tick, in Unix time.
+        /// Deadline of the tick, in Unix time.
         stamp: Time,
-        /// In which frame.
+        /// Name of the frame.
         frame_id: String,
     }
 }
@@ -35,9 +35,9 @@ message! {
 message! {
     /// Joint values; each list has one value per name, or is empty.
     "sensor_msgs/msg/JointState" "sensor_msgs/JointState" JointState {
-        /// When.
+        /// Time.
         header: Header,
-        /// Joints.
+        /// Joint names.
         name: Vec<String>,
         /// [rad], of a gripper [m].
         position: Vec<f64>,
@@ -81,7 +81,7 @@ message! {
 message! {
     /// A force and a torque at a time.
     "geometry_msgs/msg/WrenchStamped" "geometry_msgs/WrenchStamped" WrenchStamped {
-        /// When.
+        /// Time.
         header: Header,
         /// Force and torque at the sensor.
         wrench: Wrench,
@@ -91,11 +91,11 @@ message! {
 message! {
     /// A line of the text log.
     "rcl_interfaces/msg/Log" "rcl_interfaces/Log" Log {
-        /// When.
+        /// Time.
         stamp: Time,
         /// 10 debug, 20 info, 30 warn, 40 error, 50 fatal.
         level: u8,
-        /// Who says it: the run.
+        /// Name of the run.
         name: String,
         /// The line.
         msg: String,
@@ -111,7 +111,7 @@ message! {
 message! {
     /// Timing of a tick. One per tick.
     "dimos_msgs/msg/Tick" "dimos_msgs/Tick" Tick {
-        /// When.
+        /// Time.
         header: Header,
         /// Index of the tick, counted from 0.
         tick: u64,
@@ -119,13 +119,13 @@ message! {
         deadline_ns: u64,
         /// Wake-up after the deadline [ns].
         late_ns: u64,
-        /// Wake-up to the last command handed over [ns].
+        /// Wake-up to the last command passed to the device threads [ns].
         compute_ns: u64,
         /// Whole periods skipped before this tick.
         skipped: u32,
-        /// The lateness that cost them, of this tick or of the one before [ns].
+        /// Lateness that caused the skip, of this tick or of the previous one [ns].
         overrun_ns: u64,
-        /// When the tick took the next one to be due, in monotonic time [ns].
+        /// Assumed deadline of the next tick, in monotonic time [ns].
         next_ns: u64,
         /// Samples lost since the last tick in this log because the ring to the recorder was full.
         dropped: u32,
@@ -133,9 +133,9 @@ message! {
 }
 
 message! {
-    /// Something happened in a tick.
+    /// An event of a tick.
     "dimos_msgs/msg/Event" "dimos_msgs/Event" Event {
-        /// When.
+        /// Time.
         header: Header,
         /// Index of the tick.
         tick: u64,
@@ -143,7 +143,7 @@ message! {
         kind: String,
         /// info, warn or error.
         severity: String,
-        /// Id of the request it answers, as in /dimos/requests; empty if it answers none.
+        /// Id of the request it answers, as in /dimos/requests; empty if none.
         request: Vec<u64>,
         /// The arm concerned, or empty.
         arm: String,
@@ -151,37 +151,37 @@ message! {
         task: String,
         /// The joint concerned, or empty.
         joint: String,
-        /// The status word of the outcome, task state, phase or limit.
+        /// Status word of the outcome, task state, phase or limit.
         status: String,
         /// The event's numbers, if any.
         values: Vec<f64>,
-        /// All of it in a sentence.
+        /// The event as a sentence.
         text: String,
     }
 }
 
 message! {
-    /// How an arm is. At changes, and ten times a second.
+    /// Status of an arm. On changes, and ten times a second.
     "dimos_msgs/msg/ArmStatus" "dimos_msgs/ArmStatus" ArmStatus {
-        /// When.
+        /// Time.
         header: Header,
         /// Index of the tick.
         tick: u64,
         /// unknown, disabled, activating, ready, held or standby.
         phase: String,
-        /// Why it is in that phase, e.g. operator_stop, arm_fault, link_lost.
+        /// Reason for the phase, e.g. operator_stop, arm_fault, link_lost.
         cause: String,
-        /// The same as a sentence; empty if there is nothing to say.
+        /// The reason as a sentence; empty if there is none.
         cause_text: String,
         /// down, up, stale or faulted.
         link: String,
-        /// The control mode the arm is in.
+        /// The arm's control mode.
         mode: String,
         /// Whether the motors are on.
         enabled: bool,
         /// The arm's own error code, 0 for none.
         error: i32,
-        /// What the arm says about that error.
+        /// The arm's text for that error.
         error_text: String,
         /// Age of the newest joint state [s]; NaN before the first.
         age: f64,
@@ -189,22 +189,21 @@ message! {
         velocity_source: String,
         /// Number of the newest state, 0 before the first.
         seq: u64,
-        /// The device thread held the arm by itself.
+        /// The device thread held the arm on its own.
         self_held: bool,
     }
 }
 
 message! {
-    /// What a tick read of an arm, besides the values in /joint_states: with those, all of it. On each tick that
-    /// read something else than the tick before.
+    /// What a tick read of an arm, besides the values in /joint_states. On each tick in which it changed.
     "dimos_msgs/msg/ArmInput" "dimos_msgs/ArmInput" ArmInput {
-        /// When.
+        /// Time.
         header: Header,
         /// Index of the tick.
         tick: u64,
         /// Number of the state, 0 before the first. Its values in /joint_states are NaN while it is 0.
         seq: u64,
-        /// When its joint positions were measured, in monotonic time [ns].
+        /// Measurement time of its joint positions, in monotonic time [ns].
         stamp_ns: u64,
         /// absent, measured or estimated. Estimated velocities were computed by the tick, not read.
         velocity_source: String,
@@ -216,7 +215,7 @@ message! {
         pose: Vec<f64>,
         /// Force [N] and torque [Nm] at the sensor; empty if not reported.
         wrench: Vec<f64>,
-        /// The control mode the arm is in.
+        /// The arm's control mode.
         mode: String,
         /// Whether the motors are on.
         enabled: bool,
@@ -224,38 +223,37 @@ message! {
         error: i32,
         /// down, up, stale or faulted.
         link: String,
-        /// The device thread held the arm by itself.
+        /// The device thread held the arm on its own.
         self_held: bool,
         /// Number of the newest command that was written to the wire.
         written: u64,
-        /// What was seen of the arm that this run did not order: mode, power, or empty.
+        /// A change of the arm that this run did not order: mode, power, or empty.
         interference: String,
-        /// Part of the state's age in which the device thread could not run [ns].
+        /// Part of the state's age during which the device thread could not run [ns].
         own_delay_ns: u64,
     }
 }
 
 message! {
-    /// What a tick wants of an arm, besides the values in /joint_commands. On each tick that wants something else
-    /// than the tick before.
+    /// What a tick commands an arm, besides the values in /joint_commands. On each tick in which it changed.
     "dimos_msgs/msg/ArmOutput" "dimos_msgs/ArmOutput" ArmOutput {
-        /// When.
+        /// Time.
         header: Header,
         /// Index of the tick.
         tick: u64,
         /// Number of the command, 0 before the first.
         seq: u64,
-        /// The control mode of the command; empty while the arm is left alone.
+        /// The control mode of the command; empty if the arm is not commanded.
         mode: String,
         /// Gripper opening [m]; meaningless while gripper_seq is 0.
         gripper: f64,
         /// Counts gripper commands.
         gripper_seq: u32,
-        /// Counts requests that the arm stop by its own means.
+        /// Number of stops ordered from the arm's controller.
         stop_seq: u32,
-        /// When the tick will read states next, in monotonic time [ns].
+        /// Time of the tick's next read, in monotonic time [ns].
         next_tick_ns: u64,
-        /// Counts starts of commanded motion: after enabling and after a change of mode.
+        /// Number of starts of commanded motion: after enabling and after a change of mode.
         start_seq: u32,
     }
 }

@@ -1,5 +1,5 @@
-//! What other threads than the tick want in the log, on its way to the recorder: in order, and bounded. Nobody waits
-//! for the recorder; what it has no room for is lost and counted.
+//! Bounded queue of notes from other threads than the tick to the recorder. Senders never block; notes that do not fit
+//! are dropped and counted.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -9,48 +9,47 @@ use crate::clock::Mono;
 use crate::telemetry::describe::Severity;
 use crate::trajectory::JointTrajectory;
 
-/// Most memory for notes that the recorder has not taken yet [bytes]: minutes of requests, dozens of the longest
-/// trajectories.
-const MAX_WAITING: usize = 64 << 20;
-/// What a note takes besides its text [bytes].
-const NOTE: usize = 128;
+/// Maximum memory of queued notes [bytes]: minutes of requests, dozens of the longest trajectories.
+const MAX_QUEUED: usize = 64 << 20;
+/// Memory of a note besides its text [bytes].
+const NOTE_OVERHEAD: usize = 128;
 
-/// What other threads want in the log.
+/// An entry for the log from another thread than the tick.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Note {
-    /// A request, sent before it is told to the tick.
+    /// A request; noted before it is passed to the tick.
     Request {
-        /// The id that the tick answers with.
+        /// Id of the request.
         id: u64,
-        /// When it came.
+        /// Time of arrival.
         stamp: Mono,
-        /// The request as it was told to the tick.
+        /// The request as passed to the tick.
         json: String,
     },
-    /// A request to follow a trajectory, sent before it is told to the tick. Logged with the tick's answer: where that
-    /// is a refusal, without the points that the tick did not look at.
+    /// A trajectory request; noted before it is passed to the tick. Logged with the tick's answer: if that is a
+    /// rejection, without the points that the tick did not check.
     Execute {
-        /// The id that the tick answers with.
+        /// Id of the request.
         id: u64,
-        /// When it came.
+        /// Time of arrival.
         stamp: Mono,
         /// Index of the task.
         task: u16,
-        /// The motion's number.
+        /// Id of the motion.
         motion: u64,
-        /// What is to be followed.
+        /// The trajectory.
         trajectory: Arc<JointTrajectory>,
     },
     /// A line of text.
     Log {
-        /// How much it matters.
+        /// Severity.
         severity: Severity,
-        /// When.
+        /// Time.
         stamp: Mono,
         /// The line.
         text: String,
     },
-    /// What an arm says about its present error.
+    /// An arm's text for its current error.
     ArmText {
         /// Index of the arm.
         arm: u16,
@@ -60,28 +59,29 @@ pub enum Note {
 }
 
 impl Note {
-    /// Roughly what it takes [bytes].
+    /// Returns its approximate size [bytes].
     fn size(&self) -> usize {
-        NOTE + match self {
-            Self::Request { json: text, .. } | Self::Log { text, .. } | Self::ArmText { text, .. } => text.len(),
-            Self::Execute { trajectory, .. } => {
-                let values = trajectory
-                    .points
-                    .iter()
-                    .map(|p| size_of_val(p) + 8 * (p.positions.len() + p.velocities.len() + p.accelerations.len()));
-                values.sum()
+        NOTE_OVERHEAD
+            + match self {
+                Self::Request { json: text, .. } | Self::Log { text, .. } | Self::ArmText { text, .. } => text.len(),
+                Self::Execute { trajectory, .. } => {
+                    let values = trajectory
+                        .points
+                        .iter()
+                        .map(|p| size_of_val(p) + 8 * (p.positions.len() + p.velocities.len() + p.accelerations.len()));
+                    values.sum()
+                }
             }
-        }
     }
 }
 
-/// Why a note is not in the log.
+/// Why a note was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum NoteLost {
-    /// The recorder is too far behind.
+    /// The queue is full.
     #[error("the recorder is too far behind")]
     Full,
-    /// There is no recorder any more.
+    /// The recorder has ended.
     #[error("the recorder has ended")]
     Ended,
 }
@@ -92,32 +92,32 @@ struct Shared {
     lost: AtomicU64,
 }
 
-/// The way to the recorder. Clones lead to the same one.
+/// Sender of notes to the recorder. Clones share one queue.
 #[derive(Debug, Clone)]
 pub struct Notes {
     sender: Sender<Note>,
     shared: Arc<Shared>,
 }
 
-/// The recorder's end.
+/// Receiver of the recorder.
 #[derive(Debug)]
-pub struct Noted {
+pub struct NoteReceiver {
     receiver: Receiver<Note>,
     shared: Arc<Shared>,
 }
 
-/// A way to the recorder, and its end.
-pub fn channel() -> (Notes, Noted) {
+/// Creates a queue.
+pub fn channel() -> (Notes, NoteReceiver) {
     let (sender, receiver) = std::sync::mpsc::channel();
     let shared = Arc::<Shared>::default();
-    (Notes { sender, shared: shared.clone() }, Noted { receiver, shared })
+    (Notes { sender, shared: shared.clone() }, NoteReceiver { receiver, shared })
 }
 
 impl Notes {
-    /// Sends a note. Never waits.
+    /// Sends a note. Never blocks.
     pub fn send(&self, note: Note) -> Result<(), NoteLost> {
         let size = note.size();
-        if self.shared.waiting.fetch_add(size, Ordering::Relaxed) + size > MAX_WAITING {
+        if self.shared.waiting.fetch_add(size, Ordering::Relaxed) + size > MAX_QUEUED {
             self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
             return Err(NoteLost::Full);
@@ -126,8 +126,8 @@ impl Notes {
     }
 }
 
-impl Noted {
-    /// All that there is.
+impl NoteReceiver {
+    /// Takes all queued notes.
     pub(super) fn take(&self) -> Vec<Note> {
         let notes: Vec<Note> = self.receiver.try_iter().collect();
         let size = notes.iter().map(Note::size).sum();
@@ -135,7 +135,7 @@ impl Noted {
         notes
     }
 
-    /// Notes lost since this was asked last.
+    /// Returns the number of notes dropped since the last call.
     pub(super) fn lost(&self) -> u64 {
         self.shared.lost.swap(0, Ordering::Relaxed)
     }

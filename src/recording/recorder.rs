@@ -1,5 +1,5 @@
-//! The recorder thread: takes samples from the tick's ring and notes from everybody else, logs them, and hands
-//! events on in words. The only thread that waits for the disk; nobody waits for it.
+//! The recorder thread: takes samples from the tick's ring and notes from other threads, logs them, and passes events
+//! on as text. It is the only thread that waits for the disk; no thread waits for it.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -12,26 +12,26 @@ use std::time::Duration;
 
 use thiserror::Error;
 
+use super::disk_space::Megabytes;
 use super::log_writer::LogAttachment;
 pub use super::notes::Note;
-use super::notes::Noted;
-use super::space::Megabytes;
+use super::notes::NoteReceiver;
 use super::worker::Worker;
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::telemetry::describe::{Described, Names};
 use crate::telemetry::{Event, Sample};
 
-/// How often the ring is emptied: half as often as the log is flushed, because each time costs a wake-up.
+/// Period at which the ring is emptied: half the flush period, because each wake-up has a cost.
 const DRAIN_EVERY: Duration = Duration::from_millis(50);
-/// The same in the first second, so that a run's first state is on disk soon.
+/// Period during the first second, so that a run's first state is on disk soon.
 const DRAIN_EVERY_AT_FIRST: Duration = Duration::from_millis(2);
-/// Room for the write buffer: more than what a run logs between two flushes.
+/// Size of the write buffer [bytes]: more than a run logs between two flushes.
 const BUFFER: usize = 256 * 1024;
 
 /// What to record, and where.
 #[derive(Debug, Clone)]
 pub struct RecorderConfig {
-    /// The log file, which must not exist yet; its folder is made. `None` records nothing.
+    /// The log file, which must not exist yet; its folder is created. `None` records nothing.
     pub path: Option<PathBuf>,
     /// Name of the run.
     pub run: String,
@@ -39,96 +39,96 @@ pub struct RecorderConfig {
     pub names: Names,
     /// Frame of the joint states: the blueprint's `joint_state_frame_id`.
     pub frame_id: String,
-    /// Files to put into the log, the blueprint first of all.
+    /// Files to attach, the blueprint first.
     pub attachments: Vec<LogAttachment>,
-    /// More about the run, besides its name, arms, joints and tasks.
+    /// Further metadata, besides name, arms, joints and tasks.
     pub metadata: BTreeMap<String, String>,
     /// Offset between monotonic and Unix time.
     pub wall: WallOffset,
-    /// The log ends when less room than this is left on its disk [bytes].
+    /// Minimum free space on the disk; below it the log ends [bytes].
     pub min_free: u64,
 }
 
-/// What the recorder tells while it runs, on its own thread: be quick.
+/// Notices of the recorder, delivered on its thread: handlers must be fast.
 #[derive(Debug)]
 pub enum Notice<'a> {
-    /// Something happened in the tick with this index.
+    /// An event of a tick.
     Event {
         /// Index of the tick.
         tick: u64,
-        /// What happened.
+        /// The event.
         event: &'a Event,
-        /// The same in words.
+        /// The event as text.
         described: &'a Described,
     },
-    /// The recorder fell behind: so many samples are missing in the log.
+    /// The recorder fell behind: number of samples missing in the log.
     Lost(u32),
-    /// The log ends here, before the run. Said once; events are still told.
+    /// The log ends before the run. Reported once; events are still reported.
     Stopped(&'a RecordError),
 }
 
-/// Why there is no log, or no more of it.
+/// Why there is no log, or why it ended early.
 #[derive(Debug, Error)]
 pub enum RecordError {
-    /// The file or its folder cannot be made.
-    #[error("the log {path} cannot be made: {source}\nhint: {}", hint(source))]
+    /// The file or its folder cannot be created.
+    #[error("cannot create the log {path}: {source}\nhint: {}", hint(source))]
     Create {
         /// The log file.
         path: PathBuf,
-        /// Why.
+        /// The error.
         source: std::io::Error,
     },
     /// A write failed.
-    #[error("the log {path} ends here: {reason}\nhint: see whether the disk is full; --no-record runs without a log")]
+    #[error("the log {path} ends here: {reason}\nhint: check whether the disk is full; --no-record runs without a log")]
     Write {
         /// The log file.
         path: PathBuf,
-        /// Why.
+        /// The error.
         reason: String,
     },
     /// The disk is nearly full.
     #[error(
-        "the log {path}: only {free} are free on its disk, and {min_free} must be\n\
-         hint: make room, name another file with --record FILE, or set recording.min_free; --no-record runs without a log"
+        "the log {path}: {free} free on its disk (minimum {min_free})\n\
+         hint: free some space, choose another file with --record FILE, or set recording.min_free; --no-record runs without a log"
     )]
     Room {
         /// The log file.
         path: PathBuf,
-        /// What is free.
+        /// Free space.
         free: Megabytes,
-        /// What must be.
+        /// Minimum free space.
         min_free: Megabytes,
     },
-    /// The file is not where it was.
+    /// The file was moved or removed.
     #[error(
-        "the log {path} ends here: it was removed or replaced while it was written\nhint: keep logs out of folders that are cleaned up"
+        "the log {path} ends here: it was removed or replaced while it was being written\nhint: do not log to folders that are cleaned up automatically"
     )]
     Removed {
         /// The log file.
         path: PathBuf,
     },
     /// The thread cannot be started.
-    #[error("the recorder thread cannot be started: {0}\nhint: see whether a limit on threads or memory is reached")]
+    #[error("cannot start the recorder thread: {0}\nhint: check the limits on threads and memory")]
     Thread(std::io::Error),
 }
 
 fn hint(source: &std::io::Error) -> &'static str {
     match source.kind() {
-        std::io::ErrorKind::AlreadyExists => "a log is never overwritten: name another file, or remove it first",
-        _ => "name another file with --record FILE, or run with --no-record",
+        std::io::ErrorKind::AlreadyExists => "a log is never overwritten: choose another file name, or remove the file",
+        _ => "choose another file with --record FILE, or run with --no-record",
     }
 }
 
-/// Figures of a running recorder.
+/// Statistics of a running recorder.
 #[derive(Debug, Default)]
 pub struct RecorderStats {
     /// Messages logged.
     pub messages: AtomicU64,
     /// Length of the log [bytes].
     pub bytes: AtomicU64,
-    /// Samples lost, because the recorder fell behind.
+    /// Samples lost because the recorder fell behind.
     pub dropped: AtomicU64,
-    /// A write failed: there is no more log.
+    /// A write failed: the log has ended.
     pub failed: AtomicBool,
 }
 
@@ -142,12 +142,11 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Begins the log and starts the thread `recorder`. Without a path the ring is emptied and events are told all
-    /// the same.
+    /// Creates the log and starts the thread `recorder`. Without a path it still empties the ring and reports events.
     pub fn start(
         config: RecorderConfig,
         ring: rtrb::Consumer<Sample>,
-        notes: Noted,
+        notes: NoteReceiver,
         on_notice: impl FnMut(Notice<'_>) + Send + 'static,
     ) -> Result<Self, RecordError> {
         let stats = Arc::new(RecorderStats::default());
@@ -171,18 +170,18 @@ impl Recorder {
         Ok(Self { path: config.path, stats, stop, thread })
     }
 
-    /// Where the log is.
+    /// Returns the path of the log.
     pub fn path(&self) -> Option<&Path> {
         self.path.as_deref()
     }
 
-    /// Its figures, up to date at any time.
+    /// Returns live statistics.
     pub fn stats(&self) -> Arc<RecorderStats> {
         self.stats.clone()
     }
 
-    /// Takes what is left in the ring and closes the log. Call it when the tick has ended. The error is the one that
-    /// ended the log, if one did.
+    /// Takes the remaining samples and closes the log. Call it after the tick has ended. Returns the error that ended
+    /// the log, if any.
     pub fn finish(mut self) -> Result<(), RecordError> {
         self.join()
     }
@@ -199,7 +198,7 @@ impl Recorder {
 
 impl Drop for Recorder {
     fn drop(&mut self) {
-        // Its error was told as `Notice::Stopped`, or there is nobody left to tell.
+        // The error was reported as `Notice::Stopped`, or there is no receiver left.
         let _ = self.join();
     }
 }
@@ -214,8 +213,8 @@ fn create_file(path: &Path) -> Result<File, RecordError> {
     make().map_err(|source| RecordError::Create { path: path.to_owned(), source })
 }
 
-/// A sink that counts what goes through it, and so knows where it is: a buffered file that is asked writes first what
-/// it has, and asks the kernel.
+/// A sink that counts bytes and so knows its position: asking a buffered file for it would flush the buffer and call
+/// the kernel.
 struct Counted<W> {
     inner: W,
     stats: Arc<RecorderStats>,

@@ -1,5 +1,5 @@
-//! Reads the records of an MCAP file one after the other, within bounds: whatever the file says, no more than
-//! [`LIMIT`] bytes of it are in memory at a time, and a file that was cut is read up to the cut.
+//! Reads the records of an MCAP file in order and in bounded memory: at most [`LIMIT`] bytes at a time, whatever the
+//! file contains; a truncated file is read up to the cut.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -10,22 +10,22 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{MAGIC, McapError, parse_record};
 use thiserror::Error;
 
-/// Longest record, and longest contents of a chunk, that are read [bytes]. Attachments may be longer.
+/// Maximum length of a record, and of a chunk's contents [bytes]. Attachments may be longer.
 pub const LIMIT: usize = 16 * 1024 * 1024;
-/// Opcode and length, before each record.
+/// Opcode and length before each record.
 const PREFIX: usize = 9;
-/// Footer record and closing magic, at the end of every complete file.
+/// Footer record and closing magic at the end of every complete file.
 const TAIL: u64 = (PREFIX + 20 + MAGIC.len()) as u64;
 
 /// Why a log cannot be read, or not to its end.
 #[derive(Debug, Error)]
 pub enum ReplayError {
     /// The file cannot be opened or read.
-    #[error("the log {path} cannot be read: {source}\nhint: `dimos replay --last` plays the newest log")]
+    #[error("cannot read the log {path}: {source}\nhint: `dimos replay --last` plays the newest log")]
     Io {
         /// The log file.
         path: PathBuf,
-        /// Why.
+        /// The error.
         source: std::io::Error,
     },
     /// Not an MCAP file.
@@ -34,31 +34,31 @@ pub enum ReplayError {
         /// The file.
         path: PathBuf,
     },
-    /// The file ends too early, or what follows is damaged. Everything before was read.
+    /// The file is truncated or damaged. Everything before was read.
     #[error(
-        "the log {path} ends at byte {at}: {reason}\nhint: everything before was read; a log ends like this when its run was killed, or is still going on"
+        "the log {path} ends at byte {at}: {reason}\nhint: everything before was read; this happens if the run was killed or is still live"
     )]
     Cut {
         /// The log file.
         path: PathBuf,
-        /// Where the first record begins that cannot be read [bytes from the start].
+        /// Start of the first unreadable record [bytes from the start].
         at: u64,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
 }
 
-/// A record: its kind and contents. Of a kind that is of no use here the contents are empty.
+/// A record: kind and contents. Contents of kinds that are not used are empty.
 pub struct RawRecord {
-    /// Which kind of record: one of `mcap::records::op`.
+    /// Kind: one of `mcap::records::op`.
     pub opcode: u8,
-    /// Where it begins [bytes from the start of the file].
+    /// Position of its start [bytes from the start of the file].
     pub at: u64,
-    /// Its contents.
+    /// Contents.
     pub body: Vec<u8>,
 }
 
-/// Reads an MCAP file from one record to the next.
+/// Reads an MCAP file record by record.
 pub struct RecordReader {
     path: PathBuf,
     file: BufReader<File>,
@@ -69,7 +69,7 @@ pub struct RecordReader {
 }
 
 impl RecordReader {
-    /// Opens a file and checks that it begins as MCAP does.
+    /// Opens a file and checks its MCAP magic.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
         let io = |source| ReplayError::Io { path: path.to_owned(), source };
         let file = File::open(path).map_err(io)?;
@@ -83,13 +83,13 @@ impl RecordReader {
         Ok(Self { path: path.to_owned(), file, length, at: magic.len() as u64, ended: false, attachments: false })
     }
 
-    /// Reads attachments as well, up to [`LIMIT`]; without this they are passed over.
+    /// Also reads attachments, up to [`LIMIT`]; by default they are skipped.
     pub fn with_attachments(mut self) -> Self {
         self.attachments = true;
         self
     }
 
-    /// Where the summary begins; `None` if the file was cut, or has none.
+    /// Returns the position of the summary; `None` if the file is truncated or has none.
     pub fn summary_start(&mut self) -> Result<Option<u64>, ReplayError> {
         if self.length < TAIL + MAGIC.len() as u64 {
             return Ok(None);
@@ -101,7 +101,7 @@ impl RecordReader {
         Ok((complete && start >= MAGIC.len() as u64 && start < self.length).then_some(start))
     }
 
-    /// Goes to where a record begins.
+    /// Moves to the start of a record.
     pub fn go_to(&mut self, at: u64) -> Result<(), ReplayError> {
         self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(e))?;
         self.at = at;
@@ -109,12 +109,12 @@ impl RecordReader {
         Ok(())
     }
 
-    /// Goes to the first record of the file.
+    /// Moves to the first record.
     pub fn rewind(&mut self) -> Result<(), ReplayError> {
         self.go_to(MAGIC.len() as u64)
     }
 
-    /// The next record; `None` after the footer of a complete file. After an error there is nothing more.
+    /// Returns the next record; `None` after the footer of a complete file, and after an error.
     pub fn next_record(&mut self) -> Result<Option<RawRecord>, ReplayError> {
         if self.ended {
             return Ok(None);
@@ -127,16 +127,16 @@ impl RecordReader {
     fn read_record(&mut self) -> Result<RawRecord, ReplayError> {
         let at = self.at;
         if self.length - at < PREFIX as u64 {
-            return Err(self.cut(at, "it has no proper end"));
+            return Err(self.cut(at, "no valid footer"));
         }
         let prefix: [u8; PREFIX] = self.read()?;
         let [opcode, length @ ..] = prefix;
         let length = u64::from_le_bytes(length);
         if opcode == 0 {
-            return Err(self.cut(at, "there is no record there"));
+            return Err(self.cut(at, "no record at this position"));
         }
         if length > self.length - at - PREFIX as u64 {
-            return Err(self.cut(at, "it ends in the middle of a record"));
+            return Err(self.cut(at, "the file ends inside a record"));
         }
         self.at = at + PREFIX as u64 + length;
         let body = match opcode {
@@ -145,12 +145,12 @@ impl RecordReader {
                 self.file.seek_relative(length as i64).map_err(|e| self.io(e))?;
                 Vec::new()
             }
-            _ if length > LIMIT as u64 => return Err(self.cut(at, "a record is longer than 16 MiB")),
+            _ if length > LIMIT as u64 => return Err(self.cut(at, "a record exceeds 16 MiB")),
             _ => self.body(length)?,
         };
         let closed = || self.length - self.at >= MAGIC.len() as u64;
         if opcode == op::FOOTER && !(closed() && self.read::<{ MAGIC.len() }>()? == *MAGIC) {
-            return Err(self.cut(at, "it has no proper end"));
+            return Err(self.cut(at, "no valid footer"));
         }
         Ok(RawRecord { opcode, at, body })
     }
@@ -171,14 +171,14 @@ impl RecordReader {
         ReplayError::Io { path: self.path.clone(), source }
     }
 
-    /// The error for a record that cannot be read. Nothing is read after it.
+    /// Returns the error of an unreadable record. Reading ends there.
     pub fn cut(&mut self, at: u64, reason: impl ToString) -> ReplayError {
         self.ended = true;
         ReplayError::Cut { path: self.path.clone(), at, reason: reason.to_string() }
     }
 }
 
-/// The header of a chunk record: time range, sizes, compression.
+/// Returns the header of a chunk record: time range, sizes, compression.
 pub fn chunk_header(body: &[u8]) -> Result<ChunkHeader, McapError> {
     match parse_record(op::CHUNK, body)? {
         Record::Chunk { header, .. } => Ok(header),
@@ -186,7 +186,7 @@ pub fn chunk_header(body: &[u8]) -> Result<ChunkHeader, McapError> {
     }
 }
 
-/// Unpacks a chunk record and hands on the records inside, in order. Its checksum is verified before the first.
+/// Unpacks a chunk record and passes its records on in order. Verifies its checksum first.
 pub fn unpack_chunk(body: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), McapError> {
     let Record::Chunk { header, data } = parse_record(op::CHUNK, body)? else { return Err(McapError::UnexpectedEoc) };
     if header.uncompressed_size > LIMIT as u64 {
@@ -195,7 +195,7 @@ pub fn unpack_chunk(body: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), 
     match header.compression.as_str() {
         "" => walk(&data, each),
         "zstd" => {
-            // The library's reader unpacks; it is given the chunk as a file of one record.
+            // The library's reader unpacks the chunk as a file with a single record.
             let mut reader = LinearReader::new_with_options(
                 LinearReaderOptions::default()
                     .with_skip_start_magic(true)
@@ -221,7 +221,7 @@ pub fn unpack_chunk(body: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), 
     }
 }
 
-/// The records of a chunk that is not compressed.
+/// Passes on the records of an uncompressed chunk.
 fn walk(mut rest: &[u8], mut each: impl FnMut(u8, &[u8])) -> Result<(), McapError> {
     while let Some((&opcode, after)) = rest.split_first() {
         let (length, after) = after.split_first_chunk().ok_or(McapError::UnexpectedEoc)?;

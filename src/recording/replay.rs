@@ -1,4 +1,4 @@
-//! Reads a log back: its messages, decoded, in the order of their time, up to where the file was cut.
+//! Reads a log: its decoded messages in order of time, up to a cut.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -15,11 +15,11 @@ pub use super::records::ReplayError;
 /// Which messages to read.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Selection {
-    /// Topics; all of them if empty.
+    /// Topics; empty for all.
     pub topics: Vec<String>,
-    /// From this Unix time on [ns].
+    /// First Unix time [ns].
     pub from: u64,
-    /// Up to this Unix time, inclusive [ns].
+    /// Last Unix time, inclusive [ns].
     pub to: u64,
 }
 
@@ -29,20 +29,20 @@ impl Default for Selection {
     }
 }
 
-/// What a log says about itself.
+/// Information about a log.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct LogInfo {
     /// Unix times of its first and last message [ns]; `None` without messages.
     pub span: Option<(u64, u64)>,
     /// Whether the log was closed properly.
     pub complete: bool,
-    /// What the run said about itself: `run`, `version`, `arms`, `tasks`, `wall_offset_ns` and more.
+    /// Metadata of the run: `run`, `version`, `arms`, `tasks`, `wall_offset_ns` and more.
     pub metadata: BTreeMap<String, String>,
     /// Topics and their schemas.
     pub topics: BTreeMap<String, String>,
 }
 
-/// A log, being read.
+/// A log opened for reading.
 pub struct LogReader {
     records: RecordReader,
     selection: Selection,
@@ -54,7 +54,7 @@ pub struct LogReader {
 }
 
 impl LogReader {
-    /// Opens a log. A closed one is looked up in its summary; one that was cut is read through once, to know its end.
+    /// Opens a log. Uses the summary of a closed log; scans a truncated one to find its end.
     pub fn open(path: &Path) -> Result<Self, ReplayError> {
         let mut records = RecordReader::open(path)?;
         let mut channels = Channels::default();
@@ -77,12 +77,12 @@ impl LogReader {
         })
     }
 
-    /// What the log says about itself.
+    /// Returns information about the log.
     pub fn info(&self) -> &LogInfo {
         &self.info
     }
 
-    /// Starts over, with the messages of a selection.
+    /// Restarts with the messages of a selection.
     pub fn select(&mut self, selection: Selection) -> Result<(), ReplayError> {
         self.selection = selection;
         self.ready.clear();
@@ -91,8 +91,8 @@ impl LogReader {
         self.records.rewind()
     }
 
-    /// The next message; `None` at the end of a closed log. `ReplayError::Cut` comes once, in the place of the end,
-    /// when the log was cut or is damaged from there on.
+    /// Returns the next message; `None` at the end of a closed log. Returns `ReplayError::Cut` once, where a truncated
+    /// or damaged log ends.
     pub fn next_entry(&mut self) -> Result<Option<Entry>, ReplayError> {
         loop {
             if let Some(entry) = self.ready.pop_front() {
@@ -102,12 +102,12 @@ impl LogReader {
                 return Err(e);
             }
             let Some(record) = self.records.next_record()? else { return Ok(None) };
-            // Messages that stood before the damage come first.
+            // Messages before the damage come first.
             self.failed = self.take(&record).err();
         }
     }
 
-    /// Samples that the recorder lost, in what was read so far, whether or not `/dimos/tick` was selected.
+    /// Returns the number of samples lost by the recorder so far, whether or not `/dimos/tick` is selected.
     pub fn lost(&self) -> u64 {
         self.lost
     }
@@ -132,7 +132,7 @@ impl LogReader {
     }
 }
 
-/// A file that goes along with a log, by its name; `None` if there is none before the first message.
+/// Returns an attachment by name; `None` if there is none before the first message.
 pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReplayError> {
     let mut records = RecordReader::open(path)?.with_attachments();
     loop {
@@ -149,7 +149,7 @@ pub fn attachment(path: &Path, name: &str) -> Result<Option<Vec<u8>>, ReplayErro
     }
 }
 
-/// Time span and channels from the summary of a closed log; `None` if it does not say.
+/// Reads time span and channels from the summary of a closed log; `None` if it lacks them.
 fn summary(records: &mut RecordReader, start: u64, channels: &mut Channels) -> Result<Option<LogInfo>, ReplayError> {
     records.go_to(start)?;
     let mut info = None;
@@ -165,14 +165,14 @@ fn summary(records: &mut RecordReader, start: u64, channels: &mut Channels) -> R
                 }
             }
             Ok(None) => return Ok(info),
-            // A summary that cannot be read is one that is not there.
+            // An unreadable summary counts as absent.
             Err(ReplayError::Cut { .. }) => return Ok(None),
             Err(e) => return Err(e),
         }
     }
 }
 
-/// Time span and channels of a log without a summary: by reading all of it.
+/// Reads time span and channels of a log without a summary, from the whole file.
 fn scan(records: &mut RecordReader, channels: &mut Channels) -> Result<LogInfo, ReplayError> {
     records.rewind()?;
     let mut info = LogInfo::default();
@@ -211,7 +211,7 @@ fn scan(records: &mut RecordReader, channels: &mut Channels) -> Result<LogInfo, 
     }
 }
 
-/// What the run said about itself: it stands before the first message.
+/// Reads the run's metadata, stored before the first message.
 fn metadata(records: &mut RecordReader) -> Result<BTreeMap<String, String>, ReplayError> {
     records.rewind()?;
     loop {

@@ -1,5 +1,4 @@
-//! Turns a tick's samples into messages: collects them until the tick is closed, then logs all of them with the
-//! tick's time.
+//! Turns a tick's samples into messages: collects them until the tick is closed, then logs them with the tick's time.
 
 use std::collections::BTreeMap;
 use std::io::{Seek, Write};
@@ -18,27 +17,27 @@ use crate::joint::{ControlMode, Joints};
 use crate::telemetry::describe::{Described, Names, Severity};
 use crate::telemetry::{ArmSample, Cause, Phase, TickSample};
 
-/// Longest time between two messages on `/arm_status/<arm>`.
+/// Maximum time between two messages on `/arm_status/<arm>`.
 const STATUS_EVERY: Duration = Duration::from_millis(100);
 
-/// The samples of the tick that is not closed yet, and what was logged of each arm last.
+/// The samples of the current tick, and the latest logged values of each arm.
 pub struct TickLog {
     run: String,
     names: Names,
     frame_id: String,
     wall: WallOffset,
-    /// The messages of all arms, made once with their names and filled anew for each tick.
+    /// Messages of all arms, created once with their names and refilled for each tick.
     states: JointState,
     commands: JointState,
     arms: Vec<ArmLog>,
     events: Vec<(u64, Described)>,
-    /// Samples given up since the last tick was closed, because the end of their own tick never came.
+    /// Samples dropped since the last closed tick because the end of their own tick was lost.
     given_up: u32,
 }
 
 #[derive(Default)]
 struct ArmLog {
-    /// What came of this arm since the last tick was closed.
+    /// Sample of this arm since the last closed tick.
     pending: Option<ArmSample>,
     state: Option<ArmState>,
     command: Option<ArmCommand>,
@@ -48,17 +47,17 @@ struct ArmLog {
 }
 
 impl ArmLog {
-    /// What the tick read of the arm, if it read anything.
+    /// Returns the state that the tick read, if any.
     fn read(&self) -> Option<&ArmState> {
         self.pending.as_ref().map(|s| &s.state).filter(|s| s.seq > 0)
     }
 }
 
-/// What makes an arm's status worth telling at once.
+/// Parts of an arm's status whose change is logged at once.
 type StatusKey = (Phase, Cause, crate::arm::Link, ControlMode, bool, i32, VelocitySource, bool, String);
 
 impl TickLog {
-    /// Nothing logged yet.
+    /// Creates one with nothing logged yet.
     pub fn new(run: String, names: Names, frame_id: String, wall: WallOffset) -> Self {
         let name = names.arms.iter().flat_map(|a| a.joints.clone()).collect();
         let states = JointState { name, ..JointState::default() };
@@ -66,8 +65,8 @@ impl TickLog {
         Self { run, names, frame_id, wall, commands: states.clone(), states, arms, events: Vec::new(), given_up: 0 }
     }
 
-    /// What readers need to understand the log, for its metadata: the joints of each arm, and the offset between
-    /// the monotonic times in it and Unix time.
+    /// Returns metadata that readers need: the joints of each arm, and the offset between its monotonic times and Unix
+    /// time.
     pub fn metadata(&self) -> BTreeMap<String, String> {
         let arms: serde_json::Map<_, _> =
             self.names.arms.iter().map(|a| (a.hardware_id.clone(), a.joints.clone().into())).collect();
@@ -80,7 +79,7 @@ impl TickLog {
         ])
     }
 
-    /// Makes the topics known that every log has.
+    /// Declares the topics that every log has.
     pub fn announce<W: Write + Seek>(&self, log: &mut LogWriter<W>) -> McapResult<()> {
         log.announce::<JointState>("/joint_states")?;
         log.announce::<JointState>("/joint_commands")?;
@@ -96,34 +95,34 @@ impl TickLog {
         log.announce::<Log>("/rosout")
     }
 
-    /// Takes what a tick read of an arm.
+    /// Takes an arm's sample.
     pub fn arm(&mut self, sample: ArmSample) {
         let older = self.arms.get_mut(usize::from(sample.arm)).and_then(|arm| arm.pending.replace(sample));
         self.given_up += u32::from(older.is_some());
     }
 
-    /// Takes something that happened in the tick with this index.
+    /// Takes an event of the tick with this index.
     pub fn event(&mut self, tick: u64, described: Option<Described>) {
         self.events.extend(described.map(|d| (tick, d)));
     }
 
-    /// Forgets what came since the last tick was closed: there is no log to put it into.
+    /// Drops what was collected since the last closed tick: there is no log.
     pub fn clear(&mut self) {
         self.arms.iter_mut().for_each(|arm| arm.pending = None);
         self.events.clear();
         self.given_up = 0;
     }
 
-    /// Takes an arm's text for its present error.
+    /// Takes an arm's text for its current error.
     pub fn arm_text(&mut self, arm: u16, text: String) {
         if let Some(arm) = self.arms.get_mut(usize::from(arm)) {
             arm.error_text = text;
         }
     }
 
-    /// Logs a request as it was told to the tick.
+    /// Logs a request as passed to the tick.
     pub fn request<W: Write + Seek>(&self, log: &mut LogWriter<W>, id: u64, stamp: Mono, json: &str) -> McapResult<()> {
-        // A request that is not JSON is kept as text rather than lost.
+        // A request that is not JSON is logged as text rather than lost.
         let request = serde_json::from_str(json).unwrap_or_else(|_| serde_json::Value::from(json));
         let data = serde_json::json!({ "id": id, "request": request }).to_string();
         log.publish("/dimos/requests", self.wall.wall(stamp), &Text { data })
@@ -148,7 +147,7 @@ impl TickLog {
         log.publish("/rosout", time, &line)
     }
 
-    /// Logs all that came since the last tick was closed. Says how many samples were lost since then.
+    /// Logs what was collected since the last closed tick. Returns the number of samples lost since then.
     pub fn close<W: Write + Seek>(&mut self, log: &mut LogWriter<W>, tick: &TickSample) -> McapResult<u32> {
         let mut tick = *tick;
         if tick.dropped > 0 {
@@ -169,14 +168,14 @@ impl TickLog {
             self.line(log, d.severity, tick.deadline, &d.text)?;
             let time = self.wall.wall(tick.deadline);
             if d.severity == Severity::Error {
-                log.do_not_wait();
+                log.flush_soon();
             }
             log.publish("/dimos/events", time, &self.event_message(&tick, index, d))?;
         }
         Ok(tick.dropped)
     }
 
-    /// Drops the samples of ticks before this one. A sample's own tick ended before its `next_tick`.
+    /// Drops samples of earlier ticks. A sample's own tick ended before its `next_tick`.
     fn give_up_older(&mut self, deadline: Mono) {
         for arm in &mut self.arms {
             let older = arm.pending.take_if(|s| s.command.next_tick <= deadline);
@@ -220,7 +219,7 @@ impl TickLog {
         log.publish("/joint_commands", self.wall.wall(tick.deadline), message)
     }
 
-    /// One value per joint of all arms, NaN where an arm has none; empty if no arm has any.
+    /// Returns one value per joint of all arms, NaN for arms without; empty if no arm has any.
     fn column(&self, column: &mut Vec<f64>, values: impl Fn(&ArmLog) -> Option<Joints>) {
         let mut any = false;
         column.clear();

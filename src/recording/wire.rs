@@ -1,35 +1,35 @@
-//! How Rust types become fields of ROS 2 messages. [`message!`](crate::recording::wire::message) declares a message
-//! once: struct, schema text, encoder and decoder all come from that one list of fields, so they cannot disagree.
+//! Rust types as fields of ROS 2 messages. [`message!`](crate::recording::wire::message) declares a message once:
+//! struct, schema text, encoder and decoder all follow from one list of fields.
 
 use serde::Serialize;
 
 use super::cdr::{CdrError, Decoder, Encoder};
 
-/// The definitions a message depends on: name (`pkg/Type`) and text.
+/// Definitions that a message depends on: name (`pkg/Type`) and text.
 pub type Definitions = Vec<(&'static str, String)>;
 
 /// A type that can be a field of a message.
 pub trait Field: Sized {
     /// Its type in a message definition, e.g. `float64[]`.
     const ROS: &'static str;
-    /// Fewest bytes it takes, to bound what a sequence of it may claim.
+    /// Minimum size [bytes], to bound the length that a sequence may claim.
     const MIN_SIZE: usize;
-    /// Appends it.
+    /// Encodes it.
     fn put(&self, out: &mut Encoder);
-    /// Reads it.
+    /// Decodes it.
     fn get(from: &mut Decoder<'_>) -> Result<Self, CdrError>;
     /// Adds the definitions it needs, its own included, each once.
     fn define(_known: &mut Definitions) {}
 }
 
-/// A message type with a name of its own.
+/// A named message type.
 pub trait Message: Field + Serialize {
     /// Schema name, e.g. `sensor_msgs/msg/JointState`.
     const SCHEMA: &'static str;
-    /// Its fields, one a line.
+    /// Returns its fields, one per line.
     fn fields() -> String;
 
-    /// The whole schema text: its fields, then the definitions they need, the way the `ros2msg` encoding wants them.
+    /// Returns the schema text: its fields, then the definitions they need, in the format of the `ros2msg` encoding.
     fn schema_text() -> String {
         let mut known = Definitions::new();
         Self::define(&mut known);
@@ -40,7 +40,7 @@ pub trait Message: Field + Serialize {
         text
     }
 
-    /// The message in these bytes.
+    /// Decodes a message.
     fn decode(bytes: &[u8]) -> Result<Self, CdrError> {
         Self::get(&mut Decoder::new(bytes)?)
     }
@@ -110,8 +110,8 @@ impl Field for String {
     }
 }
 
-/// Declares a message: `"pkg/msg/Type" "pkg/Type" Name { field: type, … }`. Doc comments of fields become comments
-/// of the schema, so that a log explains itself.
+/// Declares a message: `"pkg/msg/Type" "pkg/Type" Name { field: type, … }`. Doc comments of fields become comments of
+/// the schema, so that a log is self-describing.
 macro_rules! message {
     ($(#[$meta:meta])* $schema:literal $ros:literal $name:ident {
         $($(#[doc = $doc:literal])* $field:ident: $type:ty,)*
@@ -131,7 +131,7 @@ macro_rules! message {
             fn get(
                 from: &mut $crate::recording::cdr::Decoder<'_>,
             ) -> Result<Self, $crate::recording::cdr::CdrError> {
-                // Fields of a struct literal are evaluated in the order they are written: the wire's.
+                // Fields of a struct literal are evaluated in the order written: the wire's.
                 Ok(Self { $($field: $crate::recording::wire::Field::get(from)?,)* })
             }
             fn define(known: &mut $crate::recording::wire::Definitions) {

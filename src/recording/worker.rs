@@ -1,4 +1,4 @@
-//! What the recorder thread does, one step at a time.
+//! The steps of the recorder thread.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -10,26 +10,26 @@ use std::time::Duration;
 
 use mcap::{McapError, McapResult};
 
-use super::executes::{Execute, Executes};
+use super::disk_space;
 use super::log_writer::LogWriter;
-use super::notes::Noted;
+use super::notes::NoteReceiver;
+use super::pending_executes::{Execute, PendingExecutes};
 use super::recorder::{Note, Notice, RecordError, RecorderConfig, RecorderStats};
-use super::space;
 use super::tick_log::TickLog;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::telemetry::describe::{Described, Names, describe};
 use crate::telemetry::{Event, Outcome, Sample, TickSample};
 
-/// How often the disk is asked to keep what it was given, against a loss of power.
+/// Period of syncing the file to disk, against a loss of power.
 const SYNC_EVERY: Duration = Duration::from_secs(1);
-/// How often it is looked whether the disk has room and the log is still there.
+/// Period of checking the disk's free space and the log file.
 const WATCH_EVERY: Duration = Duration::from_millis(500);
 
-/// Samples and notes in, log and notices out. A test steps it on a clock of its own.
+/// Turns samples and notes into log and notices. Tests step it with their own clock.
 pub(super) struct Worker<W: Write + Seek, F> {
     path: PathBuf,
     log: Option<LogWriter<W>>,
-    /// The file once more, to be told to keep what it has.
+    /// A second handle of the file, for syncing.
     disk: Option<File>,
     synced: Mono,
     min_free: u64,
@@ -37,9 +37,9 @@ pub(super) struct Worker<W: Write + Seek, F> {
     ticks: TickLog,
     names: Names,
     ring: rtrb::Consumer<Sample>,
-    notes: Noted,
-    /// Trajectories that the tick has not answered yet.
-    executes: Executes,
+    notes: NoteReceiver,
+    /// Trajectory requests that the tick has not answered yet.
+    executes: PendingExecutes,
     on_notice: F,
     stats: Arc<RecorderStats>,
     ended: Option<RecordError>,
@@ -51,7 +51,7 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         sink: Option<W>,
         disk: Option<File>,
         ring: rtrb::Consumer<Sample>,
-        notes: Noted,
+        notes: NoteReceiver,
         on_notice: F,
         stats: Arc<RecorderStats>,
     ) -> Result<Self, RecordError> {
@@ -78,17 +78,17 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             names,
             ring,
             notes,
-            executes: Executes::default(),
+            executes: PendingExecutes::default(),
             on_notice,
             stats,
             ended: None,
         })
     }
 
-    /// Takes everything there is and logs it.
+    /// Takes all pending samples and notes and logs them.
     pub(super) fn step(&mut self, now: Mono) {
-        // Counted before the notes are taken: a request is noted before it is told to the tick, so the note of every
-        // request that these samples answer is there, and stands before the answer in the log.
+        // Counted before the notes are taken: a request is noted before it is passed to the tick, so the note of every
+        // request that these samples answer is present, and is logged before the answer.
         let waiting = self.ring.slots();
         let notes = self.notes.take();
         let lost = self.notes.lost();
@@ -97,8 +97,8 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             (self.on_notice)(Notice::Lost(lost.min(u64::from(u32::MAX)) as u32));
         }
         let samples: Vec<Sample> = self.ring.read_chunk(waiting).into_iter().flatten().collect();
-        // Events are told before anything waits for the disk.
-        let mut described = self.tell_events(&samples);
+        // Events are reported before any disk access.
+        let mut described = self.report_events(&samples);
         if let Err(e) = self.write(notes, &samples, &mut described, now) {
             self.stop_log(write_error(&self.path, &e));
         } else if now.since(self.watched) >= WATCH_EVERY {
@@ -107,16 +107,16 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         }
     }
 
-    /// Ends the log while there is still room to close it, or when it is not there any more.
+    /// Ends the log while there is space to close it, or when the file is gone.
     fn watch(&mut self) {
         let Some((file, _)) = self.disk.as_ref().zip(self.log.as_ref()) else { return };
-        let Err(reason) = space::watch(&self.path, file, self.min_free) else { return };
+        let Err(reason) = disk_space::watch(&self.path, file, self.min_free) else { return };
         let closed = self.log.take().map(|log| log.finish().map(drop)).transpose();
-        // What the room is too small for is the worse news.
+        // A full disk is the more important error.
         self.stop_log(closed.map_or_else(|e| write_error(&self.path, &e), |_| reason));
     }
 
-    fn tell_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
+    fn report_events(&mut self, samples: &[Sample]) -> VecDeque<Described> {
         let mut all = VecDeque::new();
         for sample in samples {
             if let Sample::Event(tick, event) = sample {
@@ -177,7 +177,7 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         }
     }
 
-    /// A request has its answer: one to follow a trajectory is logged now.
+    /// Handles a request's answer: a trajectory request is logged now.
     fn answered(&mut self, id: u64, outcome: &Outcome) -> McapResult<()> {
         let Some((log, execute)) = self.log.as_mut().zip(self.executes.answered(id)) else { return Ok(()) };
         let taken_on = matches!(outcome, Outcome::Accepted);
@@ -208,7 +208,7 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         self.ended = Some(error);
     }
 
-    /// Takes what is left and closes the log.
+    /// Takes the rest and closes the log.
     pub(super) fn finish(mut self, now: Mono) -> Result<(), RecordError> {
         self.step(now);
         for (id, execute) in std::mem::take(&mut self.executes).into_unanswered() {
@@ -242,7 +242,7 @@ mod tests {
     use std::io::{Cursor, Error, ErrorKind, SeekFrom};
     use std::sync::Mutex;
 
-    /// A disk with little room left.
+    /// A disk with little space left.
     struct Full {
         inner: Cursor<Vec<u8>>,
         room: usize,
@@ -280,8 +280,8 @@ mod tests {
             wall: WallOffset::of(Mono::ZERO, 0),
             min_free: 0,
         };
-        let told = Arc::new(Mutex::new(Vec::new()));
-        let sink = told.clone();
+        let notices = Arc::new(Mutex::new(Vec::new()));
+        let sink = notices.clone();
         let on_notice = move |n: Notice<'_>| match n {
             Notice::Stopped(e) => sink.lock().unwrap().push(e.to_string()),
             Notice::Event { described, .. } => sink.lock().unwrap().push(described.kind.to_owned()),
@@ -300,8 +300,8 @@ mod tests {
         assert_eq!(producer.slots(), 64);
         assert!(stats.failed.load(Ordering::Relaxed));
         let message = "the log run.mcap ends here: No space left on device\n\
-                       hint: see whether the disk is full; --no-record runs without a log";
-        assert_eq!(*told.lock().unwrap(), [message, "degraded"]);
+                       hint: check whether the disk is full; --no-record runs without a log";
+        assert_eq!(*notices.lock().unwrap(), [message, "degraded"]);
         assert_eq!(worker.finish(Mono(1)).unwrap_err().to_string(), message);
     }
 }

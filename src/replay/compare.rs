@@ -1,4 +1,4 @@
-//! Compares what came out of a tick that was run again with what the log says came out then.
+//! Compares the outputs of a replayed tick with those in the log.
 
 use std::fmt;
 
@@ -18,9 +18,9 @@ use crate::telemetry::describe::{Described, Names, describe};
 pub enum Value {
     /// A number, and its bits.
     Number {
-        /// The number; null in JSON where it is not finite.
+        /// A number and its bits.
         value: f64,
-        /// Its bits as an IEEE 754 double, in hexadecimal.
+        /// IEEE 754 bits of the double, in hexadecimal.
         bits: String,
     },
     /// Anything else.
@@ -47,14 +47,14 @@ impl fmt::Display for Value {
     }
 }
 
-/// The first thing that came out differently.
+/// The first difference.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Difference {
-    /// The tick.
+    /// Index of the tick.
     pub tick: u64,
-    /// When it was [s after the first tick].
+    /// Time [s after the first tick].
     pub time: f64,
-    /// What differs, e.g. `position command`.
+    /// The differing quantity, e.g. `position command`.
     pub what: &'static str,
     /// The arm concerned.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -62,16 +62,16 @@ pub struct Difference {
     /// The joint concerned.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub joint: Option<String>,
-    /// What the log says.
+    /// Logged value.
     pub logged: Value,
-    /// What came out now.
+    /// Replayed value.
     pub rerun: Value,
 }
 
-/// Something that differs, of which arm and of which of its joints.
-type Found = (&'static str, Option<(usize, Option<usize>)>, Value, Value);
+/// A differing quantity, its arm and joint, and both values.
+type Mismatch = (&'static str, Option<(usize, Option<usize>)>, Value, Value);
 
-/// What to compare with.
+/// Compares ticks with a log.
 #[derive(Debug)]
 pub(super) struct Comparison<'a> {
     names: &'a Names,
@@ -82,7 +82,7 @@ impl<'a> Comparison<'a> {
         Self { names: &recorded.names }
     }
 
-    /// The first difference, if there is one; `time` is the tick's time after the first tick [ns].
+    /// Returns the first difference; `time` is the tick's time after the first tick [ns].
     pub fn compare(&self, logged: &LoggedTick, output: &TickOutput, time: u64) -> Option<Difference> {
         let (what, place, then, now) = self.arms(logged, output).or_else(|| self.events(&logged.events, output))?;
         let arm = place.and_then(|(arm, joint)| Some((self.names.arms.get(arm)?, joint)));
@@ -97,7 +97,7 @@ impl<'a> Comparison<'a> {
         })
     }
 
-    fn arms(&self, logged: &LoggedTick, output: &TickOutput) -> Option<Found> {
+    fn arms(&self, logged: &LoggedTick, output: &TickOutput) -> Option<Mismatch> {
         let mut first = 0;
         let arms = logged.arms.iter().zip(&output.arms).zip(&self.names.arms).enumerate();
         for (i, ((then, now), names)) in arms {
@@ -157,14 +157,14 @@ impl<'a> Comparison<'a> {
         None
     }
 
-    fn events(&self, logged: &[Event], output: &TickOutput) -> Option<Found> {
+    fn events(&self, logged: &[Event], output: &TickOutput) -> Option<Mismatch> {
         if logged.is_empty() && output.events.is_empty() {
             return None;
         }
         let count = logged.len().max(output.events.len());
         (0..count).find_map(|k| {
             let (then, now) = (logged.get(k), output.events.get(k).map(|event| describe(event, self.names)));
-            let same = then.zip(now.as_ref()).is_some_and(|(then, now)| is_told_by(now, then));
+            let same = then.zip(now.as_ref()).is_some_and(|(then, now)| is_reported_by(now, then));
             (!same).then(|| {
                 let then = then.map_or(Value::text(""), |e| Value::text(&e.text));
                 ("event", None, then, now.map_or(Value::text(""), |d| Value::Text(d.text)))
@@ -173,8 +173,8 @@ impl<'a> Comparison<'a> {
     }
 }
 
-/// Whether a message tells this event. The sentence may be another one: other versions have other words.
-fn is_told_by(now: &Described, then: &Event) -> bool {
+/// Returns whether a message reports this event. The sentence may differ between versions.
+fn is_reported_by(now: &Described, then: &Event) -> bool {
     let name = |name: &Option<String>| name.clone().unwrap_or_default();
     let bits = |values: &[f64]| values.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
     now.kind == then.kind

@@ -1,22 +1,22 @@
-//! A curve through what was commanded tick by tick, which is no faster and no steeper than that was.
+//! Fits a curve to commands recorded per tick, with no higher velocity or acceleration than theirs.
 //!
-//! The commands are the control points of a quadratic B-spline: its velocity runs in straight lines through the
-//! differences of the commands, so velocity and acceleration stay within those that were commanded, and the curve
-//! passes each command by an eighth of what its second difference is (0.025 mrad at 2 rad/s² and 100 Hz). Between the
-//! middles of two ticks it is a parabola, which points with positions and velocities reproduce exactly. Points that a
-//! cubic between their neighbours reproduces as well are left out.
+//! The commands are the control points of a quadratic B-spline: its velocity is piecewise linear through the
+//! differences of the commands, so velocity and acceleration stay within the commanded ones, and the curve deviates
+//! from each command by an eighth of its second difference (0.025 mrad at 2 rad/s² and 100 Hz). Between the middles of
+//! two ticks it is a parabola, which points with positions and velocities reproduce exactly. Points that a cubic
+//! between their neighbours reproduces are left out.
 
 use super::motion::RecordedMotion;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};
 
-/// A point is left out if the curve without it is this close [rad].
-const CLOSE: f64 = 5e-7;
-/// By this part a curve without some points may be faster or steeper.
+/// Maximum deviation from leaving out a point [rad].
+const TOLERANCE: f64 = 5e-7;
+/// Relative excess of velocity or acceleration allowed by leaving out points.
 const SLACK: f64 = 1e-4;
-/// Most ticks between two points.
-const LONGEST: usize = 4096;
+/// Maximum number of ticks between two points.
+const MAX_TICKS: usize = 4096;
 
-/// The curve, from rest to rest.
+/// Returns the curve, from rest to rest.
 pub fn fit(motion: &RecordedMotion) -> JointTrajectory {
     let (rows, dt) = (&motion.rows, motion.period);
     let mut knots = Vec::with_capacity(rows.len() + 1);
@@ -47,13 +47,14 @@ struct Knot {
     velocities: Vec<f64>,
 }
 
-/// The knots that the curve needs: from each on, the next is as far away as it can be.
+/// Returns the knots that the curve needs: each as far from the previous one as possible.
 fn needed(knots: &[Knot], dt: f64) -> Vec<usize> {
     let mut kept = vec![0];
     let mut a = 0;
     while a + 1 < knots.len() {
-        let furthest = (knots.len() - 1).min(a + LONGEST);
-        // In steps that double, then in halves: what is reproduced from afar is from near as well, nearly always.
+        let furthest = (knots.len() - 1).min(a + MAX_TICKS);
+        // In steps that double, then bisection: a span that is reproduced nearly always means that shorter ones are
+        // too.
         let (mut good, mut step) = (a + 1, 2);
         while a + step <= furthest && is_reproduced(knots, a, a + step, dt) {
             good = a + step;
@@ -70,7 +71,7 @@ fn needed(knots: &[Knot], dt: f64) -> Vec<usize> {
     kept
 }
 
-/// Whether one cubic from knot `a` to knot `b` stands for all between them, for every joint.
+/// Returns whether one cubic from knot `a` to knot `b` reproduces all between them, for every joint.
 fn is_reproduced(knots: &[Knot], a: usize, b: usize, dt: f64) -> bool {
     let h = (b - a) as f64 * dt;
     (0..knots[a].positions.len()).all(|j| {
@@ -81,14 +82,14 @@ fn is_reproduced(knots: &[Knot], a: usize, b: usize, dt: f64) -> bool {
         let (mut fastest, mut steepest) = (v0.abs().max(v1.abs()), 0.0f64);
         for k in a..b {
             let (x, knot, next) = ((k - a) as f64 * dt, &knots[k], &knots[k + 1]);
-            if (p0 + x * (v0 + x * (c2 + x * c3)) - knot.positions[j]).abs() > CLOSE {
+            if (p0 + x * (v0 + x * (c2 + x * c3)) - knot.positions[j]).abs() > TOLERANCE {
                 return false;
             }
             fastest = fastest.max(knot.velocities[j].abs());
             steepest = steepest.max((next.velocities[j] - knot.velocities[j]).abs() / dt);
         }
         let (a0, a1) = (2.0 * c2, 2.0 * c2 + 6.0 * c3 * h);
-        // Where the acceleration changes its sign, the velocity is at its peak.
+        // Where the acceleration changes sign, the velocity has its peak.
         let peak = if a0 * a1 < 0.0 { v0 - 0.5 * a0 * a0 * h / (a1 - a0) } else { 0.0 };
         let within = |value: f64, most: f64| value.abs() <= most * (1.0 + SLACK) + 1e-9;
         within(a0, steepest) && within(a1, steepest) && within(peak, fastest)
@@ -109,7 +110,7 @@ mod tests {
         RecordedMotion { joints: make_joints("arm", rows[0].len()), period: DT, rows, lost: 0 }
     }
 
-    /// Furthest distance between the curve and what was commanded.
+    /// Returns the largest distance between the curve and the commands.
     fn distance(spline: &Spline, rows: &[Vec<f64>]) -> f64 {
         let mut out = vec![Sample::default(); spline.joints()];
         let mut cursor = Cursor::default();
@@ -122,7 +123,7 @@ mod tests {
         furthest
     }
 
-    /// Whatever a limiter lets through is within its limits as a curve too.
+    /// A motion within a limiter's limits stays within them as a curve.
     #[test]
     fn a_motion_within_limits_makes_a_curve_within_limits() {
         let (velocity, acceleration) = (1.5, 4.0);

@@ -1,5 +1,4 @@
-//! A log, tick by tick: what each tick read, what it was told, and what came of it, put together again from the
-//! messages of the log.
+//! Reassembles a log tick by tick: what each tick read, its requests, and its outputs.
 
 use std::collections::BTreeMap;
 
@@ -14,32 +13,32 @@ use crate::recording::cdr::{CdrError, Decoder, Encoder};
 use crate::recording::messages::{ArmInput, ArmOutput, Event, JointState, Text, Tick};
 use crate::recording::wire::{Field, Message};
 
-/// Length of what stands before every message [bytes].
+/// Length of the header before every message [bytes].
 const HEADER: usize = 4;
-/// Where its time stamp ends [bytes].
+/// End of its time stamp [bytes].
 const STAMP_END: usize = HEADER + 8;
 
-/// What a message is about.
+/// Subject of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Topic {
     /// Joint values read.
     States,
     /// Joint values commanded.
     Commands,
-    /// Whatever else was read of an arm.
+    /// Messages on `/dimos/inputs/<arm>`: the rest of an arm's state.
     Input(usize),
-    /// Whatever else was wanted of an arm.
+    /// Messages on `/dimos/outputs/<arm>`: the rest of an arm's command.
     Output(usize),
     /// The end of a tick.
     Tick,
-    /// Something happened.
+    /// An event.
     Event,
-    /// Something was asked.
+    /// A request.
     Request,
 }
 
 impl Topic {
-    /// What a topic of the log is about; `None`: nothing that a tick read or made.
+    /// Returns the subject of a topic; `None` if it is no input or output of a tick.
     pub fn of(topic: &str, recorded: &Recorded) -> Option<Self> {
         let arm = |id: &str| recorded.names.arms.iter().position(|arm| arm.hardware_id == id);
         Some(match topic {
@@ -59,31 +58,31 @@ impl Topic {
 /// One arm of a tick.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LoggedArm {
-    /// The state as the tick read it. Where the tick estimated the velocities, it says that it has none …
+    /// The state as the tick read it, without velocities that the tick estimated …
     pub state: ArmState,
-    /// … and they are here [rad/s].
+    /// … which are here [rad/s].
     pub velocity: Joints,
-    /// What it wants of the arm, besides joint values: as of the last message.
+    /// Command besides joint values, as of the latest message.
     pub output: ArmOutput,
-    /// Whether that message is of this tick.
+    /// Whether that message belongs to this tick.
     pub output_is_new: bool,
 }
 
 /// A tick of a log.
 #[derive(Debug, Default)]
 pub(super) struct LoggedTick {
-    /// Its message.
+    /// Message on `/dimos/tick`.
     pub tick: Tick,
-    /// Its arms.
+    /// Arms.
     pub arms: Vec<LoggedArm>,
     /// Commanded joint values.
     pub commands: JointState,
-    /// What happened in it.
+    /// Events.
     pub events: Vec<Event>,
 }
 
 impl LoggedTick {
-    /// The times it worked with.
+    /// Returns the tick's times.
     pub fn time(&self) -> TickTime {
         TickTime {
             now: Mono(self.tick.deadline_ns),
@@ -95,16 +94,16 @@ impl LoggedTick {
     }
 }
 
-/// Puts ticks together.
+/// Assembles ticks from messages.
 #[derive(Debug)]
 pub(super) struct Assembler {
     joints: Vec<String>,
     /// First joint and number of joints of each arm.
     spans: Vec<(usize, usize)>,
-    /// The tick that is being put together, or is complete but for its events.
+    /// The tick under assembly, or complete except for its events.
     pub logged: LoggedTick,
     closed: bool,
-    /// Frame and joint names as they stand in every message with joint values: read once, then compared.
+    /// Frame and joint names of messages with joint values: decoded once, then compared.
     names: Vec<u8>,
     /// Joint values read, until the tick is closed.
     states: JointState,
@@ -132,17 +131,17 @@ impl Assembler {
         }
     }
 
-    /// Whether a message on this topic belongs to a later tick, so that the present one is complete.
+    /// Returns whether a message on this topic belongs to a later tick, so that the current one is complete.
     pub fn completes(&self, topic: Topic) -> bool {
         self.closed && !matches!(topic, Topic::Event | Topic::Request)
     }
 
-    /// Whether there is a tick that misses nothing but, perhaps, events.
+    /// Returns whether the tick is complete except, perhaps, for events.
     pub fn is_closed(&self) -> bool {
         self.closed
     }
 
-    /// Makes room for the next tick.
+    /// Prepares for the next tick.
     pub fn next(&mut self) {
         self.closed = false;
         self.logged.events.clear();
@@ -151,7 +150,7 @@ impl Assembler {
         self.states = JointState::default();
     }
 
-    /// Takes a message. An error says what is wrong with it.
+    /// Takes a message. The error describes what is wrong with it.
     pub fn take(&mut self, topic: Topic, bytes: &[u8]) -> Result<(), String> {
         self.decode(topic, bytes).map_err(|e| format!("{topic:?}: {e}"))
     }
@@ -162,11 +161,11 @@ impl Assembler {
             Topic::Commands => self.logged.commands = self.joint_values(bytes)?,
             Topic::Input(arm) => {
                 let input: ArmInput = message(bytes)?;
-                let arm = self.logged.arms.get_mut(arm).ok_or("no such arm")?;
+                let arm = self.logged.arms.get_mut(arm).ok_or("unknown arm")?;
                 read_input(&input, &mut arm.state)?;
             }
             Topic::Output(arm) => {
-                let arm = self.logged.arms.get_mut(arm).ok_or("no such arm")?;
+                let arm = self.logged.arms.get_mut(arm).ok_or("unknown arm")?;
                 (arm.output, arm.output_is_new) = (message(bytes)?, true);
             }
             Topic::Tick => {
@@ -189,16 +188,16 @@ impl Assembler {
         let values = if known { self.lists(bytes).map_err(|e| e.to_string())? } else { self.first_values(bytes)? };
         let fits = |list: &[f64]| list.is_empty() || list.len() == self.joints.len();
         if ![&values.position, &values.velocity, &values.effort].into_iter().all(|list| fits(list)) {
-            return Err("it has not one value for each joint".to_owned());
+            return Err("the number of values differs from the number of joints".to_owned());
         }
         Ok(values)
     }
 
-    /// A message with names that were not seen before.
+    /// Decodes a message whose names are new.
     fn first_values(&mut self, bytes: &[u8]) -> Result<JointState, String> {
         let values: JointState = message(bytes)?;
         if values.name != self.joints {
-            return Err("its joints are not those of the run".to_owned());
+            return Err("the joints differ from those of the run".to_owned());
         }
         let mut head = Encoder::default();
         values.header.put(&mut head);
@@ -207,7 +206,7 @@ impl Assembler {
         Ok(values)
     }
 
-    /// The lists of a message whose names are known.
+    /// Decodes the lists of a message whose names are known.
     fn lists(&self, bytes: &[u8]) -> Result<JointState, CdrError> {
         let mut from = Decoder::new(bytes)?;
         from.skip(STAMP_END - HEADER + self.names.len())?;
@@ -215,7 +214,7 @@ impl Assembler {
         Ok(JointState { position: list()?, velocity: list()?, effort: list()?, ..JointState::default() })
     }
 
-    /// The joint values of a state stand in another message than the rest of it.
+    /// The joint values of a state are in a separate message.
     fn fill_in_values(&mut self) {
         for (arm, &(first, dof)) in self.logged.arms.iter_mut().zip(&self.spans) {
             let state = &mut arm.state;
@@ -230,16 +229,16 @@ impl Assembler {
         }
     }
 
-    /// The requests that the tick was told, in their order. An error names one that cannot be told again.
-    pub fn requests(&mut self, told: &mut Vec<Envelope>) -> Result<(), String> {
-        told.clear();
-        // What the tick starts by itself is answered with the number 0.
+    /// Appends the tick's requests in order. The error names a request that cannot be repeated.
+    pub fn requests(&mut self, out: &mut Vec<Envelope>) -> Result<(), String> {
+        out.clear();
+        // The tick answers its own starts with id 0.
         for id in self.logged.events.iter().flat_map(|e| &e.request).copied().filter(|id| *id != 0) {
             let request = match self.waiting.remove(&id) {
                 Some(request) => request.map_err(|e| format!("request {id} cannot be read: {e}"))?,
                 None => return Err(format!("request {id} is missing")),
             };
-            told.push(Envelope { id, request });
+            out.push(Envelope { id, request });
         }
         Ok(())
     }
@@ -249,17 +248,17 @@ fn message<M: Message>(bytes: &[u8]) -> Result<M, String> {
     M::decode(bytes).map_err(|e| e.to_string())
 }
 
-/// The values of an arm's joints out of those of all.
+/// Returns the values of an arm's joints from those of all.
 pub(super) fn values(list: &[f64], first: usize, dof: usize) -> Option<Joints> {
     list.get(first..first + dof).map(crate::joint::joints_of)
 }
 
-/// What a state says besides joint values. Efforts, gripper, pose and wrench are left out: no tick uses them.
+/// Reads a state besides joint values. Skips efforts, gripper, pose and wrench, which no tick uses.
 fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
     *state = ArmState {
         seq: input.seq,
         stamp: Mono(input.stamp_ns),
-        // The tick is to estimate again what it estimated then.
+        // The tick estimates again what it estimated then.
         velocity_source: match source(&input.velocity_source)? {
             VelocitySource::Estimated => VelocitySource::Absent,
             other => other,
@@ -279,20 +278,20 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
 
 fn interference(name: &str) -> Result<Interference, String> {
     let all = [Interference::None, Interference::Mode, Interference::Power, Interference::Stop];
-    all.into_iter().find(|i| i.name() == name).ok_or_else(|| format!("{name:?} is no interference"))
+    all.into_iter().find(|i| i.name() == name).ok_or_else(|| format!("{name:?} is not an interference"))
 }
 
 fn source(name: &str) -> Result<VelocitySource, String> {
     let all = [VelocitySource::Absent, VelocitySource::Measured, VelocitySource::Estimated];
-    all.into_iter().find(|s| s.name() == name).ok_or_else(|| format!("{name:?} is no source of velocities"))
+    all.into_iter().find(|s| s.name() == name).ok_or_else(|| format!("{name:?} is not a source of velocities"))
 }
 
 fn link(name: &str) -> Result<Link, String> {
     let all = [Link::Down, Link::Up, Link::Stale, Link::Faulted];
-    all.into_iter().find(|l| l.name() == name).ok_or_else(|| format!("{name:?} is no state of a connection"))
+    all.into_iter().find(|l| l.name() == name).ok_or_else(|| format!("{name:?} is not a connection state"))
 }
 
-/// A control mode by its name.
+/// Returns a control mode by name.
 fn mode(name: &str) -> Result<ControlMode, String> {
     let all = [
         ControlMode::Position,
@@ -303,5 +302,5 @@ fn mode(name: &str) -> Result<ControlMode, String> {
         ControlMode::CartesianVelocity,
         ControlMode::Impedance,
     ];
-    all.into_iter().find(|m| m.name() == name).ok_or_else(|| format!("{name:?} is no control mode"))
+    all.into_iter().find(|m| m.name() == name).ok_or_else(|| format!("{name:?} is not a control mode"))
 }

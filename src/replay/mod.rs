@@ -1,4 +1,4 @@
-//! Logs put to use again: run once more through the coordinator and compared, or as a motion for arms.
+//! Uses of logs: replay through the coordinator with comparison, or as a motion for arms.
 //!
 //! ```text
 //! log ─▶ recorded (who ran) ─▶ inputs (tick by tick) ─▶ verify: Coordinator::tick ─▶ the same commands?

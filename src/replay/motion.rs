@@ -1,7 +1,7 @@
-//! The motion in a log: where its joints were commanded to be, tick by tick, else where they were.
+//! The motion in a log: commanded joint positions per tick, otherwise measured ones.
 //!
-//! Time is control time: tick number times period, as for every trajectory. Where a joint is commanded by velocity or
-//! not at all, its measured positions are taken, averaged over ±0.1 s (which makes no motion faster or steeper), and
+//! Time is control time: tick index times period, as for every trajectory. Where a joint is commanded by velocity or
+//! not at all, its measured positions are averaged over ±0.1 s (which increases neither velocity nor acceleration), and
 //! the step between measured and commanded positions is faded out over a second.
 
 use std::path::Path;
@@ -10,28 +10,28 @@ use super::recorded::{Recorded, RecordedError};
 use crate::recording::messages::JointState;
 use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
 
-/// Measured positions are averaged over so much time before and after [s].
-const AVERAGED: f64 = 0.1;
+/// Measured positions are averaged over this time before and after [s].
+const AVERAGING_TIME: f64 = 0.1;
 /// The step between two sources is faded out over this time [s].
-const FADE: f64 = 1.0;
+const FADE_TIME: f64 = 1.0;
 
-/// Longest gap that a straight line may bridge [s].
-const LONGEST_GAP: f64 = 1.0;
+/// Maximum gap bridged by a straight line [s].
+const MAX_GAP: f64 = 1.0;
 
-/// The motion of a log's joints.
+/// Motion of a log's joints.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordedMotion {
-    /// The joints that there is anything of.
+    /// Joints with recorded positions.
     pub joints: Vec<String>,
     /// Time between two rows [s].
     pub period: f64,
     /// Positions [rad], one row per tick, one value per joint.
     pub rows: Vec<Vec<f64>>,
-    /// Ticks that are missing in the log; they are bridged in a straight line.
+    /// Ticks missing in the log; bridged by straight lines.
     pub lost: u64,
 }
 
-/// What a tick says of each joint.
+/// Joint values of a tick.
 struct Row {
     tick: u64,
     measured: Vec<f64>,
@@ -39,8 +39,8 @@ struct Row {
 }
 
 impl RecordedMotion {
-    /// Reads the motion between two Unix times [ns]. Where anything is commanded by position, it begins and ends with
-    /// that.
+    /// Reads the motion between two Unix times [ns]. If there are position commands, it begins and ends with the first
+    /// and last of them.
     pub fn read(path: &Path, from: u64, to: u64) -> Result<Self, RecordedError> {
         let recorded = Recorded::open(path)?;
         let names = recorded.joints();
@@ -51,9 +51,9 @@ impl RecordedMotion {
         let last = rows.iter().rposition(is_commanded).unwrap_or(whole.1);
         let rows = rows.get(first..=last).unwrap_or_default();
         let period = 1.0 / recorded.config.rate;
-        let gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > LONGEST_GAP + period;
+        let gap = |w: &[Row]| w[1].tick.saturating_sub(w[0].tick) as f64 * period > MAX_GAP + period;
         if let Some(w) = rows.windows(2).find(|w| gap(w)) {
-            let what = format!("ticks {} to {} are missing, too many to be bridged", w[0].tick + 1, w[1].tick - 1);
+            let what = format!("ticks {} to {} are missing: too long a gap to bridge", w[0].tick + 1, w[1].tick - 1);
             return Err(RecordedError::Unfit { path: path.to_owned(), what });
         }
         let ticks: u64 = rows.windows(2).map(|w| w[1].tick.saturating_sub(w[0].tick).saturating_sub(1)).sum();
@@ -87,25 +87,25 @@ fn rows(path: &Path, joints: usize, from: u64, to: u64) -> Result<Vec<Row>, Reco
                 }
                 _ => {}
             },
-            // What stands before a cut can be followed all the same.
+            // The part before a cut is usable.
             Ok(None) | Err(ReplayError::Cut { .. }) => return Ok(rows),
             Err(e) => return Err(e.into()),
         }
     }
 }
 
-/// One joint's positions, tick by tick without gaps; `None` if it has any tick without a position.
+/// Returns one joint's positions per tick without gaps; `None` if a tick lacks a position.
 fn column(rows: &[Row], joint: usize, period: f64) -> Option<Vec<f64>> {
     let commanded = bridged(rows, |row| row.commanded[joint]);
-    let measured = averaged(&bridged(rows, |row| row.measured[joint]), (AVERAGED / period).round() as usize);
-    let steps = (FADE / period).max(1.0);
+    let measured = averaged(&bridged(rows, |row| row.measured[joint]), (AVERAGING_TIME / period).round() as usize);
+    let steps = (FADE_TIME / period).max(1.0);
     let mut out: Vec<f64> = Vec::with_capacity(commanded.len());
     let (mut offset, mut age, mut by_command) = (0.0, 0.0, None);
     for (k, (c, m)) in commanded.iter().zip(&measured).enumerate() {
         let is_commanded = c.is_finite();
         let source = if is_commanded { c } else { m };
         if let (Some(last), true) = (out.last(), by_command.is_some_and(|before| before != is_commanded)) {
-            // Measured positions are known before they are needed, so a joint that moves goes on moving.
+            // Measured positions are known ahead of time, so a moving joint keeps moving.
             let before = if is_commanded { *c } else { measured[k - 1] };
             (offset, age) = (last - before, 0.0);
         }
@@ -122,7 +122,7 @@ fn column(rows: &[Row], joint: usize, period: f64) -> Option<Vec<f64>> {
     (!out.is_empty()).then_some(out)
 }
 
-/// Values tick by tick; ticks that are missing lie on a straight line.
+/// Returns values per tick, interpolated at missing ticks.
 fn bridged(rows: &[Row], value: impl Fn(&Row) -> f64) -> Vec<f64> {
     let mut out: Vec<f64> = Vec::with_capacity(rows.len());
     for pair in rows.windows(2) {
@@ -135,7 +135,7 @@ fn bridged(rows: &[Row], value: impl Fn(&Row) -> f64) -> Vec<f64> {
     out
 }
 
-/// Weighted averages: the weight falls in a straight line to both sides.
+/// Returns weighted averages with a triangular window.
 fn averaged(values: &[f64], width: usize) -> Vec<f64> {
     let last = values.len().saturating_sub(1) as isize;
     let box_once = |values: &[f64], ahead: usize, behind: usize| -> Vec<f64> {
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn commanded_positions_are_taken_as_they_are() {
+    fn commanded_positions_are_used_unchanged() {
         let rows: Vec<Row> = (0..50).map(|k| row(k, 7.0, 0.01 * (k as f64).sin())).collect();
         let c = column(&rows, 0, 0.01).unwrap();
         assert!(c.iter().zip(&rows).all(|(c, row)| *c == row.commanded[0]));

@@ -1,5 +1,5 @@
-//! A recorded motion made ready for the arms of a blueprint: which task follows which part of it, where each arm
-//! begins, and whether the limits allow it. What happens then: `cli::replay::onto`.
+//! Prepares a recorded motion for the arms of a blueprint: which task follows which part, where each arm starts, and
+//! whether its limits allow the motion. `cli::replay::onto` executes it.
 
 use serde::Serialize;
 use thiserror::Error;
@@ -9,30 +9,32 @@ use crate::control::config::CoordinatorConfig;
 use crate::control::limit::Bounds;
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryError, TrajectoryPoint};
 
-/// Most values in one trajectory: it is checked, logged and kept in memory as a whole.
-const MOST_VALUES: usize = 300_000;
-/// By this part limits may be exceeded: rounding.
+/// Maximum values in one trajectory: it is checked, logged and held in memory as a whole.
+const MAX_VALUES: usize = 300_000;
+/// Factor by which limits may be exceeded, for rounding.
 const SLACK: f64 = 1.001;
 
-/// Why a motion cannot be followed by the arms of a blueprint.
+/// Why the arms of a blueprint cannot follow a motion.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum OntoError {
-    /// There is no motion.
-    #[error("the log has no motion to follow: no joint has a position in every tick\nhint: choose another part of it")]
-    Nothing,
-    /// A joint is in the log and not in the blueprint.
+    /// The log has no motion.
     #[error(
-        "the log moves {joint}, which the blueprint {blueprint} does not have\nhint: joints are matched by name; it has {has}"
+        "the log has no motion to follow: no joint has a position in every tick\nhint: select another part of the log"
+    )]
+    Nothing,
+    /// A joint of the log is not in the blueprint.
+    #[error(
+        "the log moves {joint}, which the blueprint {blueprint} does not have\nhint: joints are matched by name; the blueprint has {has}"
     )]
     NoSuchJoint {
         /// The joint.
         joint: String,
         /// The blueprint.
         blueprint: String,
-        /// The joints that it has.
+        /// The joints of the blueprint.
         has: String,
     },
-    /// No task can follow it.
+    /// No task can follow the motion.
     #[error(
         "no trajectory task of the blueprint covers the joints of {arm}\n\
          hint: add one: `tasks: [{{name: traj_{arm}, type: trajectory, joint_names: {{hardware: {arm}}}}}]`"
@@ -41,32 +43,32 @@ pub enum OntoError {
         /// The arm.
         arm: String,
     },
-    /// It is too long.
+    /// The motion is too long.
     #[error(
-        "the motion has {0} values, and may have {MOST_VALUES}\nhint: choose a part of it with --start-offset and --duration"
+        "the motion has {0} values (limit {MAX_VALUES})\nhint: select a part of it with --start-offset and --duration"
     )]
     TooLong(usize),
-    /// It is no trajectory.
-    #[error("the motion cannot be followed: {0}\nhint: choose another part of the log")]
+    /// The motion is not a valid trajectory.
+    #[error("the arms cannot follow the motion: {0}\nhint: select another part of the log")]
     Trajectory(#[from] TrajectoryError),
 }
 
-/// A limit that the motion would break.
+/// A limit that the motion exceeds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Broken {
+pub struct LimitViolation {
     /// The joint.
     pub joint: String,
     /// `position`, `velocity` or `acceleration`.
     pub limit: &'static str,
-    /// How far the motion goes, at its worst [rad, rad/s or rad/s²].
+    /// Maximum value of the motion [rad, rad/s or rad/s²].
     pub reaches: f64,
-    /// How far it may go.
+    /// The limit.
     pub allowed: f64,
-    /// By how much that is too far.
+    /// The excess.
     pub by: f64,
 }
 
-impl Broken {
+impl LimitViolation {
     fn unit(&self) -> &'static str {
         match self.limit {
             "position" => "rad",
@@ -76,11 +78,11 @@ impl Broken {
     }
 }
 
-impl std::fmt::Display for Broken {
+impl std::fmt::Display for LimitViolation {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { joint, limit, reaches, allowed, by } = self;
         let unit = self.unit();
-        write!(f, "{joint} would break its {limit} limit by {by:.4} {unit}: {reaches:.4} of {allowed:.4} {unit}")
+        write!(f, "{joint} exceeds its {limit} limit by {by:.4} {unit}: {reaches:.4} of {allowed:.4} {unit}")
     }
 }
 
@@ -93,36 +95,36 @@ pub struct Part {
     pub trajectory: JointTrajectory,
 }
 
-/// An arm on its way to where the motion begins.
+/// Motion of an arm to the start of the recorded motion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Approach {
     /// The arm.
     pub arm: String,
-    /// Where each of its joints goes [rad]; `None`: it stays where it is.
+    /// Target of each joint [rad]; `None`: the joint stays where it is.
     pub target: Vec<Option<f64>>,
 }
 
-/// A motion for the arms of a blueprint.
+/// Execution plan of a motion.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// First, one arm after the other goes to where it begins.
+    /// First, the arms move to the start one after the other.
     pub approaches: Vec<Approach>,
-    /// Then all parts begin together.
+    /// Then all parts start together.
     pub parts: Vec<Part>,
 }
 
-/// Whether an arm of a blueprint is a real one: neither emulated nor a plant in memory.
+/// Returns whether an arm of a blueprint is real: neither emulated nor a mock.
 pub fn is_real(arm: &Arm) -> bool {
     !arm.simulated && arm.adapter.transport != "memory"
 }
 
-/// Finds the arms and tasks of a blueprint that follow a motion, joint by joint of the same name.
+/// Assigns a motion to the arms and tasks of a blueprint, joint by joint of the same name.
 pub fn plan(blueprint: &Blueprint, motion: &JointTrajectory) -> Result<Plan, OntoError> {
     let Some(first) = motion.points.first().filter(|_| !motion.joint_names.is_empty()) else {
         return Err(OntoError::Nothing);
     };
     let size = motion.points.len() * motion.joint_names.len();
-    if size > MOST_VALUES {
+    if size > MAX_VALUES {
         return Err(OntoError::TooLong(size));
     }
     let all: Vec<&String> = blueprint.arms.iter().flat_map(|arm| &arm.joints).collect();
@@ -135,7 +137,7 @@ pub fn plan(blueprint: &Blueprint, motion: &JointTrajectory) -> Result<Plan, Ont
     let approaches = (blueprint.arms.iter().filter(driven))
         .map(|arm| Approach { arm: arm.hardware_id.clone(), target: arm.joints.iter().map(value).collect() })
         .collect();
-    // One task for all of it, so that nothing can fall apart; else one for each arm.
+    // Prefers one task for all joints, so that they stay synchronized; otherwise one per arm.
     let parts = match task_for(blueprint, &motion.joint_names, &all) {
         Some(task) => vec![Part { task, trajectory: motion.clone() }],
         None => (blueprint.arms.iter().filter(driven))
@@ -161,7 +163,7 @@ fn task_for(blueprint: &Blueprint, joints: &[String], all: &[&String]) -> Option
     blueprint.tasks.iter().find(covers).map(|task| task.name.clone())
 }
 
-/// The motion of some of its joints.
+/// Returns the motion of some of its joints.
 fn only(motion: &JointTrajectory, wanted: impl Fn(&String) -> bool) -> JointTrajectory {
     let chosen: Vec<usize> = (0..motion.joint_names.len()).filter(|&k| wanted(&motion.joint_names[k])).collect();
     let pick = |values: &[f64]| chosen.iter().filter_map(|&k| values.get(k).copied()).collect();
@@ -175,17 +177,17 @@ fn only(motion: &JointTrajectory, wanted: impl Fn(&String) -> bool) -> JointTraj
     JointTrajectory { joint_names: chosen.iter().map(|&k| motion.joint_names[k].clone()).collect(), points }
 }
 
-/// What the limits of the arms say to a motion.
+/// Result of checking a motion against the arms' limits.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Verdict {
-    /// Limits that it would break: positions first, then the worst of the others.
-    pub broken: Vec<Broken>,
-    /// So much of its speed would be within velocities and accelerations; 1 if it is already.
+pub struct LimitCheck {
+    /// Limits that it exceeds: positions first, then the others, worst first.
+    pub broken: Vec<LimitViolation>,
+    /// Speed factor at which velocities and accelerations stay within the limits; 1 if they already do.
     pub possible_rate: f64,
 }
 
-/// Compares a motion with the limits of all arms. `joints` are the names of all joints, arm by arm.
-pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Result<Verdict, TrajectoryError> {
+/// Checks a motion against the limits of all arms. `joints` are the names of all joints, arm by arm.
+pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Result<LimitCheck, TrajectoryError> {
     let limits = config.arms.iter().flat_map(|arm| (0..arm.dof).map(move |j| (&arm.limits, j)));
     let bounds: Vec<Bounds> = limits
         .map(|(l, j)| {
@@ -193,7 +195,7 @@ pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Resu
         })
         .collect();
     let mut positions = Vec::new();
-    let mut others: Vec<(f64, Broken)> = Vec::new();
+    let mut others: Vec<(f64, LimitViolation)> = Vec::new();
     let mut possible_rate = 1.0f64;
     for part in &plan.parts {
         let spline = Spline::new(&part.trajectory)?;
@@ -202,7 +204,7 @@ pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Resu
             let (Some(b), e) = (found, spline.extremes(k)) else { continue };
             let broken = |limit, reaches: f64, allowed: f64| {
                 let by = (reaches - allowed).abs();
-                Broken { joint: joint.clone(), limit, reaches, allowed, by }
+                LimitViolation { joint: joint.clone(), limit, reaches, allowed, by }
             };
             if e.lowest < b.lower - 1e-6 {
                 positions.push(broken("position", e.lowest, b.lower));
@@ -224,5 +226,5 @@ pub fn check(plan: &Plan, config: &CoordinatorConfig, joints: &[String]) -> Resu
     positions.sort_by(|a, b| b.by.total_cmp(&a.by));
     others.sort_by(|a, b| a.0.total_cmp(&b.0));
     let broken = positions.into_iter().chain(others.into_iter().map(|(_, broken)| broken)).collect();
-    Ok(Verdict { broken, possible_rate })
+    Ok(LimitCheck { broken, possible_rate })
 }

@@ -1,4 +1,4 @@
-//! What a log says about its run: which arms and tasks there were, and what their coordinator was made from.
+//! The run of a log: its arms, its tasks, and the configuration of its coordinator.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -10,49 +10,49 @@ use crate::joint::MAX_DOF;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError, attachment};
 use crate::telemetry::describe::{ArmNames, Names};
 
-/// Name of the attachment that a coordinator can be made from.
+/// Name of the attachment with the coordinator's configuration.
 pub const COORDINATOR: &str = "coordinator.json";
 
-/// Why a log cannot be run again.
+/// Why a log cannot be replayed.
 #[derive(Debug, Error)]
 pub enum RecordedError {
     /// It cannot be read.
     #[error(transparent)]
     Replay(#[from] ReplayError),
-    /// It does not say what its coordinator was made from.
+    /// It lacks the coordinator's configuration.
     #[error(
-        "the log {path} has no {COORDINATOR}: what its coordinator was made from is not known\n\
-         hint: only logs that `dimos run` wrote can be run again; `dimos replay` plays any"
+        "the log {path} has no {COORDINATOR}: the configuration of its coordinator is unknown\n\
+         hint: only logs written by `dimos run` can be replayed; `dimos replay` without --verify or --onto plays any log"
     )]
     NoCoordinator {
         /// The log.
         path: PathBuf,
     },
-    /// What it says does not fit together.
-    #[error("the log {path} cannot be run again: {what}\nhint: a program of another version may have written it")]
+    /// Its contents are inconsistent.
+    #[error("the log {path} cannot be replayed: {what}\nhint: another version of the program may have written it")]
     Unfit {
         /// The log.
         path: PathBuf,
-        /// What is wrong.
+        /// The problem.
         what: String,
     },
 }
 
-/// The run behind a log.
+/// The run of a log.
 #[derive(Debug, Clone)]
 pub struct Recorded {
     /// The log.
     pub path: PathBuf,
-    /// What its coordinator was made from.
+    /// Configuration of its coordinator.
     pub config: CoordinatorConfig,
     /// Names of arms, joints and tasks, in the order of the coordinator's indices.
     pub names: Names,
-    /// What the log says about itself.
+    /// Metadata of the log.
     pub info: LogInfo,
 }
 
 impl Recorded {
-    /// Reads what a log says about its run.
+    /// Reads the run of a log.
     pub fn open(path: &Path) -> Result<Self, RecordedError> {
         let info = LogReader::open(path)?.info().clone();
         let path = path.to_owned();
@@ -65,7 +65,7 @@ impl Recorded {
         }
     }
 
-    /// Names of all joints, arm by arm.
+    /// Returns the names of all joints, arm by arm.
     pub fn joints(&self) -> Vec<String> {
         self.names.arms.iter().flat_map(|arm| arm.joints.clone()).collect()
     }
@@ -73,18 +73,18 @@ impl Recorded {
 
 fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Result<Names, String> {
     if !(0.1..=1e5).contains(&config.rate) {
-        return Err(format!("its tick rate is {} Hz", config.rate));
+        return Err(format!("the tick rate is {} Hz", config.rate));
     }
     let joints: BTreeMap<String, Vec<String>> = metadata
         .get("arms")
         .and_then(|text| serde_json::from_str(text).ok())
-        .ok_or("its metadata does not name the joints")?;
+        .ok_or("the metadata does not name the joints")?;
     let mut arms = Vec::new();
     for arm in &config.arms {
         check_limits(arm)?;
         let joints = joints.get(&arm.name).filter(|j| j.len() == arm.dof);
         let joints =
-            joints.ok_or_else(|| format!("its metadata does not name the {} joints of {}", arm.dof, arm.name))?;
+            joints.ok_or_else(|| format!("the metadata does not name the {} joints of {}", arm.dof, arm.name))?;
         arms.push(ArmNames { hardware_id: arm.name.clone(), joints: joints.clone() });
     }
     let all: usize = config.arms.iter().map(|a| a.dof).sum();
@@ -99,7 +99,7 @@ fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Res
     Ok(Names { arms, tasks: config.tasks.iter().map(|t| t.name.clone()).collect() })
 }
 
-/// A file may say anything; the coordinator relies on limits that leave room to move.
+/// A file may contain anything; the coordinator relies on limits that leave room to move.
 fn check_limits(arm: &ArmConfig) -> Result<(), String> {
     let l = &arm.limits;
     let lists = [&l.position_lower, &l.position_upper, &l.velocity_max, &l.acceleration_max];

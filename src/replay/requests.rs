@@ -1,4 +1,4 @@
-//! Requests as a log tells them, made into requests again: the other way round than `runtime::dispatch`.
+//! Converts logged requests back to requests: the inverse of `runtime::dispatch`.
 
 use serde::Deserialize;
 
@@ -9,14 +9,14 @@ use crate::trajectory::{JointTrajectory, Spline};
 
 /// A message of `/dimos/requests`.
 #[derive(Debug, Deserialize)]
-struct Line {
+struct RequestMessage {
     id: u64,
-    request: Told,
+    request: LoggedRequest,
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Told {
+enum LoggedRequest {
     Execute { task: u16, motion: u64, trajectory: JointTrajectory },
     Cancel { task: Option<u16> },
     Servo { task: u16, target: Vec<Option<f64>> },
@@ -31,16 +31,16 @@ enum Told {
     Shutdown {},
 }
 
-/// The id of a request, whatever it asks.
+/// The id of any request.
 #[derive(Debug, Deserialize)]
 struct Id {
     id: u64,
 }
 
-/// Reads a request. `joints` are the names of all joints, arm by arm. Where only its contents cannot be read, the
-/// inner result says why.
+/// Reads a request. `joints` are the names of all joints, arm by arm. The inner result fails if only the contents are
+/// unreadable.
 pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<Request, String>), String> {
-    match serde_json::from_str::<Line>(json) {
+    match serde_json::from_str::<RequestMessage>(json) {
         Ok(line) => Ok((line.id, request(line.request, joints))),
         Err(e) => match serde_json::from_str::<Id>(json) {
             Ok(Id { id }) => Ok((id, Err(e.to_string()))),
@@ -49,43 +49,43 @@ pub fn read(json: &str, joints: &[String]) -> Result<(u64, Result<Request, Strin
     }
 }
 
-fn request(told: Told, joints: &[String]) -> Result<Request, String> {
-    Ok(match told {
-        Told::Execute { task, motion, trajectory } => {
+fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> {
+    Ok(match logged {
+        LoggedRequest::Execute { task, motion, trajectory } => {
             let spline = Spline::new(&trajectory).map_err(|e| e.to_string())?;
             let index = |name: &String| joints.iter().position(|j| j == name).map(|j| j as u16);
             let found: Option<Vec<u16>> = trajectory.joint_names.iter().map(index).collect();
-            let joints = found.ok_or("its trajectory has a joint that no arm has")?;
+            let joints = found.ok_or("the trajectory has a joint that no arm has")?;
             Request::Execute { task, motion: Box::new(Motion { id: motion, joints, spline }) }
         }
-        Told::Cancel { task } => Request::Cancel { task },
-        Told::Servo { task, target } => Request::Servo { task, target: values(&target) },
-        Told::Velocity { task, target } => Request::Velocity { task, target: values(&target) },
-        Told::Pose { task, position, orientation } => {
+        LoggedRequest::Cancel { task } => Request::Cancel { task },
+        LoggedRequest::Servo { task, target } => Request::Servo { task, target: values(&target) },
+        LoggedRequest::Velocity { task, target } => Request::Velocity { task, target: values(&target) },
+        LoggedRequest::Pose { task, position, orientation } => {
             let goal = Goal::Pose { position: numbers(position), orientation: numbers(orientation) };
             Request::Steer { task, goal }
         }
-        Told::Twist { task, linear, angular, tool } => {
+        LoggedRequest::Twist { task, linear, angular, tool } => {
             let goal = Goal::Twist { linear: numbers(linear), angular: numbers(angular), tool };
             Request::Steer { task, goal }
         }
-        Told::Stop { arm } => Request::Stop { arm },
-        Told::Reset { arm } => Request::Reset { arm },
-        Told::Ready { arm } => Request::Ready { arm },
-        Told::Park { arm } => Request::Park { arm },
-        Told::Gripper { arm, opening } => Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN) },
-        Told::Shutdown {} => Request::Shutdown,
+        LoggedRequest::Stop { arm } => Request::Stop { arm },
+        LoggedRequest::Reset { arm } => Request::Reset { arm },
+        LoggedRequest::Ready { arm } => Request::Ready { arm },
+        LoggedRequest::Park { arm } => Request::Park { arm },
+        LoggedRequest::Gripper { arm, opening } => Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN) },
+        LoggedRequest::Shutdown {} => Request::Shutdown,
     })
 }
 
-/// JSON has no infinities and no NaN: what was not finite is null. It is refused all the same.
-fn values(told: &[Option<f64>]) -> Joints {
-    let values: Vec<f64> = told.iter().map(|v| v.unwrap_or(f64::NAN)).collect();
+/// JSON has no infinities and no NaN: values that were not finite are null. The tick rejects the request all the same.
+fn values(logged: &[Option<f64>]) -> Joints {
+    let values: Vec<f64> = logged.iter().map(|v| v.unwrap_or(f64::NAN)).collect();
     joints_of(&values)
 }
 
-fn numbers<const N: usize>(told: [Option<f64>; N]) -> [f64; N] {
-    told.map(|v| v.unwrap_or(f64::NAN))
+fn numbers<const N: usize>(logged: [Option<f64>; N]) -> [f64; N] {
+    logged.map(|v| v.unwrap_or(f64::NAN))
 }
 
 #[cfg(test)]
@@ -96,9 +96,9 @@ mod tests {
     use crate::runtime::log_of;
     use crate::trajectory::TrajectoryPoint;
 
-    /// What is read is told in the same words again.
+    /// Reading and logging a request again gives the same text.
     #[test]
-    fn every_request_is_read_as_it_was_told() {
+    fn every_request_is_read_as_it_was_logged() {
         let target = joints_of(&[0.1 + 0.2, -0.0, f64::MIN_POSITIVE, 1e300, std::f64::consts::PI]);
         for request in [
             Request::Cancel { task: None },
@@ -121,8 +121,8 @@ mod tests {
             Request::Gripper { arm: 1, opening: 0.1 + 0.2 },
             Request::Shutdown,
         ] {
-            let told = log_of(&request);
-            let line = json!({"id": 7, "request": told}).to_string();
+            let logged = log_of(&request);
+            let line = json!({"id": 7, "request": logged}).to_string();
             let (id, again) = read(&line, &[]).unwrap();
             // Debug output shows every bit of a number, and the sign of zero.
             assert_eq!((id, format!("{:?}", again.unwrap())), (7, format!("{request:?}")));
@@ -139,17 +139,17 @@ mod tests {
         };
         let points = vec![point(0.0, 0.1, 0.0), point(1.0 / 3.0, 0.2, 0.7), point(0.7, 0.3, 0.0)];
         let trajectory = JointTrajectory { joint_names: vec!["b".into(), "a".into()], points };
-        let told = json!({"id": 9, "request": {"execute": {"task": 1, "motion": 5, "trajectory": trajectory}}});
+        let logged = json!({"id": 9, "request": {"execute": {"task": 1, "motion": 5, "trajectory": trajectory}}});
         let names = ["a".to_owned(), "b".to_owned()];
-        let (_, request) = read(&told.to_string(), &names).unwrap();
+        let (_, request) = read(&logged.to_string(), &names).unwrap();
         let Ok(Request::Execute { task: 1, motion }) = request else { panic!("{request:?}") };
         assert_eq!(*motion, Motion { id: 5, joints: vec![1, 0], spline: Spline::new(&trajectory).unwrap() });
-        let (_, unknown) = read(&told.to_string(), &names[..1]).unwrap();
+        let (_, unknown) = read(&logged.to_string(), &names[..1]).unwrap();
         assert!(unknown.unwrap_err().contains("joint"));
     }
 
     #[test]
-    fn what_cannot_be_read_is_said() {
+    fn unreadable_requests_are_reported() {
         assert!(read("{", &[]).is_err());
         let (id, unknown) = read(r#"{"id":4,"request":{"dance":{}}}"#, &[]).unwrap();
         assert!(id == 4 && unknown.unwrap_err().contains("dance"));

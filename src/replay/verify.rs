@@ -1,5 +1,5 @@
-//! Runs a log once more: what every tick read and was told goes through [`Coordinator::tick`] again, and what comes
-//! out is compared with what came out then, bit for bit.
+//! Replays a log: passes the inputs and requests of every tick through [`Coordinator::tick`] again, and compares the
+//! outputs bit for bit.
 
 use std::path::Path;
 
@@ -17,45 +17,45 @@ use crate::control::request::Envelope;
 use crate::recording::records::{RawRecord, RecordReader, unpack_chunk};
 use crate::recording::replay::ReplayError;
 
-/// How far a log could be verified.
+/// Result of a verification.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[serde(tag = "result", rename_all = "snake_case")]
 pub enum Finding {
-    /// All of it came out the same.
+    /// All outputs are identical.
     Reproducible,
-    /// Something came out differently; the first such thing.
+    /// The first difference.
     Different(Difference),
-    /// From some tick on, what a tick read or was told is not in the log. All before came out the same.
+    /// From some tick on, inputs are missing in the log. All earlier outputs are identical.
     Incomplete {
         /// The first tick that cannot be verified.
         tick: u64,
-        /// Why.
+        /// The reason.
         why: String,
     },
 }
 
-/// What came of verifying a log.
+/// Result and figures of a verification.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Verification {
-    /// What was found.
+    /// The result.
     #[serde(flatten)]
     pub finding: Finding,
-    /// Ticks that came out the same.
+    /// Ticks with identical outputs.
     pub ticks: u64,
-    /// Requests that they were told.
+    /// Their requests.
     pub requests: u64,
-    /// Events that they told.
+    /// Their events.
     pub events: u64,
     /// Time from the first to the last of these ticks [s].
     pub length: f64,
 }
 
-/// Runs a log once more and compares.
+/// Replays a log and compares.
 pub fn verify(path: &Path) -> Result<Verification, RecordedError> {
     let recorded = Recorded::open(path)?;
     if recorded.config.version != CONTROL_VERSION {
         let what = format!(
-            "it was recorded with version {} of the tick's rules, this program has version {CONTROL_VERSION}: the same \
+            "it was recorded with control version {}, this program has version {CONTROL_VERSION}: the same \
              inputs give other commands (verify it with the program that recorded it)",
             recorded.config.version
         );
@@ -89,8 +89,8 @@ struct Rerun<'a> {
     coordinator: Coordinator,
     comparison: Comparison<'a>,
     states: Vec<ArmState>,
-    told: Vec<Envelope>,
-    /// The first tick's deadline and the last's [ns].
+    requests: Vec<Envelope>,
+    /// Deadlines of the first and of the last tick [ns].
     span: Option<(u64, u64)>,
     counts: Verification,
     found: Option<Finding>,
@@ -105,7 +105,7 @@ impl<'a> Rerun<'a> {
             coordinator: Coordinator::new(&recorded.config),
             comparison: Comparison::new(recorded),
             states: vec![ArmState::default(); recorded.config.arms.len()],
-            told: Vec::new(),
+            requests: Vec::new(),
             span: None,
             counts: Verification { finding: Finding::Reproducible, ticks: 0, requests: 0, events: 0, length: 0.0 },
             found: None,
@@ -122,7 +122,7 @@ impl<'a> Rerun<'a> {
         }
     }
 
-    /// A record of a chunk, or one that stands by itself.
+    /// Handles a record of a chunk, or one outside of chunks.
     fn contents(&mut self, opcode: u8, body: &[u8]) {
         match opcode {
             _ if self.found.is_some() => {}
@@ -134,7 +134,7 @@ impl<'a> Rerun<'a> {
                 }
             }
             op::MESSAGE => {
-                // Channel, sequence and two times come before the message itself.
+                // Channel, sequence and two times precede the message.
                 let Some((header, bytes)) = body.split_at_checked(22) else { return };
                 let channel = usize::from(u16::from_le_bytes([header[0], header[1]]));
                 if let Some(topic) = self.channels.get(channel).copied().flatten() {
@@ -161,22 +161,22 @@ impl<'a> Rerun<'a> {
         self.found = Some(Finding::Incomplete { tick, why });
     }
 
-    /// Runs the tick that is complete.
+    /// Runs the complete tick.
     fn run_tick(&mut self) {
         let (index, dropped) = (self.ticks.logged.tick.tick, self.ticks.logged.tick.dropped);
         let expected = self.counts.ticks;
         if index != expected || dropped > 0 {
             return self.stop_at(expected, format!("{dropped} samples were lost up to tick {index}"));
         }
-        if let Err(why) = self.ticks.requests(&mut self.told) {
+        if let Err(why) = self.ticks.requests(&mut self.requests) {
             return self.stop_at(index, why);
         }
         let logged = &self.ticks.logged;
         for (state, arm) in self.states.iter_mut().zip(&logged.arms) {
             *state = arm.state;
         }
-        self.counts.requests += self.told.len() as u64;
-        let mut requests = self.told.drain(..);
+        self.counts.requests += self.requests.len() as u64;
+        let mut requests = self.requests.drain(..);
         let output = self.coordinator.tick(logged.time(), &self.states, || requests.next());
         drop(requests);
         let deadline = logged.tick.deadline_ns;
@@ -193,7 +193,7 @@ impl<'a> Rerun<'a> {
 
     fn finish(mut self, cut: Option<ReplayError>) -> Verification {
         match cut {
-            // The last tick's requests and events may be among what was cut off.
+            // The last tick's requests and events may be lost in the cut.
             Some(cut) if self.found.is_none() => self.stop_at(self.counts.ticks, first_line(&cut.to_string())),
             None if self.found.is_none() && self.ticks.is_closed() => self.run_tick(),
             _ => {}

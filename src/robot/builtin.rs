@@ -1,14 +1,13 @@
-//! The robots in the box: descriptions written for this project from published dimensions and limits, with shapes
-//! made of primitives.
+//! Built-in robots: descriptions written for this project from published dimensions and limits, with primitive shapes.
 
 use std::sync::OnceLock;
 
-/// What marks the name of one of them in place of a path: `builtin:xarm6`.
+/// Prefix of a built-in robot's name in place of a path: `builtin:xarm6`.
 pub const PREFIX: &str = "builtin:";
 
 macro_rules! robots {
     ($($name:literal),*) => {
-        /// The names of those in the box.
+        /// Names of the robots shipped with this crate.
         pub const NAMES: &[&str] = &[$($name),*];
 
         fn shipped(name: &str) -> Option<&'static str> {
@@ -37,24 +36,24 @@ robots!(
     "yourarm_gripper"
 );
 
-/// Those that the program which embeds this crate brings along.
-static MORE: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
+/// Robots added by a program that embeds this crate.
+static EMBEDDED: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 
-/// Lets the names of `more` stand for their texts, before those in the box. For `main`, once, before anything else.
+/// Adds named descriptions, which win over the shipped ones. Call it once, first thing in `main`.
 pub fn embed(more: Vec<(&'static str, &'static str)>) {
-    let _ = MORE.set(more);
+    let _ = EMBEDDED.set(more);
 }
 
 fn more() -> impl Iterator<Item = (&'static str, &'static str)> {
-    MORE.get().into_iter().flatten().copied()
+    EMBEDDED.get().into_iter().flatten().copied()
 }
 
-/// The URDF of one, in the box or brought along.
+/// Returns the URDF of a built-in or embedded robot.
 pub fn text(name: &str) -> Option<&'static str> {
     more().find(|(own, _)| *own == name).map(|(_, text)| text).or_else(|| shipped(name))
 }
 
-/// All names, those in the box and those brought along.
+/// Returns all names, shipped and embedded.
 pub fn names() -> impl Iterator<Item = &'static str> {
     NAMES.iter().copied().chain(more().map(|(name, _)| name))
 }

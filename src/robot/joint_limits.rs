@@ -1,15 +1,15 @@
-//! `joint_limits.yaml` as MoveIt has it: limits that URDF cannot state, above all accelerations and jerks.
+//! MoveIt's `joint_limits.yaml`: limits that URDF cannot state, above all accelerations and jerks.
 //!
 //! ```yaml
 //! joint_limits:
 //!   joint1: {has_velocity_limits: true, max_velocity: 2.0, has_acceleration_limits: true, max_acceleration: 5.0}
 //! ```
-//! A limit counts unless its `has_…` says false. Positions can only be narrowed.
+//! A limit applies unless its `has_…` flag is false. Positions can only be narrowed.
 
 use crate::robot::model::RobotModel;
 use crate::yaml::{Diag, NodeId, SourceId, Tree, did_you_mean};
 
-/// Reads a source, and narrows or completes the robot's limits by it. Mistakes are reported.
+/// Reads a file and applies its limits to the robot. Mistakes are reported.
 pub fn apply(tree: &mut Tree, source: SourceId, robot: &mut RobotModel) {
     let Some(root) = tree.parse(source) else { return };
     let Some((_, joints)) = tree.entry(root, "joint_limits") else {
@@ -35,14 +35,14 @@ pub fn apply(tree: &mut Tree, source: SourceId, robot: &mut RobotModel) {
         own.lower = read.lower.map_or(own.lower, |lower| own.lower.max(lower));
         own.upper = read.upper.map_or(own.upper, |upper| own.upper.min(upper));
         if own.lower > own.upper {
-            let what = format!("no position is left to the joint `{name}`: {} to {}", own.lower, own.upper);
+            let what = format!("no position is left for the joint `{name}`: {} to {}", own.lower, own.upper);
             let diag = Diag::error(what).at(tree.label(limits));
             tree.report(diag.hint("positions here narrow those of the URDF; are they swapped?"));
         }
     }
 }
 
-/// The limits of one joint as typed; `None` where there is none, or where it was switched off.
+/// Limits of one joint as written; `None` where absent or switched off.
 #[derive(Debug, Default)]
 struct Entry {
     lower: Option<f64>,
@@ -65,7 +65,7 @@ impl Entry {
                 return Some(value);
             }
             let at = tree.get(node, key).unwrap_or(node);
-            let diag = Diag::error(format!("`{key}` is {value}: a limit is above zero")).at(tree.label(at));
+            let diag = Diag::error(format!("`{key}` is {value}: a limit must be above zero")).at(tree.label(at));
             tree.report(diag);
             None
         };
@@ -81,12 +81,12 @@ impl Entry {
     }
 }
 
-/// A finite number; anything else is reported.
+/// Returns a finite number; reports anything else.
 fn number(tree: &mut Tree, node: NodeId, key: &str) -> Option<f64> {
     let value = tree.get(node, key)?;
     let number = tree.text(value).and_then(|text| text.trim().parse::<f64>().ok()).filter(|v| v.is_finite());
     if number.is_none() {
-        let diag = Diag::error(format!("`{key}` is no number")).at(tree.label(value));
+        let diag = Diag::error(format!("`{key}` is not a number")).at(tree.label(value));
         tree.report(diag);
     }
     number
@@ -129,8 +129,8 @@ mod tests {
         for (text, what) in [
             ("joints: {}", "the key `joint_limits` is missing"),
             ("joint_limits: {j2: {max_velocity: 1}}", "this robot has no joint `j2`"),
-            ("joint_limits: {j1: {max_velocity: fast}}", "`max_velocity` is no number"),
-            ("joint_limits: {j1: {max_velocity: -1}}", "a limit is above zero"),
+            ("joint_limits: {j1: {max_velocity: fast}}", "`max_velocity` is not a number"),
+            ("joint_limits: {j1: {max_velocity: -1}}", "a limit must be above zero"),
             ("joint_limits: {j1: {min_position: 5}}", "no position is left"),
         ] {
             let (_, found) = with(text);

@@ -1,4 +1,4 @@
-//! A description on disk, or one of those in the box → the robot, and everything that is wrong with it.
+//! Loads a description, from disk or built in, and collects everything wrong with it.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -14,88 +14,88 @@ use crate::robot::xml::{self, Calls, Document};
 use crate::robot::{builtin, joint_limits, xacro};
 use crate::yaml::{Diag, Label, Report, Severity, Tree, render};
 
-/// Which description to read, and how.
+/// A description and how to read it.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Source {
     /// A URDF or xacro file, or `builtin:NAME`.
     pub path: PathBuf,
-    /// Folders of packages by name; those that ROS's environment variables show are found too.
+    /// Folders of packages by name; those of ROS's environment variables are found too.
     pub packages: BTreeMap<String, PathBuf>,
-    /// Values of `xacro:arg`s.
+    /// Values of `xacro:arg`.
     pub xacro_args: BTreeMap<String, String>,
-    /// The robot's SRDF, which may be xacro too.
+    /// The robot's SRDF; may be xacro.
     pub srdf: Option<PathBuf>,
     /// The robot's `joint_limits.yaml`.
     pub joint_limits: Option<PathBuf>,
-    /// What to do about mesh files.
+    /// Whether to look for mesh files.
     pub meshes: Meshes,
 }
 
 impl Source {
-    /// A description without arguments.
+    /// Creates a source without arguments.
     pub fn new(path: impl Into<PathBuf>) -> Self {
         Self { path: path.into(), ..Self::default() }
     }
 }
 
-/// A description that was read.
+/// A loaded description.
 #[derive(Debug, Default)]
 pub struct Loaded {
     tree: Tree,
-    /// The robot; `None` when there are mistakes.
+    /// The robot; `None` if there are errors.
     pub model: Option<RobotModel>,
-    /// What its SRDF says; empty where there is none.
+    /// Contents of its SRDF; empty without one.
     pub semantics: Semantics,
     /// The expanded URDF.
     pub document: Option<Document>,
-    /// Every file that was read, the first one first. Empty for those in the box.
+    /// Every file read, the main one first. Empty for built-in robots.
     pub files: Vec<PathBuf>,
 }
 
 impl Loaded {
-    /// All mistakes as text.
+    /// Returns all diagnostics as text.
     pub fn render(&self, colour: bool) -> String {
         self.tree.diags().iter().map(|diag| render(&self.tree, diag, colour) + "\n").collect()
     }
 
-    /// All mistakes as data.
+    /// Returns all diagnostics as data.
     pub fn reports(&self) -> Vec<Report> {
         self.tree.diags().iter().map(|diag| diag.located(&self.tree)).collect()
     }
 
-    /// Number of warnings.
+    /// Returns the number of warnings.
     pub fn warnings(&self) -> usize {
         self.tree.diags().iter().filter(|d| d.severity == Severity::Warning).count()
     }
 
-    /// Whether anything must be put right.
+    /// Returns whether there are errors.
     pub fn has_errors(&self) -> bool {
         self.tree.has_errors()
     }
 
-    /// Adds a mistake that showed later, in a file that the description names.
+    /// Adds a diagnostic found later, in a file that the description refers to.
     pub fn report(&mut self, diag: Diag) {
         self.tree.report(diag);
     }
 
-    /// The expanded URDF as text.
+    /// Returns the expanded URDF as text.
     pub fn urdf(&self) -> Option<String> {
         self.document.as_ref().map(Document::to_text)
     }
 
-    /// The robot, or all mistakes as text.
+    /// Returns the robot, or all diagnostics as text.
     pub fn into_model(self) -> Result<RobotModel, String> {
         let text = self.render(false);
         self.model.ok_or(text)
     }
 
-    /// The mistakes for `--json`.
+    /// Returns the diagnostics for `--json`.
     pub fn to_json(&self) -> serde_json::Value {
         json!({"valid": !self.has_errors() && self.model.is_some(), "problems": self.reports()})
     }
 }
 
-/// Reads a description: expanded if it is xacro, completed by its SRDF and limits, with every mistake that it has.
+/// Loads a description: expands xacro, applies SRDF and limits, and collects every mistake.
 pub fn load(source: &Source) -> Loaded {
     let mut loaded = Loaded::default();
     let packages = Packages::named(source.packages.clone()).with_environment();
@@ -121,7 +121,7 @@ pub fn load(source: &Source) -> Loaded {
     loaded
 }
 
-/// An XML file, expanded if it is xacro. Only the main one minds arguments without effect.
+/// Reads an XML file, expanded if it is xacro. `arguments`: only the main file reports arguments without effect.
 fn expanded(
     path: &Path,
     source: &Source,
@@ -136,27 +136,27 @@ fn expanded(
         let expansion = xacro::expand(&mut loaded.tree, path, document, packages, &source.xacro_args)?;
         loaded.files.extend(expansion.files.into_iter().skip(1));
         for (name, near) in expansion.unknown_args.into_iter().filter(|_| main) {
-            let what = format!("no xacro:arg is named `{name}`: the argument has no effect");
+            let what = format!("there is no xacro:arg `{name}`: the argument has no effect");
             let diag = Diag::warning(what).at(Label::start_of(id));
             loaded.tree.report(diag.maybe_hint(near.map(|near| format!("did you mean `{near}`?"))));
         }
         return Some((expansion.document, expansion.calls));
     }
     for name in source.xacro_args.keys().filter(|_| main) {
-        let what = format!("the argument `{name}` has no effect: the description is no xacro");
+        let what = format!("the argument `{name}` has no effect: the description is not xacro");
         loaded.tree.report(Diag::warning(what).at(Label::start_of(id)));
     }
     Some((document, Calls::default()))
 }
 
-/// The text of a file, or of a robot in the box.
+/// Returns the text of a file, or of a built-in robot.
 fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
     if let Some(robot) = path.to_str().and_then(|name| name.strip_prefix(builtin::PREFIX)) {
         if let Some(text) = builtin::text(robot) {
             return Some(text.to_owned());
         }
         let hint = crate::yaml::did_you_mean(robot, builtin::names(), "there are");
-        loaded.tree.report(Diag::error(format!("no robot in the box is named `{robot}`")).maybe_hint(hint));
+        loaded.tree.report(Diag::error(format!("unknown built-in robot `{robot}`")).maybe_hint(hint));
         return None;
     }
     let refused = |what: String| format!("{}: {what}", path.display());
@@ -166,7 +166,7 @@ fn text_of(path: &Path, loaded: &mut Loaded) -> Option<String> {
             return Err(refused(format!("the file is larger than {} MiB", xml::MAX_BYTES >> 20)));
         }
         let bytes = fs::read(path).map_err(|e| refused(e.to_string()))?;
-        String::from_utf8(bytes).map_err(|_| refused("bytes that are not UTF-8".to_owned()))
+        String::from_utf8(bytes).map_err(|_| refused("the file is not UTF-8".to_owned()))
     };
     match read() {
         Ok(text) => {

@@ -1,4 +1,4 @@
-//! Triangle meshes from STL, OBJ and Collada files: vertices joined, finite, in metres.
+//! Triangle meshes from STL, OBJ and Collada files: vertices merged, finite, in metres.
 
 mod collada;
 
@@ -11,33 +11,33 @@ use nalgebra::{Point3, Vector3};
 
 use crate::robot::model::MeshFile;
 
-/// The largest file that is read [bytes].
+/// Maximum file size [bytes].
 pub const MAX_BYTES: u64 = 64 << 20;
-/// The most triangles of a mesh.
+/// Maximum number of triangles.
 pub const MAX_TRIANGLES: usize = 2_000_000;
-/// The largest coordinate that can belong to a robot or its surroundings [m].
+/// Maximum coordinate [m].
 const MAX_COORDINATE: f64 = 1e6;
 
 /// A triangle mesh in the frame of its shape.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Mesh {
-    /// Corners [m], each once.
+    /// Vertices [m], each once.
     pub vertices: Vec<Point3<f64>>,
-    /// Corners of each triangle, anticlockwise seen from outside.
+    /// Vertices of each triangle, anticlockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
 }
 
 impl Mesh {
-    /// Reads the file of a shape, and scales it. The error names the file.
+    /// Reads and scales the file of a shape. The error names the file.
     pub fn load(mesh: &MeshFile) -> Result<Self, String> {
         match &mesh.path {
             Some(path) => Self::read(path, mesh.scale),
-            None => Err(format!("{}: the file was not found", mesh.uri)),
+            None => Err(format!("{}: file not found", mesh.uri)),
         }
     }
 
-    /// Reads a file, and scales it. A scale with an odd number of negative factors mirrors: the triangles are turned
-    /// round, so that their outside stays outside.
+    /// Reads and scales a file. A scale with an odd number of negative factors mirrors: triangles are reversed to keep
+    /// their outside.
     pub fn read(path: &Path, scale: Vector3<f64>) -> Result<Self, String> {
         let named = |what: String| format!("{}: {what}", path.display());
         let about = fs::metadata(path).map_err(|e| named(e.to_string()))?;
@@ -51,14 +51,14 @@ impl Mesh {
         Self::from_bytes(&bytes, path, scale).map_err(named)
     }
 
-    /// Reads a file's bytes; the name's ending says which format they are.
+    /// Reads a file's bytes; the extension of `name` decides the format.
     pub fn from_bytes(bytes: &[u8], name: &Path, scale: Vector3<f64>) -> Result<Self, String> {
         let ending = name.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
         let corners = match ending.as_str() {
             "dae" => collada::read(bytes)?,
             "stl" => foreign(|| mesh_loader::stl::from_slice(bytes))?,
             "obj" => foreign(|| {
-                // Materials are of no interest: no further file is opened.
+                // Materials are not needed: no other file is opened.
                 mesh_loader::obj::from_slice(bytes, None::<&Path>, |_: &Path| -> std::io::Result<Vec<u8>> {
                     Ok(Vec::new())
                 })
@@ -71,10 +71,10 @@ impl Mesh {
         Self::weld(&corners, scale)
     }
 
-    /// Joins equal corners; leaves out triangles without area.
+    /// Merges equal vertices; drops triangles without area.
     fn weld(corners: &[[Point3<f64>; 3]], scale: Vector3<f64>) -> Result<Self, String> {
         if corners.len() > MAX_TRIANGLES {
-            return Err(format!("{} triangles: more than {MAX_TRIANGLES}", corners.len()));
+            return Err(format!("{} triangles (limit {MAX_TRIANGLES})", corners.len()));
         }
         let mut mesh = Self::default();
         let mut seen: HashMap<[u64; 3], u32> = HashMap::with_capacity(corners.len() / 2);
@@ -82,7 +82,7 @@ impl Mesh {
         for triangle in corners {
             let mut indices = [0; 3];
             for (index, corner) in indices.iter_mut().zip(triangle) {
-                // Adding zero makes one of both zeros.
+                // Adding zero turns -0.0 into 0.0.
                 let point = corner.coords.component_mul(&scale).add_scalar(0.0);
                 if !point.iter().all(|v| v.abs() <= MAX_COORDINATE) {
                     return Err(format!("a vertex at {} {} {}", point.x, point.y, point.z));
@@ -99,19 +99,19 @@ impl Mesh {
             }
         }
         if mesh.triangles.is_empty() {
-            return Err("no triangle in it".to_owned());
+            return Err("no triangles".to_owned());
         }
         Ok(mesh)
     }
 
-    /// The corners of the box around it, lowest and highest [m].
+    /// Returns the lowest and highest corner of the bounding box [m].
     pub fn bounds(&self) -> (Point3<f64>, Point3<f64>) {
         let start = self.vertices.first().copied().unwrap_or_default();
         self.vertices.iter().fold((start, start), |(low, high), v| (low.inf(v), high.sup(v)))
     }
 }
 
-/// Triangles by the mesh library. It may panic on what nobody exports; that ends this file only.
+/// Reads triangles with the mesh library, which may panic on malformed files; a panic becomes an error.
 fn foreign(read: impl FnOnce() -> std::io::Result<mesh_loader::Scene>) -> Result<Vec<[Point3<f64>; 3]>, String> {
     let scene = catch_unwind(AssertUnwindSafe(read)).map_err(|_| "the file is damaged".to_owned())?;
     let scene = scene.map_err(|e| e.to_string())?;
@@ -123,7 +123,7 @@ fn foreign(read: impl FnOnce() -> std::io::Result<mesh_loader::Scene>) -> Result
         };
         for [a, b, c] in &mesh.faces {
             let (Some(a), Some(b), Some(c)) = (corner(*a), corner(*b), corner(*c)) else {
-                return Err("a triangle names a vertex that does not exist".to_owned());
+                return Err("a triangle refers to a missing vertex".to_owned());
             };
             corners.push([a, b, c]);
         }

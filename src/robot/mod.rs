@@ -1,11 +1,11 @@
-//! Robot descriptions: what is read from URDF, xacro, SRDF and mesh files, as plain data.
+//! Robot descriptions: URDF, xacro, SRDF and mesh files as plain data.
 //!
 //! ```text
 //!  .xacro ─▶ xacro ─▶ xml ─▶ urdf ─▶ model        srdf, joint_limits.yaml ─▶ groups, poses, limits
 //!  .urdf ──────────▶ xml ──┘    └─ packages ─▶ mesh files ─▶ mesh
 //! ```
 //!
-//! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
+//! Every element keeps its position in the source, through includes and macros, so that diagnostics point at it.
 
 pub mod builtin;
 mod joint_limits;
@@ -23,7 +23,7 @@ pub mod xml;
 pub use load::{Loaded, Source, load};
 pub use model::{Geometry, Inertial, Joint, JointKind, Limits, Link, MeshFile, Mimic, RobotModel, Shape};
 
-/// A small generator for tests: the same numbers for the same seed.
+/// A small generator for tests: the same seed gives the same numbers.
 #[cfg(test)]
 fn test_random(seed: u64) -> impl FnMut() -> u64 {
     let mut state = seed;

@@ -1,6 +1,6 @@
 //! A robot as plain data: links, joints, shapes, limits. Frames and units as in URDF: metres, radians, seconds.
 //!
-//! The links stand in the order of the tree, parents before children, and joint `i` carries link `i + 1`:
+//! Links are in tree order, parents before children, and joint `i` carries link `i + 1`:
 //!
 //! ```text
 //!  links   [0] base ── [1] link1 ── [2] link2 …
@@ -13,11 +13,11 @@ use std::path::PathBuf;
 use nalgebra::{Isometry3, Matrix3, Unit, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// A robot: a tree of links. Links are `0..n`, joints are `0..n-1`, both in an order where parents come first;
-/// joint `i` moves link `i + 1`.
+/// A robot: a tree of links. Links are `0..n`, joints are `0..n-1`, both with parents first; joint `i` moves link `i +
+/// 1`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct RobotModel {
-    /// The robot's name.
+    /// Name of the robot.
     pub name: String,
     /// The links; `links[0]` is the root.
     pub links: Vec<Link>,
@@ -25,29 +25,29 @@ pub struct RobotModel {
     pub joints: Vec<Joint>,
 }
 
-/// A rigid body with its own frame: that of the joint which carries it.
+/// A rigid body with its own frame: that of the joint that carries it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Link {
-    /// Its name, unique in the robot.
+    /// Name, unique in the robot.
     pub name: String,
-    /// What it looks like.
+    /// Visual shapes.
     pub visuals: Vec<Shape>,
-    /// What must not touch anything.
+    /// Collision shapes.
     pub collisions: Vec<Shape>,
-    /// Mass and inertia, where stated.
+    /// Mass and inertia, if given.
     pub inertial: Option<Inertial>,
 }
 
 /// A shape on a link.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shape {
-    /// Its name, where it has one.
+    /// Name, if given.
     pub name: Option<String>,
     /// The shape's frame in the link's frame.
     pub origin: Isometry3<f64>,
-    /// What it is.
+    /// Geometry.
     pub geometry: Geometry,
-    /// Red, green, blue, opacity, each 0–1; `None` for collision shapes and where nothing is stated.
+    /// Red, green, blue, opacity, each 0–1; `None` for collision shapes and where not given.
     pub color: Option<[f64; 4]>,
 }
 
@@ -82,19 +82,19 @@ pub enum Geometry {
     Mesh(MeshFile),
 }
 
-/// A mesh that a shape names.
+/// A mesh file of a shape.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MeshFile {
-    /// As the description names it: `package://arm/meshes/base.stl`, `file:///…`, a relative path.
+    /// URI in the description: `package://arm/meshes/base.stl`, `file:///…`, a relative path.
     pub uri: String,
-    /// Where it is; `None` when the file was not found, or not looked for.
+    /// Its path; `None` if the file was not found, or not looked for.
     pub path: Option<PathBuf>,
     /// Factors along x, y, z; a negative one mirrors.
     pub scale: Vector3<f64>,
 }
 
 impl MeshFile {
-    /// Whether it is a Collada file: a scene that must be converted to triangles.
+    /// Returns whether it is a Collada file: a scene that must be converted to triangles.
     pub fn is_collada(&self) -> bool {
         self.uri.to_ascii_lowercase().ends_with(".dae")
     }
@@ -103,7 +103,7 @@ impl MeshFile {
 /// Mass and inertia.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Inertial {
-    /// The frame of centre of mass and inertia, in the link's frame.
+    /// Frame of centre of mass and inertia, in the link's frame.
     pub origin: Isometry3<f64>,
     /// Mass [kg].
     pub mass: f64,
@@ -111,22 +111,22 @@ pub struct Inertial {
     pub inertia: Matrix3<f64>,
 }
 
-/// What a joint lets its link do.
+/// Kind of a joint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum JointKind {
-    /// Nothing.
+    /// No motion.
     Fixed,
-    /// Turn about the axis, between limits [rad].
+    /// Rotation about the axis, between limits [rad].
     Revolute,
-    /// Turn about the axis without end [rad].
+    /// Rotation about the axis without limits [rad].
     Continuous,
-    /// Slide along the axis, between limits [m].
+    /// Translation along the axis, between limits [m].
     Prismatic,
 }
 
 impl JointKind {
-    /// URDF's word for it.
+    /// Returns URDF's name of it.
     pub fn name(self) -> &'static str {
         match self {
             Self::Fixed => "fixed",
@@ -136,26 +136,26 @@ impl JointKind {
         }
     }
 
-    /// The unit of its position.
+    /// Returns the unit of its position.
     pub fn unit(self) -> &'static str {
         if self == Self::Prismatic { "m" } else { "rad" }
     }
 
-    /// Whether its position is an angle [rad] and not a length [m].
+    /// Returns whether its position is an angle [rad] rather than a length [m].
     pub fn is_angle(self) -> bool {
         matches!(self, Self::Revolute | Self::Continuous)
     }
 }
 
-/// A joint: where it sits on its parent, and how its child moves.
+/// A joint: its frame on the parent link, and the motion of the child link.
 ///
-/// The child's frame in the parent's frame at position `q` is `origin · motion(q)`, where the motion turns about
-/// `axis` (revolute, continuous) or slides along it (prismatic).
+/// The child's frame in the parent's frame at position `q` is `origin · motion(q)`; the motion rotates about `axis`
+/// (revolute, continuous) or translates along it (prismatic).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Joint {
-    /// Its name, unique in the robot.
+    /// Name, unique in the robot.
     pub name: String,
-    /// What it lets its child do.
+    /// Kind.
     pub kind: JointKind,
     /// Index of the parent link.
     pub parent: usize,
@@ -163,26 +163,26 @@ pub struct Joint {
     pub child: usize,
     /// The joint's frame in the parent link's frame.
     pub origin: Isometry3<f64>,
-    /// Direction of the axis in the joint's frame. Of no meaning for fixed joints.
+    /// Direction of the axis in the joint's frame. Unused for fixed joints.
     pub axis: Unit<Vector3<f64>>,
-    /// Its limits.
+    /// Limits.
     pub limits: Limits,
-    /// The joint that it follows, if it does not move on its own.
+    /// The joint that it mimics, if any.
     pub mimic: Option<Mimic>,
 }
 
 impl Joint {
-    /// Whether it can move, on its own or by following another.
+    /// Returns whether it can move, independently or as a mimic joint.
     pub fn is_movable(&self) -> bool {
         self.kind != JointKind::Fixed
     }
 
-    /// Whether it has a position of its own: it moves, and does not follow another.
+    /// Returns whether it has a position of its own: it moves, and is not a mimic joint.
     pub fn is_independent(&self) -> bool {
         self.is_movable() && self.mimic.is_none()
     }
 
-    /// The child's frame in the parent's frame at a position [rad or m].
+    /// Returns the child's frame in the parent's frame at a position [rad or m].
     pub fn transform(&self, position: f64) -> Isometry3<f64> {
         match self.kind {
             JointKind::Fixed => self.origin,
@@ -194,25 +194,25 @@ impl Joint {
     }
 }
 
-/// Limits of a joint; for prismatic joints in metres instead of radians. What is not stated is infinite or `None`.
+/// Limits of a joint; for prismatic joints in metres instead of radians. Absent limits are infinite or `None`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Lowest position [rad or m]; -∞ for continuous joints.
     pub lower: f64,
     /// Highest position [rad or m]; ∞ for continuous joints.
     pub upper: f64,
-    /// Highest speed [rad/s or m/s]; ∞ where none is stated.
+    /// Maximum speed [rad/s or m/s]; ∞ if not given.
     pub velocity: f64,
-    /// Highest torque or force [N·m or N]; ∞ where none is stated.
+    /// Maximum torque or force [N·m or N]; ∞ if not given.
     pub effort: f64,
-    /// Highest acceleration [rad/s² or m/s²]; URDF states none, `joint_limits.yaml` may.
+    /// Maximum acceleration [rad/s² or m/s²]; not in URDF, optional in `joint_limits.yaml`.
     pub acceleration: Option<f64>,
-    /// Highest jerk [rad/s³ or m/s³]; URDF states none, `joint_limits.yaml` may.
+    /// Maximum jerk [rad/s³ or m/s³]; not in URDF, optional in `joint_limits.yaml`.
     pub jerk: Option<f64>,
 }
 
 impl Limits {
-    /// No limits at all.
+    /// No limits.
     pub const NONE: Self = Self {
         lower: f64::NEG_INFINITY,
         upper: f64::INFINITY,
@@ -223,39 +223,39 @@ impl Limits {
     };
 }
 
-/// A joint that follows another: `position = multiplier · leader + offset`.
+/// A mimic relation: `position = multiplier · leader + offset`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mimic {
-    /// Index of the joint that leads: always an independent one, chains are resolved.
+    /// Index of the leader: always an independent joint, chains are resolved.
     pub leader: usize,
     /// Factor.
     pub multiplier: f64,
-    /// Position when the leader stands at zero [rad or m].
+    /// Position when the leader is at zero [rad or m].
     pub offset: f64,
 }
 
 impl RobotModel {
-    /// Index of a link by name.
+    /// Returns the index of a link by name.
     pub fn link_index(&self, name: &str) -> Option<usize> {
         self.links.iter().position(|link| link.name == name)
     }
 
-    /// Index of a joint by name.
+    /// Returns the index of a joint by name.
     pub fn joint_index(&self, name: &str) -> Option<usize> {
         self.joints.iter().position(|joint| joint.name == name)
     }
 
-    /// The joint that carries a link; `None` for the root.
+    /// Returns the joint that carries a link; `None` for the root.
     pub fn parent_joint(&self, link: usize) -> Option<&Joint> {
         link.checked_sub(1).and_then(|i| self.joints.get(i))
     }
 
-    /// Indices of the joints that have a position of their own, in the order of the tree: the robot's configuration.
+    /// Returns the indices of the independent joints, in tree order: the robot's configuration.
     pub fn independent_joints(&self) -> Vec<usize> {
         (0..self.joints.len()).filter(|i| self.joints[*i].is_independent()).collect()
     }
 
-    /// Indices of the joints from one link down to another, in that order; `None` when `tip` does not hang below
+    /// Returns the indices of the joints from one link down to another, in that order; `None` if `tip` is not below
     /// `base`.
     pub fn chain(&self, base: usize, tip: usize) -> Option<Vec<usize>> {
         let mut joints = Vec::new();
@@ -269,8 +269,8 @@ impl RobotModel {
         Some(joints)
     }
 
-    /// Positions of all joints from those of independent ones by name; joints that are not named stand at zero, and
-    /// followers follow.
+    /// Returns the positions of all joints from those of independent ones by name; joints not named are at zero, mimic
+    /// joints follow.
     pub fn positions(&self, named: &HashMap<String, f64>) -> Vec<f64> {
         let own = |joint: &Joint| named.get(&joint.name).copied().unwrap_or(0.0);
         let position = |joint: &Joint| match joint.mimic {
@@ -280,7 +280,8 @@ impl RobotModel {
         self.joints.iter().map(position).collect()
     }
 
-    /// The frame of every link in the root's frame, from positions of all joints (see [`RobotModel::positions`]).
+    /// Returns the frame of every link in the root's frame, from positions of all joints (see
+    /// [`RobotModel::positions`]).
     pub fn link_poses(&self, positions: &[f64]) -> Vec<Isometry3<f64>> {
         let mut poses = vec![Isometry3::identity(); self.links.len()];
         for (i, joint) in self.joints.iter().enumerate() {
@@ -289,7 +290,7 @@ impl RobotModel {
         poses
     }
 
-    /// The first link that collides by a Collada file, and the file.
+    /// Returns the first link with a Collada file as collision mesh, and the file.
     pub fn collada_collision(&self) -> Option<(&Link, &MeshFile)> {
         let mesh = |shape| match shape {
             &Shape { geometry: Geometry::Mesh(ref mesh), .. } if mesh.is_collada() => Some(mesh),
@@ -298,7 +299,7 @@ impl RobotModel {
         self.links.iter().find_map(|link| Some((link, link.collisions.iter().find_map(mesh)?)))
     }
 
-    /// Mesh files of all shapes.
+    /// Returns the mesh files of all shapes.
     pub fn meshes(&self) -> impl Iterator<Item = &MeshFile> {
         let shapes = self.links.iter().flat_map(|link| link.visuals.iter().chain(&link.collisions));
         shapes.filter_map(|shape| match &shape.geometry {
@@ -308,7 +309,7 @@ impl RobotModel {
     }
 }
 
-/// A pose from a position [m] and URDF's fixed-axis roll, pitch, yaw [rad].
+/// Returns a pose from a position [m] and URDF's fixed-axis roll, pitch, yaw [rad].
 pub fn pose(xyz: [f64; 3], rpy: [f64; 3]) -> Isometry3<f64> {
     Isometry3::from_parts(xyz.into(), nalgebra::UnitQuaternion::from_euler_angles(rpy[0], rpy[1], rpy[2]))
 }

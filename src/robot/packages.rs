@@ -1,6 +1,6 @@
-//! Where the files are that a description names: `package://`, `file://`, relative paths, `$(find …)`.
+//! Resolves the file references of a description: `package://`, `file://`, relative paths, `$(find …)`.
 //!
-//! A name may not lead out of its package by `..`: paths are made plain as text before anything is opened.
+//! A reference cannot leave its package by `..`: paths are normalized as text before anything is opened.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,13 +8,13 @@ use std::path::{Component, Path, PathBuf};
 
 use percent_encoding::percent_decode_str;
 
-/// How far above a description its own package is looked for.
-const LEVELS: usize = 8;
+/// Maximum number of parent folders searched for a description's own package.
+const MAX_PARENTS: usize = 8;
 
-/// Where packages are.
+/// Locations of packages.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Packages {
-    /// Given by name: `package_paths` of a blueprint, `--package`.
+    /// By name: `package_paths` of a blueprint, `--package`.
     named: BTreeMap<String, PathBuf>,
     /// Folders of packages, from `ROS_PACKAGE_PATH`.
     ros: Vec<PathBuf>,
@@ -23,12 +23,12 @@ pub struct Packages {
 }
 
 impl Packages {
-    /// Packages given by name, and none else.
+    /// Uses only packages given by name.
     pub fn named(named: BTreeMap<String, PathBuf>) -> Self {
         Self { named, ..Self::default() }
     }
 
-    /// The same with those that ROS's environment variables show.
+    /// Adds the packages of ROS's environment variables.
     pub fn with_environment(mut self) -> Self {
         let paths = |name| std::env::var_os(name).map(|v| std::env::split_paths(&v).collect()).unwrap_or_default();
         self.ros = paths("ROS_PACKAGE_PATH");
@@ -36,11 +36,11 @@ impl Packages {
         self
     }
 
-    /// The folder of a package: the one given by name, then ROS 1's and ROS 2's, then the package that the file
-    /// itself lies in. The error says where it was looked for.
+    /// Returns the folder of a package: the one given by name, then ROS 1's and ROS 2's, then the package that contains
+    /// the file itself. The error lists the folders searched.
     pub fn find(&self, package: &str, beside: &Path) -> Result<PathBuf, String> {
         if package.is_empty() || package.contains(['/', '\\']) || package.starts_with('.') {
-            return Err(format!("`{package}` is no name of a package"));
+            return Err(format!("`{package}` is not a package name"));
         }
         if let Some(folder) = self.named.get(package) {
             return match folder.is_dir() {
@@ -57,16 +57,16 @@ impl Packages {
             return Ok(absolute(&found));
         }
         let beside = absolute(beside);
-        if let Some(own) = beside.ancestors().take(LEVELS).find(|folder| is_package(folder, package)) {
+        if let Some(own) = beside.ancestors().take(MAX_PARENTS).find(|folder| is_package(folder, package)) {
             return Ok(own.to_owned());
         }
         Err(format!(
-            "the package `{package}` is not known\nhint: say where it is: --package {package}=FOLDER, or \
+            "unknown package `{package}`\nhint: give its folder: --package {package}=FOLDER, or \
              `package_paths` in a blueprint; ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are looked at too"
         ))
     }
 
-    /// The file that a URI means, for a description in the folder `beside`. It exists.
+    /// Returns the existing file that a URI refers to, for a description in the folder `beside`.
     pub fn resolve(&self, uri: &str, beside: &Path) -> Result<PathBuf, String> {
         let path = if let Some(rest) = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://")) {
             let (package, inside) = rest.split_once('/').unwrap_or((rest, ""));
@@ -83,26 +83,26 @@ impl Packages {
                 false => plain(&absolute(beside).join(path)),
             }
         } else if let Some((scheme, _)) = uri.split_once("://") {
-            return Err(format!("files cannot be read by `{scheme}://`\nhint: use package://, file:// or a path"));
+            return Err(format!("`{scheme}://` is not supported\nhint: use package://, file:// or a path"));
         } else {
             plain(&absolute(beside).join(uri))
         };
         match path.is_file() {
             true => Ok(path),
-            false => Err(format!("there is no file {}", path.display())),
+            false => Err(format!("file not found: {}", path.display())),
         }
     }
 
-    /// The folders that a description in the folder `beside` may include files from: its own package, or that folder
-    /// alone where there is none.
+    /// Returns the folder that a description in the folder `beside` may include files from: its own package, or
+    /// `beside` itself without a package.
     pub fn own(&self, beside: &Path) -> PathBuf {
         let beside = absolute(beside);
-        let own = beside.ancestors().take(LEVELS).find(|folder| folder.join("package.xml").is_file());
+        let own = beside.ancestors().take(MAX_PARENTS).find(|folder| folder.join("package.xml").is_file());
         own.unwrap_or(&beside).to_owned()
     }
 }
 
-/// Whether a folder is a package: by its own name, or by the name in its `package.xml`.
+/// Returns whether a folder is a package: by its own name, or by the name in its `package.xml`.
 fn is_package(folder: &Path, package: &str) -> bool {
     if folder.file_name().is_some_and(|name| name == package) {
         return true;
@@ -114,12 +114,12 @@ fn is_package(folder: &Path, package: &str) -> bool {
     name.is_some_and(|(name, _)| name.trim() == package)
 }
 
-/// An absolute path without `.` and `..`, made so as text.
+/// Returns an absolute path without `.` and `..`, normalized as text.
 pub fn absolute(path: &Path) -> PathBuf {
     plain(&std::path::absolute(path).unwrap_or_else(|_| path.to_owned()))
 }
 
-/// A path without `.` and `..`, made so as text: what is opened is exactly what was checked.
+/// Returns a path without `.` and `..`, normalized as text: what is opened is exactly what was checked.
 pub fn plain(path: &Path) -> PathBuf {
     let mut out = PathBuf::new();
     for part in path.components() {
@@ -136,7 +136,7 @@ pub fn plain(path: &Path) -> PathBuf {
     out
 }
 
-/// A URI's path with its `%20` resolved.
+/// Decodes `%20` in a URI's path.
 fn decoded(text: &str) -> String {
     percent_decode_str(text).decode_utf8().map_or_else(|_| text.to_owned(), Into::into)
 }
@@ -187,16 +187,16 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_is_said() {
+    fn a_missing_file_or_package_is_reported() {
         let folder = folder();
         let packages = packages(folder.path());
         for (uri, what) in [
             ("package://zz/a.stl", "--package zz=FOLDER"),
             ("package://g/../ros/p/b.stl", "leads out of its package"),
             ("package://g/%2e%2e/ros/p/b.stl", "leads out of its package"),
-            ("package://../given/a.stl", "is no name of a package"),
-            ("package://g/none.stl", "there is no file"),
-            ("https://x/a.stl", "cannot be read by `https://`"),
+            ("package://../given/a.stl", "is not a package name"),
+            ("package://g/none.stl", "file not found"),
+            ("https://x/a.stl", "`https://` is not supported"),
         ] {
             let error = packages.resolve(uri, folder.path()).unwrap_err();
             assert!(error.contains(what), "{uri}: {error}");

@@ -1,17 +1,17 @@
-//! Random numbers from a seed: the same seed gives the same numbers on every machine, for ever.
+//! Random numbers from a seed: the same seed gives the same numbers on every machine.
 
 /// A generator of 64 random bits at a time (Steele, Lea and Flood, "Fast splittable pseudorandom number generators",
-/// 2014: SplitMix64). Small, fast, and good enough to scatter configurations; never for secrets.
+/// 2014: SplitMix64). Small, fast, good enough to sample configurations; not for secrets.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Random(u64);
 
 impl Random {
-    /// The sequence of a seed.
+    /// Creates the sequence of a seed.
     pub fn new(seed: u64) -> Self {
         Self(seed)
     }
 
-    /// The next 64 bits.
+    /// Returns the next 64 bits.
     pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
@@ -20,17 +20,17 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// The next number in 0..1.
+    /// Returns the next number in 0..1.
     pub fn unit(&mut self) -> f64 {
         (self.bits() >> 11) as f64 * (1.0 / (1u64 << 53) as f64)
     }
 
-    /// The next number between two.
+    /// Returns the next number between two.
     pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.unit()
     }
 
-    /// The next index below `n`; 0 when `n` is 0.
+    /// Returns the next index below `n`; 0 if `n` is 0.
     pub fn below(&mut self, n: usize) -> usize {
         ((u128::from(self.bits()) * n as u128) >> 64) as usize
     }

@@ -1,6 +1,6 @@
-//! SRDF: what a robot's joints and links are for. Groups, named poses, end effectors, pairs of links that may touch.
+//! SRDF: groups, named poses, end effectors, allowed collision pairs.
 //!
-//! A description's SRDF is often shared by variants of the robot: names that this robot lacks are warnings.
+//! An SRDF is often shared by variants of a robot: unknown links and joints are warnings.
 
 use std::collections::BTreeSet;
 
@@ -8,72 +8,71 @@ use crate::robot::model::RobotModel;
 use crate::robot::xml::{Attribute, Calls, Element};
 use crate::yaml::{Diag, Tree, did_you_mean};
 
-/// What an SRDF says.
+/// Contents of an SRDF.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Semantics {
-    /// Groups of joints, by which motion is asked for.
+    /// Groups of joints.
     pub groups: Vec<Group>,
     /// Named poses.
     pub poses: Vec<NamedPose>,
     /// End effectors.
     pub end_effectors: Vec<EndEffector>,
-    /// Pairs of links whose contact does not count.
+    /// Allowed collision pairs.
     pub disabled: Vec<DisabledPair>,
 }
 
 /// A group of joints and links.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Group {
-    /// Its name.
+    /// Name of the group.
     pub name: String,
-    /// Names of joints, each with its child link.
+    /// Joints, each with its child link.
     pub joints: Vec<String>,
-    /// Names of links, each with the joint that carries it.
+    /// Links, each with the joint that carries it.
     pub links: Vec<String>,
     /// Base and tip of chains.
     pub chains: Vec<(String, String)>,
-    /// Names of groups that are part of it.
+    /// Names of its subgroups.
     pub groups: Vec<String>,
 }
 
 /// A named pose of a group.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedPose {
-    /// Its name.
+    /// Name of the pose.
     pub name: String,
     /// The group.
     pub group: String,
-    /// Joints with their positions [rad or m].
+    /// Joints and their positions [rad or m].
     pub positions: Vec<(String, f64)>,
 }
 
 /// An end effector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EndEffector {
-    /// Its name.
+    /// Name of the end effector.
     pub name: String,
     /// The group of its own joints and links.
     pub group: String,
-    /// The link that it is mounted on.
+    /// The link it is mounted on.
     pub parent_link: String,
-    /// The group that carries it, where stated.
+    /// The group that carries it, if given.
     pub parent_group: Option<String>,
 }
 
-/// A pair of links whose contact does not count.
+/// An allowed collision pair (`disable_collisions`).
 #[derive(Debug, Clone, PartialEq)]
 pub struct DisabledPair {
     /// One link.
     pub a: String,
     /// The other.
     pub b: String,
-    /// Why: `Adjacent`, `Never` …
+    /// The reason: `Adjacent`, `Never` …
     pub reason: String,
 }
 
 impl Semantics {
-    /// Indices of the joints of a group that have a position of their own, in the order of the tree; `None` for an
-    /// unknown group.
+    /// Returns the indices of the independent joints of a group, in tree order; `None` for an unknown group.
     pub fn group_joints(&self, robot: &RobotModel, group: &str) -> Option<Vec<usize>> {
         let mut joints = BTreeSet::new();
         let mut open = vec![group];
@@ -97,8 +96,8 @@ impl Semantics {
         Some(joints.into_iter().filter(own).collect())
     }
 
-    /// The named poses that give a position to every one of these joints, in their order. Where two have the same
-    /// name, the first one counts.
+    /// Returns the named poses that cover all these joints, in their order. Of two with the same name, the first one
+    /// wins.
     pub fn poses_of(&self, joints: &[String]) -> Vec<(&str, Vec<f64>)> {
         let mut poses: Vec<(&str, Vec<f64>)> = Vec::new();
         for pose in &self.poses {
@@ -110,7 +109,7 @@ impl Semantics {
         poses
     }
 
-    /// The pairs of links whose contact does not count, by name.
+    /// Returns the allowed collision pairs, by name.
     pub fn disabled_pairs(&self) -> impl Iterator<Item = (String, String)> + '_ {
         self.disabled.iter().map(|pair| (pair.a.clone(), pair.b.clone()))
     }
@@ -147,7 +146,7 @@ struct Reader<'t> {
     robot: &'t RobotModel,
     tree: &'t mut Tree,
     calls: &'t Calls,
-    /// Disabled pairs with links that the robot lacks.
+    /// Pairs of links that the robot lacks.
     missing: usize,
 }
 
@@ -162,7 +161,7 @@ impl Reader<'_> {
         found
     }
 
-    /// A name that the robot should have.
+    /// Returns a name that the robot should have.
     fn named(&mut self, element: &Element, attribute: &str, joint: bool) -> Option<String> {
         let found = self.needed(element, attribute)?;
         let (what, known): (_, Vec<&str>) = match joint {
@@ -190,7 +189,7 @@ impl Reader<'_> {
                     let Some((base, tip)) = base.zip(tip) else { continue };
                     let ends = self.robot.link_index(&base).zip(self.robot.link_index(&tip));
                     if ends.and_then(|(b, t)| self.robot.chain(b, t)).is_none() {
-                        let what = format!("`{tip}` does not hang below `{base}`: this is no chain");
+                        let what = format!("`{tip}` is not below `{base}`: this is not a chain");
                         self.tree.report(Diag::error(what).at(part.at.label()));
                     }
                     group.chains.push((base, tip));
@@ -212,7 +211,7 @@ impl Reader<'_> {
             match value.value.trim().parse::<f64>() {
                 Ok(position) if position.is_finite() => positions.push((name, position)),
                 _ => {
-                    let what = format!("`{}` is no position of a joint", value.value);
+                    let what = format!("`{}` is not a joint position", value.value);
                     self.tree.report(Diag::error(what).at(value.at.label()));
                 }
             }
@@ -240,7 +239,7 @@ impl Reader<'_> {
         Some(DisabledPair { a, b, reason })
     }
 
-    /// Groups that others name must be there.
+    /// Checks that subgroups exist.
     fn check_groups(&mut self, root: &Element, out: &Semantics) {
         let known: Vec<&str> = out.groups.iter().map(|g| g.name.as_str()).collect();
         let inner = root.named("group").flat_map(|g| g.named("group")).filter_map(|g| g.attribute("name"));
@@ -248,7 +247,7 @@ impl Reader<'_> {
         let effectors = root.named("end_effector").filter_map(|e| e.attribute("group"));
         for name in inner.chain(states).chain(effectors).filter(|name| !known.contains(&name.value.as_str())) {
             let hint = did_you_mean(&name.value, known.iter().copied(), "the groups are");
-            let diag = Diag::error(format!("no group is named `{}`", name.value)).at(name.at.label());
+            let diag = Diag::error(format!("unknown group `{}`", name.value)).at(name.at.label());
             self.tree.report(diag.maybe_hint(hint));
         }
     }
@@ -309,11 +308,11 @@ mod tests {
     fn wrong_names_are_found() {
         for (body, what) in [
             ("<group name='a'><joint name='j9'/></group>", "this robot has no joint `j9`"),
-            ("<group name='a'><chain base_link='l2' tip_link='l0'/></group>", "does not hang below"),
-            ("<group_state name='h' group='b'/>", "no group is named `b`"),
+            ("<group name='a'><chain base_link='l2' tip_link='l0'/></group>", "is not below"),
+            ("<group_state name='h' group='b'/>", "unknown group `b`"),
             (
                 "<group name='a'/><group_state name='h' group='a'><joint name='j1' value='x'/></group_state>",
-                "is no position",
+                "is not a joint position",
             ),
             ("<group/>", "this `group` has no `name`"),
         ] {

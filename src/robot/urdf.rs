@@ -1,7 +1,7 @@
-//! URDF → [`RobotModel`]. Everything that is wrong is reported at once, each at its place; tags without meaning here
-//! (`gazebo`, `transmission`, `ros2_control` …) are passed over.
+//! URDF → [`RobotModel`]. Reports all mistakes at once, each with its position; ignores tags of other tools (`gazebo`,
+//! `transmission`, `ros2_control` …).
 //!
-//! Read from our own tree and not by a URDF crate, so that mistakes have places: docs/decisions/0023.
+//! Uses our own XML tree rather than a URDF crate, so that mistakes have positions: docs/decisions/0023.
 
 mod numbers;
 mod shapes;
@@ -13,23 +13,23 @@ use std::path::PathBuf;
 use nalgebra::{Unit, Vector3};
 
 use crate::robot::model::{Joint, JointKind, Limits, Link, Mimic, RobotModel};
-use crate::robot::xml::{Calls, Element, Place};
+use crate::robot::xml::{Calls, Element, SourcePos};
 use crate::yaml::{Diag, Tree, did_you_mean, quote};
 
-/// The most links of a robot.
+/// Maximum number of links.
 pub const MAX_LINKS: usize = 512;
 
-/// What to do about mesh files.
+/// Handling of mesh files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Meshes {
     /// Look for each: a missing collision mesh is an error, a missing visual mesh a warning.
     #[default]
     Find,
-    /// Do not look: shapes keep their names of files, for uses that need no shapes.
+    /// Do not look for files: for uses that need no shapes.
     Ignore,
 }
 
-/// Where a file is that a description names, or why it cannot be found.
+/// Resolves a URI to a file, or returns why not.
 pub type Resolve<'a> = dyn Fn(&str) -> Result<PathBuf, String> + 'a;
 
 /// Reads a robot from the root element of a description.
@@ -45,7 +45,7 @@ pub fn read(
     model.filter(|_| reader.errors == 0)
 }
 
-/// Reads a robot from a text without looking for its meshes; the mistakes as text. For tests and built-in robots.
+/// Reads a robot from a text without looking for meshes; returns the mistakes as text. For tests and built-in robots.
 pub fn from_text(name: &str, text: &str) -> Result<RobotModel, String> {
     let mut tree = Tree::new();
     let source = tree.add_source(name, text);
@@ -56,7 +56,7 @@ pub fn from_text(name: &str, text: &str) -> Result<RobotModel, String> {
     model.ok_or_else(lines)
 }
 
-/// Reads one description.
+/// Reader of one description.
 struct Reader<'t> {
     tree: &'t mut Tree,
     calls: &'t Calls,
@@ -67,40 +67,40 @@ struct Reader<'t> {
     errors: usize,
 }
 
-/// A joint as written, before its links are known.
+/// A joint as written, before links are resolved.
 struct RawJoint {
     joint: Joint,
-    at: Place,
-    parent: (String, Place),
-    child: (String, Place),
+    at: SourcePos,
+    parent: (String, SourcePos),
+    child: (String, SourcePos),
     mimic: Option<RawMimic>,
 }
 
 /// A `mimic` as written.
 struct RawMimic {
     leader: String,
-    at: Place,
+    at: SourcePos,
     multiplier: f64,
     offset: f64,
 }
 
 impl Reader<'_> {
-    fn error(&mut self, at: Place, what: impl Into<String>) {
+    fn error(&mut self, at: SourcePos, what: impl Into<String>) {
         self.report(at, Diag::error(what));
     }
 
-    fn report(&mut self, at: Place, diag: Diag) {
+    fn report(&mut self, at: SourcePos, diag: Diag) {
         self.errors += usize::from(diag.severity == crate::yaml::Severity::Error);
         let diag = self.calls.explain(diag.at(at.label()), at);
         self.tree.report(diag);
     }
 
-    fn warn(&mut self, at: Place, what: impl Into<String>) {
+    fn warn(&mut self, at: SourcePos, what: impl Into<String>) {
         self.report(at, Diag::warning(what));
     }
 
-    /// An attribute that must be there and not be empty.
-    fn needed<'e>(&mut self, element: &'e Element, name: &str) -> Option<(&'e str, Place)> {
+    /// Returns a required attribute that is not empty.
+    fn needed<'e>(&mut self, element: &'e Element, name: &str) -> Option<(&'e str, SourcePos)> {
         match element.attribute(name) {
             Some(a) if !a.value.trim().is_empty() => Some((a.value.as_str(), a.at)),
             Some(a) => {
@@ -128,12 +128,12 @@ impl Reader<'_> {
             match element.name.as_str() {
                 "link" if links.len() < MAX_LINKS => links.extend(self.link(element)),
                 "link" => {
-                    self.error(element.at, format!("a robot may have {MAX_LINKS} links at most"));
+                    self.error(element.at, format!("a robot may have at most {MAX_LINKS} links"));
                     return None;
                 }
                 "joint" if joints.len() < MAX_LINKS => joints.extend(self.joint(element)),
                 "joint" => {
-                    self.error(element.at, format!("a robot may have {} joints at most", MAX_LINKS - 1));
+                    self.error(element.at, format!("a robot may have at most {} joints", MAX_LINKS - 1));
                     return None;
                 }
                 _ => {}
@@ -146,7 +146,7 @@ impl Reader<'_> {
         self.assemble(name?, links, joints)
     }
 
-    fn link(&mut self, element: &Element) -> Option<(Link, Place)> {
+    fn link(&mut self, element: &Element) -> Option<(Link, SourcePos)> {
         let (name, at) = self.needed(element, "name")?;
         let visuals = element.named("visual").filter_map(|e| self.shape(e, false)).collect();
         let collisions = element.named("collision").filter_map(|e| self.shape(e, true)).collect();
@@ -171,7 +171,7 @@ impl Reader<'_> {
         let limits = kind.and_then(|kind| self.limits(element, kind));
         let mimic = element.child("mimic").filter(|_| moves).map(|e| self.mimic(e));
         let (name, at) = name?;
-        // Values stand in for those that were reported: the joint's place in the tree is checked all the same.
+        // Defaults replace values that were reported: the joint's position in the tree is checked all the same.
         let joint = Joint {
             name: name.to_owned(),
             kind: kind.unwrap_or(JointKind::Fixed),
@@ -193,13 +193,13 @@ impl Reader<'_> {
             "continuous" => Some(JointKind::Continuous),
             "prismatic" => Some(JointKind::Prismatic),
             "floating" | "planar" | "spherical" => {
-                let diag = Diag::error(format!("joints of type `{word}` cannot be driven"));
+                let diag = Diag::error(format!("joints of type `{word}` are not supported"));
                 self.report(at, diag.hint("an arm's joints are revolute, continuous, prismatic or fixed"));
                 None
             }
             other => {
                 let hint = did_you_mean(other, ["fixed", "revolute", "continuous", "prismatic"], "the types are");
-                self.report(at, Diag::error(format!("no joint type is named {}", quote(other))).maybe_hint(hint));
+                self.report(at, Diag::error(format!("unknown joint type {}", quote(other))).maybe_hint(hint));
                 None
             }
         }
@@ -234,7 +234,7 @@ impl Reader<'_> {
                 self.error(limit.at, "this limit has neither `lower` nor `upper`");
                 fine = false;
             }
-            // URDF: an end that is not stated is zero.
+            // URDF: an omitted end is zero.
             let lower = self.number_or(limit, "lower", 0.0);
             let upper = self.number_or(limit, "upper", 0.0);
             match (lower, upper) {
@@ -259,7 +259,7 @@ impl Reader<'_> {
         (fine && !(bounded && missing)).then_some(limits)
     }
 
-    /// A limit that is positive; not stated means infinite. Zero is what exporters write where nobody said anything.
+    /// Returns a positive limit; infinite if omitted. Exporters write zero for an unknown limit.
     fn rate(&mut self, limit: &Element, name: &str) -> Option<f64> {
         let value = self.number_or(limit, name, f64::INFINITY)?;
         let at = limit.attribute(name).map_or(limit.at, |a| a.at);
@@ -269,8 +269,8 @@ impl Reader<'_> {
         }
         if value == 0.0 {
             if name == "velocity" {
-                let what = "a velocity limit of 0 is taken for one that was never stated";
-                self.report(at, Diag::warning(what).hint("state the joint's real limit"));
+                let what = "a velocity limit of 0 counts as not given";
+                self.report(at, Diag::warning(what).hint("give the joint's actual limit"));
             }
             return Some(f64::INFINITY);
         }
@@ -285,7 +285,7 @@ impl Reader<'_> {
     }
 }
 
-/// A follower that is not resolved yet.
+/// A mimic joint that is not resolved yet.
 impl From<(&RawMimic, usize)> for Mimic {
     fn from((raw, leader): (&RawMimic, usize)) -> Self {
         Self { leader, multiplier: raw.multiplier, offset: raw.offset }

@@ -1,13 +1,13 @@
-//! xacro without Python: macros, properties, conditions, includes and expressions of robot descriptions are expanded
-//! as the original (version 2.1) does it; its quirks included, where files depend on them.
+//! xacro without Python: expands macros, properties, conditions, includes and expressions like the original (version
+//! 2.1), including the quirks that files depend on.
 //!
 //! ```text
 //!  text ${…} $(…) ─▶ text ─▶ syntax ─▶ evaluate (functions, methods, format) ─▶ value
 //!  elements ───────▶ expand (scope: properties, macros; call: macro calls; include: files, yaml11) ─▶ elements
 //! ```
 //!
-//! What a file may do is bounded: it reads files of its own package and of packages it was given, its work and its
-//! output are counted, and its expressions are no Python.
+//! A file's power is limited: it reads files of its own package and of given packages, its work and output are counted,
+//! and its expressions are not Python.
 
 mod call;
 mod evaluate;
@@ -29,34 +29,34 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use crate::robot::packages::Packages;
-use crate::robot::xml::{Calls, Document, Place};
+use crate::robot::xml::{Calls, Document, SourcePos};
 use crate::yaml::{Diag, SourceId, Tree};
 
-/// The namespace that marks a file as xacro.
+/// Namespace declaration that marks a file as xacro.
 const NAMESPACE: &str = "xmlns:xacro";
-/// Expansion nests deeply where macros call themselves: it has a stack of its own [bytes].
+/// Stack size of the expansion thread [bytes]: recursive macros nest deeply.
 const STACK: usize = 256 << 20;
 
-/// What an expansion came to.
+/// Result of an expansion.
 #[derive(Debug, Clone, Default)]
 pub struct Expansion {
     /// The expanded file.
     pub document: Document,
-    /// The macro calls that places refer to.
+    /// Macro calls that source positions refer to.
     pub calls: Calls,
-    /// Every file that was read, the first one first.
+    /// Every file read, the main one first.
     pub files: Vec<PathBuf>,
-    /// Arguments that no file knows, each with a name that is close.
+    /// Arguments that no file declares, each with a similar name.
     pub unknown_args: Vec<(String, Option<String>)>,
 }
 
-/// Whether a description needs expansion: by its name, or by what its root declares.
+/// Returns whether a description needs expansion: by its file name, or by the namespaces of its root.
 pub fn is_xacro(path: &Path, document: &Document) -> bool {
     path.extension().is_some_and(|e| e == "xacro") || document.root.attribute(NAMESPACE).is_some()
 }
 
-/// Expands a file that was parsed already. `args` are the values of `xacro:arg`s. What is wrong is reported, with
-/// the macro calls and includes that led there; then nothing comes out.
+/// Expands a parsed file. `args` are the values of `xacro:arg`. Reports errors with the macro calls and includes that
+/// led there, and then returns nothing.
 pub fn expand(
     tree: &mut Tree,
     path: &Path,
@@ -72,25 +72,25 @@ pub fn expand(
     });
     let failed = match done {
         Ok(Ok(expansion)) => return expansion,
-        Ok(Err(_)) => "the expansion failed within: this is a mistake of the program".to_owned(),
+        Ok(Err(_)) => "the expansion panicked: a bug in this program".to_owned(),
         Err(error) => format!("the expansion cannot be started: {error}"),
     };
-    tree.report(Diag::error(failed).at(Place { source, ..Place::default() }.label()));
+    tree.report(Diag::error(failed).at(SourcePos { source, ..SourcePos::default() }.label()));
     None
 }
 
-/// Why an expansion ended.
+/// Why an expansion failed.
 #[derive(Debug)]
-struct Trouble {
+struct ExpansionError {
     message: String,
-    at: Option<Place>,
+    at: Option<SourcePos>,
     hint: Option<String>,
-    also: Vec<(Place, String)>,
+    also: Vec<(SourcePos, String)>,
 }
 
-type Result<T = ()> = std::result::Result<T, Box<Trouble>>;
+type Result<T = ()> = std::result::Result<T, Box<ExpansionError>>;
 
-impl Trouble {
+impl ExpansionError {
     fn new(message: impl Into<String>) -> Box<Self> {
         let message = message.into();
         let (message, hint) = match message.split_once("\nhint: ") {
@@ -100,7 +100,7 @@ impl Trouble {
         Box::new(Self { message, at: None, hint, also: Vec::new() })
     }
 
-    fn at(mut self: Box<Self>, place: Place) -> Box<Self> {
+    fn at(mut self: Box<Self>, place: SourcePos) -> Box<Self> {
         self.at.get_or_insert(place);
         self
     }
@@ -110,8 +110,8 @@ impl Trouble {
         self
     }
 
-    /// Adds a place that led here; the outer ones of a long way are left out.
-    fn also(mut self: Box<Self>, place: Place, text: impl Into<String>) -> Box<Self> {
+    /// Adds a position that led here; drops the outer ones of a long chain.
+    fn also(mut self: Box<Self>, place: SourcePos, text: impl Into<String>) -> Box<Self> {
         if self.also.len() < 3 && self.at != Some(place) {
             self.also.push((place, text.into()));
         }
@@ -119,7 +119,7 @@ impl Trouble {
     }
 
     fn diag(self, calls: &Calls, source: SourceId) -> Diag {
-        let at = self.at.unwrap_or(Place { source, ..Place::default() });
+        let at = self.at.unwrap_or(SourcePos { source, ..SourcePos::default() });
         let mut diag = calls.explain(Diag::error(self.message).at(at.label()), at).maybe_hint(self.hint);
         for (place, text) in self.also {
             diag = diag.also(place.label().with_text(text));

@@ -1,40 +1,40 @@
-//! XML as an owned tree whose every element and attribute knows where it was written.
+//! XML as an owned tree; every element and attribute keeps its position in the source.
 //!
-//! Parsing is `roxmltree`'s; this tree can be changed (xacro does), keeps prefixes and CDATA as written, and is
-//! printed in one canonical form. Entities and DTDs are refused.
+//! Parsed by `roxmltree`. This tree can be modified (by xacro), keeps prefixes and CDATA as written, and prints in one
+//! canonical form. Entities and DTDs are rejected.
 
 use roxmltree::{ParsingOptions, TextPos};
 
 use crate::yaml::{Diag, Label, SourceId, Tree};
 
-/// The largest file that is read [bytes].
+/// Maximum file size [bytes].
 pub const MAX_BYTES: usize = 8 << 20;
-/// The deepest nesting of elements.
+/// Maximum nesting of elements.
 pub const MAX_DEPTH: usize = 128;
-/// The most nodes of one file.
+/// Maximum number of nodes per file.
 const MAX_NODES: u32 = 1_000_000;
 /// The namespace of xacro's elements.
 const XACRO: &str = "xmlns:xacro=\"http://www.ros.org/wiki/xacro\"";
 
-/// Where something was written.
+/// Position in a source.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Place {
-    /// The text.
+pub struct SourcePos {
+    /// The source.
     pub source: SourceId,
     /// First byte.
     pub start: u32,
-    /// Byte after the last.
+    /// One past the last byte.
     pub end: u32,
-    /// The macro call that it came out of: an index into [`Calls`]; 0 where there is none.
+    /// Macro call that it was expanded from: an index into [`Calls`]; 0 for none.
     pub call: u32,
 }
 
-impl Place {
+impl SourcePos {
     pub(super) fn new(source: SourceId, range: std::ops::Range<usize>) -> Self {
         Self { source, start: range.start as u32, end: range.end as u32, call: 0 }
     }
 
-    /// The place as a label of a mistake.
+    /// Returns a diagnostic label for the position.
     pub fn label(self) -> Label {
         Label { source: self.source, range: self.start as usize..self.end as usize, text: String::new() }
     }
@@ -47,8 +47,8 @@ pub struct Attribute {
     pub name: String,
     /// Value, entities resolved.
     pub value: String,
-    /// Where the value stands.
-    pub at: Place,
+    /// Position of the value.
+    pub at: SourcePos,
 }
 
 /// An element.
@@ -56,28 +56,28 @@ pub struct Attribute {
 pub struct Element {
     /// Name with prefix, as written.
     pub name: String,
-    /// Where the start tag's name stands.
-    pub at: Place,
-    /// Attributes, in the order they were written.
+    /// Position of the name in the start tag.
+    pub at: SourcePos,
+    /// Attributes, in the order of the source.
     pub attributes: Vec<Attribute>,
-    /// What it contains.
+    /// Content.
     pub children: Vec<Node>,
 }
 
-/// What an element contains.
+/// Content of an element.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Node {
     /// An element.
     Element(Element),
     /// Text.
-    Text(String, Place),
-    /// Text that is never looked into.
+    Text(String, SourcePos),
+    /// A CDATA section.
     CData(String),
     /// A comment.
-    Comment(String, Place),
+    Comment(String, SourcePos),
     /// A processing instruction.
     Instruction(String),
-    /// What xacro leaves behind so that comments above are kept; prints as nothing.
+    /// Marks where xacro keeps the comments above; prints nothing.
     Barrier(u32),
 }
 
@@ -90,21 +90,21 @@ pub struct Document {
     pub root: Element,
 }
 
-/// The macro calls of an expansion, so that what came out of one can be traced. Number 0 is no call.
+/// The macro calls of an expansion, to trace expanded elements. Index 0 is no call.
 #[derive(Debug, Clone, Default)]
-pub struct Calls(Vec<(String, Place)>);
+pub struct Calls(Vec<(String, SourcePos)>);
 
 impl Calls {
-    /// Notes a call; its number.
-    pub(super) fn add(&mut self, name: &str, at: Place) -> u32 {
+    /// Records a call and returns its index.
+    pub(super) fn add(&mut self, name: &str, at: SourcePos) -> u32 {
         self.0.push((name.to_owned(), at));
         self.0.len() as u32
     }
 
-    /// Adds to a mistake the calls that led to its place, innermost first.
-    pub fn explain(&self, mut diag: Diag, at: Place) -> Diag {
+    /// Adds to a diagnostic the calls that led to its position, innermost first.
+    pub fn explain(&self, mut diag: Diag, at: SourcePos) -> Diag {
         let mut call = at.call;
-        // Two are enough to find it, and a recursive macro has hundreds.
+        // Two are enough to find it; a recursive macro has hundreds.
         for _ in 0..2 {
             let Some((name, place)) = (call as usize).checked_sub(1).and_then(|i| self.0.get(i)) else { break };
             diag = diag.also(place.label().with_text(format!("in this call of the macro `{name}`")));
@@ -115,20 +115,20 @@ impl Calls {
 }
 
 impl Element {
-    /// The attribute of a name.
+    /// Returns an attribute by name.
     pub fn attribute(&self, name: &str) -> Option<&Attribute> {
         self.attributes.iter().find(|a| a.name == name)
     }
 
     /// Sets an attribute, replacing one of the same name.
-    pub fn set(&mut self, name: &str, value: String, at: Place) {
+    pub fn set(&mut self, name: &str, value: String, at: SourcePos) {
         match self.attributes.iter_mut().find(|a| a.name == name) {
             Some(attribute) => attribute.value = value,
             None => self.attributes.push(Attribute { name: name.to_owned(), value, at }),
         }
     }
 
-    /// Child elements.
+    /// Returns the child elements.
     pub fn elements(&self) -> impl Iterator<Item = &Element> {
         self.children.iter().filter_map(|node| match node {
             Node::Element(element) => Some(element),
@@ -136,17 +136,17 @@ impl Element {
         })
     }
 
-    /// Child elements of a name.
+    /// Returns the child elements with a name.
     pub fn named<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a Element> {
         self.elements().filter(move |e| e.name == name)
     }
 
-    /// The first child element of a name.
+    /// Returns the first child element with a name.
     pub fn child<'a>(&'a self, name: &'a str) -> Option<&'a Element> {
         self.elements().find(|e| e.name == name)
     }
 
-    /// Marks everything inside as having come out of a macro call.
+    /// Marks all content as expanded from a macro call.
     pub(super) fn stamp(&mut self, call: u32) {
         self.at.call = call;
         self.attributes.iter_mut().for_each(|a| a.at.call = call);
@@ -160,7 +160,7 @@ impl Element {
     }
 }
 
-/// Parses a source. What is wrong is reported, at its place; then nothing comes out.
+/// Parses a source. Reports errors with their position, and then returns nothing.
 pub fn parse(tree: &mut Tree, source: SourceId) -> Option<Document> {
     let text = tree.source(source)?.text.clone();
     if text.len() > MAX_BYTES {
@@ -200,7 +200,7 @@ pub fn parse(tree: &mut Tree, source: SourceId) -> Option<Document> {
     }
 }
 
-/// The byte of a row and column, both counted from 1.
+/// Returns the byte offset of a row and column, both from 1.
 fn offset(text: &str, pos: TextPos) -> usize {
     let line = text.split_inclusive('\n').take(pos.row.saturating_sub(1) as usize).map(str::len).sum::<usize>();
     let rest = text.get(line..).unwrap_or_default();
@@ -212,7 +212,7 @@ fn offset(text: &str, pos: TextPos) -> usize {
 struct Copy<'t> {
     source: SourceId,
     text: &'t str,
-    too_deep: Option<Place>,
+    too_deep: Option<SourcePos>,
 }
 
 impl Copy<'_> {
@@ -220,7 +220,7 @@ impl Copy<'_> {
         let start = node.range().start + 1;
         let rest = self.text.get(start..).unwrap_or_default();
         let length = rest.find(|c: char| c.is_whitespace() || c == '/' || c == '>').unwrap_or(rest.len());
-        let at = Place::new(self.source, start..start + length);
+        let at = SourcePos::new(self.source, start..start + length);
         let name = rest.get(..length).unwrap_or_default().to_owned();
         if depth > MAX_DEPTH {
             self.too_deep.get_or_insert(at);
@@ -229,7 +229,7 @@ impl Copy<'_> {
         let mut attributes = self.declarations(node, at);
         for attribute in node.attributes() {
             let name = self.text.get(attribute.range_qname()).unwrap_or_default().to_owned();
-            let at = Place::new(self.source, attribute.range_value());
+            let at = SourcePos::new(self.source, attribute.range_value());
             attributes.push(Attribute { name, value: attribute.value().to_owned(), at });
         }
         let mut children = Vec::new();
@@ -242,8 +242,8 @@ impl Copy<'_> {
         Element { name, at, attributes, children }
     }
 
-    /// The namespaces that an element declares itself.
-    fn declarations(&self, node: roxmltree::Node<'_, '_>, at: Place) -> Vec<Attribute> {
+    /// Returns the namespaces declared by the element itself.
+    fn declarations(&self, node: roxmltree::Node<'_, '_>, at: SourcePos) -> Vec<Attribute> {
         let parent = node.parent_element();
         let own = |ns: &&roxmltree::Namespace<'_>| {
             ns.name() != Some("xml") && parent.is_none_or(|p| p.lookup_namespace_uri(ns.name()) != Some(ns.uri()))
@@ -257,23 +257,23 @@ impl Copy<'_> {
     }
 
     fn node(&mut self, node: roxmltree::Node<'_, '_>, depth: usize) -> Option<Node> {
-        let at = Place::new(self.source, node.range());
+        let at = SourcePos::new(self.source, node.range());
         if node.is_element() {
             return Some(Node::Element(self.element(node, depth)));
         }
         if node.is_comment() {
             let text = node.text().unwrap_or_default();
-            // Line ends are one character in XML; the parser sees to that in texts only.
+            // A line end is one character in XML; the parser ensures that in texts only.
             return Some(Node::Comment(text.replace("\r\n", "\n").replace('\r', "\n"), at));
         }
         let instruction = node.pi()?;
         Some(Node::Instruction(format!("{} {}", instruction.target, instruction.value.unwrap_or_default())))
     }
 
-    /// A text with the CDATA sections in it told apart: roxmltree joins them.
+    /// Splits a text into CDATA sections and text: roxmltree joins them.
     fn texts(&self, node: roxmltree::Node<'_, '_>, children: &mut Vec<Node>) {
         const OPEN: &str = "<![CDATA[";
-        let at = Place::new(self.source, node.range());
+        let at = SourcePos::new(self.source, node.range());
         let text = node.text().unwrap_or_default();
         let end = match node.next_sibling() {
             Some(next) => next.range().start,
@@ -303,7 +303,7 @@ impl Copy<'_> {
     }
 }
 
-/// Text with its character references resolved.
+/// Returns text with its character references resolved.
 fn resolved(raw: &str) -> String {
     let wrapped = format!("<t>{raw}</t>");
     let parsed = roxmltree::Document::parse(&wrapped);
@@ -311,8 +311,8 @@ fn resolved(raw: &str) -> String {
 }
 
 impl Document {
-    /// The canonical text: two spaces a level, attributes in the order of their names, no white space between
-    /// elements but line breaks. What xacro prints, without its banner.
+    /// Returns the canonical text: two spaces per level, attributes sorted by name, only line breaks between elements.
+    /// Equals xacro's output without its banner.
     pub fn to_text(&self) -> String {
         let mut out = String::from("<?xml version=\"1.0\" ?>\n");
         self.before.iter().for_each(|node| write_node(node, 0, &mut out));
@@ -333,7 +333,7 @@ fn write_node(node: &Node, depth: usize, out: &mut String) {
             }
         }
         Node::CData(text) => {
-            // What stands in a section must not end it.
+            // The text of a section must not end it.
             let text = text.replace("]]>", "]]]]><![CDATA[>");
             out.push_str(&format!("<![CDATA[{text}]]>"));
         }
@@ -413,25 +413,25 @@ mod tests {
     }
 
     #[test]
-    fn cdata_is_told_from_text() {
+    fn cdata_and_text_are_distinguished() {
         for (text, expected) in [
             ("<r><![CDATA[a<b]]></r>", vec![Node::CData("a<b".into())]),
             (
                 "<r>x&amp;<![CDATA[&amp;]]></r>",
-                vec![Node::Text("x&".into(), Place::default()), Node::CData("&amp;".into())],
+                vec![Node::Text("x&".into(), SourcePos::default()), Node::CData("&amp;".into())],
             ),
             (
                 "<r><![CDATA[1]]>y<!--c--></r>",
                 vec![
                     Node::CData("1".into()),
-                    Node::Text("y".into(), Place::default()),
-                    Node::Comment("c".into(), Place::default()),
+                    Node::Text("y".into(), SourcePos::default()),
+                    Node::Comment("c".into(), SourcePos::default()),
                 ],
             ),
         ] {
             let plain = |node: Node| match node {
-                Node::Text(t, _) => Node::Text(t, Place::default()),
-                Node::Comment(t, _) => Node::Comment(t, Place::default()),
+                Node::Text(t, _) => Node::Text(t, SourcePos::default()),
+                Node::Comment(t, _) => Node::Comment(t, SourcePos::default()),
                 other => other,
             };
             let (_, document) = read(text);

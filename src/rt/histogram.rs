@@ -1,14 +1,14 @@
-//! A histogram of durations that one thread fills and others read, without locks: buckets of atomic counters, 16
-//! to each power of two, so that a figure read from it is at most 6 % too high.
+//! Lock-free histogram of durations, written by one thread and read by others: atomic counters, 16 buckets per power of
+//! two, so that a percentile is at most 6 % too high.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Buckets per power of two.
-const FINE: usize = 16;
-/// Powers of two that are told apart: up to 2^36 ns, about 69 s.
+const BUCKETS_PER_POWER: usize = 16;
+/// Number of powers of two: up to 2^36 ns, about 69 s.
 const POWERS: usize = 33;
 
-/// Durations in nanoseconds, counted.
+/// Counts of durations in nanoseconds.
 #[derive(Debug)]
 pub struct Histogram {
     buckets: Vec<AtomicU64>,
@@ -17,22 +17,25 @@ pub struct Histogram {
 
 impl Default for Histogram {
     fn default() -> Self {
-        Self { buckets: (0..POWERS * FINE).map(|_| AtomicU64::new(0)).collect(), highest: AtomicU64::new(0) }
+        Self {
+            buckets: (0..POWERS * BUCKETS_PER_POWER).map(|_| AtomicU64::new(0)).collect(),
+            highest: AtomicU64::new(0),
+        }
     }
 }
 
-/// What a histogram says.
+/// Percentiles of a histogram.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Figures {
-    /// How many durations were counted.
+    /// Number of durations.
     pub count: u64,
-    /// Half of them are no longer [µs].
+    /// Median [µs].
     pub p50: f64,
-    /// 99 % of them are no longer [µs].
+    /// 99th percentile [µs].
     pub p99: f64,
-    /// 99.9 % of them are no longer [µs].
+    /// 99.9th percentile [µs].
     pub p99_9: f64,
-    /// The longest [µs].
+    /// Maximum [µs].
     pub max: f64,
 }
 
@@ -45,7 +48,7 @@ impl Histogram {
         self.highest.fetch_max(ns, Ordering::Relaxed);
     }
 
-    /// What was counted so far.
+    /// Returns the current percentiles.
     pub fn figures(&self) -> Figures {
         let counts: Vec<u64> = self.buckets.iter().map(|b| b.load(Ordering::Relaxed)).collect();
         let count: u64 = counts.iter().sum();
@@ -64,20 +67,20 @@ impl Histogram {
 }
 
 fn index_of(ns: u64) -> usize {
-    if ns < FINE as u64 {
+    if ns < BUCKETS_PER_POWER as u64 {
         return ns as usize;
     }
     let power = ns.ilog2() as usize;
-    let fine = (ns >> (power - 4)) as usize & (FINE - 1);
-    ((power - 3) * FINE + fine).min(POWERS * FINE - 1)
+    let fine = (ns >> (power - 4)) as usize & (BUCKETS_PER_POWER - 1);
+    ((power - 3) * BUCKETS_PER_POWER + fine).min(POWERS * BUCKETS_PER_POWER - 1)
 }
 
 fn upper_end(bucket: usize) -> u64 {
-    if bucket < FINE {
+    if bucket < BUCKETS_PER_POWER {
         return bucket as u64;
     }
-    let (power, fine) = (bucket / FINE + 3, (bucket % FINE) as u64);
-    ((FINE as u64 + fine + 1) << (power - 4)) - 1
+    let (power, fine) = (bucket / BUCKETS_PER_POWER + 3, (bucket % BUCKETS_PER_POWER) as u64);
+    ((BUCKETS_PER_POWER as u64 + fine + 1) << (power - 4)) - 1
 }
 
 #[cfg(test)]
@@ -99,7 +102,7 @@ mod tests {
     fn every_duration_has_its_bucket_and_the_longest_do_not_overflow() {
         for ns in (0..4096).chain([u64::MAX, 1 << 36, (1 << 36) - 1]) {
             let b = index_of(ns);
-            assert!(b < POWERS * FINE);
+            assert!(b < POWERS * BUCKETS_PER_POWER);
             assert!(ns > 1 << 35 || upper_end(b) >= ns, "{ns}");
         }
         assert_eq!(Histogram::default().figures(), Figures::default());

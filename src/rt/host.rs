@@ -1,6 +1,5 @@
-//! What the host grants a real-time thread: FIFO scheduling, locked memory, short wake-ups from idle states. Each
-//! is asked for; what is refused is told with its remedy and never stops a run. The reasons and figures are in
-//! `docs/realtime.md`.
+//! Real-time setup of the host: FIFO scheduling, locked memory, no deep idle states. Each is requested; a refusal is
+//! reported with its fix and never stops a run. Reasons and figures are in `docs/realtime.md`.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
@@ -8,31 +7,32 @@ use std::time::Duration;
 
 use crate::clock::{Clock, Mono, MonotonicClock};
 
-/// FIFO priority of the watchdog: above everything it watches.
+/// FIFO priority of the watchdog: above all that it watches.
 pub const WATCHDOG_PRIORITY: i32 = 82;
-/// FIFO priority of the device threads: above the tick, so that a command is on the wire before the next one comes.
+/// FIFO priority of the device threads: above the tick, so that a command is written before the next one arrives.
 pub const DEVICE_PRIORITY: i32 = 81;
 /// FIFO priority of the tick.
 pub const TICK_PRIORITY: i32 = 80;
-/// FIFO priority of emulators: they stand for controllers, which do not wait for this host's other work.
+/// FIFO priority of emulators: they replace controllers, which do not share this host's processors.
 pub const EMULATOR_PRIORITY: i32 = 79;
-/// FIFO priority of the thread that takes an operator's stop: below all that moves arms, above everything else.
+/// FIFO priority of the thread that receives an operator's stop: below all threads that move arms, above everything
+/// else.
 pub const STOP_PRIORITY: i32 = 10;
-/// What the grant of real-time scheduling is called.
+/// Name of the scheduling grant.
 pub const SCHEDULING: &str = "real-time scheduling";
-/// Stack of a timed thread [bytes].
+/// Stack of a real-time thread [bytes].
 pub const STACK: usize = 256 * 1024;
 
-/// One thing that was asked of the host.
+/// One request to the host and its result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Grant {
-    /// What was asked for.
+    /// What was requested.
     pub what: &'static str,
     /// Whether it was granted.
     pub granted: bool,
-    /// What was granted, or why not.
+    /// Details: what was granted, or why not.
     pub detail: String,
-    /// What to do when it was not; empty when it was.
+    /// The fix if it was refused; otherwise empty.
     pub remedy: &'static str,
 }
 
@@ -41,35 +41,35 @@ const MEMLOCK_REMEDY: &str =
     "allow it: `@realtime - memlock unlimited` in /etc/security/limits.d/ (LimitMEMLOCK=infinity under systemd)";
 const LATENCY_REMEDY: &str = "allow it: let your group write /dev/cpu_dma_latency by a udev rule, or run as root";
 
-/// Holds idle states off for as long as it lives.
+/// Keeps deep idle states disabled until dropped.
 #[derive(Debug)]
 pub struct LatencyHold(#[expect(dead_code, reason = "the kernel keeps the request while the file is open")] File);
 
-/// Asks for all that concerns the whole process. The hold must be kept for as long as the run lives.
+/// Requests all process-wide settings. Keep the returned hold for the duration of the run.
 pub fn prepare_process(hold_latency: bool) -> (Vec<Grant>, Option<LatencyHold>) {
     let mut grants = vec![probe_fifo(), lock_memory()];
     let hold = hold_latency.then(hold_cpu_latency);
     let kept = match hold {
         None => {
-            let detail = "left on: the run asks for no real time".to_owned();
-            grants.push(Grant { what: "idle states held off", granted: false, detail, remedy: "" });
+            let detail = "left enabled: the run does not request real time".to_owned();
+            grants.push(Grant { what: "deep idle states disabled", granted: false, detail, remedy: "" });
             None
         }
         Some(Ok(file)) => {
             let detail = "/dev/cpu_dma_latency at 0 µs".to_owned();
-            grants.push(Grant { what: "idle states held off", granted: true, detail, remedy: "" });
+            grants.push(Grant { what: "deep idle states disabled", granted: true, detail, remedy: "" });
             Some(file)
         }
         Some(Err(e)) => {
             let detail = format!("/dev/cpu_dma_latency: {e}");
-            grants.push(Grant { what: "idle states held off", granted: false, detail, remedy: LATENCY_REMEDY });
+            grants.push(Grant { what: "deep idle states disabled", granted: false, detail, remedy: LATENCY_REMEDY });
             None
         }
     };
     (grants, kept)
 }
 
-/// Tries FIFO on the calling thread and goes back to the ordinary class.
+/// Tries FIFO on the calling thread and returns to the default class.
 fn probe_fifo() -> Grant {
     match set_fifo(TICK_PRIORITY) {
         Ok(()) => {
@@ -84,7 +84,7 @@ fn probe_fifo() -> Grant {
     }
 }
 
-/// Puts the calling thread into the FIFO class.
+/// Switches the calling thread to the FIFO class.
 pub fn set_fifo(priority: i32) -> io::Result<()> {
     // SAFETY: sched_param is plain data, zero is a valid value for it.
     let mut param: libc::sched_param = unsafe { std::mem::zeroed() };
@@ -99,7 +99,7 @@ pub fn set_fifo(priority: i32) -> io::Result<()> {
 fn set_other() {
     // SAFETY: as in `set_fifo`.
     let param: libc::sched_param = unsafe { std::mem::zeroed() };
-    // SAFETY: as in `set_fifo`; going back to the ordinary class is always allowed.
+    // SAFETY: as in `set_fifo`; returning to the default class is always allowed.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_OTHER, &param) };
 }
 
@@ -122,8 +122,9 @@ fn ask_for_short_slices() {
     unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &attr, 0) };
 }
 
-/// Makes the calling thread fit for timed work: FIFO when permitted, otherwise short slices and the shortest timer slack; its
-/// stack is touched, and locked as far as the limit allows, so that no page fault comes later. Returns whether it runs under FIFO.
+/// Prepares the calling thread for timed work: FIFO if permitted, otherwise short slices and the shortest timer slack;
+/// touches its stack and locks it as far as the limit allows, so that it causes no page faults later. Returns whether it
+/// runs under FIFO.
 pub fn enter_realtime(priority: i32) -> bool {
     let fifo = set_fifo(priority).is_ok();
     if !fifo {
@@ -145,15 +146,15 @@ fn touch_stack() {
     std::hint::black_box(&mut pages);
 }
 
-/// Locks all memory of the process, but only where that cannot make a later allocation fail: locked virtual size
-/// counts against the limit.
+/// Locks all memory of the process, but only if that cannot make a later allocation fail: locked virtual size counts
+/// against the limit.
 fn lock_memory() -> Grant {
     let what = "memory locked";
     if !may_lock_all() {
         let detail = "only rings and stacks, as far as the limit allows".to_owned();
         return Grant { what, granted: false, detail, remedy: MEMLOCK_REMEDY };
     }
-    // SAFETY: takes flags only; concerns the whole process and moves nothing.
+    // SAFETY: takes flags only; affects the whole process and moves nothing.
     match unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE | libc::MCL_ONFAULT) } {
         0 => Grant { what, granted: true, detail: "all, as it is touched".to_owned(), remedy: "" },
         _ => Grant { what, granted: false, detail: io::Error::last_os_error().to_string(), remedy: MEMLOCK_REMEDY },
@@ -165,7 +166,7 @@ fn may_lock_all() -> bool {
     limit.current.is_none() || has_capability(14)
 }
 
-/// Whether the process has a capability in effect (14 = CAP_IPC_LOCK), as the kernel states it.
+/// Returns whether the process has an effective capability (14 = CAP_IPC_LOCK), as reported by the kernel.
 fn has_capability(bit: u32) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("CapEff:"));
@@ -175,7 +176,7 @@ fn has_capability(bit: u32) -> bool {
 /// Locks the pages of a buffer, as far as the limit allows; for processes that may not lock everything.
 pub fn lock_pages<T>(buffer: &[T]) {
     let length = std::mem::size_of_val(buffer);
-    // SAFETY: the range is that of a live slice; locking changes nothing that Rust can see.
+    // SAFETY: the range is that of a live slice; locking changes nothing visible to Rust.
     unsafe { libc::mlock2(buffer.as_ptr().cast(), length, libc::MLOCK_ONFAULT as libc::c_uint) };
 }
 
@@ -185,9 +186,9 @@ fn hold_cpu_latency() -> io::Result<LatencyHold> {
     Ok(LatencyHold(file))
 }
 
-/// Sleeps until a point of the monotonic clock; returns at once when it is past.
+/// Sleeps until a time of the monotonic clock; returns at once if it is past.
 pub fn sleep_until(deadline: Mono) {
-    // To the kernel a timer that is due already is a timer like any other, and costs as much.
+    // The kernel treats a timer that is already due like any other, at the same cost.
     if MonotonicClock.now() >= deadline {
         return;
     }
@@ -195,11 +196,11 @@ pub fn sleep_until(deadline: Mono) {
         tv_sec: (deadline.0 / 1_000_000_000) as i64,
         tv_nsec: (deadline.0 % 1_000_000_000) as i64,
     };
-    // A signal that cuts the sleep short is slept through.
+    // Continues a sleep that a signal interrupted.
     while rustix::thread::clock_nanosleep_absolute(rustix::thread::ClockId::Monotonic, &at).is_err() {}
 }
 
-/// Processor time used by the calling thread.
+/// Returns the processor time of the calling thread.
 pub fn thread_cpu_time() -> Duration {
     let t = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
     Duration::new(t.tv_sec as u64, t.tv_nsec as u32)

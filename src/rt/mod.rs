@@ -1,7 +1,7 @@
-//! The real-time ground: latest-value slots, wake-ups, scheduling, memory. The only place with `unsafe`.
+//! Real-time primitives: latest-value slots, wake-ups, scheduling, memory. The only module with `unsafe`.
 
-pub mod beat;
 pub mod due;
+pub mod heartbeat;
 pub mod histogram;
 pub mod host;
 pub mod slot;

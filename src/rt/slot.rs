@@ -1,11 +1,11 @@
-//! A latest-value slot between two threads: the writer never waits, the reader never waits, and the reader always
-//! sees a whole value, the newest one. A triple buffer.
+//! Latest-value slot between two threads: neither the writer nor the reader ever blocks, and the reader always sees a
+//! complete value, the newest one. A triple buffer.
 
 use std::cell::UnsafeCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
-/// Bit of the shared byte that says the middle buffer holds a value the reader has not taken.
+/// Bit of the shared byte: the middle buffer holds a value that the reader has not taken.
 const FRESH: u8 = 0b100;
 const INDEX: u8 = 0b011;
 
@@ -33,7 +33,7 @@ pub struct SlotReader<T> {
     own: u8,
 }
 
-/// A slot that holds `initial` until the first write.
+/// Creates a slot with the value `initial`.
 pub fn slot<T: Copy + Send>(initial: T) -> (SlotWriter<T>, SlotReader<T>) {
     let shared = Arc::new(Shared {
         buffers: [UnsafeCell::new(initial), UnsafeCell::new(initial), UnsafeCell::new(initial)],
@@ -56,7 +56,7 @@ impl<T: Copy> SlotWriter<T> {
 }
 
 impl<T: Copy> SlotReader<T> {
-    /// The newest value; the same one again where there is no newer.
+    /// Returns the newest value; repeats it if there is no newer one.
     pub fn read(&mut self) -> T {
         if self.shared.middle.load(Ordering::Relaxed) & FRESH != 0 {
             let before = self.shared.middle.swap(self.own, Ordering::AcqRel);
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
     use std::collections::HashSet;
 
-    /// A value that shows when it is torn: all words follow from the first.
+    /// A value that reveals tearing: all words follow from the first.
     fn value(n: u64) -> [u64; 32] {
         std::array::from_fn(|k| {
             n.wrapping_mul(0x9e37_79b9_7f4a_7c15).rotate_left(k as u32) ^ if k == 0 { 0 } else { n }
@@ -110,7 +110,7 @@ mod tests {
         assert_eq!((reader.read(), reader.read()), (9, 9));
     }
 
-    /// The protocol as a machine of single steps. A buffer is two words, written and read one at a time.
+    /// The protocol as a state machine of single steps. A buffer is two words, written and read one at a time.
     #[derive(Clone, PartialEq, Eq, Hash)]
     struct Model {
         buffers: [[u8; 2]; 3],
@@ -120,7 +120,7 @@ mod tests {
         reader: (u8, u8),
         half: u8,
         seen: u8,
-        /// The newest value published when the present read began.
+        /// The newest value published when the current read began.
         due: u8,
     }
 

@@ -7,23 +7,23 @@ use std::time::Duration;
 
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 
-/// The waiting end and the raising end in one; clones share the same event.
+/// An event for waiting and raising; clones share it.
 #[derive(Debug, Clone)]
 pub struct Wake(Arc<OwnedFd>);
 
 impl Wake {
-    /// A new event, not raised.
+    /// Creates an event that is not raised.
     pub fn new() -> io::Result<Self> {
         Ok(Self(Arc::new(eventfd(0, EventfdFlags::NONBLOCK | EventfdFlags::CLOEXEC)?)))
     }
 
-    /// Raises the event: one non-blocking write, fit for the tick.
+    /// Raises the event: one non-blocking write, safe in the tick.
     pub fn raise(&self) {
-        // The only possible failure is a full counter, and then it is raised already.
+        // The only possible failure is a full counter, which means raised.
         let _ = rustix::io::write(self.0.as_fd(), &1u64.to_ne_bytes());
     }
 
-    /// Waits until the event is raised or the time is over, and lowers it. `true`: it was raised.
+    /// Waits until the event is raised or the timeout ends, and lowers it. Returns whether it was raised.
     pub fn wait(&self, timeout: Duration) -> bool {
         let timeout = timespec(timeout);
         let mut fds = [PollFd::new(&*self.0, PollFlags::IN)];
@@ -36,7 +36,7 @@ impl Wake {
         }
     }
 
-    /// The same, and ends also when `other` becomes readable (or broken, which a read will tell). `true`: it has.
+    /// Same, but also ends when `other` becomes readable or broken; returns whether it did.
     pub fn wait_or_readable(&self, other: BorrowedFd<'_>, timeout: Duration) -> bool {
         let timeout = timespec(timeout);
         let mut fds = [PollFd::new(&*self.0, PollFlags::IN), PollFd::from_borrowed_fd(other, PollFlags::IN)];

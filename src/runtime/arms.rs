@@ -12,7 +12,7 @@ use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
 use crate::hardware::spec::AdapterError;
 use crate::joint::JointLimits;
-use crate::rt::beat::Beat;
+use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
 
 /// An adapter must know within this time whether its device answers; a little is added for the machine.
@@ -54,7 +54,7 @@ pub struct BroughtUp {
 /// Connects all arms at once, or none: on the first that fails, all others are let go again.
 pub fn bring_up(
     blueprint: &Blueprint,
-    beat: &Arc<Beat>,
+    beat: &Arc<Heartbeat>,
     note: impl Fn(usize, Note) + Clone + Send + 'static,
 ) -> Result<BroughtUp, StartError> {
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);

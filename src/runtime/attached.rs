@@ -14,7 +14,7 @@ use super::build::robots;
 use super::planner_link::answer_travelling;
 use super::planner_port::{PlannerPort, registered};
 use crate::planning::config::PlannerConfig;
-use crate::planning::setup::Setup;
+use crate::planning::planning_scene::PlanningScene;
 use crate::rpc::api::{RegisterPlanner, RegisteredRobot};
 use crate::rpc::planner_end::{NoLine, PlannerEnd};
 
@@ -99,7 +99,7 @@ struct Process {
 
 impl Process {
     /// Attaches, says so, and answers for as long as it is let.
-    async fn live(self, setup: Setup, ready: &Sender<Result<(), StartError>>, mut told: impl FnMut(Turn)) {
+    async fn live(self, setup: PlanningScene, ready: &Sender<Result<(), StartError>>, mut told: impl FnMut(Turn)) {
         let begun = async {
             let end = PlannerEnd::register(&self.socket, &self.registration).await.map_err(refused)?;
             let limits = &end.registered.limits;

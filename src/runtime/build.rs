@@ -26,12 +26,12 @@ use crate::control::tick_loop::{self, Pulse, TickPorts};
 use crate::hardware::device;
 use crate::joint::MAX_DOF;
 use crate::planning::config::PlannerConfig;
-use crate::planning::setup::Setup;
+use crate::planning::planning_scene::PlanningScene;
+use crate::recording::disk_space;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::{self, Notes};
 use crate::recording::recorder::{Note, Notice, Recorder, RecorderConfig};
-use crate::recording::space;
 use crate::rpc::report::StatusReport;
 use crate::rpc::server::Server;
 use crate::rpc::streams::Streams;
@@ -57,7 +57,7 @@ impl Run {
         let wall = WallOffset::take(&MonotonicClock);
         let log = log_path(blueprint, &options, &name, wall)?;
         if let Some(log) = &log {
-            space::check(log, blueprint.recording.min_free.0).map_err(|e| split_hint(&e.to_string()))?;
+            disk_space::check(log, blueprint.recording.min_free.0).map_err(|e| split_hint(&e.to_string()))?;
         }
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
@@ -246,8 +246,8 @@ impl Run {
 }
 
 /// The planner's robots, with what must be said of them.
-pub(super) fn robots(config: &PlannerConfig) -> Result<Setup, StartError> {
-    let setup = Setup::load(config).map_err(|what| StartError::Blueprint {
+pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError> {
+    let setup = PlanningScene::load(config).map_err(|what| StartError::Blueprint {
         what,
         hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
     })?;

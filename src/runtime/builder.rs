@@ -1,10 +1,10 @@
 //! A run from a blueprint's name or text, for programs: what `dimos run` does with its arguments.
 
 use super::{Options, Record, Run, StartError};
-use crate::assets::{Cache, Quiet};
+use crate::assets::{Cache, NoProgress};
 use crate::blueprint::{self, FindError, Found, Loaded, Overrides, Source};
 use crate::hardware::registry::{AdapterSpec, Registry};
-use crate::planning::desk::Solver;
+use crate::planning::planner_thread::Solver;
 use crate::rpc::place::RunFolder;
 
 /// A run that is not up yet. What is not said is as the blueprint says.
@@ -112,7 +112,7 @@ impl Builder {
     pub fn fetch(&self) -> Result<(), StartError> {
         let loaded = self.check();
         for asset in loaded.blueprint.iter().flat_map(|blueprint| blueprint.awaited_assets()) {
-            Cache::standard().fetch(asset, &mut Quiet).map_err(|error| StartError::Blueprint {
+            Cache::standard().fetch(asset, &mut NoProgress).map_err(|error| StartError::Blueprint {
                 what: error.what,
                 hint: error.hint.unwrap_or_else(|| "nothing was connected".to_owned()),
             })?;

@@ -49,7 +49,7 @@ pub use service_manager::ServiceManager;
 use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
-use crate::planning::desk::Solver;
+use crate::planning::planner_thread::Solver;
 use crate::recording::recorder::Recorder;
 use crate::rpc::place::RunFolder;
 use crate::rpc::server::Server;

@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index};
 use super::service::internal;
 use crate::collision::Stop;
-use crate::planning::desk::{Job, NotBegun, Progress};
 use crate::planning::padded::GivenUp;
 use crate::planning::path::length;
-use crate::planning::setup::{PlannedRobot, Setup};
-use crate::planning::solve::{Found, Goal, Request};
+use crate::planning::pipeline::{Goal, PlanRequest, PlannedMotion};
+use crate::planning::planner_thread::{BeginError, Job, Progress};
+use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
 use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
 use crate::rpc::{Code, RpcError};
 
@@ -24,13 +24,13 @@ impl PlannerPort {
         let setup = self.desk.setup();
         let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
         let positions = all_positions(setup, moment)?;
-        let request = Request { goals, positions, speed: plan.speed, seed: plan.seed };
+        let request = PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed };
         let id = moment.plan;
         self.desk.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
             match why {
-                NotBegun::Busy => error.hint("wait for it, or `dimos cancel`"),
-                NotBegun::Hangs => error.hint("start the planner again"),
+                BeginError::Busy => error.hint("wait for it, or `dimos cancel`"),
+                BeginError::Hangs => error.hint("start the planner again"),
             }
         })?;
         Ok(api::PlanReply { plan: id })
@@ -74,10 +74,10 @@ impl PlannerPort {
     }
 
     /// The world may have changed since a plan was made, or a robot that it does not move may have moved.
-    async fn still_free(&self, job: &Job, found: &Arc<Found>, moment: &Moment) -> Result<(), RpcError> {
+    async fn still_free(&self, job: &Job, found: &Arc<PlannedMotion>, moment: &Moment) -> Result<(), RpcError> {
         let positions = all_positions(self.desk.setup(), moment)?;
         let stop = Stop::new(Some(Instant::now() + REVIEW_LIMIT), None);
-        apart(self.desk.review(found.clone(), positions, stop)).await?.map_err(|failure| {
+        apart(self.desk.revalidate(found.clone(), positions, stop)).await?.map_err(|failure| {
             let what = format!("plan {} is no longer free: {}", job.id, failure.what);
             RpcError::new(Code::PlanOutdated, what).hint("plan again: the world is not as it was")
         })
@@ -119,12 +119,12 @@ impl PlannerPort {
 }
 
 /// Where every robot is [rad], in the setup's order.
-pub(super) fn all_positions(setup: &Setup, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
+pub(super) fn all_positions(setup: &PlanningScene, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
     let configs = setup.robots.iter().map(|robot| &robot.config);
     configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
 }
 
-fn goal_of(setup: &Setup, goal: &api::PlanGoal) -> Result<(usize, Goal), RpcError> {
+fn goal_of(setup: &PlanningScene, goal: &api::PlanGoal) -> Result<(usize, Goal), RpcError> {
     let index = robot_index(setup, &goal.robot)?;
     let config = &setup.robots.get(index).ok_or_else(internal)?.config;
     let joints = |values: &[f64]| {
@@ -142,7 +142,7 @@ fn goal_of(setup: &Setup, goal: &api::PlanGoal) -> Result<(usize, Goal), RpcErro
             joints(config.named_poses.get(name).ok_or_else(unknown)?)?
         }
         (_, _, Some(pose)) if goal.linear => Goal::Line(isometry(pose)),
-        (_, _, Some(pose)) if pose.rpy.is_none() && pose.quat.is_none() => Goal::Place(pose.xyz.into()),
+        (_, _, Some(pose)) if pose.rpy.is_none() && pose.quat.is_none() => Goal::Position(pose.xyz.into()),
         (_, _, Some(pose)) => Goal::Pose(isometry(pose)),
         _ => return Err(internal()),
     };
@@ -161,7 +161,7 @@ pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError
     })
 }
 
-pub(super) fn found(port: &PlannerPort, plan: Option<u64>) -> Result<(Job, Arc<Found>), RpcError> {
+pub(super) fn found(port: &PlannerPort, plan: Option<u64>) -> Result<(Job, Arc<PlannedMotion>), RpcError> {
     let job = job(port, plan)?;
     match &job.progress {
         Progress::Found(found, _) => Ok((job.clone(), found.clone())),
@@ -199,7 +199,7 @@ pub(super) fn report(job: &Job) -> api::PlanningReport {
     }
 }
 
-fn summary(job: &Job, found: &Found) -> PlanSummary {
+fn summary(job: &Job, found: &PlannedMotion) -> PlanSummary {
     PlanSummary {
         joints: found.trajectory.joint_names.clone(),
         start: found.path.first().cloned().unwrap_or_default(),
@@ -218,13 +218,13 @@ fn summary(job: &Job, found: &Found) -> PlanSummary {
 }
 
 fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
-    let GivenUp { place, link, other, distance, .. } = given_up;
-    let (near, link, other) = (place.name().to_owned(), link.clone(), other.clone());
+    let GivenUp { near, link, other, distance, .. } = given_up;
+    let (near, link, other) = (near.name().to_owned(), link.clone(), other.clone());
     api::PaddingGivenUp { near, link, other, distance: *distance }
 }
 
 /// The trajectory as rpc has it.
-fn travelling(found: &Found) -> api::Trajectory {
+fn travelling(found: &PlannedMotion) -> api::Trajectory {
     let point = |point: &crate::trajectory::TrajectoryPoint| api::Point {
         time_from_start: point.time_from_start,
         positions: point.positions.clone(),

@@ -12,17 +12,17 @@ use super::recheck::Released;
 use super::service::internal;
 use super::world_requests::typed;
 use crate::planning::config::{JointBounds, PlannerConfig};
-use crate::planning::desk::{Desk, Solver};
-use crate::planning::idle::Measured;
-use crate::planning::setup::Setup;
-use crate::planning::solve::solve;
+use crate::planning::pipeline::solve;
+use crate::planning::planner_thread::{PlannerThread, Solver};
+use crate::planning::planning_scene::PlanningScene;
+use crate::planning::unplanned_joints::Measured;
 use crate::rpc::api::{CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject};
 use crate::rpc::api::{Request as Call, WorldAdd, WorldReport};
 use crate::rpc::{Code, RpcError};
 
 /// A planner.
 pub struct PlannerPort {
-    pub(super) desk: Desk,
+    pub(super) desk: PlannerThread,
     /// The objects of the world, as they were given.
     pub(super) objects: Mutex<BTreeMap<String, WorldObject>>,
     /// The plans that were handed over, by number.
@@ -34,7 +34,7 @@ impl PlannerPort {
     /// place of this program's own.
     pub fn start(
         config: &PlannerConfig,
-        setup: Setup,
+        setup: PlanningScene,
         limits: &BTreeMap<String, CommandLimits>,
         solver: Option<Solver>,
     ) -> Result<Self, String> {
@@ -46,7 +46,7 @@ impl PlannerPort {
         };
         let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
-        let desk = Desk::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
+        let desk = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
         let desk = desk.map_err(|e| format!("no planner thread: {e}"))?;
         Ok(Self { desk, objects: Mutex::new(objects), released: Mutex::default() })
     }
@@ -84,8 +84,8 @@ impl PlannerPort {
 }
 
 /// A planner's robots, as a run needs to know them.
-pub fn registered(setup: &Setup) -> Vec<RegisteredRobot> {
-    let robot = |robot: &crate::planning::setup::PlannedRobot| RegisteredRobot {
+pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
+    let robot = |robot: &crate::planning::planning_scene::PlannedRobot| RegisteredRobot {
         name: robot.config.name.clone(),
         joints: robot.config.coordinator_joints.clone(),
         task: robot.config.task.clone(),
@@ -109,7 +109,7 @@ pub(super) async fn apart<T: Send + 'static>(work: impl FnOnce() -> T + Send + '
     tokio::task::spawn_blocking(work).await.map_err(failed)
 }
 
-pub(super) fn robot_index(setup: &Setup, name: &str) -> Result<usize, RpcError> {
+pub(super) fn robot_index(setup: &PlanningScene, name: &str) -> Result<usize, RpcError> {
     let names: Vec<&str> = setup.robots.iter().map(|robot| robot.config.name.as_str()).collect();
     setup.robot(name).ok_or_else(|| RpcError::unknown(Code::UnknownRobot, "robot", name, &names))
 }

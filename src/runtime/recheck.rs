@@ -13,7 +13,7 @@ use super::service::Service;
 use crate::collision::Stop;
 use crate::control::request::Request;
 use crate::planning::ahead::rests_before;
-use crate::planning::solve::Found;
+use crate::planning::pipeline::PlannedMotion;
 use crate::rpc::api::{BlockedReport, Moment, Recheck, RecheckReply};
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::TaskState;
@@ -24,11 +24,11 @@ const LIMIT: Duration = Duration::from_secs(1);
 const RELEASED: usize = 64;
 
 /// A plan that was handed over, and the version of the world in which its motion was found free.
-pub(super) type Released = (Arc<Found>, u64);
+pub(super) type Released = (Arc<PlannedMotion>, u64);
 
 impl PlannerPort {
     /// Remembers a plan that is handed over: it may be asked about while it is carried out.
-    pub(super) fn remember(&self, plan: u64, found: Arc<Found>, version: u64) {
+    pub(super) fn remember(&self, plan: u64, found: Arc<PlannedMotion>, version: u64) {
         let mut released = lock(&self.released);
         while released.len() >= RELEASED {
             released.pop_first();

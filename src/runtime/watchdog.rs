@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use super::Ending;
 use crate::clock::{Clock, MonotonicClock};
-use crate::rt::beat::Beat;
+use crate::rt::heartbeat::Heartbeat;
 use crate::rt::host;
 
 /// How often it looks: each look costs a wake-up of the processor.
@@ -30,7 +30,7 @@ pub struct Watchdog {
 impl Watchdog {
     /// Starts the thread `watchdog`. `alive` is called at each look that finds a new beat, and must not wait.
     pub fn start(
-        beat: Arc<Beat>,
+        beat: Arc<Heartbeat>,
         period: Duration,
         endings: Sender<Ending>,
         mut alive: impl FnMut() + Send + 'static,
@@ -88,7 +88,8 @@ mod tests {
 
     #[test]
     fn a_sign_of_life_is_given_for_a_beat_and_for_nothing_else() {
-        let (beat, signs, (endings, ended)) = (Arc::new(Beat::default()), Arc::new(AtomicUsize::new(0)), channel());
+        let (beat, signs, (endings, ended)) =
+            (Arc::new(Heartbeat::default()), Arc::new(AtomicUsize::new(0)), channel());
         let given = signs.clone();
         let alive = move || {
             given.fetch_add(1, Ordering::Relaxed);

@@ -11,7 +11,7 @@ use super::service::internal;
 use crate::collision::Solid;
 use crate::collision::world::{Attached, Obstacle, World};
 use crate::planning::config::{ObjectConfig, ObjectShape};
-use crate::planning::setup::{PlannedRobot, obstacle};
+use crate::planning::planning_scene::{PlannedRobot, obstacle};
 use crate::robot::kinematics::{frame, pose};
 use crate::rpc::api::{self, Done, Moment, ShapeSpec, WorldObject};
 use crate::rpc::{Code, RpcError};

@@ -1,12 +1,12 @@
-//! Events in words: what the log, rpc and the terminal say about something that happened in a tick.
+//! Events as text for the log, rpc and the terminal.
 //!
-//! The tick speaks in indices, because it may not allocate; here they become names again.
+//! The tick reports indices, because it may not allocate; this module resolves them to names.
 
 use serde::Serialize;
 
 use super::{Age, Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
 
-/// The names behind the tick's indices, in the blueprint's order.
+/// The names behind the tick's indices, in the order of the blueprint.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Names {
     /// The arms.
@@ -25,37 +25,37 @@ pub struct ArmNames {
 }
 
 impl Names {
-    /// An arm's `hardware_id`.
+    /// Returns an arm's `hardware_id`.
     pub fn arm(&self, arm: u16) -> String {
         self.arms.get(usize::from(arm)).map_or_else(|| format!("arm #{arm}"), |a| a.hardware_id.clone())
     }
 
-    /// A task's name.
+    /// Returns a task's name.
     pub fn task(&self, task: u16) -> String {
         self.tasks.get(usize::from(task)).cloned().unwrap_or_else(|| format!("task #{task}"))
     }
 
-    /// The name of a joint, counted over all arms.
+    /// Returns the name of a joint, counted over all arms.
     pub fn joint(&self, joint: u16) -> String {
         let mut all = self.arms.iter().flat_map(|a| &a.joints);
         all.nth(usize::from(joint)).cloned().unwrap_or_else(|| format!("joint #{joint}"))
     }
 }
 
-/// How much an event matters.
+/// Severity of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// As it should be.
+    /// Normal operation.
     Info,
-    /// Not as somebody wanted it.
+    /// A request or a command was not carried out as wanted.
     Warn,
-    /// An arm is held, or the tick fails to keep its time.
+    /// An arm is held, or the tick misses its deadlines.
     Error,
 }
 
 impl Severity {
-    /// The name used in rpc and logs.
+    /// Returns its name in rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::Info => "info",
@@ -65,12 +65,12 @@ impl Severity {
     }
 }
 
-/// An event with names and a sentence. What does not apply to an event is `None` or empty.
+/// An event with names and a sentence. Fields that do not apply are `None` or empty.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Described {
     /// `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun` or `degraded`.
     pub kind: &'static str,
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
     /// The request it answers.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -84,9 +84,9 @@ pub struct Described {
     /// The joint concerned.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub joint: Option<String>,
-    /// The status word: of the outcome, the task's state, the arm's phase, the limit.
+    /// Status word: of the outcome, the task's state, the arm's phase, the limit.
     pub status: &'static str,
-    /// The event's numbers: an error [rad], a step [rad], what was asked of a limited joint, skipped periods and
+    /// Numbers of the event: an error [rad], a step [rad], the requested value of a limited joint, skipped periods and
     /// lateness [ns], an arm's error code.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub values: Vec<f64>,
@@ -94,27 +94,27 @@ pub struct Described {
     pub text: String,
 }
 
-/// An event in words.
+/// Describes an event.
 pub fn describe(event: &Event, names: &Names) -> Described {
     match *event {
         Event::Request(id, outcome) => request(id, outcome, names),
         Event::Task(task, state, reason) => task_changed(task, state, reason, names),
         Event::Preempted(loser, winner, joint, equal) => {
-            let why = if equal { "has the same priority and comes first" } else { "has the higher priority" };
+            let why = if equal { "has the same priority and is listed first" } else { "has the higher priority" };
             let (loser, winner, joint) = (names.task(loser), names.task(winner), names.joint(joint));
             let text = format!("task {loser} lost {joint} to {winner}, which {why}");
             Described { task: Some(loser), joint: Some(joint), ..plain("preempted", Severity::Warn, "preempted", text) }
         }
         Event::ModeConflict(loser, winner, arm) => {
             let (loser, winner, arm) = (names.task(loser), names.task(winner), names.arm(arm));
-            let text = format!("task {loser} was refused: {winner} uses another control mode on {arm}");
+            let text = format!("task {loser} was rejected: {winner} uses another control mode on {arm}");
             let d = plain("mode_conflict", Severity::Warn, "refused", text);
             Described { task: Some(loser), arm: Some(arm), ..d }
         }
         Event::Arm(arm, phase, cause) => arm_changed(arm, phase, cause, names),
         Event::Limited(joint, kind, asked) => {
             let joint = names.joint(joint);
-            let text = format!("{joint} is limited in {}: {asked:.4} {} was asked", kind.name(), unit(kind));
+            let text = format!("{joint} is limited in {}: {asked:.4} {} commanded", kind.name(), unit(kind));
             let d = plain("limited", Severity::Warn, kind.name(), text);
             Described { joint: Some(joint), values: vec![asked], ..d }
         }
@@ -125,7 +125,7 @@ pub fn describe(event: &Event, names: &Names) -> Described {
             Described { values: vec![f64::from(skipped), late_ns as f64], ..d }
         }
         Event::Degraded => {
-            let text = "ten ticks in a row were late by a period or more".into();
+            let text = "ten consecutive ticks were late by a period or more".into();
             plain("degraded", Severity::Error, "late", text)
         }
     }
@@ -161,32 +161,32 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
     d
 }
 
-/// What came of a request, in words.
+/// Returns the outcome of a request as text.
 pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
     match *outcome {
         Outcome::Accepted => "accepted".into(),
-        Outcome::Cancelled => "the motion is being ended".into(),
-        Outcome::AlreadyStopped => "there was no motion to end".into(),
+        Outcome::Cancelled => "the motion is being cancelled".into(),
+        Outcome::AlreadyStopped => "there was no motion to cancel".into(),
         Outcome::AlreadyExecuting(task) => format!("task {} is executing already", names.task(task)),
         Outcome::StartStateMismatch(joint, by) => {
-            format!("the trajectory starts {} from where {} is", angle(by), names.joint(joint))
+            format!("the trajectory starts {} from the position of {}", angle(by), names.joint(joint))
         }
-        Outcome::StartStateUnavailable(arm) => format!("there is no fresh state of {}", names.arm(arm)),
+        Outcome::StartStateUnavailable(arm) => format!("no recent state of {}", names.arm(arm)),
         Outcome::ArmNotReady(arm, phase, cause) => {
             format!("{} is not ready: {}{}", names.arm(arm), phase.name(), because(cause))
         }
         Outcome::ArmLatched(arm, cause) => format!("{} is held{}: reset it first", names.arm(arm), because(cause)),
         Outcome::StillFaulted(arm, cause) => format!("{} cannot be reset yet{}", names.arm(arm), because(cause)),
-        Outcome::WrongTask(task) => format!("task {} cannot do that", names.task(task)),
+        Outcome::WrongTask(task) => format!("task {} does not support this request", names.task(task)),
         Outcome::NonFinite(joint) => format!("the target of {} is not a finite number", names.joint(joint)),
         Outcome::OutOfLimits(joint, by) => {
             format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
         }
         Outcome::InvalidTarget(task) => {
-            format!("the target of task {} is not finite, or its orientation is none", names.task(task))
+            format!("the target of task {} is not finite, or its orientation is invalid", names.task(task))
         }
         Outcome::NoGripper(arm) => format!("{} has no gripper", names.arm(arm)),
-        Outcome::ShuttingDown => "the run is ending".into(),
+        Outcome::ShuttingDown => "the run is shutting down".into(),
     }
 }
 
@@ -220,12 +220,12 @@ fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> D
     d
 }
 
-/// Why a task is in its state, in words; empty where there is nothing to say.
+/// Returns the reason of a task's state as text; empty if there is none.
 pub fn reason_text(reason: &Reason, names: &Names) -> String {
     match *reason {
         Reason::None => String::new(),
         Reason::Cancelled => "cancelled".into(),
-        Reason::Timeout => "its targets stopped coming".into(),
+        Reason::Timeout => "no target within its timeout".into(),
         Reason::StreamEnded => "its stream was ended".into(),
         Reason::PathTolerance(joint, by) => format!("{} was {} from the path", names.joint(joint), angle(by)),
         Reason::GoalTolerance(joint, by) => format!("{} ended {} from the goal", names.joint(joint), angle(by)),
@@ -234,19 +234,19 @@ pub fn reason_text(reason: &Reason, names: &Names) -> String {
         Reason::NonFinite(joint) => format!("the command of {} was not a finite number", names.joint(joint)),
         Reason::Jump(joint, by) => format!("the command of {} jumped by {}", names.joint(joint), angle(by)),
         Reason::TrackingError(joint, by) => {
-            format!("{} was {} from where it was commanded to be", names.joint(joint), angle(by))
+            format!("tracking error of {} was {}", names.joint(joint), angle(by))
         }
     }
 }
 
-/// What holds an end effector back, in words; empty where nothing does.
+/// Returns what limits an end effector as text; empty if nothing does.
 pub fn bound_text(bound: Bound, names: &Names) -> String {
     match bound {
         Bound::None => String::new(),
-        Bound::Velocity(joint) => format!("the highest speed of {}", names.joint(joint)),
-        Bound::Position(joint) => format!("the end of the range of {}", names.joint(joint)),
-        Bound::Singularity => "a singular configuration nearby".into(),
-        Bound::Invalid => "a target that cannot be computed with".into(),
+        Bound::Velocity(joint) => format!("the velocity limit of {}", names.joint(joint)),
+        Bound::Position(joint) => format!("the position limit of {}", names.joint(joint)),
+        Bound::Singularity => "a singularity nearby".into(),
+        Bound::Invalid => "a target that is not finite".into(),
     }
 }
 
@@ -262,18 +262,18 @@ fn arm_changed(arm: u16, phase: Phase, cause: Cause, names: &Names) -> Described
     Described { arm: Some(name), values: code(cause), ..plain("arm", severity, phase.name(), text) }
 }
 
-/// Why an arm is held, in words; empty for `Cause::None`.
+/// Returns why an arm is held as text; empty for `Cause::None`.
 pub fn cause_text(cause: Cause) -> String {
     match cause {
         Cause::None => String::new(),
-        Cause::Operator => "an operator stopped it".into(),
+        Cause::Operator => "stopped by an operator".into(),
         Cause::Stale(age) => stale_text(age),
         Cause::Fault(code) => format!("the arm reports error {code}"),
-        Cause::LinkLost => "the connection to it was lost".into(),
+        Cause::LinkLost => "the connection was lost".into(),
         Cause::NonFinite => "a command was not a finite number".into(),
         Cause::Jump => "a command jumped".into(),
         Cause::Overrun => "the tick lost too much time".into(),
-        Cause::HeartbeatLost => "its device thread saw no heartbeat of the tick".into(),
+        Cause::HeartbeatLost => "the device thread saw no heartbeat of the tick".into(),
         Cause::PowerLost => "the motors were disabled unexpectedly".into(),
         Cause::Tracking(joint, by) => format!(
             "tracking error of joint {} is {}: it is blocked, pushed or moved by another program",
@@ -289,21 +289,21 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::ModeChanged => "the panel, hand guiding or another program changed the control mode".into(),
         Cause::StoppedElsewhere => "the panel or another program stopped the arm".into(),
         Cause::PowerChanged => "the panel or another program enabled the motors".into(),
-        Cause::Shutdown => "the run is ending".into(),
+        Cause::Shutdown => "the run is shutting down".into(),
     }
 }
 
-/// Figures of a stale state in words.
+/// Returns the figures of a stale state as text.
 fn stale_text(age: Age) -> String {
     let ms = |us: u32| (us + 500) / 1000;
     let own = if age.own_us >= 500 {
-        format!("; this computer stood still for {} ms", ms(age.own_us))
+        format!("; this computer was stalled for {} ms", ms(age.own_us))
     } else {
         String::new()
     };
-    // The other reasons for a stale state: reads fail, or what is read is not plausible.
+    // Other reasons for a stale state: reads fail, or positions are implausible.
     if age.age_us <= age.limit_us {
-        return "its states cannot be read".into();
+        return "its state cannot be read".into();
     }
     format!("no state for {} ms (limit {} ms{own})", ms(age.age_us), ms(age.limit_us))
 }
@@ -369,6 +369,6 @@ mod tests {
     fn a_refused_request_carries_its_id_and_status() {
         let d = describe(&Event::Request(7, Outcome::StartStateMismatch(0, 0.5)), &names());
         assert_eq!((d.request, d.status), (Some(7), "START_STATE_MISMATCH"));
-        assert_eq!(d.text, "request 7: the trajectory starts 0.5000 rad (28.65°) from where left_joint1 is");
+        assert_eq!(d.text, "request 7: the trajectory starts 0.5000 rad (28.65°) from the position of left_joint1");
     }
 }

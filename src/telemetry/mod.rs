@@ -1,5 +1,5 @@
-//! What the tick tells about itself: plain data of fixed size, pushed into one ring, read by the recorder thread,
-//! which logs it, and hands events on to rpc and the text log. Nothing here allocates.
+//! Telemetry of the tick: plain data of fixed size, pushed into one ring. The recorder thread reads it, logs it, and
+//! passes events on to rpc and the text log. Nothing here allocates.
 
 pub mod describe;
 
@@ -7,30 +7,30 @@ use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
 
 /// One entry of the ring.
-// The ring holds values: a box would be an allocation in the tick.
+// The ring holds values: a box would allocate in the tick.
 #[allow(clippy::large_enum_variant)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Sample {
-    /// What a tick read of one arm and what it commands. One per arm and tick, before the tick's `Tick`.
+    /// An arm's sample. One per arm and tick, before the tick's `Tick`.
     Arm(ArmSample),
     /// Closes a tick.
     Tick(TickSample),
-    /// Something happened in the tick with this index.
+    /// An event of the tick with this index.
     Event(u64, Event),
 }
 
-/// What a tick read of one arm and what it commands.
+/// State and command of one arm in a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmSample {
-    /// Index of the arm, in the blueprint's order.
+    /// Index of the arm, in the order of the blueprint.
     pub arm: u16,
     /// The state as the tick read it (with estimated velocities filled in).
     pub state: ArmState,
-    /// The command as it went to the device thread.
+    /// The command as passed to the device thread.
     pub command: ArmCommand,
     /// The arm's phase after the tick.
     pub phase: Phase,
-    /// Why it is in that phase.
+    /// Reason for the phase.
     pub cause: Cause,
 }
 
@@ -41,29 +41,29 @@ pub struct TickSample {
     pub tick: u64,
     /// The tick's deadline: the time it works with.
     pub deadline: Mono,
-    /// When it took the next tick to be due.
+    /// Assumed deadline of the next tick.
     pub next: Mono,
     /// Wake-up after the deadline [ns].
     pub late_ns: u64,
-    /// Time from wake-up to the last command handed over [ns].
+    /// Time from wake-up to the last command passed to the device threads [ns].
     pub compute_ns: u64,
     /// Whole periods skipped before this tick.
     pub skipped: u32,
-    /// The lateness that cost them [ns]: of this tick or of the one before.
+    /// Lateness that caused the skip [ns]: of this tick or of the previous one.
     pub overrun_ns: u64,
-    /// Samples that found the ring full since the last tick that got through.
+    /// Samples dropped by a full ring since the last one that was accepted.
     pub dropped: u32,
 }
 
-/// What an arm is ready for.
+/// Phase of an arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Phase {
     /// No state yet.
     #[default]
     Unknown,
-    /// Motors off: nothing is sent.
+    /// Motors off: no commands are sent.
     Disabled,
-    /// Just enabled: holds where it is, for the length of the ramp.
+    /// Just enabled: holds its position for the duration of the ramp.
     Activating,
     /// Holds or follows its tasks.
     Ready,
@@ -74,7 +74,7 @@ pub enum Phase {
 }
 
 impl Phase {
-    /// The name used in tables, rpc and logs.
+    /// Returns its name in tables, rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::Unknown => "unknown",
@@ -87,21 +87,21 @@ impl Phase {
     }
 }
 
-/// Age of a state, and what it is compared with.
+/// Age of a state and its limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Age {
     /// Age without this computer's own delays [µs].
     pub age_us: u32,
     /// Its limit [µs].
     pub limit_us: u32,
-    /// Time in which this computer's threads could not run [µs].
+    /// Time during which this computer's threads could not run [µs].
     pub own_us: u32,
 }
 
 /// Why an arm is held.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Cause {
-    /// Nothing happened.
+    /// No cause.
     #[default]
     None,
     /// An operator's `stop`.
@@ -110,22 +110,22 @@ pub enum Cause {
     Stale(Age),
     /// The arm reports an error.
     Fault(i32),
-    /// The device thread lost the arm.
+    /// The device thread lost the connection to the arm.
     LinkLost,
     /// A command was not finite.
     NonFinite,
-    /// A command jumped further than a joint may.
+    /// A command jumped by more than a joint's limit.
     Jump,
-    /// The tick lost too much time.
+    /// The tick skipped too much time.
     Overrun,
-    /// The device thread held the arm by itself.
+    /// The device thread held the arm on its own.
     HeartbeatLost,
-    /// The motors went off without being asked.
+    /// The motors were disabled unexpectedly.
     PowerLost,
-    /// A joint of the arm (counted from 0) is this far from its set points of the last `lag` seconds [rad, or rad/s in
-    /// velocity mode].
+    /// A joint of the arm (counted from 0) has this tracking error, compared with its setpoints of the last `lag`
+    /// seconds [rad, or rad/s in velocity mode].
     Tracking(u16, f64),
-    /// A joint of the arm was measured this far from where it can be [rad].
+    /// The measured position of a joint jumped by this much [rad].
     PositionJump(u16, f64),
     /// A joint of the arm moved this far while the arm was being enabled [rad].
     MovedWhileActivating(u16, f64),
@@ -135,17 +135,18 @@ pub enum Cause {
     PowerChanged,
     /// The arm was stopped, paused or reset, and not by this run.
     StoppedElsewhere,
-    /// The run is ending.
+    /// The run is shutting down.
     Shutdown,
 }
 
 impl Cause {
-    /// Whether a panel, a person or another program has the arm: it then gets neither set points nor a stop.
+    /// Returns whether a panel, a person or another program controls the arm: it then gets neither setpoints nor a
+    /// stop.
     pub fn is_foreign(self) -> bool {
         matches!(self, Self::ModeChanged | Self::PowerChanged | Self::StoppedElsewhere)
     }
 
-    /// The name used in rpc and logs.
+    /// Returns its name in rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -172,23 +173,23 @@ impl Cause {
 /// State of a task, with the reference system's names.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum TaskState {
-    /// Nothing to do.
+    /// Idle.
     #[default]
     Idle,
     /// In motion, or following a stream.
     Executing,
-    /// Slowing down after a cancel.
+    /// Decelerating after a cancel.
     Cancelling,
-    /// Ended where it should.
+    /// Reached its goal.
     Completed,
     /// Ended elsewhere.
     Aborted,
-    /// A command of it was refused as unfit for the arm.
+    /// A command was rejected as unsafe for the arm.
     Fault,
 }
 
 impl TaskState {
-    /// The name used in tables, rpc and logs.
+    /// Returns its name in tables, rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::Idle => "IDLE",
@@ -201,17 +202,17 @@ impl TaskState {
     }
 }
 
-/// Why a task is in its state.
+/// Reason of a task's state.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Reason {
-    /// Nothing special.
+    /// No reason.
     #[default]
     None,
     /// An operator's cancel.
     Cancelled,
-    /// Its stream of targets stopped.
+    /// No target within its timeout.
     Timeout,
-    /// Its stream of targets was ended by whom it came from, or by an operator's cancel.
+    /// Its stream was ended by the client, or by an operator's cancel.
     StreamEnded,
     /// A joint was further from the path than the path tolerance: joint, error [rad].
     PathTolerance(u16, f64),
@@ -225,27 +226,27 @@ pub enum Reason {
     NonFinite(u16),
     /// A command jumped: joint, step [rad].
     Jump(u16, f64),
-    /// A joint was further from where it was commanded to be than the task allows: joint, error [rad].
+    /// The tracking error of a joint exceeded the task's tolerance: joint, error [rad].
     TrackingError(u16, f64),
 }
 
-/// What holds an end effector back.
+/// What limits an end effector's motion.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Bound {
     /// Nothing.
     #[default]
     None,
-    /// The highest speed of this joint.
+    /// The velocity limit of this joint.
     Velocity(u16),
-    /// The end of this joint's range.
+    /// A position limit of this joint.
     Position(u16),
-    /// The arm is close to a singular configuration.
+    /// A singularity nearby.
     Singularity,
-    /// Its target or its state is nothing to compute with.
+    /// Its target or its state is not finite.
     Invalid,
 }
 
-/// What a limit did to a command.
+/// Effect of a limit on a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitKind {
     /// Position held inside its range.
@@ -257,7 +258,7 @@ pub enum LimitKind {
 }
 
 impl LimitKind {
-    /// The name used in rpc and logs.
+    /// Returns its name in rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::Position => "position",
@@ -267,64 +268,65 @@ impl LimitKind {
     }
 }
 
-/// Something that happened in a tick. Indices are those of the blueprint: arms, tasks, joints (over all arms).
+/// An event of a tick. Indices are those of the blueprint: arms, tasks, joints (over all arms).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Event {
-    /// A request was handled: its id and what came of it.
+    /// A request was handled: id and outcome.
     Request(u64, Outcome),
     /// A task changed its state.
     Task(u16, TaskState, Reason),
     /// A task lost a joint: loser, winner, joint, whether both have the same priority.
     Preempted(u16, u16, u16, bool),
-    /// A task's command was refused because a better one on the same arm uses another mode: loser, winner, arm.
+    /// A task's command was rejected because a task with priority on the same arm uses another mode: loser, winner,
+    /// arm.
     ModeConflict(u16, u16, u16),
     /// An arm changed its phase.
     Arm(u16, Phase, Cause),
-    /// Commands of a joint began to be limited: joint, which limit, what was asked [rad, rad/s or rad/s²].
+    /// A joint's commands began to be limited: joint, limit, commanded value [rad, rad/s or rad/s²].
     Limited(u16, LimitKind, f64),
-    /// Periods were skipped: how many, how late the tick was [ns].
+    /// Periods were skipped: number, lateness of the tick [ns].
     Overrun(u32, u64),
-    /// Ten ticks in a row were late by a period or more.
+    /// Ten consecutive ticks were late by a period or more.
     Degraded,
 }
 
-/// What came of a request, with the reference system's names where it has one.
+/// Outcome of a request, with the reference system's names where they exist.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Outcome {
-    /// Taken on.
+    /// Accepted.
     Accepted,
-    /// Motion is being ended.
+    /// The motion is being cancelled.
     Cancelled,
-    /// There was no motion to end.
+    /// There was no motion to cancel.
     AlreadyStopped,
-    /// The task is executing already: the task.
+    /// The task is already executing: the task.
     AlreadyExecuting(u16),
     /// The trajectory does not start where the arm is: joint, distance [rad].
     StartStateMismatch(u16, f64),
-    /// No fresh state of the arm: the arm.
+    /// No recent state of the arm: the arm.
     StartStateUnavailable(u16),
     /// The arm is not ready for motion: arm, its phase and cause.
     ArmNotReady(u16, Phase, Cause),
     /// The arm's latch must be reset first: arm, cause.
     ArmLatched(u16, Cause),
-    /// The thing that latched the arm still stands: arm, cause.
+    /// The cause of the arm's latch persists: arm, cause.
     StillFaulted(u16, Cause),
-    /// The task cannot do that.
+    /// The task does not support the request.
     WrongTask(u16),
     /// A target is not finite: joint.
     NonFinite(u16),
     /// A target is outside the joint's limits: joint, by how much [rad or rad/s].
     OutOfLimits(u16, f64),
-    /// The target is not finite, or its orientation is none: the task.
+    /// The target is not finite, or its orientation is invalid: the task.
     InvalidTarget(u16),
     /// The arm has no gripper: the arm.
     NoGripper(u16),
-    /// The run is ending.
+    /// The run is shutting down.
     ShuttingDown,
 }
 
 impl Outcome {
-    /// The status word used in rpc and logs.
+    /// Returns its status word in rpc and logs.
     pub fn name(self) -> &'static str {
         match self {
             Self::Accepted => "ACCEPTED",
@@ -346,21 +348,21 @@ impl Outcome {
     }
 }
 
-/// What is told of a task.
+/// Published state of a task.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TaskView {
-    /// What it does.
+    /// Its state.
     pub state: TaskState,
-    /// Why.
+    /// Its reason.
     pub reason: Reason,
-    /// Id of its present or last motion; 0 = none yet.
+    /// Id of its current or latest motion; 0 = none yet.
     pub motion: u64,
-    /// How much of the motion is done (0–1).
+    /// Part of the motion completed (0–1).
     pub progress: f64,
     /// Time along the motion [s].
     pub elapsed: f64,
-    /// Time to the motion's end [s].
+    /// Remaining time of the motion [s].
     pub remaining: f64,
-    /// What holds its end effector back, while it moves one.
+    /// What limits its end effector, while it moves one.
     pub bound: Bound,
 }

@@ -1,4 +1,4 @@
-//! How the Deserializer walks into lists, groups and choices. Each step adds its node to a passing error.
+//! Access of the Deserializer to lists, groups and choices. Each level adds its node to a passing error.
 
 use serde::de::value::{BorrowedStrDeserializer, U32Deserializer};
 use serde::de::{
@@ -7,10 +7,10 @@ use serde::de::{
 
 use crate::yaml::de::De;
 use crate::yaml::error::{ReadError, What};
-use crate::yaml::stand_in::StandIn;
+use crate::yaml::placeholder::Placeholder;
 use crate::yaml::tree::NodeId;
 
-/// Where a [`Located`] value gets its place and its value from.
+/// Sequence that yields the position, then the value, of a [`Located`].
 pub(super) struct Placed<'a> {
     de: De<'a>,
     step: u8,
@@ -54,31 +54,31 @@ impl<'a> SeqAccess<'a> for Items<'a> {
     type Error = ReadError;
 
     fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
-        let Some(&item) = self.items.find(|item| !self.de.detour.dropped.contains(item)) else { return Ok(None) };
-        // Also errors that arise after the Deserializer returned, as those of `try_from`, belong to this element.
+        let Some(&item) = self.items.find(|item| !self.de.workaround.dropped.contains(item)) else { return Ok(None) };
+        // Errors raised after the Deserializer returned, as by `try_from`, also belong to this element.
         seed.deserialize(self.de.of(item)).map(Some).map_err(|e| e.inside(item))
     }
 }
 
-/// The value that belongs to the key just read.
+/// The value of the key just read.
 enum Next {
     None,
     Value(NodeId),
-    StandIn,
+    Placeholder,
 }
 
-/// The entries of a group, then its stand-ins.
+/// The entries of a group, then its placeholders.
 pub(super) struct Entries<'a> {
     de: De<'a>,
     entries: std::slice::Iter<'a, (NodeId, NodeId)>,
-    stand_ins: std::slice::Iter<'a, &'static str>,
+    placeholders: std::slice::Iter<'a, &'static str>,
     next: Next,
 }
 
 impl<'a> Entries<'a> {
     pub(super) fn new(de: De<'a>, entries: &'a [(NodeId, NodeId)]) -> Self {
-        let stand_ins = de.detour.stand_ins.get(&de.node).map_or(&[][..], Vec::as_slice);
-        Self { de, entries: entries.iter(), stand_ins: stand_ins.iter(), next: Next::None }
+        let placeholders = de.workaround.placeholders.get(&de.node).map_or(&[][..], Vec::as_slice);
+        Self { de, entries: entries.iter(), placeholders: placeholders.iter(), next: Next::None }
     }
 }
 
@@ -86,29 +86,29 @@ impl<'a> MapAccess<'a> for Entries<'a> {
     type Error = ReadError;
 
     fn next_key_seed<K: DeserializeSeed<'a>>(&mut self, seed: K) -> Result<Option<K::Value>, ReadError> {
-        if let Some(&(key, value)) = self.entries.find(|(_, value)| !self.de.detour.dropped.contains(value)) {
+        if let Some(&(key, value)) = self.entries.find(|(_, value)| !self.de.workaround.dropped.contains(value)) {
             self.next = Next::Value(value);
             let de = De { key: true, ..self.de.of(key) };
             return seed.deserialize(de).map(Some).map_err(|e| e.inside(key).inside(value));
         }
-        let Some(&name) = self.stand_ins.next() else { return Ok(None) };
-        self.next = Next::StandIn;
+        let Some(&name) = self.placeholders.next() else { return Ok(None) };
+        self.next = Next::Placeholder;
         seed.deserialize(BorrowedStrDeserializer::<ReadError>::new(name)).map(Some)
     }
 
     fn next_value_seed<V: DeserializeSeed<'a>>(&mut self, seed: V) -> Result<V::Value, ReadError> {
         match std::mem::replace(&mut self.next, Next::None) {
             Next::Value(value) => seed.deserialize(self.de.of(value)).map_err(|e| e.inside(value)),
-            Next::StandIn => seed.deserialize(StandIn { node: self.de.node }).map_err(|_| {
-                // Whatever it says: the missing key is what was wrong.
-                ReadError::new(What::StandIn)
+            Next::Placeholder => seed.deserialize(Placeholder { node: self.de.node }).map_err(|_| {
+                // Ignore its error: the missing key has been reported.
+                ReadError::new(What::Placeholder)
             }),
             Next::None => Err(ReadError::value("a value without a key", None)),
         }
     }
 }
 
-/// One word of several, with the value that may belong to it.
+/// An enum variant, with its content if any.
 pub(super) struct Choice<'a> {
     de: De<'a>,
     word: NodeId,

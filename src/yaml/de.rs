@@ -1,5 +1,5 @@
-//! The Deserializer over a [`Tree`]. What healing decided (entries left out, stand-ins put in) is applied while
-//! reading; the tree itself is not touched. Each level adds its node to a passing error.
+//! The Deserializer over a [`Tree`]. Applies the omissions and placeholders of the recovery while reading; the tree
+//! itself is not modified. Each level adds its node to a passing error.
 
 use std::collections::{HashMap, HashSet};
 
@@ -12,22 +12,22 @@ use crate::yaml::located::{LOCATED, TEXT};
 use crate::yaml::scalar::{self, Scalar};
 use crate::yaml::tree::{Kind, NodeId, Tree};
 
-/// What a read must work round.
+/// Omissions and placeholders of a read.
 #[derive(Debug, Default)]
-pub(super) struct Detour {
-    /// Values and list elements to leave out.
+pub(super) struct Workaround {
+    /// Values and list elements to skip.
     pub(super) dropped: HashSet<NodeId>,
-    /// Keys to put stand-ins for, by group.
-    pub(super) stand_ins: HashMap<NodeId, Vec<&'static str>>,
+    /// Keys to fill with placeholders, by group.
+    pub(super) placeholders: HashMap<NodeId, Vec<&'static str>>,
 }
 
-/// One node, about to be read.
+/// One node to read.
 #[derive(Clone, Copy)]
 pub(super) struct De<'a> {
     pub(super) tree: &'a Tree,
-    pub(super) detour: &'a Detour,
+    pub(super) workaround: &'a Workaround,
     pub(super) node: NodeId,
-    /// It is a key: always text.
+    /// Whether it is a key: always text.
     pub(super) key: bool,
 }
 
@@ -37,7 +37,7 @@ impl<'a> De<'a> {
     }
 
     fn kind(&self) -> Result<&'a Kind, ReadError> {
-        self.tree.node(self.node).map(|n| &n.kind).ok_or_else(|| ReadError::value("there is no such value", None))
+        self.tree.node(self.node).map(|n| &n.kind).ok_or_else(|| ReadError::value("the value does not exist", None))
     }
 
     fn found(&self) -> String {
@@ -203,7 +203,7 @@ impl<'a> Deserializer<'a> for De<'a> {
     fn deserialize_seq<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
         match self.kind()? {
             Kind::Seq(items) => self.seq(items, visitor),
-            // `tasks:` with nothing below it is an empty list: everything was commented out.
+            // An empty `tasks:` is an empty list: its entries may be commented out.
             _ if self.is_null() => self.seq(&[], visitor),
             Kind::Scalar { .. } => Err(self.wrong("a list", None)),
             _ => Err(self.wrong("a list", Some("start each entry with `- `".to_owned()))),

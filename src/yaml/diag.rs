@@ -1,4 +1,4 @@
-//! A mistake: what, where, and what to do about it.
+//! A diagnostic: what is wrong, where, and how to fix it.
 
 use std::ops::Range;
 
@@ -6,54 +6,54 @@ use serde::Serialize;
 
 use crate::yaml::tree::{SourceId, Tree};
 
-/// How bad it is.
+/// Severity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// Must be put right before anything starts.
+    /// Must be fixed before anything starts.
     Error,
-    /// Works, but is probably not meant.
+    /// Works, but is probably not intended.
     Warning,
 }
 
-/// A marked place in a source.
+/// A marked range in a source.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Label {
     /// The source.
     pub source: SourceId,
     /// Bytes of its text.
     pub range: Range<usize>,
-    /// What to write beside the mark; may be empty.
+    /// Text beside the mark; may be empty.
     pub text: String,
 }
 
 impl Label {
-    /// The very start of a source.
+    /// Returns a label at the start of a source.
     pub fn start_of(source: SourceId) -> Self {
         Self { source, range: 0..0, text: String::new() }
     }
 
-    /// The same place with a text beside it.
+    /// Returns the same label with a text.
     pub fn with_text(mut self, text: impl Into<String>) -> Self {
         self.text = text.into();
         self
     }
 }
 
-/// A mistake.
+/// A diagnostic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Diag {
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
-    /// What is wrong, in a sentence without full stop.
+    /// What is wrong: a sentence without full stop.
     pub message: String,
-    /// Where.
+    /// Position.
     pub at: Option<Label>,
-    /// Other places that matter.
+    /// Related positions.
     pub also: Vec<Label>,
-    /// Facts that help to understand it.
+    /// Additional facts.
     pub notes: Vec<String>,
-    /// What to do about it.
+    /// How to fix it.
     pub hint: Option<String>,
 }
 
@@ -62,23 +62,23 @@ impl Diag {
         Self { severity, message, at: None, also: Vec::new(), notes: Vec::new(), hint: None }
     }
 
-    /// A mistake that must be put right.
+    /// Creates an error.
     pub fn error(message: impl Into<String>) -> Self {
         Self::new(Severity::Error, message.into())
     }
 
-    /// Something that is probably not meant.
+    /// Creates a warning.
     pub fn warning(message: impl Into<String>) -> Self {
         Self::new(Severity::Warning, message.into())
     }
 
-    /// Says where.
+    /// Sets the position.
     pub fn at(mut self, label: Label) -> Self {
         self.at = Some(label);
         self
     }
 
-    /// Marks another place.
+    /// Adds a related position.
     pub fn also(mut self, label: Label) -> Self {
         self.also.push(label);
         self
@@ -90,19 +90,19 @@ impl Diag {
         self
     }
 
-    /// Says what to do about it.
+    /// Sets the hint.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
     }
 
-    /// Says what to do about it, where something is known.
+    /// Sets the hint, if there is one.
     pub fn maybe_hint(mut self, hint: Option<String>) -> Self {
         self.hint = hint.or(self.hint);
         self
     }
 
-    /// The mistake as data, its place as file, line and column.
+    /// Converts it to data, with file, line and column.
     pub fn located(&self, tree: &Tree) -> Report {
         let (file, line, column) = match &self.at {
             Some(label) => {
@@ -128,10 +128,10 @@ impl Diag {
     }
 }
 
-/// A mistake as data, for `--json`.
+/// A diagnostic as data, for `--json`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Report {
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
     /// The file, or the command-line option.
     pub file: Option<String>,
@@ -141,9 +141,9 @@ pub struct Report {
     pub column: Option<usize>,
     /// What is wrong.
     pub message: String,
-    /// Facts that help to understand it.
+    /// Additional facts.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<String>,
-    /// What to do about it.
+    /// How to fix it.
     pub hint: Option<String>,
 }

@@ -1,4 +1,4 @@
-//! The error of the Deserializer: what went wrong, and the nodes it happened in, innermost first.
+//! The error of the Deserializer: what is wrong, and the nodes around it, innermost first.
 
 use std::fmt;
 
@@ -6,26 +6,26 @@ use serde::de::{Expected, Unexpected};
 
 use crate::yaml::tree::NodeId;
 
-/// What went wrong.
+/// Kind of error.
 #[derive(Debug, Clone)]
 pub(super) enum What {
-    /// A value is not what it should be.
+    /// A value has the wrong type or range.
     Value { message: String, hint: Option<String> },
-    /// A word is none of those allowed.
+    /// An unknown enum variant.
     Variant { given: String, known: &'static [&'static str] },
-    /// A key has no meaning.
+    /// An unknown key.
     UnknownKey { given: String, known: &'static [&'static str] },
-    /// A key that is needed is not there.
+    /// A missing required key.
     MissingKey(&'static str),
-    /// The stand-in for a missing value was refused; it has been reported before.
-    StandIn,
+    /// A placeholder for a missing value was rejected; the missing key has been reported.
+    Placeholder,
 }
 
 /// An error on its way out of the Deserializer.
 #[derive(Debug, Clone)]
 pub(super) struct ReadError {
     pub(super) what: What,
-    /// The nodes it happened in, innermost first.
+    /// The nodes around it, innermost first.
     pub(super) trail: Vec<NodeId>,
 }
 
@@ -38,7 +38,7 @@ impl ReadError {
         Self::new(What::Value { message: message.into(), hint })
     }
 
-    /// Adds a node that it happened in.
+    /// Adds an enclosing node.
     pub(super) fn inside(mut self, node: NodeId) -> Self {
         if self.trail.last() != Some(&node) {
             self.trail.push(node);
@@ -54,7 +54,7 @@ impl fmt::Display for ReadError {
             What::Variant { given, .. } => write!(f, "unknown word `{given}`"),
             What::UnknownKey { given, .. } => write!(f, "unknown key `{given}`"),
             What::MissingKey(key) => write!(f, "the key `{key}` is missing"),
-            What::StandIn => f.write_str("a needed value is missing"),
+            What::Placeholder => f.write_str("a required value is missing"),
         }
     }
 }
@@ -62,7 +62,7 @@ impl fmt::Display for ReadError {
 impl std::error::Error for ReadError {}
 
 impl serde::de::Error for ReadError {
-    /// A message may end with a line `hint: …`.
+    /// Splits a `hint: …` line off the message.
     fn custom<T: fmt::Display>(message: T) -> Self {
         let message = message.to_string();
         match message.split_once("\nhint: ") {

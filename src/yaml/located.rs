@@ -1,4 +1,4 @@
-//! Values that know where they were written.
+//! Values that keep their position in the source.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -10,21 +10,21 @@ use serde::{Serialize, Serializer};
 
 use crate::yaml::tree::{NOWHERE, NodeId};
 
-/// The name by which the Deserializer of this module knows [`Located`].
+/// Name by which this module's Deserializer recognizes [`Located`].
 pub(super) const LOCATED: &str = "$dimos::yaml::Located";
-/// The name by which it knows [`Text`].
+/// Name by which it recognizes [`Text`].
 pub(super) const TEXT: &str = "$dimos::yaml::Text";
 
-/// A value and the node it was read from; [`NOWHERE`] when it did not come from a file.
+/// A value and its node; [`NOWHERE`] if it did not come from a file.
 #[derive(Debug, Clone, Copy)]
 pub struct Located<T> {
-    /// Where.
+    /// Position.
     pub at: NodeId,
-    /// What.
+    /// Value.
     pub value: T,
 }
 
-/// A value of any shape, to be read as its own type later. A node of it can be found by `at`.
+/// A value of any shape, to be read as its own type later.
 pub type Raw = Located<serde_json::Value>;
 
 impl<T> From<T> for Located<T> {
@@ -46,7 +46,7 @@ impl<T: Default> Default for Located<T> {
     }
 }
 
-/// The place says nothing about equality.
+/// Ignores the position.
 impl<T: PartialEq> PartialEq for Located<T> {
     fn eq(&self, other: &Self) -> bool {
         self.value == other.value
@@ -89,21 +89,21 @@ impl<'de, T: Deserialize<'de>> Visitor<'de> for LocatedVisitor<T> {
         f.write_str("a value")
     }
 
-    /// From the Deserializer of this module: the node, then the value.
+    /// From this module's Deserializer: the node, then the value.
     fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<Self::Value, A::Error> {
-        let missing = || serde::de::Error::custom("a value without a place");
+        let missing = || serde::de::Error::custom("a value without a position");
         let at = seq.next_element()?.ok_or_else(missing)?;
         let value = seq.next_element()?.ok_or_else(missing)?;
         Ok(Located { at, value })
     }
 
-    /// From any other: there is no place.
+    /// From any other Deserializer: no position.
     fn visit_newtype_struct<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
         T::deserialize(deserializer).map(Located::from)
     }
 }
 
-/// A word, number or boolean exactly as it was written: `0.50` stays `0.50`.
+/// A word, number or boolean as written: `0.50` remains `0.50`.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 #[serde(transparent)]
 pub struct Text(pub String);
@@ -144,7 +144,7 @@ impl<'de> Visitor<'de> for TextVisitor {
     }
 }
 
-/// A group of free keys, with their places, in the order they were written.
+/// A group of arbitrary keys with their positions, in order of the source.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Keyed<V>(pub Vec<(Located<String>, V)>);
 
@@ -155,7 +155,7 @@ impl<V> Default for Keyed<V> {
 }
 
 impl<V> Keyed<V> {
-    /// The value of a key.
+    /// Returns the value of a key.
     pub fn get(&self, key: &str) -> Option<&V> {
         self.0.iter().find(|(k, _)| k.value == key).map(|(_, v)| v)
     }

@@ -1,24 +1,24 @@
-//! Merging one tree over another, for includes: groups key by key, named lists by id, everything else replaced.
+//! Merges one tree over another, for includes: groups key by key, named lists by id, everything else replaced.
 
 use crate::yaml::tree::{Kind, NodeId, Tree};
 
-/// What is merged how. Paths are keys joined by dots.
+/// Merge rules. Paths are keys joined by dots.
 #[derive(Debug, Clone, Copy)]
 pub struct MergeRules {
-    /// Lists whose entries are matched by the value of a key: path and key.
+    /// Lists whose entries are matched by a key: path and key.
     pub by_id: &'static [(&'static str, &'static str)],
-    /// Keys whose value is replaced as a whole, although it may be a group.
+    /// Keys whose value is replaced as a whole, even if it is a group.
     pub whole: &'static [&'static str],
 }
 
 impl MergeRules {
-    /// The key that identifies the entries of a list.
+    /// Returns the key that identifies the entries of a list.
     pub fn id_key(&self, path: &str) -> Option<&'static str> {
         self.by_id.iter().find(|(p, _)| *p == path).map(|(_, key)| *key)
     }
 }
 
-/// Merges `over` into `base` and gives the result's node. Both must come from separate reads.
+/// Merges `over` into `base` and returns the result's node. Both must come from separate reads.
 pub fn merge(tree: &mut Tree, base: NodeId, over: NodeId, rules: &MergeRules) -> NodeId {
     merge_at(tree, base, over, rules, "")
 }
@@ -42,7 +42,7 @@ fn merge_at(tree: &mut Tree, base: NodeId, over: NodeId, rules: &MergeRules, pat
         (Some(Kind::Seq(mut items)), Some(Kind::Seq(more))) if rules.id_key(path).is_some() => {
             let id_key = rules.id_key(path).unwrap_or_default();
             let id_of = |tree: &Tree, item| tree.get(item, id_key).and_then(|id| tree.text(id).map(str::to_owned));
-            // An id that one file gives twice is merged once, so that the second is still seen as a duplicate.
+            // An id that one file uses twice is merged once, so that the second is still reported as a duplicate.
             let mut open: Vec<usize> = (0..items.len()).collect();
             for item in more {
                 let id = id_of(tree, item);
@@ -62,7 +62,7 @@ fn merge_at(tree: &mut Tree, base: NodeId, over: NodeId, rules: &MergeRules, pat
     if tree.damaged.contains(&base) {
         tree.damaged.insert(over);
     }
-    // The result stands where the later text stands.
+    // The result has the position of the later text.
     tree.set_kind(over, merged);
     over
 }

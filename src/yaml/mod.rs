@@ -1,34 +1,34 @@
-//! Reads YAML so that every mistake is found at once, each at its place. Knows nothing of arms.
+//! YAML reader that reports all mistakes at once, each with its position. Independent of robotics.
 //!
 //! ```text
-//! text ─▶ parse ─▶ Tree ─▶ merge (includes) ─▶ set (arguments) ─▶ read::<T> ─▶ T, and what was lost on the way
+//!  text ─▶ parse ─▶ Tree ─▶ merge (includes) ─▶ set (arguments) ─▶ read::<T> ─▶ T, and skipped nodes
 //!                   └─ every node keeps its source and range; every mistake becomes a Diag ─▶ render | JSON
 //! ```
 //!
-//! Three ideas carry it:
-//! * a **located tree**: nodes know where they were written, also after includes and `--set` were merged in;
-//! * **healing**: [`read`] notes an error, works round it and reads again, until nothing is left to report;
-//! * [`Located`] values, so that whoever checks the meaning afterwards can point at the exact place too.
+//! Three concepts:
+//! * a **located tree**: nodes keep their position, also after merging includes and `--set`;
+//! * **error recovery**: [`read`] records an error, works around it and reads again until no error is left;
+//! * [`Located`] values, so that later checks can also point at the exact position.
 
 mod access;
 mod de;
 mod diag;
 mod error;
-mod heal;
 mod located;
 mod merge;
 mod parse;
+mod placeholder;
+mod recovery;
 mod render;
 mod scalar;
 mod set;
-mod stand_in;
 mod suggest;
 mod tree;
 
 pub use diag::{Diag, Label, Report, Severity};
-pub use heal::{Lost, Missing, read};
 pub use located::{Keyed, Located, Raw, Text};
 pub use merge::{MergeRules, merge};
+pub use recovery::{Lost, Missing, read};
 pub use render::render;
 pub use set::set;
 pub use suggest::{closest, did_you_mean, quote};
@@ -36,7 +36,7 @@ pub use tree::{Kind, MAX_BYTES, MAX_DEPTH, MAX_NODES, NOWHERE, Node, NodeId, Sou
 
 use serde::de::DeserializeOwned;
 
-/// Reports every mistake that reading `node` as `T` shows.
+/// Reports every mistake found by reading `node` as `T`.
 pub fn check<T: DeserializeOwned>(tree: &mut Tree, node: NodeId) {
     read::<T>(tree, node, Missing::Report);
 }

@@ -1,5 +1,5 @@
-//! Text → located tree, from the events of `granit-parser`. Aliases are copied in place, so that every node has one
-//! parent; their number and depth are bounded.
+//! Text → located tree, from the events of `granit-parser`. Aliases are expanded in place, so that every node has one
+//! parent; their number and depth are limited.
 
 use std::collections::HashMap;
 use std::ops::Range;
@@ -11,15 +11,15 @@ use crate::yaml::suggest::quote;
 use crate::yaml::tree::{Kind, MAX_DEPTH, MAX_NODES, NodeId, SourceId, Tree};
 
 impl Tree {
-    /// Reads a source. Mistakes are reported; `None` means that nothing usable came out. A syntax error hides the
-    /// rest of its file, so what stands before it is not used either.
+    /// Parses a source. Reports mistakes; returns `None` if nothing is usable. A syntax error hides the rest of its
+    /// file, so the part before it is not used either.
     pub fn parse(&mut self, source: SourceId) -> Option<NodeId> {
         let text = self.source(source)?.text.clone();
         Builder { tree: self, source, text: &text, open: Vec::new(), anchors: HashMap::new(), root: None }.run()
     }
 }
 
-/// A list or group that is being read.
+/// A list or group under construction.
 struct Open {
     node: NodeId,
     anchor: usize,
@@ -31,9 +31,9 @@ enum Content {
     Seq(Vec<NodeId>),
     Map {
         entries: Vec<(NodeId, NodeId)>,
-        /// The key that waits for its value.
+        /// A key waiting for its value.
         key: Option<NodeId>,
-        /// Index by key text: a scan would take seconds for a file of many keys.
+        /// Index by key: a linear search would take seconds for a file with many keys.
         seen: HashMap<String, usize>,
     },
 }
@@ -47,7 +47,7 @@ struct Builder<'t> {
     root: Option<NodeId>,
 }
 
-/// The file cannot be used; why has been reported.
+/// The file is unusable; the reason has been reported.
 struct Unusable;
 
 impl<'t> Builder<'t> {
@@ -83,7 +83,7 @@ impl<'t> Builder<'t> {
         if let Some(tag) = event.tag()
             && !tag.is_yaml_core_schema()
         {
-            let diag = Diag::error(format!("the tag {} has no meaning here", quote(&tag.original())));
+            let diag = Diag::error(format!("unknown tag {}", quote(&tag.original())));
             let at = span.tag_span().unwrap_or(*span);
             self.fail(self.range(&at), diag.hint("remove it; values are written plainly"));
         }
@@ -116,7 +116,7 @@ impl<'t> Builder<'t> {
                 self.place(copy)
             }
             Event::UnresolvedAlias(name) => {
-                let diag = Diag::error(format!("no value above is named {} with `&`", quote(&name)));
+                let diag = Diag::error(format!("no value above has the anchor {}", quote(&name)));
                 self.fail(self.range(span), diag.hint("a text that starts with `*` needs quotes"));
                 Err(Unusable)
             }
@@ -147,18 +147,18 @@ impl<'t> Builder<'t> {
         };
         let own = self.tree.node(node).map_or(0..0, |n| n.range.clone());
         let of = |id: Option<NodeId>| id.and_then(|id| self.tree.node(id)).map(|n| n.range.clone());
-        // The parser ends a block where the next thing starts; people see it end with its last value.
+        // The parser ends a block at the start of the next item; readers expect it to end with its last value.
         let range = match flow {
             true => own.start..self.range(span).end,
             false => {
                 let first = of(first).map_or(own.start, |r| r.start);
-                // A list starts with its dash, when that stands before its first value.
+                // A list starts with its dash, if that precedes its first value.
                 let dash = self.text.get(own.start..first).is_some_and(|t| t.starts_with('-') && !t.contains('\n'));
                 let start = if dash { own.start } else { first };
                 start..of(last).map_or(own.end, |r| r.end)
             }
         };
-        // An alias points back to where its value was written.
+        // An alias has the position of its original value.
         let range = if range.end < range.start { own } else { range };
         self.tree.set_kind(node, kind);
         self.tree.set_range(node, range);
@@ -168,7 +168,7 @@ impl<'t> Builder<'t> {
         self.place(node)
     }
 
-    /// Puts a finished node where it belongs: into the open list or group, or at the root.
+    /// Adds a finished node to the open list or group, or makes it the root.
     fn place(&mut self, node: NodeId) -> Result<(), Unusable> {
         let Some(open) = self.open.last_mut() else {
             self.root = Some(node);
@@ -187,8 +187,8 @@ impl<'t> Builder<'t> {
                         return Ok(());
                     };
                     if let Some(&(first, value)) = seen.get(name).and_then(|&at| entries.get(at)) {
-                        let also = self.tree.label(first).with_text("first given here");
-                        let diag = Diag::error(format!("the key {} is given twice", quote(name)));
+                        let also = self.tree.label(first).with_text("first used here");
+                        let diag = Diag::error(format!("the key {} is used twice", quote(name)));
                         let diag = diag.at(self.tree.label(key)).also(also).hint("remove one of the two");
                         self.tree.report(diag);
                         self.tree.damaged.extend([map, value]);
@@ -196,7 +196,7 @@ impl<'t> Builder<'t> {
                     }
                     seen.insert(name.to_owned(), entries.len());
                     entries.push((key, node));
-                    // A value that was left out is pointed at by its key.
+                    // A missing value is reported at its key.
                     let empty = self.tree.node(node).is_some_and(|n| n.range.is_empty());
                     if let Some(range) = self.tree.node(key).map(|n| n.range.clone()).filter(|_| empty) {
                         self.tree.set_range(node, range);
@@ -207,7 +207,7 @@ impl<'t> Builder<'t> {
         Ok(())
     }
 
-    /// Copies the value an alias stands for; it keeps the place where it was written.
+    /// Copies the value of an alias, with its original position.
     fn copy(&mut self, id: NodeId, depth: usize, span: &Span) -> Result<NodeId, Unusable> {
         let Some(node) = self.tree.node(id).cloned() else { return Err(Unusable) };
         if depth >= MAX_DEPTH && !matches!(node.kind, Kind::Scalar { .. }) {
@@ -238,7 +238,7 @@ impl<'t> Builder<'t> {
     }
 
     fn too_deep<T>(&mut self, span: &Span) -> Result<T, Unusable> {
-        let diag = Diag::error(format!("lists and groups are nested deeper than {MAX_DEPTH} levels"));
+        let diag = Diag::error(format!("lists and groups are nested more than {MAX_DEPTH} levels deep"));
         self.fail(self.range(span), diag.hint("a blueprint needs about five; check the indentation and brackets"));
         Err(Unusable)
     }
@@ -250,7 +250,7 @@ impl<'t> Builder<'t> {
         let hint = if line.trim_start_matches([' ', '-']).starts_with('\t') || line.starts_with('\t') {
             "indent with spaces; YAML does not allow tabs"
         } else if before.matches('"').count() % 2 == 1 && info.contains("quoted") {
-            "a quotation mark is never closed"
+            "a quotation mark is not closed"
         } else if info.contains("flow") || info.contains("expected ',' or") || info.contains("bracket") {
             "close each bracket, and put commas between the values"
         } else {
@@ -263,7 +263,7 @@ impl<'t> Builder<'t> {
         self.fail(at..at, diag);
     }
 
-    /// Where the innermost bracket stands that is not closed yet. A pair in a list, `[a: b]`, is a group without one.
+    /// Returns the position of the innermost open bracket. A pair in a list, `[a: b]`, is a group without one.
     fn open_bracket(&self) -> Option<usize> {
         let starts = self.open.iter().rev().filter(|open| open.flow);
         let mut starts = starts.filter_map(|open| self.tree.node(open.node)).map(|node| node.range.start);

@@ -1,14 +1,14 @@
-//! Mistakes as text: message, place, the lines it is about, notes and a hint.
+//! Diagnostics as text: message, position, source lines, notes and a hint.
 
 use annotate_snippets::{AnnotationKind, Group, Level, Origin, Renderer, Snippet};
 
 use crate::yaml::diag::{Diag, Label, Severity};
 use crate::yaml::tree::Tree;
 
-/// Lines longer than this are not shown [bytes].
+/// Maximum length of a line that is shown [bytes].
 const MAX_LINE: usize = 2000;
 
-/// Draws a mistake for people.
+/// Renders a diagnostic for a terminal.
 pub fn render(tree: &Tree, diag: &Diag, colour: bool) -> String {
     let level = match diag.severity {
         Severity::Error => Level::ERROR,
@@ -43,12 +43,12 @@ pub fn render(tree: &Tree, diag: &Diag, colour: bool) -> String {
     renderer.render(&[group])
 }
 
-/// The lines of one source that a mistake is about.
+/// Source lines of a diagnostic.
 struct Window<'a> {
     file: &'a str,
     /// Number of the first line.
     line: usize,
-    /// The lines; `None` where they are too long to show.
+    /// The lines; `None` if they are too long.
     text: Option<&'a str>,
     marks: Vec<Mark<'a>>,
 }
@@ -61,7 +61,7 @@ struct Mark<'a> {
     primary: bool,
 }
 
-/// One window around each label; labels on neighbouring lines share one.
+/// Returns one window per label; labels on neighbouring lines share one.
 fn windows<'a>(tree: &'a Tree, at: &'a Label, also: &'a [Label]) -> Vec<Window<'a>> {
     let mut out: Vec<(u32, usize, usize, Window<'a>)> = Vec::new();
     for (label, primary) in std::iter::once((at, true)).chain(also.iter().map(|label| (label, false))) {

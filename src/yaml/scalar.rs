@@ -1,5 +1,4 @@
-//! What a word written without quotes is, by the core schema of YAML 1.2, and what was probably meant when it is not
-//! what was asked for.
+//! Plain scalars: their type by the core schema of YAML 1.2, and hints for a wrong type.
 
 /// A resolved scalar.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -51,7 +50,7 @@ fn number(text: &str) -> Option<Scalar<'static>> {
     text.parse().ok().map(Scalar::Float)
 }
 
-/// How a found value is called in messages.
+/// Describes a found value for messages.
 pub(super) fn describe(text: &str, plain: bool) -> String {
     let shown = crate::yaml::quote(text);
     match resolve(text, plain) {
@@ -63,7 +62,7 @@ pub(super) fn describe(text: &str, plain: bool) -> String {
     }
 }
 
-/// What to write for a boolean.
+/// Returns the hint for a boolean.
 pub(super) fn bool_hint(text: &str) -> Option<String> {
     match text.to_lowercase().as_str() {
         "yes" | "y" | "on" | "1" | "true" => Some("write true".to_owned()),
@@ -72,7 +71,7 @@ pub(super) fn bool_hint(text: &str) -> Option<String> {
     }
 }
 
-/// What to write for a number, when that can be told from what was written.
+/// Returns the hint for a number, if it can be derived from the text.
 pub(super) fn number_hint(text: &str, plain: bool) -> Option<String> {
     let is_number = |t: &str| matches!(resolve(t, true), Scalar::Int(_) | Scalar::Float(_));
     let trimmed = text.trim();

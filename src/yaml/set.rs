@@ -1,5 +1,5 @@
-//! `--set path=value`: changes one value of a tree. The argument is a source like a file, so that mistakes in it are
-//! shown in it.
+//! `--set path=value`: changes one value of a tree. The argument is a source like a file, so that mistakes are shown in
+//! it.
 
 use std::ops::Range;
 
@@ -9,8 +9,8 @@ use crate::yaml::scalar::{Scalar, resolve};
 use crate::yaml::suggest::{did_you_mean, quote};
 use crate::yaml::tree::{Kind, NodeId, SourceId, Tree};
 
-/// Applies `path=value` to the tree below `root`. Keys are separated by dots; entries of lists are addressed by id
-/// where `rules` name one, else by number. The value is YAML. Mistakes are reported.
+/// Applies `path=value` to the tree below `root`. Keys are separated by dots; list entries are addressed by id if
+/// `rules` define one, otherwise by index. The value is YAML. Reports mistakes.
 pub fn set(tree: &mut Tree, root: NodeId, argument: &str, rules: &MergeRules) {
     let source = tree.add_source("--set", argument);
     let Some(equals) = argument.find('=').filter(|at| *at > 0) else {
@@ -38,7 +38,7 @@ pub fn set(tree: &mut Tree, root: NodeId, argument: &str, rules: &MergeRules) {
     walk.put(last, last_at.clone(), value);
 }
 
-/// Reads the value in place: the path before it is blanked out, so that places are those of the argument.
+/// Parses the value with the path blanked out, so that positions are those of the argument.
 fn parse_value(tree: &mut Tree, source: SourceId, argument: &str, start: usize) -> Option<NodeId> {
     let value = argument.get(start..).unwrap_or_default();
     if value.trim().is_empty() {
@@ -56,12 +56,12 @@ struct Walk<'t> {
     source: SourceId,
     rules: &'t MergeRules,
     node: NodeId,
-    /// As [`MergeRules`] write it.
+    /// Path in the form of [`MergeRules`].
     path: String,
 }
 
 impl Walk<'_> {
-    /// Goes into a key or a list entry; makes groups that are not there yet.
+    /// Enters a key or a list entry; creates missing groups.
     fn step(&mut self, segment: &str, at: Range<usize>) -> bool {
         let next = match self.tree.node(self.node).map(|n| n.kind.clone()) {
             Some(Kind::Seq(items)) => {
@@ -92,7 +92,7 @@ impl Walk<'_> {
         true
     }
 
-    /// Puts the value at the last segment.
+    /// Sets the value at the last segment.
     fn put(&mut self, segment: &str, at: Range<usize>, value: NodeId) {
         match self.tree.node(self.node).map(|n| n.kind.clone()) {
             Some(Kind::Seq(mut items)) => {
@@ -115,7 +115,7 @@ impl Walk<'_> {
         }
     }
 
-    /// The number of a list entry given by id or number.
+    /// Returns the index of a list entry given by id or index.
     fn index(&mut self, items: &[NodeId], segment: &str, at: Range<usize>) -> Option<usize> {
         let id_key = self.rules.id_key(&self.path);
         let ids: Vec<String> = match id_key {
@@ -143,14 +143,14 @@ impl Walk<'_> {
         matches!(kind, Some(Kind::Scalar { text, plain }) if resolve(text, *plain) == Scalar::Null)
     }
 
-    /// The path as far as it was walked, as it was typed.
+    /// Returns the path walked so far, as typed.
     fn walked(&self, at: &Range<usize>) -> &str {
         let argument = self.tree.source(self.source).map_or("", |s| s.text.as_str());
         argument.get(..at.start.saturating_sub(1)).unwrap_or_default()
     }
 
     fn fail_below_value(&mut self, at: Range<usize>) {
-        let diag = Diag::error(format!("{} is a single value, nothing is below it", quote(self.walked(&at))));
+        let diag = Diag::error(format!("{} is a single value without keys", quote(self.walked(&at))));
         self.fail(at, diag.hint("end the path before this"));
     }
 

@@ -1,15 +1,15 @@
-//! "Did you mean", and how user's words are shown in messages.
+//! "Did you mean" hints, and quoting of users' words in messages.
 
-/// The candidate that was probably meant, if any is near enough.
+/// Returns the candidate that was probably meant, if one is close enough.
 pub fn closest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     if word.is_empty() || word.len() > 100 {
         return None;
     }
     let plain = |text: &str| text.to_lowercase().replace(['_', '-', ' ', '/'], "");
     let given = plain(word);
-    // One slip in three letters is near; `ip` for `rpy` is not.
+    // One typo in three letters is close; `ip` for `rpy` is not.
     let reach = (given.chars().count() / 3).max(1);
-    // `joint7` is not a slip for `joint6`: it counts on.
+    // `joint7` is not a typo of `joint6`: it continues a count.
     let words = |text: &str| text.trim_end_matches(|c: char| c.is_ascii_digit()).to_owned();
     let counts_on = |candidate: &str| {
         let candidate = plain(candidate);
@@ -27,7 +27,7 @@ pub fn closest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>) ->
         .map(|(_, candidate)| candidate)
 }
 
-/// A hint that names the probable candidate, or all of them when there are few.
+/// Returns a hint with the probable candidate, or with all of them if there are few.
 pub fn did_you_mean<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str>, what: &str) -> Option<String> {
     let all: Vec<&str> = candidates.into_iter().collect();
     if let Some(near) = closest(word, all.iter().copied()) {
@@ -42,7 +42,7 @@ pub fn did_you_mean<'a>(word: &str, candidates: impl IntoIterator<Item = &'a str
     }
 }
 
-/// A user's word in a message: in backticks, shortened, with control characters made visible.
+/// Quotes a user's word for a message: in backticks, shortened, control characters escaped.
 pub fn quote(text: &str) -> String {
     let mut shown: String = text.chars().take(60).flat_map(char::escape_debug).collect();
     // `escape_debug` is for Rust literals; quotes need no escape here.

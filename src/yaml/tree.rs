@@ -1,89 +1,89 @@
-//! The located tree: YAML values that know where they were written.
+//! The located tree: YAML values that keep their position in the source.
 
 use std::collections::HashSet;
 use std::ops::Range;
 
 use crate::yaml::diag::{Diag, Label, Severity};
 
-/// The largest file that is read [bytes].
+/// Maximum file size [bytes].
 pub const MAX_BYTES: usize = 1 << 20;
-/// The deepest nesting of lists and groups, counted through aliases.
+/// Maximum nesting of lists and groups, aliases expanded.
 pub const MAX_DEPTH: usize = 32;
-/// The most values one tree may hold, counted after aliases were expanded.
+/// Maximum number of values, aliases expanded.
 pub const MAX_NODES: usize = 200_000;
-/// More mistakes than these are not listed.
+/// Maximum number of listed diagnostics.
 const MAX_DIAGS: usize = 100;
 
 /// A node of a [`Tree`].
 pub type NodeId = u32;
 /// A text of a [`Tree`]: a file or a command-line argument.
 pub type SourceId = u32;
-/// The place of values that come from Rust code instead of a file.
+/// Position of values that come from Rust code instead of a file.
 pub const NOWHERE: NodeId = NodeId::MAX;
 
 /// A named text that nodes point into.
 #[derive(Debug, Clone)]
 pub struct Source {
-    /// How people know it: a path, or `--set`.
+    /// Display name: a path, or `--set`.
     pub name: String,
-    /// The text itself.
+    /// The text.
     pub text: String,
 }
 
-/// A value and its place.
+/// A value and its position.
 #[derive(Debug, Clone)]
 pub struct Node {
-    /// The text it was written in.
+    /// The source.
     pub source: SourceId,
-    /// Bytes of that text.
+    /// Range in its text [bytes].
     pub range: Range<usize>,
-    /// What it is.
+    /// Kind.
     pub kind: Kind,
 }
 
-/// What a node is.
+/// Kind of a node.
 #[derive(Debug, Clone)]
 pub enum Kind {
     /// A word, number or text. `plain` means written without quotes, so that it may be a number or a boolean.
     Scalar {
         /// The text, escapes resolved.
         text: String,
-        /// Written without quotes.
+        /// Whether it is written without quotes.
         plain: bool,
     },
     /// A list.
     Seq(Vec<NodeId>),
-    /// A group of keys and values, in the order they were written. Keys are scalars and unique.
+    /// A group of keys and values, in order of the source. Keys are scalars and unique.
     Map(Vec<(NodeId, NodeId)>),
 }
 
-/// Sources, their nodes, and the mistakes found so far.
+/// Sources, their nodes, and the diagnostics so far.
 #[derive(Debug, Clone, Default)]
 pub struct Tree {
     sources: Vec<Source>,
     nodes: Vec<Node>,
     diags: Vec<Diag>,
-    /// Nodes from which something was left out, so that nobody complains of its absence.
+    /// Nodes with skipped parts, whose absence must not be reported.
     pub(super) damaged: HashSet<NodeId>,
-    /// Where keys belong that stand in the wrong place.
+    /// Looks up the group of a misplaced key.
     homes: Option<fn(&str) -> Option<String>>,
-    /// Mistakes beyond the number that is listed.
+    /// Number of diagnostics that are not listed.
     pub(super) unlisted: usize,
 }
 
 impl Tree {
-    /// An empty tree.
+    /// Creates an empty tree.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Adds a text that nodes and mistakes may point into.
+    /// Adds a source.
     pub fn add_source(&mut self, name: impl Into<String>, text: impl Into<String>) -> SourceId {
         self.sources.push(Source { name: name.into(), text: text.into() });
         (self.sources.len() - 1) as SourceId
     }
 
-    /// Adds a file's bytes; reports what makes them no text of acceptable size.
+    /// Adds a file's bytes; reports what makes them unusable as text.
     pub fn add_bytes(&mut self, name: impl Into<String>, bytes: &[u8]) -> Option<SourceId> {
         let name = name.into();
         if bytes.len() > MAX_BYTES {
@@ -115,12 +115,12 @@ impl Tree {
         Some(source)
     }
 
-    /// All sources, in the order they were added.
+    /// Returns all sources, in order of addition.
     pub fn sources(&self) -> &[Source] {
         &self.sources
     }
 
-    /// The source of an id.
+    /// Returns a source by id.
     pub fn source(&self, id: SourceId) -> Option<&Source> {
         self.sources.get(id as usize)
     }
@@ -131,17 +131,17 @@ impl Tree {
         }
     }
 
-    /// The node of an id.
+    /// Returns a node by id.
     pub fn node(&self, id: NodeId) -> Option<&Node> {
         self.nodes.get(id as usize)
     }
 
-    /// Number of nodes.
+    /// Returns the number of nodes.
     pub fn len(&self) -> usize {
         self.nodes.len()
     }
 
-    /// Whether there is no node.
+    /// Returns whether there are no nodes.
     pub fn is_empty(&self) -> bool {
         self.nodes.is_empty()
     }
@@ -151,7 +151,7 @@ impl Tree {
         (self.nodes.len() - 1) as NodeId
     }
 
-    /// Adds an empty group that stands at the place of another node: for a group that was left out.
+    /// Adds an empty group at the position of another node, for a group that is absent.
     pub fn add_empty_map(&mut self, at: NodeId) -> NodeId {
         let (source, range) = self.node(at).map_or((0, 0..0), |n| (n.source, n.range.clone()));
         self.add(source, range, Kind::Map(Vec::new()))
@@ -169,7 +169,7 @@ impl Tree {
         }
     }
 
-    /// The text of a scalar.
+    /// Returns the text of a scalar.
     pub fn text(&self, id: NodeId) -> Option<&str> {
         match &self.node(id)?.kind {
             Kind::Scalar { text, .. } => Some(text),
@@ -177,7 +177,7 @@ impl Tree {
         }
     }
 
-    /// Keys and values of a group; nothing for other nodes.
+    /// Returns keys and values of a group; empty for other nodes.
     pub fn entries(&self, id: NodeId) -> &[(NodeId, NodeId)] {
         match self.node(id).map(|n| &n.kind) {
             Some(Kind::Map(entries)) => entries,
@@ -185,7 +185,7 @@ impl Tree {
         }
     }
 
-    /// Elements of a list; nothing for other nodes.
+    /// Returns the elements of a list; empty for other nodes.
     pub fn items(&self, id: NodeId) -> &[NodeId] {
         match self.node(id).map(|n| &n.kind) {
             Some(Kind::Seq(items)) => items,
@@ -193,18 +193,18 @@ impl Tree {
         }
     }
 
-    /// The node of a key in a group, and that of its value.
+    /// Returns the nodes of a key and its value.
     pub fn entry(&self, map: NodeId, key: &str) -> Option<(NodeId, NodeId)> {
         self.entries(map).iter().copied().find(|(k, _)| self.text(*k) == Some(key))
     }
 
-    /// The value of a key in a group.
+    /// Returns the value of a key.
     pub fn get(&self, map: NodeId, key: &str) -> Option<NodeId> {
         self.entry(map, key).map(|(_, value)| value)
     }
 
-    /// What stands at a path of keys and numbers with dots (`sim.faults.0`) below `root`, or as near to it as there is
-    /// anything.
+    /// Returns the node at a path of keys and indices with dots (`sim.faults.0`) below `root`, or its nearest existing
+    /// ancestor.
     pub fn nearest(&self, root: NodeId, path: &str) -> NodeId {
         let mut at = root;
         for step in path.split('.') {
@@ -220,7 +220,7 @@ impl Tree {
         at
     }
 
-    /// Takes a key out of a group.
+    /// Removes a key from a group.
     pub fn remove(&mut self, map: NodeId, key: &str) {
         let kept = self.entries(map).iter().copied().filter(|(k, _)| self.text(*k) != Some(key)).collect();
         if matches!(self.node(map).map(|n| &n.kind), Some(Kind::Map(_))) {
@@ -228,7 +228,7 @@ impl Tree {
         }
     }
 
-    /// Sets a key of a group; a new key and value stand at the place of `at`.
+    /// Sets a key of a group; a new key and value get the position of `at`.
     pub fn put_text(&mut self, map: NodeId, key: &str, value: &str, at: (SourceId, Range<usize>)) {
         let scalar = |text: &str| Kind::Scalar { text: text.to_owned(), plain: false };
         let value = self.add(at.0, at.1.clone(), scalar(value));
@@ -240,12 +240,12 @@ impl Tree {
         self.set_kind(map, Kind::Map(entries));
     }
 
-    /// Whether something that was written in a node is not in the tree, because it stood there twice.
+    /// Returns whether part of a node was dropped because it was written twice.
     pub fn is_damaged(&self, id: NodeId) -> bool {
         self.damaged.contains(&id)
     }
 
-    /// Gives the tree a way to tell in which group a key belongs, for hints.
+    /// Sets the lookup of a misplaced key's group, for hints.
     pub fn know_homes(&mut self, homes: fn(&str) -> Option<String>) {
         self.homes = Some(homes);
     }
@@ -254,7 +254,7 @@ impl Tree {
         self.homes.and_then(|homes| homes(key))
     }
 
-    /// A label on a node; of lists and groups only the first line is marked.
+    /// Returns a label on a node; of lists and groups only the first line is marked.
     pub fn label(&self, id: NodeId) -> Label {
         let Some(node) = self.node(id) else { return Label::start_of(0) };
         let text = self.source(node.source).map_or("", |s| s.text.as_str());
@@ -265,7 +265,7 @@ impl Tree {
         Label { source: node.source, range: node.range.start..end, text: String::new() }
     }
 
-    /// Notes a mistake; the same one at the same place is noted once.
+    /// Adds a diagnostic, unless the same one exists at the same position.
     pub fn report(&mut self, diag: Diag) {
         if self.diags.contains(&diag) {
             return;
@@ -276,23 +276,23 @@ impl Tree {
         }
     }
 
-    /// Mistakes that were found but not listed, because there were too many.
+    /// Returns the number of diagnostics that are not listed.
     pub fn unlisted(&self) -> usize {
         self.unlisted
     }
 
-    /// Whether a mistake was noted at exactly this node.
+    /// Returns whether there is a diagnostic at exactly this node.
     pub(super) fn has_report_at(&self, id: NodeId) -> bool {
         let label = self.label(id);
         self.diags.iter().any(|d| d.at.as_ref().is_some_and(|at| at.source == label.source && at.range == label.range))
     }
 
-    /// Whether any mistake noted so far must be put right.
+    /// Returns whether there are errors.
     pub fn has_errors(&self) -> bool {
         self.unlisted > 0 || self.diags.iter().any(|d| d.severity == Severity::Error)
     }
 
-    /// The mistakes noted so far, in the order they were found.
+    /// Returns the diagnostics, in order of detection.
     pub fn diags(&self) -> &[Diag] {
         &self.diags
     }

@@ -13,8 +13,8 @@ use dimos::control::request::{Envelope, Motion, Request};
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::planning::ahead::{look_ahead, rests_before};
 use dimos::planning::config::{JointBounds, ObjectConfig, ObjectShape};
-use dimos::planning::setup::{Setup, obstacle};
-use dimos::planning::solve::{self, Found, Goal, solve};
+use dimos::planning::pipeline::{self, Goal, PlannedMotion, solve};
+use dimos::planning::planning_scene::{PlanningScene, obstacle};
 use dimos::robot::random::Random;
 use dimos::runtime::Run;
 use dimos::telemetry::TaskState;
@@ -64,7 +64,7 @@ struct Virtual {
 
 impl Virtual {
     /// Executing a motion from where it starts.
-    fn executing(found: &Found) -> Self {
+    fn executing(found: &PlannedMotion) -> Self {
         let start: Vec<f64> = found.path[0].clone();
         let arm = ArmState {
             dof: DOF,
@@ -122,7 +122,7 @@ impl Virtual {
     }
 }
 
-fn at(found: &Found, time: f64) -> Vec<f64> {
+fn at(found: &PlannedMotion, time: f64) -> Vec<f64> {
     let spline = Spline::new(&found.trajectory).unwrap();
     let mut samples = vec![Sample::default(); DOF];
     spline.sample(time, &mut Cursor::default(), &mut samples);
@@ -130,7 +130,7 @@ fn at(found: &Found, time: f64) -> Vec<f64> {
 }
 
 /// A motion from somewhere to somewhere, where there is one.
-fn motion(setup: &Setup, checker: &mut ExactChecker, random: &mut Random) -> Option<Found> {
+fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random) -> Option<PlannedMotion> {
     let mut somewhere = || {
         (0..1000).find_map(|_| {
             let inside = |l: &dimos::robot::model::Limits| random.between(l.lower.max(-2.5), l.upper.min(2.5));
@@ -140,13 +140,13 @@ fn motion(setup: &Setup, checker: &mut ExactChecker, random: &mut Random) -> Opt
     };
     let (start, goal) = (somewhere()?, somewhere()?);
     let (speed, seed) = (random.between(0.2, 1.0), random.bits());
-    let request = solve::Request { goals: vec![(0, Goal::Joints(goal))], positions: vec![start], speed, seed };
+    let request = pipeline::PlanRequest { goals: vec![(0, Goal::Joints(goal))], positions: vec![start], speed, seed };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);
     solve(setup, &setup.world, &request, &stop).ok().filter(|found| found.trajectory.duration() > 0.5)
 }
 
 /// Something at a link of the arm, as it is at a configuration.
-fn something(setup: &Setup, q: &[f64], random: &mut Random) -> ObjectConfig {
+fn something(setup: &PlanningScene, q: &[f64], random: &mut Random) -> ObjectConfig {
     let robot = &setup.robots[0];
     let kinematics = &robot.body.kinematics;
     let mut frames = kinematics.frames();
@@ -171,9 +171,9 @@ fn too_close(judge: &ExactChecker, q: &[f64]) -> Option<f64> {
 }
 
 /// The planner's robots, as a run narrows them to what its arm may be commanded.
-fn setup() -> Setup {
+fn setup() -> PlanningScene {
     let loaded = Run::from_name("yourarm-planner").unwrap().check();
-    let setup = Setup::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
+    let setup = PlanningScene::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
     let bounds = JointBounds { position: [-3.0, 3.0], velocity: 3.0, acceleration: ACCELERATION, jerk: JERK };
     setup.within(&(1..=DOF).map(|j| (format!("arm_joint{j}"), bounds)).collect()).unwrap()
 }

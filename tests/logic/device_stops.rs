@@ -12,7 +12,7 @@ use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
 use dimos::hardware::spec::{AdapterError, ManipulatorAdapter};
 use dimos::joint::ControlMode;
-use dimos::rt::beat::Beat;
+use dimos::rt::heartbeat::Heartbeat;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
 use dimos::testing::{Call, MockAdapter};
 
@@ -20,7 +20,7 @@ const LIMIT: Duration = Duration::from_secs(20);
 
 struct Bench {
     device: Device,
-    beat: Arc<Beat>,
+    beat: Arc<Heartbeat>,
     states: SlotReader<ArmState>,
     commands: SlotWriter<ArmCommand>,
     command: ArmCommand,
@@ -34,7 +34,7 @@ fn bench(native_rate: f64) -> Bench {
 
 /// A device thread with this adapter; `mock` is it, or stands idle.
 fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
-    let beat = Arc::new(Beat::default());
+    let beat = Arc::new(Heartbeat::default());
     let (state_writer, states) = slot(ArmState::default());
     let (commands, command_reader) = slot(ArmCommand::default());
     let config = DeviceConfig {

@@ -22,6 +22,7 @@ mod conformance_finds_faults;
 mod conformance_pushed;
 mod coordinator;
 mod device_stops;
+mod english;
 mod faults_virtual;
 mod guards_virtual;
 mod kinematics;

@@ -19,7 +19,7 @@ use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
-use dimos::rt::beat::Beat;
+use dimos::rt::heartbeat::Heartbeat;
 use dimos::rt::slot::slot;
 use dimos::rt::wake::Wake;
 use dimos::telemetry::{ArmSample, Cause, Event, Phase, Sample, TaskState, TaskView};
@@ -317,7 +317,7 @@ fn a_device_thread_in_health_takes_and_gives_back_no_memory() {
     };
     let counted = Arc::new(AtomicU64::new(u64::MAX));
     let adapter = Watched { inner: (SPEC.create)(&config).unwrap(), readings: 0, counted: counted.clone() };
-    let beat = Arc::new(Beat::default());
+    let beat = Arc::new(Heartbeat::default());
     let (state_writer, mut states) = slot(ArmState::default());
     let (mut commands, command_reader) = slot(ArmCommand::default());
     let device = DeviceConfig {

@@ -12,7 +12,7 @@ use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use dimos::planning::blend::curves;
 use dimos::planning::cartesian::{LineSettings, Shortfall, straight_line};
 use dimos::planning::path::{distance, tidy};
-use dimos::planning::planner::{PlanError, PlanSettings, plan};
+use dimos::planning::path_planner::{PlanError, PlanSettings, plan};
 use dimos::planning::shortcut::{ShortcutSettings, shorten};
 use dimos::planning::timing::{TimingSettings, time};
 use dimos::planning::topp::{JointBound, parameterize};
@@ -111,14 +111,14 @@ fn what_cannot_be_planned_is_said() {
     assert!(matches!(ask(start, &[0.0; 3], &Stop::never()), Err(PlanError::Shape("goal", 7))));
     let cancelled = Stop::new(None, Some(Arc::new(AtomicBool::new(true))));
     assert_eq!(ask(start, goal, &cancelled).unwrap_err(), PlanError::Cancelled);
-    let looked = checker.looks();
+    let looked = checker.checks();
     assert_eq!(plan(&mut checker, start, &[goal.to_vec()], &settings, &cancelled), Err(PlanError::Cancelled));
-    assert!(checker.looks() - looked <= 4, "{} looks after it was cancelled", checker.looks() - looked);
+    assert!(checker.checks() - looked <= 4, "{} checks after it was cancelled", checker.checks() - looked);
     // Neither do shortening and timing go on.
     let long: Vec<Vec<f64>> = (0..40).map(|k| start.iter().map(|x| x + 0.01 * f64::from(k % 7)).collect()).collect();
-    let looked = checker.looks();
+    let looked = checker.checks();
     shorten(&mut checker, &long, &ShortcutSettings::default(), 0, &cancelled);
-    assert_eq!(checker.looks(), looked);
+    assert_eq!(checker.checks(), looked);
 }
 
 #[test]

@@ -114,7 +114,7 @@ fn list(value: &Value) -> Vec<f64> {
 fn check_shows_what_files_add_to_a_robot() {
     let home = lab();
     let shown = home.dimos("check lab.yaml").with(0).says(&[
-        "rig.urdf.xacro:4:53: the visual mesh cannot be found and is not shown",
+        "rig.urdf.xacro:4:53: visual mesh not found, it is not shown",
         "1 pair of `disable_collisions` with links that this robot lacks",
         "the SRDF's pose `beyond` cannot be used: `rail` at 0.9 m is outside the model's limits",
         "3 warnings",
@@ -200,13 +200,15 @@ fn links_that_always_touch_are_named_by_every_verb() {
     );
     assert_ne!(swollen, RIG);
     home.write("robots/urdf/rig.urdf.xacro", &swollen);
-    let pair = "arm and finger_left touch in every pose";
+    let pair = "arm and finger_left touch in every configuration";
     let shown = home.dimos("check lab.yaml").with(0);
     assert!(shown.out.contains(pair) && shown.out.contains("hint: "), "{}", shown.out);
     let document = home.dimos("check lab.yaml --json").with(0).json();
     assert_eq!(document["robots"][0]["always_touching"], serde_json::json!([["arm", "finger_left"]]));
     let alone = "model check robots/urdf/rig.urdf.xacro --srdf robots/rig.srdf --package rig_description=robots";
-    home.dimos(alone).with(0).says(&["the links `arm` and `finger_left` touch in every pose", "disable_collisions"]);
+    home.dimos(alone)
+        .with(0)
+        .says(&["the links `arm` and `finger_left` touch in every configuration", "disable_collisions"]);
     let run = home.run("lab.yaml --no-record");
     assert!(run.err().contains(pair) || run.out().contains(pair), "{}{}", run.out(), run.err());
     home.dimos("down").with(0);
@@ -244,7 +246,7 @@ fn mistakes_around_a_description_stand_at_the_keys_that_name_it() {
     }
     home.write("lab.yaml", BLUEPRINT);
     for (file, text, right, wrong, words) in [
-        ("robots/rig.srdf", SRDF, "value=\"3.0\"", "value=\"up\"", "rig.srdf:5:97: `up` is no position of a joint"),
+        ("robots/rig.srdf", SRDF, "value=\"3.0\"", "value=\"up\"", "rig.srdf:5:97: `up` is not a joint position"),
         (
             "robots/joint_limits.yaml",
             LIMITS,
@@ -275,10 +277,10 @@ fn model_check_knows_every_feature_of_a_description() {
     let (a_b, b_c) = (joint("j", "revolute", "a", "b", limit), joint("k", "revolute", "b", "c", limit));
     let table: Vec<(&str, String, i32, &str)> = vec![
         ("unknown tags", format!("<link name='c'><odd/></link><gazebo/><transmission/>{a_b}{b_c}"), 0, "no mistakes"),
-        ("a missing visual mesh", format!("{}{a_b}{b_c}", mesh("visual")), 0, "the visual mesh cannot be found"),
-        ("a missing collision mesh", format!("{}{a_b}{b_c}", mesh("collision")), 2, "there is no file"),
+        ("a missing visual mesh", format!("{}{a_b}{b_c}", mesh("visual")), 0, "visual mesh not found"),
+        ("a missing collision mesh", format!("{}{a_b}{b_c}", mesh("collision")), 2, "file not found"),
         ("a loop", format!("<link name='c'/>{a_b}{b_c}{}", joint("l", "fixed", "c", "a", "")), 2, "form a loop"),
-        ("two roots", format!("<link name='c'/>{a_b}"), 2, "the link `c` hangs on nothing, and neither does `a`"),
+        ("two roots", format!("<link name='c'/>{a_b}"), 2, "the links `c` and `a` both have no parent"),
         ("two parents", format!("<link name='c'/>{a_b}{b_c}{}", joint("l", "fixed", "a", "c", "")), 2, "two parents"),
         (
             "an unknown parent",
@@ -304,7 +306,7 @@ fn model_check_knows_every_feature_of_a_description() {
             "a floating joint",
             format!("<link name='c'/>{a_b}{}", b_c.replace("revolute", "floating")),
             2,
-            "cannot be driven",
+            "are not supported",
         ),
         ("twins", format!("<link name='c'/><link name='c'/>{a_b}{b_c}"), 2, "two links are named `c`"),
         (

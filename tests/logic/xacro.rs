@@ -200,7 +200,7 @@ fn files_never_lead_out_of_their_packages() {
             "<x a=\"${xacro.load_yaml('../../secret/a.yaml')}\"/><link name='b'/>",
             "is not in the package of this description",
         ),
-        ("<xacro:include filename='$(find ..)/secret/a.xacro'/>", "is no name of a package"),
+        ("<xacro:include filename='$(find ..)/secret/a.xacro'/>", "is not a package name"),
     ] {
         let path = write(root, "pkg/urdf/t.xacro", body);
         let found = mistakes(&path);
@@ -245,7 +245,7 @@ fn work_is_bounded() {
         ("<xacro:macro name='m'><a/><xacro:m/><xacro:m/></xacro:macro><xacro:m/>".to_owned(), "nested deeper than"),
         (
             "<xacro:macro name='m' params='n'><xacro:if value='${n}'><xacro:m n='${n-1}'/><xacro:m n='${n-1}'/></xacro:if></xacro:macro><xacro:m n='50'/>".to_owned(),
-            "too much work",
+            "too many steps",
         ),
         (own.to_owned(), "includes are nested deeper than"),
         (format!("<xacro:property name='p0' value='xxxxxxxxxx'/>{doubling}<a b='${{p59}}'/>"), "longer than"),
@@ -259,7 +259,7 @@ fn work_is_bounded() {
     ] {
         let path = write(folder.path(), "t.xacro", &body);
         let found = mistakes(&path);
-        assert!(found.contains(what) && !found.contains("mistake of the program"), "{what}: {:.300}\n{found:.1500}", body);
+        assert!(found.contains(what) && !found.contains("bug in this program"), "{what}: {:.300}\n{found:.1500}", body);
     }
 }
 
@@ -304,6 +304,6 @@ fn damaged_files_are_refused_quietly() {
         let path = folder.path().join(if round % files.len() == files.len() - 1 { "t.urdf" } else { "t.xacro" });
         std::fs::write(&path, &bytes).unwrap();
         let found = mistakes(&path);
-        assert!(!found.contains("mistake of the program"), "{}\n{found}", String::from_utf8_lossy(&bytes));
+        assert!(!found.contains("bug in this program"), "{}\n{found}", String::from_utf8_lossy(&bytes));
     }
 }

@@ -143,7 +143,7 @@ fn places_survive_and_are_nowhere_without_a_file() {
 #[test]
 fn caps_have_clear_errors() {
     let deep = format!("a: {}{}", "[".repeat(40), "]".repeat(40));
-    assert_eq!(only_mistake(&deep), "1:35 lists and groups are nested deeper than 32 levels");
+    assert_eq!(only_mistake(&deep), "1:35 lists and groups are nested more than 32 levels deep");
 
     let big = format!("a: {}", "x".repeat(MAX_BYTES));
     assert_eq!(only_mistake(&big), "1:1 the file is larger than 1 MiB");
@@ -161,7 +161,7 @@ fn caps_have_clear_errors() {
     assert!(only_mistake(&ladder).contains("nested deeper"), "depth counts through aliases");
 
     assert_eq!(only_mistake("a: &a [*a]"), "1:8 this alias refers to a value that contains it");
-    assert_eq!(only_mistake("a: *b"), "1:4 no value above is named `b` with `&`");
+    assert_eq!(only_mistake("a: *b"), "1:4 no value above has the anchor `b`");
     assert_eq!(only_mistake("a: 1\n---\nb: 2\n"), "2:1 a second document starts here");
     assert_eq!(only_mistake("a: 1\nb: \0\n"), "2:4 the file has a NUL byte here");
 }
@@ -246,7 +246,7 @@ fn set_says_what_is_wrong_with_it() {
     for (argument, want) in [
         ("rate", "1:1 expected `path=value`"),
         ("=1", "1:1 expected `path=value`"),
-        ("rate.x=1", "1:6 `rate` is a single value, nothing is below it"),
+        ("rate.x=1", "1:6 `rate` is a single value without keys"),
         ("list.7=1", "1:6 `list` has no entry `7`; it has 2"),
         ("arms.amr.n=1", "1:6 no entry of `arms` has the id `amr`"),
     ] {

@@ -130,7 +130,7 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
         assert_eq!(blueprint["problem"], Value::Null, "{name}");
         home.dimos(&format!("check {name} --sim")).with(0);
         let started = home.dimos(&format!("run {name} --sim --no-record --duration 200ms")).with(0);
-        started.says(&[&format!("run {name}  "), "ready", "its time is over"]);
+        started.says(&[&format!("run {name}  "), "ready", "duration reached"]);
     }
 }
 

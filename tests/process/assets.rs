@@ -46,7 +46,7 @@ fn a_run_fetches_what_it_uses_and_check_does_not() {
     home.write("cell.yaml", &blueprint(&server.url("yourarm.zip"), &sha256(&home, &file)));
 
     let checked = home.dimos("check cell.yaml").with(0);
-    assert!(checked.err.contains("yourarm is not fetched yet: what lies in it was not checked"), "{}", checked.err);
+    assert!(checked.err.contains("yourarm is not downloaded yet: its contents were not checked"), "{}", checked.err);
     assert!(server.ranges().is_empty());
     let list = home.dimos("model assets list cell.yaml --json").with(0).json();
     let row = |list: &Value, name: &str| list.as_array().unwrap().iter().find(|a| a["name"] == name).unwrap().clone();
@@ -65,7 +65,7 @@ fn a_run_fetches_what_it_uses_and_check_does_not() {
     let list = home.dimos("model assets list cell.yaml").with(0).out;
     assert!(list.contains("here") && list.contains("cache/dimos/assets/"), "{list}");
     assert_eq!(home.dimos("model assets clean cell.yaml").with(0).out, "removed yourarm\n");
-    assert_eq!(home.dimos("model assets clean cell.yaml").with(0).out, "nothing was there\n");
+    assert_eq!(home.dimos("model assets clean cell.yaml").with(0).out, "nothing to remove\n");
     let offline = home.dimos("run cell.yaml --no-record").with(1);
     assert!(offline.err.contains("error: cell.yaml:4:3: the asset `yourarm`: http://127.0.0.1"), "{}", offline.err);
     assert!(offline.err.contains("hint: ") && offline.err.contains("offline"), "{}", offline.err);

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
-use dimos::planning::setup::{Setup, obstacle};
+use dimos::planning::planning_scene::{PlanningScene, obstacle};
 use dimos::rpc::api::{
     ExecutePlan, Plan, PlanGoal, Planning, PoseSpec, Preview, ShapeSpec, WorldAdd, WorldObject, WorldRemove,
 };
@@ -30,7 +30,7 @@ fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
 struct Cell {
     run: Run,
     arm: YourArmEmulator,
-    setup: Setup,
+    setup: PlanningScene,
     _folder: tempfile::TempDir,
 }
 
@@ -40,7 +40,7 @@ fn up() -> Cell {
     let blueprint = || -> Builder {
         Run::from_name("yourarm-planner").unwrap().set("hardware.arm.address", arm.address()).record(Record::Off)
     };
-    let setup = Setup::load(blueprint().check().blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
+    let setup = PlanningScene::load(blueprint().check().blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
     let run = blueprint().folder(RunFolder::at(folder.path())).start().unwrap();
     let cell = Cell { run, arm, setup, _folder: folder };
     let begun = cell.run.move_arm("arm", &HOME, 1.0).unwrap();

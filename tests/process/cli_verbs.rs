@@ -248,7 +248,7 @@ fn mistakes_in_a_trajectory_file_are_located() {
         ("a.csv", "time,j\n0,0\n1,  x\n", "a.csv:3:5: \"x\" is not a finite number"),
         ("a.csv", "time,j\n0,0\n1,inf\n", "a.csv:3:3: \"inf\""),
         ("a.csv", "time,j\n0,0\n1\n", "a.csv:3:1: 1 values for 2 columns"),
-        ("a.csv", "time,j\n0,0\n", "a.csv: a trajectory has two points or more"),
+        ("a.csv", "time,j\n0,0\n", "a.csv: a trajectory needs at least two points"),
         ("a.json", "{\"joint_names\":[],\n\"pionts\":[]}", "a.json:2:8: unknown field `pionts`"),
         ("a.txt", "", "a.txt: neither .json nor .csv"),
         ("missing.csv", "", "missing.csv: "),

@@ -72,15 +72,15 @@ fn it_returns_when_the_arms_are_up_and_tells_run_pid_and_logs() {
     }
     assert!(text(&daemon.text_log()).contains("run coordinator-mock"));
     let told = home.dimos(&format!("run -d --duration 2m --no-record {RUN} --name plain")).with(0);
-    for part in ["run       plain", "pid       ", "arm       arm: ready", "log       none is written", "text log  "] {
+    for part in ["run       plain", "pid       ", "arm       arm: ready", "log       none", "text log  "] {
         assert!(told.out.contains(part), "no {part:?} in\n{}", told.out);
     }
     told.says(&["dimos down plain"]);
     home.dimos("down plain").with(0).says(&["plain ended"]);
     home.dimos(&format!("move --run {RUN} arm 0.1 0 0 0 0 0 0 --speed 1")).with(0);
-    home.dimos("down").with(0).says(&["coordinator-mock ended; its log: "]);
+    home.dimos("down").with(0).says(&["coordinator-mock ended; log: "]);
     assert!(!daemon.lives(), "down waits until the process has ended");
-    assert!(text(&daemon.text_log()).contains("asked to end"));
+    assert!(text(&daemon.text_log()).contains("shutdown requested"));
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn that_it_crashed_while_it_started_is_told() {
     let pid = || home.runs().runs().unwrap().iter().map(|run| run.pid as i32).find_map(Pid::from_raw);
     eventually("it starts", || pid().is_some());
     kill_process(pid().unwrap(), Signal::KILL).unwrap();
-    command.wait().with(1).says(&["coordinator-yourarm crashed while it started (signal: 9 (SIGKILL))", "hint: "]);
+    command.wait().with(1).says(&["coordinator-yourarm crashed during startup (signal: 9 (SIGKILL))", "hint: "]);
 }
 
 #[test]
@@ -137,26 +137,26 @@ fn it_ends_when_nobody_waits_for_it_any_more() {
     drop(ours);
     let mut command = home.command(&format!("run --text-log text.log {RUN}"));
     let ended = Started::of(command.stdin(Stdio::from(OwnedFd::from(theirs)))).wait();
-    ended.with(0).says(&["whoever started this run has gone before it was up", "asked to end"]);
+    ended.with(0).says(&["the starting process exited before the run was ready", "shutdown requested"]);
 }
 
 #[test]
 fn logs_shows_and_follows_the_text_of_the_living_and_the_dead() {
     let home = Home::new();
     home.dimos("logs").with(1).says(&["no run is live"]);
-    home.dimos("logs nobody").with(2).says(&["nothing is known of a run named nobody"]);
+    home.dimos("logs nobody").with(2).says(&["no record of a run named nobody"]);
     let daemon = Daemon::start(&home, RUN);
     assert_eq!(home.dimos("logs").with(0).out, text(&daemon.text_log()));
     let following = home.start("logs -f");
     following.until("run coordinator-mock");
     home.dimos("down").with(0);
     let followed = following.wait().with(0);
-    assert!(followed.out.contains("asked to end") && followed.out.contains("ended; its log: "), "{}", followed.out);
+    assert!(followed.out.contains("shutdown requested") && followed.out.contains("ended; log: "), "{}", followed.out);
     for dead in ["logs", "logs coordinator-mock", "logs --run coordinator-mock"] {
         assert_eq!(home.dimos(dead).with(0).out, followed.out, "{dead}");
     }
     let record = home.dimos("logs --json").with(0).json();
-    assert_eq!((&record["end"]["exit"], &record["end"]["why"]), (&0.into(), &"asked to end".into()));
+    assert_eq!((&record["end"]["exit"], &record["end"]["why"]), (&0.into(), &"shutdown requested".into()));
     // A run in a terminal has none.
     let foreground = home.run(&format!("{RUN} --name front"));
     home.dimos("logs").with(1).says(&["front has no text log", "hint: "]);
@@ -170,7 +170,7 @@ fn a_crashed_run_is_shown_with_its_last_words_until_it_is_started_again() {
     let other = home.run(&format!("{RUN} --name other"));
     daemon.kill();
     eventually("it is gone", || !daemon.lives());
-    let words = "dimos down ends it, controlled.";
+    let words = "Run `dimos down` for a controlled stop.";
     let shown = home.dimos("status").with(0).out;
     assert!(shown.contains("run other") && shown.contains("crashed") && shown.contains(words), "{shown}");
     other.end(Signal::TERM).with(143);

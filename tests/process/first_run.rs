@@ -32,7 +32,7 @@ fn the_banner_tells_all_and_status_and_state_answer() {
     assert!(arm["state_age_ms"].as_f64().unwrap() < 1000.0 && arm["measured_rate_hz"].as_f64().unwrap() > 10.0);
     assert_eq!(home.dimos("state").with(0).out.matches("arm_joint").count(), 6);
     assert_eq!(home.positions("arm").len(), 6);
-    run.end(Signal::INT).with(130).says(&["SIGINT", "motors off", "its log: "]);
+    run.end(Signal::INT).with(130).says(&["SIGINT", "motors off", "log: "]);
 }
 
 #[test]
@@ -71,9 +71,9 @@ fn a_move_ends_at_its_goal_and_replay_shows_it() {
     let played = home.dimos("replay --last --json --rate 1000 --topics /joint_states").with(0);
     let travelled = lines(&played.out).map(|m| numbers(&m["data"]["position"])[0]).fold(0.0, f64::max);
     assert!((0.29..0.31).contains(&travelled), "{travelled}");
-    run.wait().with(0).says(&["asked to end"]);
+    run.wait().with(0).says(&["shutdown requested"]);
     // And the name is free again.
-    home.run(&format!("{RUN} --duration 100ms")).wait().with(0).says(&["its time is over"]);
+    home.run(&format!("{RUN} --duration 100ms")).wait().with(0).says(&["duration reached"]);
 }
 
 #[test]
@@ -176,7 +176,7 @@ fn runs_have_names_and_live_side_by_side() {
     let first = home.run(RUN);
     home.dimos(&format!("run {RUN}")).with(1).says(&[RUN, &first.pid().to_string(), "hint: "]);
     let second = home.run("coordinator-mock --name other --no-record");
-    assert!(second.err().contains("none is written"), "{}", second.err());
+    assert!(second.err().contains("log        none"), "{}", second.err());
     home.dimos("state").with(2).says(&[RUN, "other", "--run"]);
     home.dimos("state --run other").with(0);
     let table = home.dimos("status").with(0).out;

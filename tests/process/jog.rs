@@ -190,7 +190,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
         assert!((cells[3].parse::<f64>().unwrap() - position.to_degrees()).abs() < 0.1, "{row} {position}");
         assert!(cells[5].starts_with('[') && cells[5].contains('#') && cells[5].ends_with(']'), "{row}");
     }
-    for part in ["JOINT arm_joint1", "+/- or arrows move it", "Space rest now", "X stop, latched", "Esc leave"] {
+    for part in ["JOINT arm_joint1", "+/- or arrows move it", "Space rest", "X stop, latched", "Esc leave"] {
         assert!(text.contains(part), "no {part:?} in\n{text}");
     }
     terminal.keys("\t");
@@ -289,7 +289,7 @@ fn where_the_terminal_tells_that_keys_go_up_that_counts() {
     terminal.until("at rest");
     // `=` goes up, by the kitty keyboard protocol: from here on a motion lives until its key goes up.
     terminal.keys("=\x1b[61;1:3u");
-    terminal.until("held while down");
+    terminal.until("moves while a key is down");
     let from = rig.joint(0).0;
     terminal.keys("=");
     eventually("it moves on without repeats", || {
@@ -351,7 +351,7 @@ fn what_is_missing_is_said_before_the_screen_is_taken() {
     let _run = home.run("coordinator-mock --no-record");
     let terminal = Terminal::new(100, 24);
     terminal.start(&home, "jog arm").wait().with(2);
-    terminal.until("no task of the run lets the keyboard move arm");
+    terminal.until("no task of the run can be jogged on arm");
     terminal.until("- {name: velocity_arm, type: velocity, joint_names: {hardware: arm}, priority: 20}");
     eventually("the terminal is given back", || terminal.is_as_before());
     let terminal = Terminal::new(100, 24);

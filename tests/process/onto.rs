@@ -191,7 +191,7 @@ fn limits_are_kept_or_the_motion_is_refused_before_anything_moves() {
     let home = Home::new();
     let log = home.recorded();
     let (_, err) = home.run("replay recorded.mcap --onto mock6.yaml --rate 4 --record refused.mcap", 1);
-    assert!(err.contains("would break its acceleration limit by 10.48") && err.contains("nothing has moved"), "{err}");
+    assert!(err.contains("exceeds its acceleration limit by 10.48") && err.contains("nothing has moved"), "{err}");
     let commanded = motion(&home.path("refused.mcap"));
     assert!(commanded.rows.iter().flatten().all(|q| *q == 0.0), "nothing may have moved");
     let rate = err.split("--rate ").nth(1).and_then(|rest| rest.split(';').next()).unwrap();
@@ -205,10 +205,10 @@ fn limits_are_kept_or_the_motion_is_refused_before_anything_moves() {
         home.run("replay recorded.mcap --onto narrow.yaml --no-record", 1).1
     };
     let err = narrow("{position: [-1, 0.4]}");
-    assert!(err.contains("arm_joint3 would break its position limit by 0.1100 rad: 0.5000 of 0.3900 rad"), "{err}");
+    assert!(err.contains("arm_joint3 exceeds its position limit by 0.1100 rad: 0.5000 of 0.3900 rad"), "{err}");
     // Recorded at 0.8 times the speed: with 0.64 times 2 rad/s².
     let err = narrow("{acceleration: 1}");
-    assert!(err.contains("would break its acceleration limit by 0.28"), "{err}");
+    assert!(err.contains("exceeds its acceleration limit by 0.28"), "{err}");
     assert!(err.contains("--rate 0.88"), "{err}");
 }
 
@@ -221,7 +221,7 @@ fn other_joints_and_real_arms_are_refused_before_anything_is_connected() {
     assert!(err.contains("hint: ") && err.contains("left_arm_joint1"), "{err}");
     let real = "replay recorded.mcap --onto coordinator-yourarm --set hardware.arm.address=127.0.0.1:9 --no-record";
     let (_, err) = home.run(real, 2);
-    assert!(err.contains("would move for real") && err.contains("--allow-motion"), "{err}");
+    assert!(err.contains("are real arms") && err.contains("--allow-motion"), "{err}");
     // Allowed, it is tried: nobody answers there.
     home.run(&format!("{real} --allow-motion"), 3);
     home.run("replay recorded.mcap --allow-motion", 2);

@@ -157,7 +157,7 @@ fn a_run_that_goes_away_is_waited_for() {
     run.end(Signal::TERM).with(143);
     planner.until("planner lab: FAULT: run cell: the run is gone");
     let waiting = home.dimos("status").with(0).out;
-    assert!(waiting.contains("lab") && waiting.contains("a planner that waits for its run"), "{waiting}");
+    assert!(waiting.contains("lab") && waiting.contains("a planner waiting for its run"), "{waiting}");
     let run = home.run("cell.yaml --no-record");
     planner.until(AGAIN);
     // The world is as it was; the plans of the run that is gone are gone with it.
@@ -237,7 +237,7 @@ fn f23_a_planner_process_that_hangs_or_dies_holds_up_nobody() {
 fn who_fits_is_attached_to_and_who_does_not_is_told_why() {
     let home = home();
     home.dimos("run lab.yaml --attach cell").with(2).says(&["no live run is named `cell`"]);
-    home.dimos("run cell.yaml --attach cell").with(2).says(&["has no planner that could be attached"]);
+    home.dimos("run cell.yaml --attach cell").with(2).says(&["has no planner to attach"]);
     let run = home.run("cell.yaml --no-record");
     home.dimos("run lab.yaml --standalone --attach cell").with(2);
     home.dimos("run lab.yaml --record x.mcap").with(2).says(&["an attached planner writes no log", "hint: "]);
@@ -254,7 +254,7 @@ hardware: [{hardware_id: arm, adapter_type: yourarm, address: sim}]
     );
     let alone = home.run("other.yaml --no-record --name other");
     assert!(!alone.err().contains("attached to"), "{}", alone.err());
-    home.dimos("run lab.yaml --attach other").with(1).says(&["does not fit run other: it has a planner of its own"]);
+    home.dimos("run lab.yaml --attach other").with(1).says(&["does not fit run other: it has its own planner"]);
     alone.end(Signal::TERM).with(143);
     let insisting = home.start("run other.yaml --attach cell");
     insisting.until(ATTACHED);
@@ -274,7 +274,7 @@ tasks: [{name: traj_b, type: trajectory, joint_names: {hardware: b}}]
 ",
         ),
     );
-    let reasons = ["does not fit run cell: it has no arm b; it has no trajectory task traj_b", "hint: "];
+    let reasons = ["does not fit run cell: no arm b; no trajectory task traj_b", "hint: "];
     home.dimos("run two.yaml --attach cell").with(1).says(&reasons);
     let alone = home.run("two.yaml --no-record");
     alone.end(Signal::TERM).with(143);
@@ -306,7 +306,7 @@ fn in_the_background_it_is_one_line_and_a_name() {
     home.dimos("run lab.yaml -d").with(1).says(&["run cell has a planner already: lab"]);
     assert!(home.dimos("logs lab").with(0).out.contains(ATTACHED));
     home.dimos("down lab").with(0).says(&["planner lab ended"]);
-    let shown = home.dimos("run lab.yaml -d").with(0).says(&["attached to run cell; dimos down lab ends it"]);
+    let shown = home.dimos("run lab.yaml -d").with(0).says(&["attached to run cell; end it with: dimos down lab"]);
     assert!(shown.out.contains("planner   lab"), "{}", shown.out);
     home.dimos("down lab").with(0);
     eventually("it is noticed", || home.status()["planner"] == Value::Null);
@@ -402,7 +402,7 @@ fn a_motion_of_an_attached_planner_obeys_a_world_that_changes() {
     let moving = home.start("move arm 1.4 -0.3 0.6 0 0.8 0 --speed 0.2 --replan");
     eventually("it moves", || home.positions("arm")[0] > 0.1);
     home.dimos("world add late --sphere 0.03 --at 0.17 0.215 0.36").with(0);
-    moving.wait().with(0).says(&["in its way after", "obstacle \"late\"", "it goes on as motion"]);
+    moving.wait().with(0).says(&["in its way after", "obstacle \"late\"", "continued as motion"]);
     is_at(&home, &[1.4, -0.3, 0.6, 0.0, 0.8, 0.0]);
     home.dimos("world remove late").with(0);
     let moving = home.start("move arm --named home --speed 0.2");

@@ -9,8 +9,8 @@ use dimos::collision::world::World;
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
-use dimos::planning::setup::Setup;
-use dimos::planning::solve::{self, solve};
+use dimos::planning::pipeline::{self, solve};
+use dimos::planning::planning_scene::PlanningScene;
 use dimos::rpc::Code;
 use dimos::rpc::api::{ExecutePlan, Plan, PlanGoal, Planner, Planning};
 use dimos::rpc::place::RunFolder;
@@ -46,11 +46,11 @@ fn planned(run: &Run, plan: Plan) -> (u64, String, String) {
 #[test]
 fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
     let folder = tempfile::tempdir().unwrap();
-    let solver = |setup: &Setup, world: &World, request: &solve::Request, stop: &Stop| {
+    let solver = |setup: &PlanningScene, world: &World, request: &pipeline::PlanRequest, stop: &Stop| {
         match request.seed {
             PANICS => panic!("a defect of the planner"),
             HANGS => loop {
-                std::hint::black_box(request); // as busy as can be, and never looks whether it shall stop
+                std::hint::black_box(request); // as busy as can be, and ignores the cancel flag
             },
             _ => solve(setup, world, request, stop),
         }
@@ -64,9 +64,9 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
         let motion = run.move_arm("arm", &[goal, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).unwrap();
         let (before, began) = (run.status().ticks, Instant::now());
         let (_, state, error) = planned(&run, to(0.5, PANICS));
-        assert!(state == "FAILED" && error.contains("a defect of the program"), "{error}");
+        assert!(state == "FAILED" && error.contains("a bug in the planner"), "{error}");
         let (_, state, error) = planned(&run, to(0.5, HANGS));
-        assert!(state == "FAILED" && error.contains("did not end when its time was over"), "{error}");
+        assert!(state == "FAILED" && error.contains("did not end at its timeout"), "{error}");
         assert_eq!(run.call(Planner {}).unwrap().state, "FAULT");
         let TickReport { count, overruns, skipped, .. } = run.status().ticks;
         let (ticks, due) = (count - before.count, began.elapsed().as_secs_f64() * 100.0);

@@ -109,7 +109,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
     let table: &[(&str, i32, &[&str])] = &[
         ("plan arm --pose 0.4 0 0.1", 1, &["the goal collides: link \"arm/", "mm deep in obstacle \"box\"", "hint: "]),
         ("plan arm 0 1.5 1.5 0 0 0", 1, &["the goal collides: link \"arm/", "deep in link \"arm/"]),
-        ("plan arm --pose 5 0 0.3 --rpy 0 0 0", 1, &["arm: the pose is not reached: ", "mm", "hint: "]),
+        ("plan arm --pose 5 0 0.3 --rpy 0 0 0", 1, &["arm: no IK solution after ", "mm", "hint: "]),
         ("plan arm 9 0 0 0 0 0", 1, &["goal: arm_joint1 at 9.0000 rad is outside its limits", "hint: "]),
         ("plan arm 0 0 0", 2, &["arm has 6 joints, the goal 3 values"]),
         ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
@@ -346,7 +346,7 @@ fn mistakes_of_a_blueprint_are_found_by_check_where_they_are() {
     let table = [
         ("end_effector_link: flange", "end_effector_link: flnge", "the model has no link `flnge`", "lab.yaml:11:26"),
         ("[joint1,", "[jont1,", "the model has no joint `jont1`", "lab.yaml:12:21"),
-        ("builtin:yourarm", "builtin:yourrm", "no robot in the box is named `yourrm`", "lab.yaml:10:19"),
+        ("builtin:yourarm", "builtin:yourrm", "unknown built-in robot `yourrm`", "lab.yaml:10:19"),
         ("builtin:yourarm", "none.urdf", "none.urdf: ", "lab.yaml:10:19"),
         (
             "end_effector_link",
@@ -514,7 +514,7 @@ fn a_goal_at_a_limit_is_refused_when_it_is_planned() {
             assert!(goal.as_array().unwrap().iter().all(|q| q.as_f64().unwrap().abs() <= 1.49 + 1e-9), "{goal}");
             home.dimos("execute").with(0);
         } else {
-            planned.with(1).says(&["the pose is not reached"]);
+            planned.with(1).says(&["no IK solution after"]);
         }
     }
 }

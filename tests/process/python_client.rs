@@ -42,7 +42,7 @@ fn the_client_does_all_that_it_says() {
     let run = home.run("scripts.yaml --no-record");
     let Some(ended) = python(&home, &[&file("tests/python/try_client.py")]) else { return };
     assert!(ended.with(0).out.ends_with("all is as it says\n"));
-    run.wait().with(0).says(&["asked to end"]);
+    run.wait().with(0).says(&["shutdown requested"]);
 }
 
 #[test]

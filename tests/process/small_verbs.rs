@@ -61,7 +61,7 @@ fn a_gripper_opens_and_closes_as_far_as_it_goes() {
         assert_eq!(said, format!("arm: gripper to {metres:.4} m\n"));
         eventually(word, || (opening() - metres).abs() < 1e-3);
     }
-    home.dimos("arm gripper bare open").with(1).says(&["bare has no gripper, or does not say how far it goes"]);
+    home.dimos("arm gripper bare open").with(1).says(&["bare has no gripper, or does not report its range"]);
     home.dimos("arm gripper rarm close").with(2).says(&["[UNKNOWN_ARM]", "did you mean `arm`?"]);
     for wrong in ["ajar", "nan", ""] {
         home.dimos(&format!("arm gripper arm {wrong}")).with(2);
@@ -194,6 +194,6 @@ fn the_doctor_finds_what_prevents_a_run() {
     std::fs::remove_dir_all(home.path().join("run")).unwrap();
     std::fs::create_dir(home.path().join("run")).unwrap();
     home.write("run/dimos", "in the way");
-    let ended = home.dimos("doctor").with(1).says(&["error: no run can work: ", "hint: "]);
+    let ended = home.dimos("doctor").with(1).says(&["error: runs cannot start: ", "hint: "]);
     assert!(ended.out.contains("BAD"), "{}", ended.out);
 }

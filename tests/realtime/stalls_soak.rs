@@ -171,7 +171,7 @@ fn soak(realtime: bool) {
             if found.is_empty() || strict || stalled < STANDSTILL {
                 break;
             }
-            println!("not judged: this computer stood still for {stalled:?}: {found:?}");
+            println!("not judged: this computer was stalled for {stalled:?}: {found:?}");
             found.clear();
         }
         failures.extend(found);

@@ -17,7 +17,7 @@ use serde_json::Value;
 /// Nothing here takes longer; a test that waits this long has failed.
 pub const PATIENCE: Duration = Duration::from_secs(30);
 /// The last line of the banner: the run is up.
-pub const UP: &str = "Ctrl-C ends it, controlled.";
+pub const UP: &str = "Press Ctrl-C for a controlled stop.";
 
 /// What runs has no right to schedule in real time from here on, even as root. A user who may not even give rights up has
 /// none.

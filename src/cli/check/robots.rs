@@ -1,4 +1,4 @@
-//! What `dimos check` says of the planner's robots. Their descriptions and shapes are read as a run reads them.
+//! The planner's robots in `dimos check`. Reads descriptions and shapes like a run.
 
 use std::collections::BTreeMap;
 
@@ -8,9 +8,9 @@ use serde_json::{Value, json};
 use crate::blueprint::{Blueprint, JointSummary, Summary};
 use crate::cli::output::{self, Table};
 use crate::planning::config::JointBounds;
-use crate::planning::setup::{PlannedRobot, Setup};
+use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
 
-/// A robot that is planned for.
+/// A planned robot.
 #[derive(Debug, Serialize)]
 pub(super) struct Robot {
     name: String,
@@ -18,13 +18,13 @@ pub(super) struct Robot {
     end_effector_link: String,
     joints: Vec<Joint>,
     named_poses: Vec<String>,
-    /// Gripper joints of which nothing says where they are: they are planned for wide open.
+    /// Gripper joints without a measurement: assumed fully open.
     taken_as_open: Vec<String>,
-    /// Pairs of links that touch in every pose.
+    /// Pairs of links that touch in every configuration.
     always_touching: Vec<[String; 2]>,
 }
 
-/// A joint with the limits that its motions are timed with; `None` where there is none.
+/// A joint with the limits of its motions; `None` if there is none.
 #[derive(Debug, Serialize)]
 struct Joint {
     model: String,
@@ -36,21 +36,21 @@ struct Joint {
     jerk: Option<f64>,
 }
 
-/// The robots of a blueprint, none while it waits for assets; the error says what a run would fail at.
+/// Returns the robots of a blueprint, none while assets are missing; the error is the one that a run would report.
 pub(super) fn of(blueprint: &Blueprint) -> Result<Vec<Robot>, String> {
-    // What lies in an asset that is not here can only be told once it is.
+    // The contents of an asset are unknown until it is downloaded.
     let Some(planner) = blueprint.planner.as_ref().filter(|_| blueprint.awaited_assets().is_empty()) else {
         return Ok(Vec::new());
     };
-    // As a run narrows them to the velocities, accelerations and jerks of its arms.
-    let setup = Setup::load(planner)?.within(&commanded(&Summary::of(blueprint)))?;
+    // With the velocity, acceleration and jerk limits of the run's arms.
+    let setup = PlanningScene::load(planner)?.within(&commanded(&Summary::of(blueprint)))?;
     Ok(setup.robots.iter().map(|planned| robot(planned, &setup)).collect())
 }
 
-/// How fast the joints of a blueprint's arms are commanded, as far as that is known without the arms.
+/// Returns the commanded limits of a blueprint's joints, as far as they are known without the arms.
 fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
     let bounds = |joint: &JointSummary| {
-        // Ranges are shown as the model has them, beside those of the arm.
+        // Position ranges are shown as in the model, beside those of the arm.
         let position = [f64::NEG_INFINITY, f64::INFINITY];
         let velocity = joint.velocity.map_or(f64::INFINITY, |limit| limit.value);
         JointBounds { position, velocity, acceleration: joint.acceleration.value, jerk: joint.jerk.value }
@@ -58,7 +58,7 @@ fn commanded(summary: &Summary) -> BTreeMap<String, JointBounds> {
     summary.arms.iter().flat_map(|arm| &arm.joints).map(|joint| (joint.name.clone(), bounds(joint))).collect()
 }
 
-fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {
+fn robot(planned: &PlannedRobot, setup: &PlanningScene) -> Robot {
     let (config, finite) = (&planned.config, |value: f64| Some(value).filter(|v| v.is_finite()));
     let names = config.joints.iter().zip(&config.coordinator_joints);
     let joints = names.zip(&planned.limits).map(|((model, coordinator), limits)| Joint {
@@ -82,7 +82,7 @@ fn robot(planned: &PlannedRobot, setup: &Setup) -> Robot {
     }
 }
 
-/// Adds what a run would fail at to the problems; whether the blueprint is still valid.
+/// Adds a run's start-up error to the problems; returns whether the blueprint is still valid.
 pub(super) fn refuse(problems: &mut Value, what: &str) -> Value {
     if let Some(problems) = problems.as_array_mut() {
         problems.push(json!({"severity": "error", "message": what}));
@@ -105,16 +105,16 @@ pub(super) fn print(robot: &Robot) {
         output::line(format_args!("  named poses: {}", robot.named_poses.join(", ")));
     }
     for joint in &robot.taken_as_open {
-        output::line(format_args!("  {joint} is planned for wide open: nothing says where it is"));
+        output::line(format_args!("  {joint} is assumed fully open: its position is not measured"));
         output::line("  hint: gripper_joint: {joint: …, closed: …, open: …} lets it follow the gripper");
     }
     for [a, b] in &robot.always_touching {
         output::line(format_args!(
-            "  warning: {a} and {b} touch in every pose: they are not checked against each other"
+            "  warning: {a} and {b} touch in every configuration: they are not checked against each other"
         ));
     }
     if !robot.always_touching.is_empty() {
-        let hint = "say so in collision_exclusion_pairs or the SRDF if they may, else correct their shapes";
+        let hint = "allow the pair in collision_exclusion_pairs or the SRDF, or correct the shapes";
         output::line(format_args!("  hint: {hint}"));
     }
 }

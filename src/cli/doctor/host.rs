@@ -1,5 +1,4 @@
-//! What is looked at, and how. Reads only; the one thing that is made is a name in the folder of the sockets, for a
-//! moment.
+//! The checks. They only read, except that the sockets folder is tested with a temporary name.
 
 use std::fs::{self, OpenOptions};
 use std::path::{Path, PathBuf};
@@ -14,9 +13,9 @@ use crate::rt::host::WATCHDOG_PRIORITY;
 
 /// Type of CAN links in `/sys/class/net/*/type` (ARPHRD_CAN).
 const CAN: &str = "280";
-/// Less room for logs than this is worth a word [bytes].
-const LITTLE_ROOM: u64 = 1 << 30;
-/// Clock sources that are read without leaving the program.
+/// Free space below which the log folder gets a warning [bytes].
+const MIN_FREE_SPACE: u64 = 1 << 30;
+/// Clock sources that are read without a system call.
 const FAST_CLOCKS: &[&str] = &["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
 
 const RT_KERNEL: &str = "sudo apt install linux-image-rt-amd64      # Debian; Ubuntu: sudo pro enable realtime-kernel";
@@ -26,18 +25,18 @@ const LATENCY: &str = "echo 'KERNEL==\"cpu_dma_latency\", GROUP=\"realtime\", MO
 const GOVERNOR: &str = "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor";
 const CLOCK: &str = "echo tsc | sudo tee /sys/devices/system/clocksource/clocksource0/current_clocksource      # lasts until the next boot";
 
-/// A computer, by its files.
+/// A computer, seen through its files.
 pub struct Host {
     root: PathBuf,
 }
 
 impl Host {
-    /// The one this runs on.
+    /// Returns this computer.
     pub fn this() -> Self {
         Self { root: PathBuf::from("/") }
     }
 
-    /// All findings.
+    /// Runs all checks.
     pub fn examine(&self) -> Vec<Finding> {
         let mut findings =
             vec![self.kernel(), self.rtprio(), self.memlock(), self.latency(), self.governor(), self.clock()];
@@ -52,12 +51,12 @@ impl Host {
         self.root.join(path)
     }
 
-    /// A file of one line.
+    /// Reads a file of one line.
     fn read(&self, path: &str) -> Option<String> {
         fs::read_to_string(self.path(path)).ok().map(|text| text.trim().to_owned())
     }
 
-    /// Names in a folder, in order.
+    /// Returns the sorted names in a folder.
     fn names(&self, folder: &str) -> Vec<String> {
         let entries = fs::read_dir(self.path(folder)).into_iter().flatten().flatten();
         let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
@@ -69,11 +68,11 @@ impl Host {
         let release = self.read("proc/sys/kernel/osrelease").unwrap_or_else(|| "unknown".into());
         let version = self.read("proc/sys/kernel/version").unwrap_or_default();
         let is_rt = self.read("sys/kernel/realtime").as_deref() == Some("1") || version.contains("PREEMPT_RT");
-        let kind = if is_rt { "PREEMPT_RT" } else { "not PREEMPT_RT: late wake-ups of 1 ms and more may happen" };
+        let kind = if is_rt { "PREEMPT_RT" } else { "not PREEMPT_RT: wake-ups may be late by 1 ms or more" };
         Finding::of(is_rt, "kernel", format!("{release}, {kind}"), RT_KERNEL)
     }
 
-    /// Whether this process has a capability (23 = CAP_SYS_NICE, 14 = CAP_IPC_LOCK).
+    /// Returns whether this process has a capability (23 = CAP_SYS_NICE, 14 = CAP_IPC_LOCK).
     fn has_capability(&self, bit: u32) -> bool {
         let status = self.read("proc/self/status").unwrap_or_default();
         let line = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
@@ -103,8 +102,8 @@ impl Host {
     fn latency(&self) -> Finding {
         let check = "cpu_dma_latency";
         match OpenOptions::new().write(true).open(self.path("dev/cpu_dma_latency")) {
-            Ok(_) => Finding::ok(check, "idle states can be held off"),
-            Err(e) => Finding::warn(check, format!("idle states cannot be held off: {e}"), LATENCY),
+            Ok(_) => Finding::ok(check, "deep idle states can be disabled"),
+            Err(e) => Finding::warn(check, format!("deep idle states cannot be disabled: {e}"), LATENCY),
         }
     }
 
@@ -123,13 +122,13 @@ impl Host {
     fn clock(&self) -> Finding {
         let folder = "sys/devices/system/clocksource/clocksource0";
         let Some(current) = self.read(&format!("{folder}/current_clocksource")) else {
-            return Finding::ok("clock source", "the kernel does not tell");
+            return Finding::ok("clock source", "unknown to the kernel");
         };
         let well = FAST_CLOCKS.contains(&current.as_str());
         let offered = self.read(&format!("{folder}/available_clocksource")).unwrap_or_default();
         let fix = match offered.split_whitespace().any(|clock| clock == "tsc") {
             true => CLOCK,
-            false => "dmesg | grep -i tsc      # says why the kernel does not trust it; see the firmware's settings",
+            false => "dmesg | grep -i tsc      # shows why the kernel does not trust it; check the firmware settings",
         };
         let slow = if well { "" } else { ": each reading of the time is a system call" };
         Finding::of(well, "clock source", format!("{current}{slow}"), fix)
@@ -157,26 +156,28 @@ impl Host {
         let is_port = |name: &String| name.starts_with("ttyUSB") || name.starts_with("ttyACM");
         let of_port = |name: String| {
             let open = rustix::fs::access(self.path(&format!("dev/{name}")), Access::READ_OK | Access::WRITE_OK);
-            let found =
-                format!("/dev/{name} {}", if open.is_ok() { "can be opened" } else { "is closed to this user" });
+            let found = format!(
+                "/dev/{name} {}",
+                if open.is_ok() { "can be opened" } else { "is not accessible to this user" }
+            );
             Finding::of(open.is_ok(), "serial port", found, "sudo usermod -aG dialout $USER      # then log in again")
         };
         self.names("dev").into_iter().filter(is_port).map(of_port).collect()
     }
 }
 
-/// Room where the logs go.
+/// Checks the free space for logs.
 fn log_room() -> Finding {
     let check = "log folder";
     let Some(folder) = log_folder() else {
-        let found = "there is none: neither XDG_STATE_HOME nor HOME is set";
+        let found = "none: neither XDG_STATE_HOME nor HOME is set";
         return Finding::bad(check, found, "export HOME=/home/$(id -un)      # or: dimos run … --no-record");
     };
     let shown = folder.display();
-    // Until the first run there is only a folder above it.
+    // Before the first run only a parent folder exists.
     let there = folder.ancestors().find(|folder| folder.is_dir()).unwrap_or(Path::new("/"));
     if rustix::fs::access(there, Access::WRITE_OK | Access::EXEC_OK).is_err() {
-        let found = format!("{shown}: {} cannot be written", there.display());
+        let found = format!("{shown}: {} is not writable", there.display());
         return Finding::bad(
             check,
             found,
@@ -188,7 +189,7 @@ fn log_room() -> Finding {
             let free = disk.f_bavail.saturating_mul(disk.f_frsize);
             let found = format!("{shown}: {:.1} GiB free", free as f64 / f64::from(1 << 30));
             Finding::of(
-                free >= LITTLE_ROOM,
+                free >= MIN_FREE_SPACE,
                 check,
                 found,
                 format!("du -sh {shown}/* | sort -h      # then remove old logs"),
@@ -198,7 +199,7 @@ fn log_room() -> Finding {
     }
 }
 
-/// Whether a run can be found by others: takes a name, and gives it back.
+/// Checks that other users can find runs: claims a name and releases it.
 fn sockets() -> Finding {
     let check = "sockets folder";
     let folder = RunFolder::standard();

@@ -1,4 +1,4 @@
-//! What moves the arm: the tasks that jog may stream to, and the stream itself.
+//! Streams of jog: the tasks it can stream to, and the next target.
 
 use std::time::{Duration, Instant};
 
@@ -7,26 +7,26 @@ use crate::rpc::api::{Cancel, Servo, Twist, TwistFrame, Velocity};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
 
-/// A servo target may be ahead of where its joint is by so much [rad]: an arm that is held back is not wound up.
-const LEAD: f64 = 0.15;
-/// Commands stay inside a joint's limits by so much [rad].
+/// Maximum lead of a servo target over its joint [rad], so that it does not wind up when the arm is blocked.
+const MAX_LEAD: f64 = 0.15;
+/// Distance of commands from a joint's limits [rad].
 const MARGIN: f64 = 0.01;
 
-/// How single joints are moved.
+/// Type of a task for jog.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// By an `eef_twist` task: the end effector.
+    /// An `eef_twist` task: the end effector.
     Twist,
-    /// By a velocity task.
+    /// A velocity task.
     Velocity,
-    /// By a servo task: positions that jog moves on.
+    /// A servo task: jog integrates positions.
     Servo,
 }
 
 /// A task to stream to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Drive {
-    /// What it follows.
+    /// Its type.
     pub kind: Kind,
     /// Its name.
     pub task: String,
@@ -37,15 +37,15 @@ pub struct Drive {
 /// The tasks that move an arm.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Drives {
-    /// The end effector.
+    /// For the end effector.
     pub tool: Option<Drive>,
-    /// Single joints.
+    /// For single joints.
     pub joints: Option<Drive>,
 }
 
 impl Drives {
-    /// The tasks of a run that move joints of this arm and of no other: of several the one of the highest priority. A
-    /// velocity task goes before a servo task, whose targets jog has to make up.
+    /// Returns the tasks of a run that move joints of only this arm, the one with the highest priority of each type.
+    /// Prefers a velocity task to a servo task, whose targets jog has to integrate.
     pub fn of(tasks: &[TaskReport], joints: &[String]) -> Self {
         let find = |name: &str, kind: Kind| {
             let ours = |task: &&TaskReport| {
@@ -58,24 +58,24 @@ impl Drives {
         Self { tool: find("eef_twist", Kind::Twist), joints: single }
     }
 
-    /// The one for a mode.
+    /// Returns the task for a mode.
     pub fn get(&self, joint_mode: bool) -> Option<&Drive> {
         if joint_mode { self.joints.as_ref() } else { self.tool.as_ref() }
     }
 
-    /// Why an arm without any cannot be moved, and what to add.
+    /// Returns the failure of an arm without such a task, with the lines to add.
     pub fn missing(arm: &str) -> Failure {
-        let what = format!("no task of the run lets the keyboard move {arm}");
+        let what = format!("no task of the run can be jogged on {arm}");
         let lines = format!("{}\n        {}", line(arm, true), line(arm, false));
-        Failure::usage(what).hint(format!("add to `tasks` of the blueprint, and start the run again:\n        {lines}"))
+        Failure::usage(what).hint(format!("add to `tasks` of the blueprint, and restart the run:\n        {lines}"))
     }
 }
 
-/// The line to add to a blueprint's tasks, for a mode.
+/// Returns the line to add to a blueprint's tasks, for a mode.
 pub fn line(arm: &str, joint_mode: bool) -> String {
     match joint_mode {
         true => format!("- {{name: velocity_{arm}, type: velocity, joint_names: {{hardware: {arm}}}, priority: 20}}"),
-        // Where the planner has the arm its description is known, and `params` can be left out.
+        // With a planner in the blueprint the description is known, and `params` can be omitted.
         false => format!(
             "- {{name: twist_{arm}, type: eef_twist, joint_names: {{hardware: {arm}}}, priority: 20, params: \
              {{model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: {arm}_}}}}"
@@ -83,21 +83,21 @@ pub fn line(arm: &str, joint_mode: bool) -> String {
     }
 }
 
-/// A motion that is asked for.
+/// A requested motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Demand {
     /// Of the end effector: x, y, z [m/s], about x, y, z [rad/s].
     Tool([f64; 3], [f64; 3], TwistFrame),
-    /// Of a task's joint of this index [rad/s].
+    /// Of the task's joint with this index [rad/s].
     Joint(usize, f64),
 }
 
-/// What the arm was seen to do and may do, for servo targets.
+/// State and limits of the arm, for servo targets.
 #[derive(Debug, Clone, Copy)]
-pub struct Sight<'a> {
-    /// Its joints.
+pub struct ArmView<'a> {
+    /// Joint states.
     pub state: Option<&'a ArmStateReport>,
-    /// Its limits.
+    /// Joint limits.
     pub arm: Option<&'a ArmReport>,
 }
 
@@ -105,24 +105,24 @@ pub struct Sight<'a> {
 #[derive(Debug)]
 pub struct Stream {
     drive: Drive,
-    /// Servo targets that were sent last [rad], and when.
+    /// Latest servo targets [rad] and their time.
     targets: Vec<f64>,
     sent: Option<Instant>,
 }
 
 impl Stream {
-    /// A stream that has not begun.
+    /// Creates a stream that has not begun.
     pub fn new(drive: Drive) -> Self {
         Self { drive, targets: Vec::new(), sent: None }
     }
 
-    /// The task that follows it.
+    /// Returns its task.
     pub fn drive(&self) -> &Drive {
         &self.drive
     }
 
     /// Sends the next target.
-    pub fn send(&mut self, client: &mut Client, demand: Demand, sight: Sight<'_>, now: Instant) -> Sent {
+    pub fn send(&mut self, client: &mut Client, demand: Demand, view: ArmView<'_>, now: Instant) -> Sent {
         let task = self.drive.task.clone();
         let width = self.drive.joints.len();
         match (self.drive.kind, demand) {
@@ -135,7 +135,7 @@ impl Stream {
             }
             (Kind::Servo, Demand::Joint(index, speed)) => {
                 let passed = self.sent.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
-                if let Some(positions) = self.advance(index, speed, passed, sight) {
+                if let Some(positions) = self.advance(index, speed, passed, view) {
                     client.call(Servo { task, positions })?;
                 }
             }
@@ -145,7 +145,7 @@ impl Stream {
         Ok(())
     }
 
-    /// Asks for rest: zero, for a task that follows velocities. A servo task rests at its last target.
+    /// Sends a target at rest: zero, for a task that follows velocities. A servo task rests at its last target.
     pub fn rest(&self, client: &mut Client) -> Sent {
         let task = self.drive.task.clone();
         match self.drive.kind {
@@ -160,28 +160,28 @@ impl Stream {
         Ok(())
     }
 
-    /// Ends the task: its joints come to rest by themselves and are free for others.
+    /// Ends the task: its joints decelerate to rest and become free for other tasks.
     pub fn end(&self, client: &mut Client) -> Sent {
         client.call(Cancel { task: Some(self.drive.task.clone()), arm: None })?;
         Ok(())
     }
 
-    /// The next servo targets: where the joints are commanded to be, moved on by what the time since the last allows.
-    fn advance(&mut self, index: usize, speed: f64, passed: Duration, sight: Sight<'_>) -> Option<Vec<f64>> {
-        let seen = |name: &String| sight.state?.joints.iter().find(|joint| joint.name == *name);
+    /// Returns the next servo targets: the commanded positions, integrated over the time since the previous target.
+    fn advance(&mut self, index: usize, speed: f64, passed: Duration, view: ArmView<'_>) -> Option<Vec<f64>> {
+        let seen = |name: &String| view.state?.joints.iter().find(|joint| joint.name == *name);
         if self.targets.is_empty() {
-            // In another mode a command is no position.
-            let positions = sight.arm.is_some_and(|arm| arm.mode.ends_with("position"));
+            // In another mode a command is not a position.
+            let positions = view.arm.is_some_and(|arm| arm.mode.ends_with("position"));
             let from = |name: &String| seen(name).and_then(|j| j.command.filter(|_| positions).or(j.position));
             self.targets = self.drive.joints.iter().map(from).collect::<Option<_>>()?;
         }
         let name = self.drive.joints.get(index)?;
         let measured = seen(name)?.position?;
-        let place = sight.state?.joints.iter().position(|joint| joint.name == *name)?;
+        let place = view.state?.joints.iter().position(|joint| joint.name == *name)?;
         let target = self.targets.get_mut(index)?;
-        let next = (*target + speed * passed.as_secs_f64()).clamp(measured - LEAD, measured + LEAD);
-        // A joint that begins outside its limits may go back in.
-        let limits = sight
+        let next = (*target + speed * passed.as_secs_f64()).clamp(measured - MAX_LEAD, measured + MAX_LEAD);
+        // A joint that starts outside its limits may move back in.
+        let limits = view
             .arm
             .and_then(|arm| arm.position_limits.get(place))
             .map_or((f64::MIN, f64::MAX), |[l, u]| ((l + MARGIN).min(*target), (u - MARGIN).max(*target)));
@@ -193,7 +193,7 @@ impl Stream {
 /// Result of a request.
 pub type Sent = std::result::Result<(), ClientError>;
 
-/// A refusal is for the screen; everything else ends jog.
+/// Returns the text of a refusal for the screen; other errors end jog.
 pub fn refusal(sent: Sent) -> Result<Option<String>> {
     match sent {
         Ok(()) => Ok(None),
@@ -249,20 +249,20 @@ mod tests {
             ..Default::default()
         };
         let (state, tenth) = (state([0.5, 0.1]), Duration::from_millis(100));
-        let sight = Sight { state: Some(&state), arm: Some(&arm) };
-        let mut step = |index, speed, passed| stream.advance(index, speed, passed, sight).unwrap();
+        let view = ArmView { state: Some(&state), arm: Some(&arm) };
+        let mut step = |index, speed, passed| stream.advance(index, speed, passed, view).unwrap();
         let near = |got: &[f64], want: [f64; 2]| got.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-12);
         let first = step(0, 0.5, Duration::ZERO);
         assert!(near(&first, [0.52, 0.12]), "{first:?}");
         let next = step(0, 0.5, tenth);
         assert!(near(&next, [0.57, 0.12]), "{next:?}");
         let ahead = step(0, 0.5, 10 * tenth);
-        assert!(near(&ahead, [0.65, 0.12]), "no more than {LEAD} ahead: {ahead:?}");
+        assert!(near(&ahead, [0.65, 0.12]), "no more than {MAX_LEAD} ahead: {ahead:?}");
         let limited = step(1, 0.5, 10 * tenth);
         assert!(near(&limited, [0.65, 0.19]), "{limited:?}");
         let back = step(1, -0.5, tenth);
         assert!(near(&back, [0.65, 0.14]), "{back:?}");
-        let blind = Sight { state: None, arm: Some(&arm) };
+        let blind = ArmView { state: None, arm: Some(&arm) };
         assert_eq!(stream.advance(0, 0.5, tenth, blind), None, "without a state there is no target");
     }
 }

@@ -1,56 +1,56 @@
-//! What is on the screen: lines of text, from what was seen and what jog does. The less room, the less of it.
+//! The screen: lines of text from the arm's state and jog's. With less space, less is shown.
 
 use std::time::Duration;
 
 use super::keys::AXES;
 use super::terminal::{Line, Look};
-use super::watch::Seen;
+use super::watch::ArmSnapshot;
 use crate::cli::output::fixed;
 use crate::rpc::report::{ArmReport, ArmStateReport, JointReport, TaskReport};
 
-/// A state older than this is worth a look.
-const OLD: Duration = Duration::from_millis(200);
-/// Narrower than this, joints have no bar.
+/// Age at which a state is highlighted.
+const STALE_AFTER: Duration = Duration::from_millis(200);
+/// Minimum width for joint bars.
 const BAR_COLUMNS: usize = 60;
-/// Fewest rows for joints, whatever else there is to show.
-const LEAST_JOINTS: usize = 1;
+/// Minimum number of joint rows.
+const MIN_JOINT_ROWS: usize = 1;
 
-/// What to show.
+/// Contents of the screen.
 pub struct View<'a> {
-    /// The run's name.
+    /// Name of the run.
     pub run: &'a str,
-    /// The arm's name.
+    /// Name of the arm.
     pub arm: &'a str,
-    /// What was seen of it.
-    pub seen: &'a Seen,
-    /// How long ago its state came to this program.
+    /// Latest data of it.
+    pub seen: &'a ArmSnapshot,
+    /// Time since its state was received.
     pub since: Option<Duration>,
-    /// Whether single joints are moved.
+    /// Whether in joint mode.
     pub joint_mode: bool,
-    /// Whether motions are along the tool's own axes.
+    /// Whether motions are along the axes of the tool frame.
     pub tool_frame: bool,
-    /// The task that is streamed to; none in a mode that the run has no task for.
+    /// Task of the stream; none in a mode without a task.
     pub task: Option<&'a str>,
-    /// The chosen joint's name.
+    /// Name of the selected joint.
     pub joint: Option<&'a str>,
-    /// The speed in words.
+    /// Speed as text.
     pub speed: String,
-    /// The motion in words; empty at rest.
+    /// Motion as text; empty at rest.
     pub moving: String,
-    /// The latest message, and whether it is a bad one.
+    /// Latest message, and whether it is an error.
     pub message: Option<(&'a str, bool)>,
-    /// Whether the terminal tells when keys go up.
+    /// Whether the terminal reports key-ups.
     pub releases: bool,
 }
 
-/// The screen's lines for so many columns and rows.
+/// Returns the screen's lines for this many columns and rows.
 pub fn lines(view: &View<'_>, (columns, rows): (usize, usize)) -> Vec<Line> {
     let head = vec![title(view), condition(view.seen)];
     let pose = pose(view.seen.state.as_ref());
     let motion = motion(view);
     let help = help(view, columns);
     let message = message(view, columns);
-    // What is dropped first where the room is short: blank lines, the keys, the pose.
+    // Dropped first if space is short: blank lines, the keys, the pose.
     let fixed_rows = head.len() + 1 + motion.len() + message.len();
     let joints = view.seen.state.as_ref().map_or(1, |state| state.joints.len());
     let mut spare = rows.saturating_sub(fixed_rows + joints);
@@ -69,7 +69,7 @@ pub fn lines(view: &View<'_>, (columns, rows): (usize, usize)) -> Vec<Line> {
     let others = fixed_rows + pose.len() + help.len() + after_head.len() + after_joints.len() + after_motion.len();
     let mut all = head;
     all.append(after_head);
-    all.extend(joint_table(view, columns, rows.saturating_sub(others).max(LEAST_JOINTS)));
+    all.extend(joint_table(view, columns, rows.saturating_sub(others).max(MIN_JOINT_ROWS)));
     all.extend(pose);
     all.append(after_joints);
     all.extend(motion);
@@ -86,15 +86,15 @@ fn title(view: &View<'_>) -> Line {
     match (view.since, view.seen.state.as_ref().and_then(|state| state.age_ms)) {
         (Some(since), Some(age)) => {
             let age = since + Duration::from_secs_f64(age.clamp(0.0, 1e9) / 1e3);
-            let look = if age > OLD { Look::Bad } else { Look::Plain };
+            let look = if age > STALE_AFTER { Look::Bad } else { Look::Plain };
             line.with(format!("state {} ms old", age.as_millis()), look)
         }
         _ => line.with("no state yet", Look::Warning),
     }
 }
 
-/// What the arm is ready for, and what stands against it.
-fn condition(seen: &Seen) -> Line {
+/// Phase of the arm, and what prevents motion.
+fn condition(seen: &ArmSnapshot) -> Line {
     let Some(arm) = &seen.arm else { return Line::default() };
     let good = |well: bool| if well { Look::Good } else { Look::Bad };
     let mut line = Line::default().with(arm.phase.clone(), good(arm.phase == "ready"));
@@ -111,7 +111,7 @@ fn condition(seen: &Seen) -> Line {
     }
 }
 
-/// The joints; where not all have room those around the chosen one.
+/// The joints; if space is short, those around the selected one.
 fn joint_table(view: &View<'_>, columns: usize, rows: usize) -> Vec<Line> {
     let Some(state) = &view.seen.state else { return vec![Line::default().and("waiting for the arm's state")] };
     let names = state.joints.iter().map(|joint| joint.name.chars().count()).max().unwrap_or(0);
@@ -147,7 +147,7 @@ fn joint_row(
     let line = Line::default().with(format!("{mark}{:>2} {text}", (index + 1) % 100), look);
     let Some([lower, upper]) = limits.filter(|[lower, upper]| bar > 0 && lower < upper) else { return line };
     let share = (position - lower) / (upper - lower);
-    // The outer twentieths are near enough a limit to be seen.
+    // Highlights the outer twentieths of the range.
     let look = match share {
         s if !(0.0..=1.0).contains(&s) => Look::Bad,
         s if !(0.05..=0.95).contains(&s) => Look::Warning,
@@ -172,7 +172,7 @@ fn pose(state: Option<&ArmStateReport>) -> Vec<Line> {
     lines
 }
 
-/// What jog does, and what bounds it.
+/// Motion of jog, and its limits.
 fn motion(view: &View<'_>) -> Vec<Line> {
     let mode = match (view.joint_mode, view.tool_frame) {
         (true, _) => format!("JOINT {}", view.joint.unwrap_or("?")),
@@ -194,7 +194,7 @@ fn motion(view: &View<'_>) -> Vec<Line> {
         "" => line.and("  at rest"),
         moving => line.and("  moving ").with(moving, Look::Good),
     };
-    // The task's own word goes before that of a joint's limiter.
+    // The task's limit has priority over a joint's.
     let held_back = task.and_then(|task| task.bound.clone());
     let bound = match held_back.or_else(|| view.seen.bound.as_ref().map(|(text, _)| text.clone())) {
         Some(text) => Line::default().with(format!("bounded: {text}"), Look::Warning),
@@ -211,7 +211,7 @@ fn state_look(task: Option<&TaskReport>) -> Look {
     }
 }
 
-/// The keys, in as many lines as they take.
+/// The keys, in as many lines as needed.
 fn help(view: &View<'_>, columns: usize) -> Vec<Line> {
     let mut keys: Vec<String> = match view.joint_mode {
         true => ["1-9,0 choose a joint", "+/- or arrows move it", "Tab end effector"].map(str::to_owned).into(),
@@ -222,9 +222,9 @@ fn help(view: &View<'_>, columns: usize) -> Vec<Line> {
             AXES.map(pair).into_iter().chain(["B base/tool axes".to_owned(), "Tab joints".to_owned()]).collect()
         }
     };
-    let always = ["[ ] speed", "Space rest now", "X stop, latched", "Esc leave"];
+    let always = ["[ ] speed", "Space rest", "X stop, latched", "Esc leave"];
     keys.extend(always.map(str::to_owned));
-    keys.push(if view.releases { "held while down".to_owned() } else { "hold a key to go on".to_owned() });
+    keys.push(if view.releases { "moves while a key is down".to_owned() } else { "hold a key to move".to_owned() });
     let mut lines = vec![String::new()];
     for key in keys {
         let long = lines.last().map_or(0, |line| line.chars().count() + 3 + key.chars().count());
@@ -237,7 +237,7 @@ fn help(view: &View<'_>, columns: usize) -> Vec<Line> {
     lines.into_iter().map(|line| Line::default().with(line, Look::Dim)).collect()
 }
 
-/// The message, broken at words into up to three lines; there is always a line for it, so that nothing jumps.
+/// The message, wrapped to up to three lines; always at least one, so that the layout is stable.
 fn message(view: &View<'_>, columns: usize) -> Vec<Line> {
     let held = view.seen.arm.as_ref().filter(|arm| arm.phase == "held").map(how_to_reset);
     let (text, bad) = match (&held, view.message) {
@@ -270,14 +270,14 @@ mod tests {
     use super::*;
     use crate::rpc::report::{CauseReport, PoseReport};
 
-    fn seen(joints: usize) -> Seen {
+    fn seen(joints: usize) -> ArmSnapshot {
         let joint = |i: usize| JointReport {
             name: format!("arm_joint{}", i + 1),
             position: Some(0.5 * i as f64 - 1.0),
             ..Default::default()
         };
         let task = TaskReport { name: "twist_arm".into(), state: "EXECUTING".into(), ..Default::default() };
-        Seen {
+        ArmSnapshot {
             state: Some(ArmStateReport {
                 age_ms: Some(4.0),
                 joints: (0..joints).map(joint).collect(),
@@ -298,7 +298,7 @@ mod tests {
         }
     }
 
-    fn view(seen: &Seen, joint_mode: bool) -> View<'_> {
+    fn view(seen: &ArmSnapshot, joint_mode: bool) -> View<'_> {
         View {
             run: "coordinator-yourarm",
             arm: "arm",
@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn the_less_room_the_less_is_shown_but_never_too_much() {
+    fn with_less_space_less_is_shown_within_the_screen() {
         let seen = seen(16);
         for joint_mode in [false, true] {
             for columns in [20, 40, 59, 60, 80, 200] {
@@ -364,14 +364,14 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_against_motion_is_said() {
+    fn what_prevents_motion_is_shown() {
         let mut seen = seen(2);
         let arm = seen.arm.as_mut().unwrap();
         arm.phase = "held".into();
         arm.cause = Some(CauseReport { name: "operator_stop".into(), text: "stopped by an operator".into() });
         seen.bound = Some(("arm_joint1 is limited in velocity".into(), std::time::Instant::now()));
         let all = text(&view(&seen, false), (80, 24)).join("\n");
-        for part in ["held: stopped by an operator", "dimos arm reset arm", "bounded: arm_joint1 is limited"] {
+        for part in ["held: stopped by an operator", "dimos arm reset arm", "limited: arm_joint1 is limited"] {
             assert!(all.contains(part), "no {part:?} in\n{all}");
         }
     }

@@ -1,86 +1,86 @@
-//! The loop of jog: keys in, targets out, the screen anew.
+//! The loop of jog: keys in, targets out, redraw.
 
 use std::time::{Duration, Instant};
 
 use crossterm::event::{Event, KeyEvent, KeyEventKind};
 
-use super::drive::{self, Demand, Drives, Kind, Sight, Stream, refusal};
-use super::hold::Held;
-use super::keys::{Motion, Wish, meaning};
+use super::active_motions::ActiveMotions;
+use super::drive::{self, ArmView, Demand, Drives, Kind, Stream, refusal};
+use super::keys::{KeyAction, Motion, meaning};
 use super::screen::{self, View};
 use super::terminal::Terminal;
-use super::watch::{Seen, Watch};
+use super::watch::{ArmSnapshot, Watch};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::Signals;
 use crate::rpc::api::{Release, State, Stop, TwistFrame};
 use crate::rpc::client::Client;
 
 /// Time between two targets.
-const BEAT: Duration = Duration::from_millis(20);
-/// Beats between two drawings.
+const PERIOD: Duration = Duration::from_millis(20);
+/// Periods between two redraws.
 const PER_DRAWING: u32 = 3;
-/// A motion that has been over for so long lets its task go, so that others may move the joints.
-const LET_GO: Duration = Duration::from_millis(500);
-/// Speeds to choose from, as fractions of the highest.
+/// Time at rest after which jog ends its task, so that others may move the joints.
+const RELEASE_AFTER: Duration = Duration::from_millis(500);
+/// Selectable speeds, as fractions of the maximum.
 const SPEEDS: [f64; 9] = [0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0];
-/// The one to begin with.
+/// Initial speed.
 const FIRST_SPEED: usize = 4;
 
-/// What was asked for on the command line.
+/// Settings from the command line.
 #[derive(Debug, Clone)]
 pub struct Setting {
-    /// The run's name.
+    /// Name of the run.
     pub run: String,
-    /// The arm's name.
+    /// Name of the arm.
     pub arm: String,
-    /// Whether single joints are moved.
+    /// Whether in joint mode.
     pub joint_mode: bool,
-    /// Whether motions are along the tool's axes.
+    /// Whether motions are along the axes of the tool frame.
     pub tool_frame: bool,
-    /// Highest speed of the end effector [m/s].
+    /// Maximum speed of the end effector [m/s].
     pub linear: f64,
-    /// Highest turning speed of the end effector [rad/s].
+    /// Maximum angular speed of the end effector [rad/s].
     pub angular: f64,
-    /// Highest speed of a joint [rad/s].
+    /// Maximum speed of a joint [rad/s].
     pub joint: f64,
 }
 
-/// Names of an arm's joints, in order.
+/// Returns the names of an arm's joints, in order.
 pub fn joints_of(client: &mut Client, arm: &str) -> Result<Vec<String>> {
     let state = client.call(State {})?.arms.into_iter().find(|state| state.hardware_id == arm);
     Ok(state.map(|state| state.joints.into_iter().map(|joint| joint.name).collect()).unwrap_or_default())
 }
 
-/// An arm that is being jogged.
+/// A session of jogging an arm.
 pub struct Session {
     client: Client,
     watch: Watch,
     drives: Drives,
     setting: Setting,
-    held: Held,
+    held: ActiveMotions,
     speed: usize,
-    /// Index of the chosen joint in its task.
+    /// Index of the selected joint in its task.
     joint: usize,
     stream: Option<Stream>,
-    /// Since when nothing moves.
+    /// When the last motion ended.
     resting: Option<Instant>,
     message: Option<(String, bool)>,
 }
 
 impl Session {
-    /// A session at rest. A mode that the run has no task for is not begun with.
+    /// Creates a session at rest. Avoids starting in a mode without a task.
     pub fn new(client: Client, watch: Watch, drives: Drives, mut setting: Setting) -> Self {
         let mut message = None;
         if drives.get(setting.joint_mode).is_none() {
             setting.joint_mode = !setting.joint_mode;
             message = Some((lacking(&setting.arm, !setting.joint_mode), false));
         }
-        let (held, speed) = (Held::default(), FIRST_SPEED);
+        let (held, speed) = (ActiveMotions::default(), FIRST_SPEED);
         Self { client, watch, drives, setting, held, speed, joint: 0, stream: None, resting: None, message }
     }
 
-    /// Jogs until somebody leaves, a signal comes, or the terminal or the run is lost. The arm comes to rest, the
-    /// terminal is given back, whatever the end.
+    /// Jogs until the user leaves, a signal arrives, or the terminal or the run is lost. In every case the arm
+    /// decelerates to rest and the terminal is restored.
     pub fn run(&mut self, mut terminal: Terminal, signals: &Signals) -> Result {
         let ended = self.follow_keys(&mut terminal, signals);
         self.held.clear();
@@ -96,7 +96,7 @@ impl Session {
             if let Some(signal) = signals.last() {
                 return Ok(Exit::by_signal(signal));
             }
-            beat = (beat + BEAT).max(Instant::now());
+            beat = (beat + PERIOD).max(Instant::now());
             loop {
                 let patience = beat.saturating_duration_since(Instant::now());
                 match terminal.event(patience).map_err(no_terminal)? {
@@ -105,7 +105,7 @@ impl Session {
                             return Ok(exit);
                         }
                     }
-                    // Without the keyboard there are no key-ups.
+                    // Without keyboard focus there are no key-ups.
                     Some((Event::FocusLost, _)) => self.held.clear(),
                     _ => {}
                 }
@@ -133,31 +133,31 @@ impl Session {
     fn key(&mut self, key: &KeyEvent, now: Instant) -> Result<Option<Exit>> {
         let Some(wish) = meaning(key, self.setting.joint_mode) else { return Ok(None) };
         match (wish, key.kind) {
-            (Wish::Move(motion), KeyEventKind::Press) => {
+            (KeyAction::Move(motion), KeyEventKind::Press) => {
                 self.message = None;
                 self.held.press(motion, now);
             }
-            (Wish::Move(motion), KeyEventKind::Repeat) => self.held.repeat(motion, now),
-            (Wish::Move(motion), KeyEventKind::Release) => self.held.release(motion, now),
+            (KeyAction::Move(motion), KeyEventKind::Repeat) => self.held.repeat(motion, now),
+            (KeyAction::Move(motion), KeyEventKind::Release) => self.held.release(motion, now),
             (_, KeyEventKind::Release) => {}
-            (Wish::Leave { interrupted }, _) => {
+            (KeyAction::Leave { interrupted }, _) => {
                 return Ok(Some(if interrupted { Exit::Interrupted } else { Exit::Ok }));
             }
-            (Wish::Speed(faster), _) => {
+            (KeyAction::Speed(faster), _) => {
                 let next = if faster { self.speed + 1 } else { self.speed.saturating_sub(1) };
                 self.speed = next.min(SPEEDS.len() - 1);
             }
-            (Wish::Frame, _) => {
+            (KeyAction::Frame, _) => {
                 self.held.clear();
                 self.setting.tool_frame = !self.setting.tool_frame;
             }
-            (Wish::Joint(index), _) => self.choose(index),
-            (Wish::Step(forward), _) => {
+            (KeyAction::Joint(index), _) => self.choose(index),
+            (KeyAction::Step(forward), _) => {
                 self.choose(if forward { self.joint + 1 } else { self.joint.saturating_sub(1) });
             }
-            (Wish::Mode, _) => self.change_mode()?,
-            (Wish::Rest, _) => self.rest()?,
-            (Wish::Stop, _) => self.stop()?,
+            (KeyAction::Mode, _) => self.change_mode()?,
+            (KeyAction::Rest, _) => self.rest()?,
+            (KeyAction::Stop, _) => self.stop()?,
         }
         Ok(None)
     }
@@ -181,41 +181,41 @@ impl Session {
         Ok(())
     }
 
-    /// Comes to rest now, and lets the task go.
+    /// Decelerates to rest and ends the task.
     fn rest(&mut self) -> Result<()> {
         self.held.clear();
         self.resting = None;
         let Some(stream) = self.stream.take() else { return Ok(()) };
-        // A task that refuses to rest rests already; letting it go is tried all the same.
+        // A task that refuses rest is at rest already; end it all the same.
         let refused = refusal(stream.rest(&mut self.client))?;
         self.message =
             refusal(stream.end(&mut self.client))?.or(refused).map(|text| (text, true)).or(self.message.take());
         Ok(())
     }
 
-    /// The latched operational stop. The lease is given back: whoever resets the arm needs it free.
+    /// Latched operational stop. Releases the lease, which the reset of the arm needs.
     fn stop(&mut self) -> Result<()> {
         self.held.clear();
         (self.stream, self.resting) = (None, None);
         let arm = self.setting.arm.clone();
         let text = match self.client.call(Stop { arm: Some(arm.clone()) }) {
             Ok(reply) => {
-                let said = reply.arms.get(&arm).map_or_else(|| "unknown".to_owned(), word);
-                format!("stop of {arm}: {said}; to go on: `dimos arm reset {arm}`, `dimos arm enable {arm}`")
+                let result = reply.arms.get(&arm).map_or_else(|| "unknown".to_owned(), word);
+                format!("stop of {arm}: {result}; next: `dimos arm reset {arm}`, `dimos arm enable {arm}`")
             }
             Err(error) => refusal(Err(error))?.unwrap_or_default(),
         };
         self.message = Some((text, true));
-        self.give_back_lease()
+        self.release_lease()
     }
 
-    fn give_back_lease(&mut self) -> Result<()> {
+    fn release_lease(&mut self) -> Result<()> {
         let released = self.client.call(Release { arm: Some(self.setting.arm.clone()) }).map(|_| ());
         refusal(released).map(|_| ())
     }
 
-    /// Sends the next target, or brings what moved to rest.
-    fn command(&mut self, seen: &Seen) -> Result<()> {
+    /// Sends the next target, or brings a moving arm to rest.
+    fn command(&mut self, seen: &ArmSnapshot) -> Result<()> {
         let now = Instant::now();
         match self.demand(now) {
             Some(demand) => self.go(demand, seen, now),
@@ -223,21 +223,21 @@ impl Session {
         }
     }
 
-    fn go(&mut self, demand: Demand, seen: &Seen, now: Instant) -> Result<()> {
+    fn go(&mut self, demand: Demand, seen: &ArmSnapshot, now: Instant) -> Result<()> {
         let Some(drive) = self.drives.get(self.setting.joint_mode).cloned() else { return Ok(()) };
         self.resting = None;
         let mut stream = match self.stream.take() {
             Some(stream) if *stream.drive() == drive => stream,
             _ => Stream::new(drive),
         };
-        let sight = Sight { state: seen.state.as_ref(), arm: seen.arm.as_ref() };
-        match refusal(stream.send(&mut self.client, demand, sight, now))? {
+        let view = ArmView { state: seen.state.as_ref(), arm: seen.arm.as_ref() };
+        match refusal(stream.send(&mut self.client, demand, view, now))? {
             None => self.stream = Some(stream),
             Some(refused) => {
                 self.held.clear();
                 self.message = Some((refused, true));
-                // Whatever holds the arm may need the lease free to be put right.
-                self.give_back_lease()?;
+                // The cause of the hold may need the lease to be fixed.
+                self.release_lease()?;
             }
         }
         Ok(())
@@ -250,18 +250,18 @@ impl Session {
                 self.resting = Some(now);
                 let refused = refusal(stream.rest(&mut self.client))?;
                 self.message = refused.map(|text| (text, true)).or(self.message.take());
-                // The next motion of a servo task begins where the arm is then.
+                // The next motion of a servo task starts at the arm's position.
                 if stream.drive().kind == Kind::Servo {
                     self.stream = self.stream.take().map(|stream| Stream::new(stream.drive().clone()));
                 }
             }
-            Some(since) if now.saturating_duration_since(since) > LET_GO => self.rest()?,
+            Some(since) if now.saturating_duration_since(since) > RELEASE_AFTER => self.rest()?,
             Some(_) => {}
         }
         Ok(())
     }
 
-    /// The motion that the held keys ask for.
+    /// Returns the motion of the held keys.
     fn demand(&mut self, now: Instant) -> Option<Demand> {
         let alive = self.held.alive(now);
         if alive.is_empty() {
@@ -289,7 +289,7 @@ impl Session {
         Some(Demand::Tool(linear, [roll, pitch, yaw].map(|v: f64| v * self.setting.angular), frame))
     }
 
-    fn view<'a>(&'a mut self, seen: &'a Seen) -> View<'a> {
+    fn view<'a>(&'a mut self, seen: &'a ArmSnapshot) -> View<'a> {
         let moving = self.demand(Instant::now()).map(|demand| in_words(&demand)).unwrap_or_default();
         let share = SPEEDS.get(self.speed).copied().unwrap_or(0.0);
         let percent = share * 100.0;
@@ -319,10 +319,10 @@ impl Session {
 }
 
 fn no_terminal(error: std::io::Error) -> Failure {
-    Failure::new(Exit::Failed, format!("the terminal is gone: {error}"))
+    Failure::new(Exit::Failed, format!("the terminal was closed: {error}"))
 }
 
-/// Why a mode is not there.
+/// Returns why a mode is unavailable.
 fn lacking(arm: &str, joint_mode: bool) -> String {
     let what = if joint_mode { "single joints" } else { "the end effector" };
     format!("no task of the run moves {what} of {arm}; add to `tasks`: {}", drive::line(arm, joint_mode))
@@ -333,7 +333,7 @@ fn word(how: &impl serde::Serialize) -> String {
     text.and_then(|v| v.as_str().map(|s| s.replace('_', " "))).unwrap_or_else(|| "unknown".to_owned())
 }
 
-/// A motion as people say it: `+x -yaw`.
+/// Returns a motion as text: `+x -yaw`.
 fn in_words(demand: &Demand) -> String {
     let sign = |v: f64| if v < 0.0 { '-' } else { '+' };
     match demand {

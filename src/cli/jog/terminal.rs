@@ -1,4 +1,4 @@
-//! The terminal while jog has it: raw, on its alternate screen, and given back however jog ends.
+//! The terminal of jog: raw, on its alternate screen, restored however jog ends.
 
 use std::io::{self, IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,27 +18,27 @@ use crossterm::{execute, queue};
 
 use crate::cli::output;
 
-/// Whether there is something to give back.
+/// Whether it must be restored.
 static TAKEN: AtomicBool = AtomicBool::new(false);
 
-/// Keys that wait to be taken up.
-const KEYS: usize = 256;
+/// Capacity of the key queue.
+const KEY_CAPACITY: usize = 256;
 
-/// How a piece of text looks.
+/// Style of a piece of text.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Look {
     /// As it comes.
     #[default]
     Plain,
-    /// It matters.
+    /// Emphasized.
     Bold,
-    /// It is there for those who look for it.
+    /// Dimmed.
     Dim,
-    /// As it should be.
+    /// Good.
     Good,
-    /// Worth a look.
+    /// Warning.
     Warning,
-    /// Wrong.
+    /// Error.
     Bad,
 }
 
@@ -58,14 +58,14 @@ impl Line {
         self.with(text, Look::Plain)
     }
 
-    /// Its text alone.
+    /// Returns its text.
     #[cfg(test)]
     pub fn text(&self) -> String {
         self.0.iter().map(|(text, _)| text.as_str()).collect()
     }
 }
 
-/// The terminal. Dropping it gives it back.
+/// The terminal. Restored when dropped.
 pub struct Terminal {
     drawn: Vec<Line>,
     size: (usize, usize),
@@ -77,20 +77,20 @@ impl Terminal {
     /// Takes the terminal.
     pub fn open() -> io::Result<Self> {
         let (columns, rows) = size()?;
-        give_back_on_panic();
+        restore_on_panic();
         enable_raw_mode()?;
         TAKEN.store(true, Ordering::SeqCst);
         let size = (columns.into(), rows.into());
         let terminal = Self { drawn: Vec::new(), size, colour: output::colour(&io::stdout()), events: listen()? };
-        // A terminal that does not know the kitty keyboard protocol passes over its sequence; one that does will tell
-        // when keys go up. Whether it does is known by the first key-up.
+        // A terminal without the kitty keyboard protocol ignores this sequence; one with it will report key-ups. The
+        // first key-up shows which it is.
         let flags = KeyboardEnhancementFlags::DISAMBIGUATE_ESCAPE_CODES | KeyboardEnhancementFlags::REPORT_EVENT_TYPES;
         let keyboard = PushKeyboardEnhancementFlags(flags);
         execute!(io::stdout(), EnterAlternateScreen, keyboard, EnableFocusChange, Hide, Clear(ClearType::All))?;
         Ok(terminal)
     }
 
-    /// Columns and rows, as they are now: not every change of them is told.
+    /// Returns columns and rows; queried each time, because not every change is reported.
     pub fn size(&mut self) -> io::Result<(usize, usize)> {
         let (columns, rows) = size()?;
         let now = (usize::from(columns), usize::from(rows));
@@ -102,10 +102,9 @@ impl Terminal {
         Ok(now)
     }
 
-    /// The next key, and when it came, waiting up to `patience`. Fails when there will be
-    /// no more.
-    pub fn event(&mut self, patience: Duration) -> io::Result<Option<(Event, Instant)>> {
-        let (event, at) = match self.events.recv_timeout(patience) {
+    /// Returns the next key and its time, waiting up to `timeout`. Fails when no more keys can come.
+    pub fn event(&mut self, timeout: Duration) -> io::Result<Option<(Event, Instant)>> {
+        let (event, at) = match self.events.recv_timeout(timeout) {
             Ok(event) => event?,
             Err(RecvTimeoutError::Timeout) => return Ok(None),
             Err(RecvTimeoutError::Disconnected) => return Err(io::ErrorKind::UnexpectedEof.into()),
@@ -113,12 +112,12 @@ impl Terminal {
         Ok(Some((event, at)))
     }
 
-    /// Whether it is still there: one that was closed gives no keys, and must not be waited for.
+    /// Returns whether it still exists: a closed terminal gives no keys, and must not be waited for.
     pub fn is_there(&self) -> bool {
         rustix::termios::tcgetattr(io::stdin()).is_ok() && io::stdin().is_terminal()
     }
 
-    /// Shows these lines, from the top; what does not fit is cut off.
+    /// Draws these lines from the top; cuts off what does not fit.
     pub fn draw(&mut self, lines: Vec<Line>) -> io::Result<()> {
         let (columns, rows) = self.size;
         let mut out = io::stdout().lock();
@@ -161,14 +160,14 @@ impl Terminal {
 
 impl Drop for Terminal {
     fn drop(&mut self) {
-        give_back();
+        restore();
     }
 }
 
-/// Reads keys on a thread of its own: on a terminal that is gone the library never comes back from its reading. And
-/// keys keep the time when they were typed, however late they are taken up.
+/// Reads keys on a separate thread: the library's read never returns from a closed terminal. Keys are time-stamped when
+/// typed.
 fn listen() -> io::Result<Receiver<io::Result<(Event, Instant)>>> {
-    let (to, events) = sync_channel(KEYS);
+    let (to, events) = sync_channel(KEY_CAPACITY);
     let listening = move || {
         loop {
             let event = read().map(|event| (event, Instant::now()));
@@ -182,8 +181,8 @@ fn listen() -> io::Result<Receiver<io::Result<(Event, Instant)>>> {
     Ok(events)
 }
 
-/// Makes the terminal what it was. That it is gone is no error here.
-fn give_back() {
+/// Restores the terminal. Ignores that it is closed.
+fn restore() {
     if TAKEN.swap(false, Ordering::SeqCst) {
         let mut out = io::stdout();
         let _ = execute!(out, DisableFocusChange, PopKeyboardEnhancementFlags, Show, LeaveAlternateScreen);
@@ -191,11 +190,11 @@ fn give_back() {
     }
 }
 
-/// A panic's message must reach a terminal that shows it.
-fn give_back_on_panic() {
+/// Restores the terminal on a panic, so that its message is visible.
+fn restore_on_panic() {
     let before = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
-        give_back();
+        restore();
         before(panic);
     }));
 }

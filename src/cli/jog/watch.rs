@@ -1,5 +1,4 @@
-//! What the run tells while jog drives: read on a connection and a thread of its own, so that nothing of it ever
-//! delays a command.
+//! Reads the run while jog drives, on its own connection and thread, so that it never delays a command.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -15,42 +14,42 @@ use crate::rpc::place::RunFolder;
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
 use crate::rpc::streams::{Stream, Subscribe};
 
-/// How often the joints are read.
-const STATE: Duration = Duration::from_millis(50);
-/// How many readings of the joints come to one of the status.
+/// Period of reading the joints.
+const STATE_PERIOD: Duration = Duration::from_millis(50);
+/// Readings of the joints per reading of the status.
 const PER_STATUS: u32 = 5;
-/// What limited a motion is shown for so long.
-const RECENT: Duration = Duration::from_millis(1500);
+/// Time for which a limit is shown.
+const LIMIT_DISPLAY_TIME: Duration = Duration::from_millis(1500);
 
-/// What was seen of the arm last.
+/// Latest data of the arm.
 #[derive(Debug, Clone, Default)]
-pub struct Seen {
+pub struct ArmSnapshot {
     /// Its joints and pose.
     pub state: Option<ArmStateReport>,
-    /// When those came.
+    /// Time of their arrival.
     pub at: Option<Instant>,
-    /// What it is ready for.
+    /// Its status.
     pub arm: Option<ArmReport>,
     /// All tasks of the run.
     pub tasks: Vec<TaskReport>,
-    /// What bounded the motion lately, in words.
+    /// The latest limit of the motion, as text.
     pub bound: Option<(String, Instant)>,
-    /// Why nothing comes any more.
+    /// Why reading has ended.
     pub lost: Option<Failure>,
 }
 
-/// Reads the run until it is dropped.
+/// Reads a run until dropped.
 pub struct Watch {
-    seen: Arc<Mutex<Seen>>,
+    seen: Arc<Mutex<ArmSnapshot>>,
     ending: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Watch {
-    /// Begins to read an arm of a run.
+    /// Starts reading an arm of a run.
     pub fn start(run: &str, arm: &str) -> Result<Self> {
         let mut client = Client::find(&RunFolder::standard(), Some(run))?;
-        let seen = Arc::new(Mutex::new(Seen::default()));
+        let seen = Arc::new(Mutex::new(ArmSnapshot::default()));
         let ending = Arc::new(AtomicBool::new(false));
         let (arm, to, end) = (arm.to_owned(), seen.clone(), ending.clone());
         let reading = move || {
@@ -63,10 +62,10 @@ impl Watch {
         Ok(Self { seen, ending, thread: Some(thread) })
     }
 
-    /// What was seen last.
-    pub fn seen(&self) -> Seen {
+    /// Returns the latest data.
+    pub fn seen(&self) -> ArmSnapshot {
         let mut seen = lock(&self.seen);
-        if seen.bound.as_ref().is_some_and(|(_, at)| at.elapsed() > RECENT) {
+        if seen.bound.as_ref().is_some_and(|(_, at)| at.elapsed() > LIMIT_DISPLAY_TIME) {
             seen.bound = None;
         }
         seen.clone()
@@ -76,18 +75,23 @@ impl Watch {
 impl Drop for Watch {
     fn drop(&mut self) {
         self.ending.store(true, Ordering::Relaxed);
-        // Only a thread that is done already is waited for: the other may wait for a run that does not answer.
+        // Joins the thread only if it has finished: it may be waiting for a run that does not answer.
         if let Some(thread) = self.thread.take().filter(JoinHandle::is_finished) {
             let _ = thread.join();
         }
     }
 }
 
-fn lock(seen: &Mutex<Seen>) -> std::sync::MutexGuard<'_, Seen> {
+fn lock(seen: &Mutex<ArmSnapshot>) -> std::sync::MutexGuard<'_, ArmSnapshot> {
     seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn read(client: &mut Client, arm: &str, to: &Mutex<Seen>, ending: &AtomicBool) -> std::result::Result<(), ClientError> {
+fn read(
+    client: &mut Client,
+    arm: &str,
+    to: &Mutex<ArmSnapshot>,
+    ending: &AtomicBool,
+) -> std::result::Result<(), ClientError> {
     client.call(Subscribe { stream: Stream::Events, rate: None })?;
     let mut next = Instant::now();
     for round in 0_u32.. {
@@ -111,14 +115,14 @@ fn read(client: &mut Client, arm: &str, to: &Mutex<Seen>, ending: &AtomicBool) -
                 seen.bound = Some((text, Instant::now()));
             }
         }
-        next = (next + STATE).max(Instant::now());
+        next = (next + STATE_PERIOD).max(Instant::now());
         std::thread::sleep(next.saturating_duration_since(Instant::now()));
     }
     Ok(())
 }
 
-/// What an event says about a bound of the arm's motion.
-fn bound(event: &Value, seen: &Seen) -> Option<String> {
+/// Returns the limit of the arm's motion in an event.
+fn bound(event: &Value, seen: &ArmSnapshot) -> Option<String> {
     let of = |field: &str| event.get(field).and_then(Value::as_str);
     let joint = of("joint")?;
     let ours = seen.state.as_ref().is_some_and(|state| state.joints.iter().any(|j| j.name == joint));

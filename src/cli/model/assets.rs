@@ -1,4 +1,4 @@
-//! `dimos model assets list|fetch|clean`: the files that a blueprint fetches, and those that are here.
+//! `dimos model assets list|fetch|clean`: a blueprint's assets and their state.
 
 use std::collections::BTreeSet;
 
@@ -22,17 +22,17 @@ pub(super) struct Args {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
-    /// List a blueprint's assets: where they come from, whether they are here
-    List(Of),
-    /// Fetch those that are not here: for a computer that is offline later
-    Fetch(Of),
-    /// Remove those that are here
-    Clean(Of),
+    /// List a blueprint's assets: origin and state
+    List(BlueprintArgs),
+    /// Download missing assets, for a computer that will be offline
+    Fetch(BlueprintArgs),
+    /// Remove downloaded assets
+    Clean(BlueprintArgs),
 }
 
-/// Of which blueprint.
+/// Selects a blueprint.
 #[derive(Debug, clap::Args)]
-struct Of {
+struct BlueprintArgs {
     /// The blueprint: a name that `list-blueprints` shows, or a file
     #[arg(value_name = "BLUEPRINT")]
     blueprint: String,
@@ -44,7 +44,7 @@ struct Of {
     json: bool,
 }
 
-impl Of {
+impl BlueprintArgs {
     fn load(&self, registry: &Registry) -> Result<Blueprint> {
         let set = self.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
         let loaded = check::load(&self.blueprint, &Overrides { set, sim: false }, registry)?;
@@ -68,7 +68,7 @@ pub(super) fn run(args: &Args, registry: &Registry) -> Result {
             for asset in blueprint.assets.iter().map(|used| &used.asset).filter(|asset| !cache.has(&asset.sha256)) {
                 fetch::one(asset)?;
             }
-            // What was not there before is checked now: paths into it, the descriptions in it.
+            // New files are checked now: paths into them, descriptions in them.
             show(&of.load(registry)?, of.json);
         }
         Verb::Clean(of) => clean(of, registry)?,
@@ -76,9 +76,9 @@ pub(super) fn run(args: &Args, registry: &Registry) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Removes the assets. What two names mean is removed once; a mistake in a description that lies in an asset is none
-/// here.
-fn clean(of: &Of, registry: &Registry) -> Result<()> {
+/// Removes the assets. A file shared by two names is removed once; mistakes in a description inside an asset are
+/// ignored.
+fn clean(of: &BlueprintArgs, registry: &Registry) -> Result<()> {
     let (blueprint, cache) = (of.load(registry)?, Cache::standard());
     let mut seen = BTreeSet::new();
     let mut removed = Vec::new();
@@ -89,7 +89,7 @@ fn clean(of: &Of, registry: &Registry) -> Result<()> {
     }
     match of.json {
         true => output::json(&json!({"removed": removed})),
-        false if removed.is_empty() => output::line("nothing was there"),
+        false if removed.is_empty() => output::line("nothing to remove"),
         false => output::line(format_args!("removed {}", removed.join(", "))),
     }
     Ok(())

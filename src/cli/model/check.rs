@@ -1,11 +1,11 @@
-//! `dimos model check`: every mistake of a description, of the meshes it names, and of its SRDF and limits.
+//! `dimos model check`: every mistake of a description, its meshes, its SRDF and its limits.
 
 use std::collections::BTreeSet;
 
 use super::File;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
-use crate::planning::setup::{always_touch, whole};
+use crate::planning::planning_scene::{always_touch, whole};
 use crate::robot::mesh::Mesh;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Geometry, Loaded, RobotModel, Shape};
@@ -17,10 +17,7 @@ pub(super) fn run(file: &File) -> Result {
     let summary = loaded.model.take().map(|robot| {
         let triangles = read_meshes(&robot, &mut loaded);
         let (links, independent) = (robot.links.len(), robot.independent_joints().len());
-        let summary = format!(
-            "{}: {links} links, {independent} joints that move on their own, {triangles} triangles",
-            robot.name
-        );
+        let summary = format!("{}: {links} links, {independent} independent joints, {triangles} triangles", robot.name);
         touching_links(robot, &mut loaded);
         summary
     });
@@ -48,24 +45,24 @@ pub(super) fn run(file: &File) -> Result {
     }
 }
 
-/// Warns of links that touch in every pose: a planner could not check them against each other.
+/// Warns of links that touch in every configuration: a planner cannot check them against each other.
 fn touching_links(robot: RobotModel, loaded: &mut Loaded) {
     let allowed = loaded.semantics.disabled_pairs().collect();
-    // What keeps shapes from being made was reported with the meshes; the rest is a mistake that only shows here.
+    // Errors of shapes were reported with the meshes; others appear only here.
     let touching = match whole(robot, allowed) {
         Ok(robot) => always_touch(&robot),
         Err(_) if loaded.has_errors() => return,
         Err(why) => return loaded.report(Diag::error(why)),
     };
     for (number, [a, b]) in touching.iter().enumerate() {
-        let what = format!("the links `{a}` and `{b}` touch in every pose: a planner does not check them");
-        let hint = "if they may touch, exclude the pair: disable_collisions in an SRDF, or collision_exclusion_pairs";
+        let what = format!("the links `{a}` and `{b}` touch in every configuration: a planner does not check them");
+        let hint = "if that is intended, exclude the pair: disable_collisions in an SRDF, or collision_exclusion_pairs";
         let last = (number + 1 == touching.len()).then(|| hint.to_owned());
         loaded.report(Diag::warning(what).maybe_hint(last));
     }
 }
 
-/// Reads all meshes; the number of their triangles. One that cannot be read is a mistake if links collide by it.
+/// Reads all meshes; returns their number of triangles. An unreadable collision mesh is an error.
 fn read_meshes(robot: &RobotModel, loaded: &mut Loaded) -> usize {
     let mut triangles = 0;
     let mut seen = BTreeSet::new();
@@ -79,7 +76,7 @@ fn read_meshes(robot: &RobotModel, loaded: &mut Loaded) -> usize {
             match Mesh::load(mesh) {
                 Ok(mesh) => triangles += mesh.triangles.len(),
                 Err(why) => {
-                    let what = format!("a mesh of the link `{}` cannot be used: {why}", link.name);
+                    let what = format!("unusable mesh of the link `{}`: {why}", link.name);
                     loaded.report(if collides { Diag::error(what) } else { Diag::warning(what) });
                 }
             }

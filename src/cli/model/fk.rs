@@ -1,4 +1,4 @@
-//! `dimos model fk`: where a link is at joint positions.
+//! `dimos model fk`: the pose of a link at joint positions.
 
 use serde_json::json;
 
@@ -12,17 +12,17 @@ use crate::yaml::did_you_mean;
 
 /// Arguments of `model fk`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "The joints are those between the two links that move on their own, in order from the base.")]
+#[command(after_help = "The joints are the independent ones between the two links, in order from the base.")]
 pub struct Args {
     #[command(flatten)]
     file: File,
-    /// Positions of the joints [rad, or m of prismatic joints]
+    /// Joint positions [rad, or m for prismatic joints]
     #[arg(value_name = "Q", value_parser = finite, allow_negative_numbers = true)]
     positions: Vec<f64>,
-    /// The link to find; default: the end of the longest chain
+    /// Link whose pose is printed; default: the end of the longest chain
     #[arg(long, value_name = "NAME")]
     link: Option<String>,
-    /// The link in whose frame to say it; default: the root
+    /// Reference link of the pose; default: the root
     #[arg(long, value_name = "NAME")]
     base: Option<String>,
 }
@@ -34,7 +34,7 @@ pub fn run(args: &Args) -> Result {
     let tip = args.link.as_deref().map_or_else(|| Ok(deepest(&robot)), |name| index(&robot, name))?;
     let name = |link: usize| robot.links.get(link).map_or("?", |l| l.name.as_str());
     let Some(chain) = robot.chain(base, tip) else {
-        return Err(Failure::usage(format!("`{}` does not hang below `{}`", name(tip), name(base))));
+        return Err(Failure::usage(format!("`{}` is not below `{}`", name(tip), name(base))));
     };
     let moving: Vec<&str> = chain
         .iter()
@@ -84,7 +84,7 @@ pub(super) fn index(robot: &RobotModel, name: &str) -> Result<usize> {
     })
 }
 
-/// The first link that most joints lead to.
+/// Returns the first link with the longest chain of joints.
 pub(super) fn deepest(robot: &RobotModel) -> usize {
     let mut depths = vec![0; robot.links.len()];
     for joint in &robot.joints {

@@ -17,32 +17,33 @@ use crate::robot::urdf::Meshes;
 /// Arguments of `model ik`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
-The joints are those between the root and the link that move on their own, in order from the base, as `model fk` takes
-them. Collisions are not looked at: `dimos plan` does that. The same call gives the same answer.")]
+The joints are the independent ones between the root and the link, in order from the base, as in `model fk`.
+Collisions are not checked: use `dimos plan` for that. The same call gives the same answer.")]
 pub struct Args {
     #[command(flatten)]
     file: File,
-    /// Where the link shall be: x, y, z [m] in the root's frame; without --rpy or --quat in any orientation
+    /// Target position of the link: x, y, z [m] in the root's frame; orientation is free unless --rpy or --quat is
+    /// given
     #[arg(long, value_names = ["X", "Y", "Z"], num_args = 3, value_parser = finite, allow_negative_numbers = true, required = true)]
     pose: Vec<f64>,
-    /// Its roll, pitch, yaw about fixed axes [rad]
+    /// Target roll, pitch, yaw about fixed axes [rad]
     #[arg(long, value_names = ["R", "P", "Y"], num_args = 3, value_parser = finite, allow_negative_numbers = true)]
     rpy: Option<Vec<f64>>,
-    /// Its orientation as a quaternion x, y, z, w
+    /// Target orientation as a quaternion x, y, z, w
     #[arg(long, value_names = ["X", "Y", "Z", "W"], num_args = 4, value_parser = finite, allow_negative_numbers = true, conflicts_with = "rpy")]
     quat: Option<Vec<f64>>,
-    /// Leave the orientation open
+    /// Leave the orientation free
     #[arg(long, conflicts_with_all = ["rpy", "quat"])]
     position_only: bool,
-    /// The link to place; default: the end of the longest chain
+    /// Link to place; default: the end of the longest chain
     #[arg(long, value_name = "NAME")]
     link: Option<String>,
-    /// Where to begin: the solution nearest to it is given [rad, or m of prismatic joints]; default: zero
+    /// Seed: the nearest solution is printed [rad, or m for prismatic joints]; default: zero
     #[arg(long, value_name = "Q", num_args = 1.., value_parser = finite, allow_negative_numbers = true)]
     seed: Option<Vec<f64>>,
 }
 
-/// Solutions that are looked for, to give the nearest of them.
+/// Number of solutions to search, of which the nearest is printed.
 const SOLUTIONS: usize = 8;
 
 /// Runs the verb.
@@ -94,13 +95,13 @@ pub fn run(args: &Args) -> Result {
         }
         Err(failure) => {
             let best: Vec<String> = failure.best.iter().map(|v| output::fixed(*v, 4)).collect();
-            let hint = format!("the nearest that was found is {}", best.join(" "));
+            let hint = format!("the closest configuration found is {}", best.join(" "));
             Err(Failure::new(Exit::Failed, failure.to_string()).hint(hint))
         }
     }
 }
 
-/// The orientation that is asked for, where one is.
+/// Returns the requested orientation, if any.
 fn orientation(args: &Args) -> Result<Option<DQuat>> {
     if let Some([r, p, y]) = args.rpy.as_deref() {
         let q = UnitQuaternion::from_euler_angles(*r, *p, *y).coords;
@@ -109,8 +110,8 @@ fn orientation(args: &Args) -> Result<Option<DQuat>> {
     let Some([x, y, z, w]) = args.quat.as_deref() else { return Ok(None) };
     let quat = DQuat::from_xyzw(*x, *y, *z, *w);
     if !(0.99..=1.01).contains(&quat.length()) {
-        let what = format!("--quat has the length {}, and must have 1", quat.length());
-        return Err(Failure::usage(what).hint("no rotation is 0 0 0 1"));
+        let what = format!("--quat has length {}, must be 1", quat.length());
+        return Err(Failure::usage(what).hint("the identity is 0 0 0 1"));
     }
     Ok(Some(quat.normalize()))
 }

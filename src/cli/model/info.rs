@@ -1,4 +1,4 @@
-//! `dimos model info` and `tree`: what a robot is made of.
+//! `dimos model info` and `tree`: the structure of a robot.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -24,10 +24,7 @@ pub(super) fn info(file: &File) -> Result {
     let independent = robot.independent_joints().len();
     let (links, joints) = (robot.links.len(), robot.joints.len());
     let root = robot.links.first().map_or("", |link| link.name.as_str());
-    output::line(format_args!(
-        "{}: {links} links, {joints} joints, {independent} of them move on their own",
-        robot.name
-    ));
+    output::line(format_args!("{}: {links} links, {joints} joints, {independent} of them independent", robot.name));
     output::line(format_args!("root: {root}"));
     output::line("");
     let headings = [
@@ -104,7 +101,7 @@ fn print_semantics(robot: &RobotModel, semantics: &Semantics) {
     for tool in &semantics.end_effectors {
         output::line(format_args!("end effector {}: {} on {}", tool.name, tool.group, tool.parent_link));
     }
-    output::line(format_args!("{} pairs of links may touch", semantics.disabled.len()));
+    output::line(format_args!("{} allowed collision pairs", semantics.disabled.len()));
 }
 
 fn joint_names(robot: &RobotModel, semantics: &Semantics, group: &str) -> Vec<String> {
@@ -157,9 +154,9 @@ pub(super) fn tree(file: &File) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Draws all below the root. The links stand depth first already; a line needs to know which branches go on.
+/// Draws all links below the root. Links are in depth-first order; a line needs to know which branches continue.
 fn draw(robot: &RobotModel) {
-    // For every open level: whether more branches follow there.
+    // For every open level: whether more branches follow.
     let mut levels: Vec<(usize, bool)> = Vec::new();
     for (i, joint) in robot.joints.iter().enumerate() {
         while levels.last().is_some_and(|(parent, _)| *parent != joint.parent) {

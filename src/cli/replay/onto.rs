@@ -25,14 +25,14 @@ use crate::rpc::report::{Deviation, MotionReport, StateReport};
 use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
 use crate::trajectory::JointTrajectory;
 
-/// Fraction of the limits with which arms go to where the motion begins.
+/// Fraction of the limits for the approach to the start of the motion.
 const APPROACH_SPEED: f64 = 0.2;
-/// How often the run is asked.
-const INTERVAL: Duration = Duration::from_millis(50);
-/// How long arms get to send their first state.
-const FIRST_STATE: Duration = Duration::from_secs(2);
-/// How long a cancelled motion may take to come to rest.
-const REST: Duration = Duration::from_secs(10);
+/// Poll period.
+const POLL_PERIOD: Duration = Duration::from_millis(50);
+/// Maximum wait for the arms' first states.
+const FIRST_STATE_TIMEOUT: Duration = Duration::from_secs(2);
+/// Maximum time for a cancelled motion to end.
+const REST_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Drives the arms of a blueprint along a part of a log.
 pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Registry) -> Result {
@@ -46,10 +46,10 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     }
     let plan = plan(&blueprint, &fit(&motion).scaled(args.rate)).map_err(split)?;
     refuse_real_arms(&blueprint, args.onto.allow_motion)?;
-    let terminal =
-        Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("no thread for the text log: {e}")))?;
+    let terminal = Terminal::start()
+        .map_err(|e| Failure::new(Exit::Failed, format!("cannot start the thread of the text log: {e}")))?;
     let signals = Signals::watch_with_hangup();
-    // The motors come on when the limits are known to allow the motion.
+    // The motors are enabled after the limits have been checked.
     let wanted: Vec<bool> = blueprint.arms.iter().map(|arm| arm.auto_enable).collect();
     blueprint.arms.iter_mut().for_each(|arm| arm.auto_enable = false);
     let run = Run::start(&blueprint, options(args)).map_err(|error| Failure {
@@ -63,7 +63,7 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     let report = run.status();
     let ended = run.stop();
     terminal.flush();
-    say_goodbye(&result, &ended, args.json);
+    print_summary(&result, &ended, args.json);
     for arm in report.arms.iter().filter(|_| !args.json) {
         output::note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
     }
@@ -87,11 +87,11 @@ fn refuse_real_arms(blueprint: &Blueprint, allowed: bool) -> Result<()> {
     if real.is_empty() || allowed {
         return Ok(());
     }
-    let what = format!("{} of {} would move for real", real.join(", "), blueprint.name);
-    Err(Failure::usage(what).hint("clear the space around it and add --allow-motion; or try without it: --sim"))
+    let what = format!("{} of {} are real arms", real.join(", "), blueprint.name);
+    Err(Failure::usage(what).hint("clear the workspace and add --allow-motion, or simulate with --sim"))
 }
 
-/// An error whose text ends with a hint in a line of its own: something is wrong with what was typed.
+/// Splits a hint off an error's text: a usage error.
 fn split(error: impl std::fmt::Display) -> Failure {
     let text = error.to_string();
     match text.split_once("\nhint: ") {
@@ -100,7 +100,7 @@ fn split(error: impl std::fmt::Display) -> Failure {
     }
 }
 
-/// Why it ended before its end.
+/// Why the motion ended early.
 enum End {
     Failed(Failure),
     Signal(i32),
@@ -144,7 +144,7 @@ struct Driver<'a> {
 impl Driver<'_> {
     fn drive(&self, wanted: &[bool]) -> std::result::Result<Vec<Deviation>, End> {
         let state = self.first_states()?;
-        self.refuse_broken_limits()?;
+        self.check_limits()?;
         for (arm, wanted) in self.blueprint.arms.iter().zip(wanted) {
             if *wanted || self.plan.approaches.iter().any(|a| a.arm == arm.hardware_id) {
                 self.run.call(ArmEnable { arm: arm.hardware_id.clone() })?;
@@ -155,7 +155,7 @@ impl Driver<'_> {
             let go = Move { arm: approach.arm.clone(), target, speed: APPROACH_SPEED };
             let begun = self.run.call(go)?;
             let (arm, duration) = (&approach.arm, begun.duration);
-            self.show.say(format_args!("approach: {arm} goes to where the motion begins, {duration:.1} s, directly"));
+            self.show.say(format_args!("approach: {arm} moves to the start of the motion, {duration:.1} s, directly"));
             self.follow(&[begun.motion], "approach")?;
         }
         let parts = self.plan.parts.iter();
@@ -180,17 +180,17 @@ impl Driver<'_> {
         Ok(reports.into_iter().flat_map(|report| report.deviation.unwrap_or_default()).collect())
     }
 
-    /// Waits until every arm has told where it is.
+    /// Waits until every arm has reported its state.
     fn first_states(&self) -> std::result::Result<StateReport, End> {
-        let limit = Instant::now() + FIRST_STATE;
+        let limit = Instant::now() + FIRST_STATE_TIMEOUT;
         loop {
             let state = self.run.call(State {})?;
             let unknown = state.arms.iter().find(|arm| arm.joints.iter().any(|j| j.position.is_none()));
             match unknown {
                 None => return Ok(state),
                 Some(arm) if Instant::now() >= limit => {
-                    let what = format!("{} does not say where it is", arm.hardware_id);
-                    let hint = "`dimos run` with this blueprint, and `dimos status`, show what it says";
+                    let what = format!("{} reports no position", arm.hardware_id);
+                    let hint = "start this blueprint with `dimos run` and check `dimos status`";
                     return Err(Failure::new(Exit::Hardware, what).hint(hint).into());
                 }
                 Some(_) => std::thread::sleep(Duration::from_millis(5)),
@@ -198,24 +198,25 @@ impl Driver<'_> {
         }
     }
 
-    fn refuse_broken_limits(&self) -> std::result::Result<(), End> {
+    fn check_limits(&self) -> std::result::Result<(), End> {
         let joints: Vec<String> = self.blueprint.arms.iter().flat_map(|arm| arm.joints.clone()).collect();
         let verdict = check_limits(self.plan, self.run.config(), &joints).map_err(|e| split(e.to_string()))?;
         let Some(worst) = verdict.broken.first() else { return Ok(()) };
         let more = verdict.broken.len() - 1;
-        let others = if more > 0 { format!(" ({more} more limits would be broken)") } else { String::new() };
+        let others = if more > 0 { format!(" ({more} more limits exceeded)") } else { String::new() };
         let hint = if worst.limit == "position" {
-            "limits are the arm's own, narrowed by `limits` in the blueprint; choose another part of the log".to_owned()
+            "limits are those of the arm, narrowed by `limits` in the blueprint; select another part of the log"
+                .to_owned()
         } else {
-            // Rounded down, or it would be refused once more.
+            // Rounded down, otherwise it would be rejected again.
             let possible = (self.rate * verdict.possible_rate * 1000.0).floor() / 1000.0;
-            format!("slow it down: --rate {possible}; a part that begins or ends in mid-motion needs other ends")
+            format!("slow it down with --rate {possible}; if the part begins or ends in motion, select other ends")
         };
         let what = format!("{worst}{others}; nothing has moved");
         Err(Failure::new(Exit::Failed, what).hint(hint).into())
     }
 
-    /// Waits for the end of all motions. Whatever goes wrong with one, or a signal, ends the others as well.
+    /// Waits for the end of all motions. A failure of one, or a signal, cancels the others.
     fn follow(&self, motions: &[u64], what: &'static str) -> std::result::Result<Vec<MotionReport>, End> {
         let bar = if self.show.bars { ProgressBar::new(1000) } else { ProgressBar::hidden() };
         if let Ok(style) = ProgressStyle::with_template("{prefix} [{bar:40}] {percent:>3} % {msg}") {
@@ -231,7 +232,7 @@ impl Driver<'_> {
                 let why = failed.error.clone().unwrap_or_else(|| "it ended before its goal".to_owned());
                 let failure =
                     Failure::new(Exit::Failed, format!("the {what} on {}: {}: {why}", failed.task, failed.state));
-                break Err(End::Failed(failure.hint("the log of this run tells what happened before")));
+                break Err(End::Failed(failure.hint("see the log of this run for the cause")));
             }
             if reports.iter().all(|r| r.done) {
                 break Ok(reports);
@@ -239,10 +240,10 @@ impl Driver<'_> {
             if let Some(signal) = self.signals.last() {
                 break Err(End::Signal(signal));
             }
-            match self.run.wait_for_end(Some(INTERVAL)) {
+            match self.run.wait_for_end(Some(POLL_PERIOD)) {
                 Ending::Duration => {}
                 Ending::Fault(fault) => break Err(End::Failed(Failure::new(Exit::Fault, fault))),
-                _ => break Err(End::Failed(Failure::new(Exit::Failed, "the run was asked to end".to_owned()))),
+                _ => break Err(End::Failed(Failure::new(Exit::Failed, "shutdown requested".to_owned()))),
             }
         };
         bar.finish_and_clear();
@@ -259,19 +260,19 @@ impl Driver<'_> {
         motions.iter().map(|&motion| Ok(self.run.call(api::Motion { motion })?)).collect()
     }
 
-    /// Ends motions and waits until they have. What cannot be ended here is ended by the stop of the run.
+    /// Cancels motions and waits for their end. A motion that cannot be cancelled ends with the run.
     fn cancel(&self, motions: &[u64]) -> std::result::Result<(), End> {
-        let limit = Instant::now() + REST;
+        let limit = Instant::now() + REST_TIMEOUT;
         if self.run.call(Cancel { task: None, arm: None }).is_ok() {
             while Instant::now() < limit && !self.reports(motions)?.iter().all(|r| r.done) {
-                std::thread::sleep(INTERVAL);
+                std::thread::sleep(POLL_PERIOD);
             }
         }
         Ok(())
     }
 }
 
-/// A whole target: joints that the motion does not move stay where they are.
+/// Returns a full target: joints outside the motion keep their positions.
 fn target(approach: &Approach, state: &StateReport) -> Vec<f64> {
     let arm = state.arms.iter().find(|arm| arm.hardware_id == approach.arm);
     let present = |j: usize| arm.and_then(|arm| arm.joints.get(j)?.position).unwrap_or(f64::NAN);
@@ -288,7 +289,7 @@ fn sent(trajectory: &JointTrajectory) -> Trajectory {
     Trajectory { joint_names: trajectory.joint_names.clone(), points: points.collect() }
 }
 
-fn say_goodbye(result: &std::result::Result<Vec<Deviation>, End>, ended: &Ended, json: bool) {
+fn print_summary(result: &std::result::Result<Vec<Deviation>, End>, ended: &Ended, json: bool) {
     #[derive(Serialize)]
     struct Line<'a> {
         event: &'static str,
@@ -311,6 +312,6 @@ fn say_goodbye(result: &std::result::Result<Vec<Deviation>, End>, ended: &Ended,
         output::note(format_args!("warning: {trouble}"));
     }
     if let Some(log) = &ended.log {
-        output::note(format_args!("its log: {}", log.display()));
+        output::note(format_args!("log: {}", log.display()));
     }
 }

@@ -1,4 +1,4 @@
-//! Hands the messages of a log to a view, each at its time.
+//! Passes the messages of a log to a view, each at its time.
 
 use std::time::Duration;
 
@@ -6,39 +6,39 @@ use super::view::View;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
 
-/// Which part of a log to play, and how.
+/// Part of a log to play, and how.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Part {
-    /// Topics; all of them if empty.
+    /// Topics; empty for all.
     pub topics: Vec<String>,
-    /// From this Unix time on [ns].
+    /// First Unix time [ns].
     pub from: u64,
-    /// Up to this Unix time, inclusive [ns].
+    /// Last Unix time, inclusive [ns].
     pub to: u64,
-    /// How much faster than it happened.
+    /// Speed factor.
     pub rate: f64,
-    /// Begin again at the end.
+    /// Repeat from the start.
     pub looping: bool,
 }
 
 /// How it ended.
 #[derive(Debug, Default)]
 pub struct End {
-    /// The log was cut here.
+    /// The cut, if the log is truncated.
     pub cut: Option<ReplayError>,
-    /// Samples that the recorder had lost.
+    /// Samples lost by the recorder.
     pub lost: u64,
-    /// Messages that are not what their schema says.
+    /// Messages that do not match their schema.
     pub damaged: u64,
 }
 
-/// Time that can be waited for.
+/// A clock that can be waited on.
 pub trait Waiting: Clock {
-    /// Returns when it is that time; at once if it is past.
+    /// Waits until that time; returns at once if it is past.
     fn wait_until(&mut self, time: Mono);
 }
 
-/// Time as it goes by.
+/// Real time.
 #[derive(Debug, Clone, Copy)]
 pub struct RealTime;
 
@@ -56,7 +56,7 @@ impl Waiting for RealTime {
 
 /// Plays a part of a log.
 pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dyn Waiting) -> anyhow::Result<End> {
-    // A cut after the part that is played is no loss to it.
+    // A cut after the selected part does not matter.
     let reaches_end = log.info().span.is_none_or(|(_, end)| part.to >= end);
     loop {
         let mut end = End::default();
@@ -87,7 +87,7 @@ pub fn play(log: &mut LogReader, part: &Part, view: &mut dyn View, time: &mut dy
         if !(part.looping && any) {
             return Ok(end);
         }
-        // A pass never takes less time than its part of the log, or a short one would loop as fast as it can.
+        // A pass takes at least the duration of its part, otherwise a short one would loop at full speed.
         time.wait_until(due(part.to));
     }
 }
@@ -108,7 +108,7 @@ mod tests {
         }
     }
 
-    /// Notes what is shown and when [ms], and gives up after a number of messages.
+    /// Records what is shown and when [ms]; stops after a number of messages.
     struct Notes {
         seen: Vec<(String, u64)>,
         room: usize,
@@ -126,17 +126,17 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_is_told_if_the_part_reaches_it() {
+    fn a_cut_is_reported_if_the_part_reaches_it() {
         let folder = tempfile::tempdir().unwrap();
         drop(log(&folder));
         let path = folder.path().join("a.mcap");
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() - 1]).unwrap();
         let mut log = LogReader::open(&path).unwrap();
-        for (to, told) in [(450, false), (900, true)] {
+        for (to, cut) in [(450, false), (900, true)] {
             let mut notes = Notes { seen: Vec::new(), room: 99 };
             let end = play(&mut log, &part(0, to), &mut notes, &mut VirtualClock::default()).unwrap();
-            assert_eq!(end.cut.is_some(), told, "up to {to} ms");
+            assert_eq!(end.cut.is_some(), cut, "up to {to} ms");
             assert_eq!(notes.seen.len() as u64, to / 100 + 1);
         }
     }

@@ -1,4 +1,4 @@
-//! `dimos replay LOG --verify`: says whether a log came out the same when it was run again.
+//! `dimos replay LOG --verify`: reports whether a replay gives identical commands.
 
 use std::path::Path;
 
@@ -8,7 +8,7 @@ use crate::replay::compare::Difference;
 use crate::replay::recorded::RecordedError;
 use crate::replay::verify::{Finding, Verification, verify};
 
-/// Verifies a log and prints what was found. Gives the exit code.
+/// Verifies a log and prints the result. Returns the exit code.
 pub fn run(path: &Path, json: bool) -> Result<u8, RecordedError> {
     let found = verify(path)?;
     if json {
@@ -31,13 +31,13 @@ fn print(found: &Verification) {
         Finding::Different(d) => {
             output::line(format_args!("different at tick {}, after {:.3} s: {}", d.tick, d.time, what(d)));
             output::line(format_args!("  in the log: {}", d.logged));
-            output::line(format_args!("  run again:  {}", d.rerun));
-            output::line(format_args!("before that: {ran} came out the same"));
-            output::note("hint: the log was changed, or a program that computes otherwise wrote it");
+            output::line(format_args!("replayed:   {}", d.rerun));
+            output::line(format_args!("before that: {ran} identical"));
+            output::note("hint: the log was modified, or written by a program with other control code");
         }
         Finding::Incomplete { tick, why } => {
             output::line(format_args!("reproducible up to a gap: {ran}"));
-            output::note(format_args!("warning: from tick {tick} on nothing can be verified: {why}"));
+            output::note(format_args!("warning: nothing can be verified from tick {tick} on: {why}"));
         }
     }
 }

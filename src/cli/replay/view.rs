@@ -1,4 +1,4 @@
-//! What a replay looks like: JSON lines, plain lines, or a table that is drawn anew again and again.
+//! Views of a replay: JSON lines, plain lines, or a table that is redrawn in place.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{self, Write};
@@ -12,7 +12,7 @@ use crate::clock::Mono;
 use crate::recording::messages::JointState;
 use crate::recording::replay::{Entry, Payload};
 
-/// Time between two drawings of the table.
+/// Time between two redraws of the table.
 const REDRAW_EVERY: Duration = Duration::from_millis(50);
 /// Log time between two plain lines of joint positions [ns].
 const LINE_EVERY: u64 = 1_000_000_000;
@@ -21,11 +21,11 @@ const TEXT_LINES: usize = 5;
 /// Width of the progress bar.
 const BAR: usize = 40;
 
-/// Something that messages are shown on.
+/// A view of messages.
 pub trait View {
-    /// Takes a message; `now` is the time by which it draws.
+    /// Takes a message; `now` is the time for redraws.
     fn show(&mut self, entry: &Entry, now: Mono) -> io::Result<()>;
-    /// The end of the log, or of one pass of a loop.
+    /// Ends the log, or one pass of a loop.
     fn end(&mut self) -> io::Result<()>;
 }
 
@@ -33,7 +33,7 @@ pub trait View {
 pub struct JsonLines<W>(W);
 
 impl<W: Write> JsonLines<W> {
-    /// Writes to `out`.
+    /// Creates a view that writes to `out`.
     pub fn new(out: W) -> Self {
         Self(out)
     }
@@ -50,7 +50,7 @@ impl<W: Write> View for JsonLines<W> {
     }
 }
 
-/// A line of joint positions a second, and each line of the text log.
+/// One line of joint positions per second, and each line of the text log.
 pub struct Plain<W> {
     out: W,
     from: u64,
@@ -59,7 +59,7 @@ pub struct Plain<W> {
 }
 
 impl<W: Write> Plain<W> {
-    /// Writes to `out`, with times counted from a Unix time [ns].
+    /// Creates a view that writes to `out`, with times relative to a Unix time [ns].
     pub fn new(out: W, from: u64) -> Self {
         Self { out, from, next: 0, others: BTreeMap::new() }
     }
@@ -80,7 +80,7 @@ impl<W: Write> View for Plain<W> {
                 }
             }
             Payload::Log(log) => writeln!(self.out, "{at:10.3} s  {}: {}", level(log.level), log.msg)?,
-            // Already said, by its line of the text log.
+            // Already shown as a line of the text log.
             Payload::Event(_) => {}
             _ => *self.others.entry(entry.topic.clone()).or_default() += 1,
         }
@@ -112,7 +112,7 @@ pub struct Live<W> {
 }
 
 impl<W: Write> Live<W> {
-    /// Draws on `out`, a terminal.
+    /// Creates a view that draws on `out`, a terminal.
     pub fn new(out: W, part: &Part) -> Self {
         Self {
             out,
@@ -152,7 +152,7 @@ impl<W: Write> Live<W> {
         }
     }
 
-    fn picture(&self) -> String {
+    fn render(&self) -> String {
         let mut lines: Vec<String> = self.arms.iter().map(|(name, text)| format!("{name}: {text}")).collect();
         if let Some(states) = &self.states {
             let mut table = Table::new();
@@ -185,11 +185,11 @@ impl<W: Write> Live<W> {
     }
 
     fn draw(&mut self) -> io::Result<()> {
-        let picture = self.picture();
-        // Up to where the last picture began, and clear from there on.
+        let render = self.render();
+        // Moves up to the start of the previous frame and clears from there on.
         let up = if self.drawn_lines > 0 { format!("\x1b[{}A\x1b[J", self.drawn_lines) } else { String::new() };
-        self.drawn_lines = picture.lines().count();
-        writeln!(self.out, "{up}{picture}")?;
+        self.drawn_lines = render.lines().count();
+        writeln!(self.out, "{up}{render}")?;
         self.out.flush()
     }
 }
@@ -214,7 +214,7 @@ fn right(text: impl ToString) -> Cell {
     Cell::new(text).set_alignment(CellAlignment::Right)
 }
 
-/// A value with its digits, or a dash where there is none.
+/// Formats a value, or a dash if there is none.
 fn number(values: &[f64], i: usize, digits: usize) -> String {
     output::number(values.get(i).copied().filter(|v| !v.is_nan()), digits)
 }

@@ -1,11 +1,11 @@
-//! Two boxes: the separating axis test (Gottschalk, Lin and Manocha, "OBBTree", 1996), with the width of the gap.
+//! Two boxes: separating axis test (Gottschalk, Lin and Manocha, "OBBTree", 1996), with the width of the gap.
 
 use glamx::{DAffine3, DVec3};
 
 use super::point::local;
 
-/// The widest gap between two boxes over the fifteen axes that can separate them [m]: never more than their
-/// distance; not positive exactly when they overlap.
+/// Returns the widest gap between two boxes over the fifteen candidate axes [m]: a lower bound of their distance, not
+/// positive exactly if they overlap.
 pub fn gap(a: &DAffine3, half_a: DVec3, b: &DAffine3, half_b: DVec3) -> f64 {
     let t = local(b.translation, a).to_array();
     let (ha, hb) = (half_a.to_array(), half_b.to_array());
@@ -26,7 +26,7 @@ pub fn gap(a: &DAffine3, half_a: DVec3, b: &DAffine3, half_b: DVec3) -> f64 {
         for j in 0..3 {
             let (j1, j2) = ((j + 1) % 3, (j + 2) % 3);
             let length = (1.0 - r[i][j] * r[i][j]).max(0.0).sqrt();
-            // Parallel edges span no axis of their own: the faces have said it all.
+            // Parallel edges span no axis; the face axes suffice.
             if length < 1e-6 {
                 continue;
             }

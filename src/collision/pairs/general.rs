@@ -1,5 +1,5 @@
-//! Any two cores, through parry: GJK for convex ones, a tree of triangles for meshes, a tree of points for clouds.
-//! Also the closest points of a pair, and how deep two cores overlap: asked for explanations, not while planning.
+//! Any two cores, with parry: GJK for convex ones, a tree of triangles for meshes, a tree of points for clouds. Also
+//! closest points and penetration depths, for reports rather than during planning.
 
 use glamx::{DAffine3, DPose3, DQuat, DVec3};
 use parry3d_f64::query::gjk::{self, CsoPoint, GJKResult, VoronoiSimplex};
@@ -8,18 +8,18 @@ use parry3d_f64::shape::{Ball, ConvexPolyhedron, Cuboid, Cylinder, Segment, Shap
 
 use super::super::shape::Placed;
 
-/// What two cores have nearest to each other.
+/// Closest points of two cores.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Nearest {
-    /// Distance of the cores [m]; negative: how far they must be moved apart.
+    /// Distance of the cores [m]; negative: penetration depth.
     pub distance: f64,
-    /// On or in the first core, in the common frame [m].
+    /// Point on or in the first core, in the common frame [m].
     pub a: DVec3,
-    /// On or in the second core.
+    /// Point on or in the second core.
     pub b: DVec3,
 }
 
-/// Distance of two cores [m], 0 where they overlap.
+/// Returns the distance of two cores [m], 0 if they overlap.
 pub fn distance(a: &Placed, b: &Placed) -> f64 {
     if let Some((cloud, other)) = cloud_and_other(a, b) {
         let (ball, radius) = other.ball();
@@ -31,7 +31,7 @@ pub fn distance(a: &Placed, b: &Placed) -> f64 {
     with_shape(a, |pa, sa| with_shape(b, |pb, sb| query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance)))
 }
 
-/// Whether two cores are within `reach` [m] of each other.
+/// Returns whether two cores are within `reach` [m] of each other.
 pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
     if let Some((cloud, other)) = cloud_and_other(a, b) {
         let (ball, radius) = other.ball();
@@ -43,14 +43,14 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
     with_shape(a, |pa, sa| {
         with_shape(b, |pb, sb| match (sa.as_support_map(), sb.as_support_map()) {
             (Some(ma), Some(mb)) => convex_within(&pa.inv_mul(pb), ma, mb, reach),
-            // What parry cannot tell counts as touching. Its closest points are not asked: for a box and a triangle
-            // they are not always the closest.
+            // A query that parry does not support counts as touching. Its closest points are not used: for a box and a
+            // triangle they are not always the closest.
             _ => query::distance(pa, sa, pb, sb).map_or(0.0, |d| d.distance) <= reach,
         })
     })
 }
 
-/// GJK ends as soon as it knows on which side of `reach` the distance lies.
+/// GJK ends as soon as the distance is known to be below or above `reach`.
 fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f64) -> bool {
     let direction = pose.translation.try_normalize().unwrap_or(DVec3::X);
     let mut simplex = VoronoiSimplex::new();
@@ -62,7 +62,7 @@ fn convex_within(pose: &DPose3, a: &dyn SupportMap, b: &dyn SupportMap, reach: f
     }
 }
 
-/// The closest points of two cores, or how deep they overlap.
+/// Returns the closest points of two cores, or their penetration depth.
 pub fn nearest(a: &Placed, b: &Placed) -> Nearest {
     if let Some((cloud, other)) = cloud_and_other(a, b) {
         let (ball, radius) = other.ball();
@@ -99,7 +99,7 @@ fn cloud_and_other<'a>(a: &'a Placed<'a>, b: &'a Placed<'a>) -> Option<(CloudRef
     }
 }
 
-/// Whether a closed mesh holds the middle of the other core: a surface alone would not touch what is inside it.
+/// Returns whether a closed mesh contains the centre of the other core, which its surface alone would not touch.
 fn holds(mesh: &Placed, other: &Placed) -> bool {
     let Placed::Mesh(frame, mesh) = mesh else { return false };
     mesh.is_closed() && mesh.holds(super::point::local(other.ball().0, frame))
@@ -115,7 +115,7 @@ fn with_shape<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R
         Placed::Segment(a, b) => f(&DPose3::IDENTITY, &Segment::new(*a, *b)),
         Placed::Box(frame, half) => f(&pose(frame), &Cuboid::new(*half)),
         Placed::Cylinder(frame, half, radius) => {
-            // parry's cylinders stand along y.
+            // parry's cylinders have the axis y.
             let mut upright = pose(frame);
             upright.rotation *= DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
             f(&upright, &Cylinder::new(*half, *radius))
@@ -126,7 +126,7 @@ fn with_shape<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R
     }
 }
 
-/// The same with boxes as hulls: parry's closest points of boxes are not always the closest.
+/// Calls `f` with boxes as convex hulls: parry's closest points of boxes are not always the closest.
 fn with_hull<R>(placed: &Placed, f: impl FnOnce(&DPose3, &dyn Shape) -> R) -> R {
     if let Placed::Box(frame, half) = placed {
         let corner = |i: u8| {

@@ -1,5 +1,5 @@
-//! Distances between two cores, one pair of kinds a file. Closed forms where there are any: the general way of
-//! `general.rs` costs ten times as much.
+//! Distances between two cores, one file per pair of kinds. Closed forms where they exist; the general method of
+//! `general.rs` is ten times slower.
 
 pub mod box_box;
 pub mod general;
@@ -11,7 +11,7 @@ use glamx::{DAffine3, DVec3};
 
 pub use super::shape::Placed;
 
-/// Distance of two cores [m], 0 where they overlap. Radii do not count.
+/// Returns the distance of two cores [m], 0 if they overlap. Radii are not included.
 pub fn distance(a: &Placed, b: &Placed) -> f64 {
     use Placed::{Box, Cylinder, Point, Segment};
     match (a, b) {
@@ -25,7 +25,7 @@ pub fn distance(a: &Placed, b: &Placed) -> f64 {
     }
 }
 
-/// Whether two cores are within `reach` [m] of each other.
+/// Returns whether two cores are within `reach` [m] of each other.
 pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
     use Placed::{Box, Point, Segment};
     match (a, b) {
@@ -35,12 +35,12 @@ pub fn within(a: &Placed, b: &Placed, reach: f64) -> bool {
         }
         (Point(_) | Segment(..) | Box(..), Point(_) | Segment(..) | Box(..)) => distance(a, b) <= reach,
         (Point(_), Placed::Cylinder(..)) | (Placed::Cylinder(..), Point(_)) => distance(a, b) <= reach,
-        // A box around each says "far apart" in most cases, at a tenth of the price.
+        // Bounding boxes exclude most pairs at a tenth of the cost.
         _ => gap(a, b) <= reach && general::within(a, b, reach),
     }
 }
 
-/// A lower bound of the distance of two cores [m], from the boxes around them: cheap.
+/// Returns a lower bound of the distance of two cores [m], from their bounding boxes: fast.
 pub fn gap(a: &Placed, b: &Placed) -> f64 {
     match (a.guard(), b.guard()) {
         (Some((f, h)), Some((g, k))) => box_box::gap(&f, h, &g, k),

@@ -1,11 +1,11 @@
 //! A segment and a box. Along the segment the squared distance from the box is convex and piecewise quadratic, with
-//! breaks where the segment crosses the planes of the box's faces: its least value is found exactly, piece by piece.
+//! breaks where the segment crosses the planes of the box's faces: its minimum is computed exactly, piece by piece.
 
 use glamx::{DAffine3, DVec3};
 
 use super::point::local;
 
-/// Distance of segment `a`–`b` from a box with half extents `half` [m]; 0 where they overlap.
+/// Returns the distance of segment `a`–`b` from a box with half extents `half` [m]; 0 if they overlap.
 pub fn distance(a: DVec3, b: DVec3, frame: &DAffine3, half: DVec3) -> f64 {
     let (a, b) = (local(a, frame), local(b, frame));
     let d = b - a;
@@ -22,8 +22,7 @@ pub fn distance(a: DVec3, b: DVec3, frame: &DAffine3, half: DVec3) -> f64 {
     if slope(1.0) <= 0.0 {
         return at(1.0).length();
     }
-    // Between two breaks the slope is a straight line: its root is found by the last break below zero and the first
-    // above.
+    // Between two breaks the slope is linear: its root follows from the last break below zero and the first above.
     let (mut low, mut high) = (0.0, 1.0);
     let (mut slope_low, mut slope_high) = (slope(0.0), slope(1.0));
     for (p, v, h) in [(a.x, d.x, half.x), (a.y, d.y, half.y), (a.z, d.z, half.z)] {

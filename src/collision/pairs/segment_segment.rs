@@ -3,7 +3,7 @@
 
 use glamx::DVec3;
 
-/// Distance of segment `a`–`b` from segment `c`–`d` [m].
+/// Returns the distance of segment `a`–`b` from segment `c`–`d` [m].
 pub fn distance(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> f64 {
     let (u, v, w) = (b - a, d - c, a - c);
     let (uu, uv, vv) = (u.length_squared(), u.dot(v), v.length_squared());
@@ -19,7 +19,7 @@ pub fn distance(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> f64 {
         (s, t) = (unit(-uw / uu), 0.0);
     } else {
         let det = uu * vv - uv * uv;
-        // Parallel segments: any point will do, the clamping below finds the right partner.
+        // Parallel segments: start from any point, the clamping below finds its partner.
         let first = if det > 1e-14 * uu * vv { unit((uv * vw - uw * vv) / det) } else { 0.0 };
         let other = (uv * first + vw) / vv;
         t = unit(other);

@@ -6,7 +6,7 @@ use glamx::{DAffine3, DVec3};
 use crate::control::config::CartesianParams;
 use crate::control::task::{Claim, Context};
 use crate::joint::MAX_DOF;
-use crate::robot::kinematics::step::{Bound as Bounded, JointBounds, JointMotion, StepSettings, Stepper, Wish};
+use crate::robot::kinematics::step::{Bound as Bounded, JointBounds, JointMotion, StepSettings, Stepper, TargetTwist};
 use crate::telemetry::Bound;
 
 /// A velocity of the end effector, in the frame of the model's root.
@@ -116,7 +116,7 @@ impl EndEffector {
                 acceleration: own.acceleration.unwrap_or(f64::INFINITY).min(view.acceleration),
             };
         }
-        let step = self.stepper.step(&mut self.joints, &Wish { linear, angular, horizon }, &self.bounds, cx.dt);
+        let step = self.stepper.step(&mut self.joints, &TargetTwist { linear, angular, horizon }, &self.bounds, cx.dt);
         // It changes its velocity no faster than the joints can follow, so that it keeps its direction.
         if step.share < 1.0 {
             self.velocity.linear = before.linear + (linear - before.linear) * step.share;

@@ -23,8 +23,8 @@ use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Clock;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::JointLimits;
-use crate::rt::beat::Beat;
 use crate::rt::due::Due;
+use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
 
@@ -46,7 +46,7 @@ pub struct DeviceConfig {
     /// Figures with which the arm's measurements and its motion are checked.
     pub supervision: Supervision,
     /// The tick's heartbeat.
-    pub beat: Arc<Beat>,
+    pub beat: Arc<Heartbeat>,
     /// Time.
     pub clock: Arc<dyn Clock>,
     /// Hears of episodes, one note at their beginning and one at their end.

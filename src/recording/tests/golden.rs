@@ -1,4 +1,4 @@
-//! Bytes and schemas as others make them, and what a log says about itself.
+//! Bytes and schemas as other tools write them, and a log's metadata.
 //!
 //! The bytes were made with PyPI mcap-ros2-support 0.6.0: `serialize_dynamic(name, definition)[name](message).hex()`,
 //! with ROS 2's own definitions of the first three types.
@@ -71,7 +71,7 @@ fn event() {
         (0..golden.len()).step_by(2).map(|i| u8::from_str_radix(&golden[i..i + 2], 16).unwrap()).collect();
     assert_eq!(EventMessage::decode(&bytes).unwrap(), message);
     for length in 0..bytes.len() {
-        assert!(EventMessage::decode(&bytes[..length]).is_err(), "{length} bytes are no message");
+        assert!(EventMessage::decode(&bytes[..length]).is_err(), "{length} bytes decode to a message");
     }
 }
 
@@ -102,7 +102,7 @@ fn a_schema_is_its_fields_and_then_what_they_need() {
         "float64 z",
     ];
     assert_eq!(without_comments, expected);
-    assert!(schema.contains("# [Nm].\ngeometry_msgs/Vector3 torque\n"), "units are told");
+    assert!(schema.contains("# [Nm].\ngeometry_msgs/Vector3 torque\n"), "units are missing");
 }
 
 #[test]

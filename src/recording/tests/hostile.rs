@@ -1,15 +1,15 @@
-//! Files that were cut or damaged, or that somebody made to do harm.
+//! Truncated, damaged and malicious files.
 
 use super::*;
 
 #[test]
 fn every_prefix_of_a_log_is_read_up_to_the_cut() {
     let (folder, path) = folder();
-    let told = Told::default();
-    let (recorder, mut ring, _notes) = start(&path, &told);
+    let notices = Notices::default();
+    let (recorder, mut ring, _notes) = start(&path, &notices);
     for n in 0..60 {
         tick(n).into_iter().for_each(|s| ring.push(s).unwrap());
-        // Several flushes, so that there are several chunks to cut.
+        // Several flushes, for several chunks to cut.
         std::thread::sleep(std::time::Duration::from_millis(8));
     }
     recorder.finish().unwrap();
@@ -25,7 +25,7 @@ fn every_prefix_of_a_log_is_read_up_to_the_cut() {
                 assert!(at <= length as u64);
                 let of = |entries: &[Entry]| entries.iter().map(|e| (e.topic.clone(), e.log_time)).collect::<Vec<_>>();
                 assert_eq!(of(&entries), of(&whole[..entries.len()]), "cut at {length}");
-                assert!(entries.len() >= longest, "a longer prefix has no fewer messages");
+                assert!(entries.len() >= longest, "a longer prefix has fewer messages");
                 longest = entries.len();
             }
             Err(ReplayError::NotMcap { .. }) => assert!(length < 8),
@@ -41,7 +41,7 @@ fn hostile_bytes_are_an_error_and_no_panic() {
     record(&path, (0..20).flat_map(tick));
     let good = std::fs::read(&path).unwrap();
     let bad = folder.path().join("bad.mcap");
-    // A small generator of its own: the same bytes on every machine.
+    // A small own generator: the same bytes on every machine.
     let mut seed = 0x2545_f491_4f6c_dd1d_u64;
     let mut random = move || {
         seed ^= seed << 13;
@@ -63,7 +63,7 @@ fn hostile_bytes_are_an_error_and_no_panic() {
 }
 
 #[test]
-fn lengths_beyond_the_bounds_are_refused_unread() {
+fn lengths_beyond_the_bounds_are_rejected_unread() {
     use mcap::records::op;
     let (folder, _) = folder();
     let path = folder.path().join("huge.mcap");

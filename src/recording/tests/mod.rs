@@ -48,11 +48,11 @@ fn deadline(tick: u64) -> Mono {
     Mono(1_000_000_000 + tick * PERIOD)
 }
 
-/// What an arm might say, with everything that is optional coming and going.
+/// A state of an arm in which all optional values appear and disappear.
 fn state(arm: u16, tick: u64) -> ArmState {
     let x = tick as f64 * 0.1 + f64::from(arm);
     ArmState {
-        // The right arm says something new on every second tick only, and nothing at first.
+        // The right arm has a new state on every second tick only, and none at first.
         seq: if arm == 0 { tick + 1 } else { tick / 2 },
         stamp: Mono(deadline(tick).0 - 1_234_567),
         dof: if arm == 0 { 3 } else { 2 },
@@ -94,34 +94,34 @@ fn tick(tick: u64) -> [Sample; 3] {
     [arm_sample(0, tick), arm_sample(1, tick), close(tick)]
 }
 
-/// What the recorder told, as text.
-type Told = Arc<Mutex<Vec<String>>>;
+/// Notices of the recorder, as text.
+type Notices = Arc<Mutex<Vec<String>>>;
 
-fn start(path: &Path, told: &Told) -> (Recorder, rtrb::Producer<Sample>, Notes) {
+fn start(path: &Path, notices: &Notices) -> (Recorder, rtrb::Producer<Sample>, Notes) {
     let (producer, consumer) = rtrb::RingBuffer::new(4096);
     let (notes, receiver) = channel();
-    let told = told.clone();
+    let notices = notices.clone();
     let on_notice = move |notice: Notice<'_>| {
         let text = match notice {
             Notice::Event { tick, described, .. } => format!("{tick}: {}", described.text),
             Notice::Lost(samples) => format!("lost {samples}"),
             Notice::Stopped(e) => e.to_string(),
         };
-        told.lock().unwrap().push(text);
+        notices.lock().unwrap().push(text);
     };
     let recorder = Recorder::start(config(path.to_owned()), consumer, receiver, on_notice).unwrap();
     (recorder, producer, notes)
 }
 
 fn record(path: &Path, samples: impl IntoIterator<Item = Sample>) -> Vec<String> {
-    let told = Told::default();
-    let (recorder, mut ring, _notes) = start(path, &told);
+    let notices = Notices::default();
+    let (recorder, mut ring, _notes) = start(path, &notices);
     samples.into_iter().for_each(|s| ring.push(s).unwrap());
     recorder.finish().unwrap();
-    std::mem::take(&mut told.lock().unwrap())
+    std::mem::take(&mut notices.lock().unwrap())
 }
 
-/// All messages up to the end or the cut, and which of the two it was.
+/// Reads all messages up to the end or the cut, and returns which of the two it was.
 fn read(path: &Path) -> Result<(Vec<Entry>, Option<ReplayError>), ReplayError> {
     let mut log = LogReader::open(path)?;
     let mut entries = Vec::new();
@@ -140,7 +140,7 @@ fn folder() -> (tempfile::TempDir, PathBuf) {
     (folder, path)
 }
 
-/// Fills in what `/joint_states` holds of an arm. `skip` joints of other arms stand before its own.
+/// Fills in an arm's values from `/joint_states`, after `skip` joints of other arms.
 fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: usize) -> ArmState {
     let pick = |values: &[f64]| {
         let mut all = [0.0; MAX_DOF];
@@ -180,7 +180,7 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
 }
 
 #[test]
-fn all_that_a_tick_read_can_be_had_back_bit_by_bit() {
+fn all_inputs_of_a_tick_are_restored_bit_by_bit() {
     let (_folder, path) = folder();
     record(&path, (0..40).flat_map(tick));
     let (entries, end) = read(&path).unwrap();
@@ -192,23 +192,23 @@ fn all_that_a_tick_read_can_be_had_back_bit_by_bit() {
         match entry.data {
             Payload::JointState(message) if entry.topic == "/joint_states" => states = Some(message),
             Payload::ArmInput(input) => drop(inputs.insert(entry.topic, input)),
-            // The tick's message is the last of what it read.
+            // The tick's message is the last of its inputs.
             Payload::Tick(t) => {
                 assert_eq!(t.deadline_ns, deadline(t.tick).0);
                 assert_eq!(entry.log_time, WALL + t.tick * PERIOD);
                 let left = with_values(&inputs["/dimos/inputs/left"], states.as_ref(), 0, 3);
                 let right = with_values(&inputs["/dimos/inputs/right"], states.as_ref(), 3, 2);
                 for (arm, found) in [(0, left), (1, right)] {
-                    let mut told = state(arm, t.tick);
-                    if told.velocity_source == VelocitySource::Absent || told.seq == 0 {
-                        told.velocity = [0.0; MAX_DOF];
+                    let mut expected = state(arm, t.tick);
+                    if expected.velocity_source == VelocitySource::Absent || expected.seq == 0 {
+                        expected.velocity = [0.0; MAX_DOF];
                     }
-                    if told.seq == 0 {
-                        told.position = [0.0; MAX_DOF];
+                    if expected.seq == 0 {
+                        expected.position = [0.0; MAX_DOF];
                     }
-                    assert_eq!(found, told, "arm {arm}, tick {}", t.tick);
+                    assert_eq!(found, expected, "arm {arm}, tick {}", t.tick);
                     let bits = |s: &ArmState| s.position.map(f64::to_bits);
-                    assert_eq!(bits(&found), bits(&told), "arm {arm}, tick {}", t.tick);
+                    assert_eq!(bits(&found), bits(&expected), "arm {arm}, tick {}", t.tick);
                 }
                 ticks += 1;
             }
@@ -219,7 +219,7 @@ fn all_that_a_tick_read_can_be_had_back_bit_by_bit() {
 }
 
 #[test]
-fn what_is_not_known_is_absent_or_nan_but_never_zero() {
+fn unknown_values_are_absent_or_nan_but_never_zero() {
     let (_folder, path) = folder();
     record(&path, (0..3).flat_map(tick));
     let (entries, _) = read(&path).unwrap();
@@ -231,7 +231,7 @@ fn what_is_not_known_is_absent_or_nan_but_never_zero() {
         })
         .collect();
     assert_eq!(states[0].name, ["left_joint1", "left_joint2", "left_joint3", "right_joint1", "right_joint2"]);
-    assert!(states[0].position[3..].iter().all(|p| p.is_nan()), "the right arm has said nothing yet");
+    assert!(states[0].position[3..].iter().all(|p| p.is_nan()), "the right arm has no state yet");
     assert!(states[0].effort.is_empty(), "no arm reports efforts on tick 0");
     assert_eq!(states[2].effort[..3], [1.5, 2.5, 0.2]);
     assert!(states[2].effort[3..].iter().all(|e| e.is_nan()), "the right arm never reports efforts");
@@ -246,8 +246,8 @@ fn what_is_not_known_is_absent_or_nan_but_never_zero() {
 #[test]
 fn a_request_stands_before_its_answer_and_events_are_told_in_words() {
     let (_folder, path) = folder();
-    let told = Told::default();
-    let (recorder, mut ring, notes) = start(&path, &told);
+    let notices = Notices::default();
+    let (recorder, mut ring, notes) = start(&path, &notices);
     notes.send(Note::ArmText { arm: 0, text: "joint 2 is too hot".into() }).unwrap();
     notes.send(Note::Request { id: 7, stamp: deadline(7), json: r#"{"method":"stop"}"#.into() }).unwrap();
     notes.send(Note::Log { severity: Severity::Info, stamp: deadline(7), text: "hello".into() }).unwrap();
@@ -259,8 +259,8 @@ fn a_request_stands_before_its_answer_and_events_are_told_in_words() {
     tick(8).into_iter().for_each(|s| ring.push(s).unwrap());
     let stats = recorder.stats();
     recorder.finish().unwrap();
-    let degraded = "ten ticks in a row were late by a period or more";
-    assert_eq!(*told.lock().unwrap(), ["7: request 7: accepted".to_owned(), format!("8: {degraded}")]);
+    let degraded = "ten consecutive ticks were late by a period or more";
+    assert_eq!(*notices.lock().unwrap(), ["7: request 7: accepted".to_owned(), format!("8: {degraded}")]);
     let (entries, _) = read(&path).unwrap();
     assert_eq!(stats.messages.load(Ordering::Relaxed), entries.len() as u64);
     assert_eq!(stats.bytes.load(Ordering::Relaxed), std::fs::metadata(&path).unwrap().len());
@@ -284,7 +284,7 @@ fn a_request_stands_before_its_answer_and_events_are_told_in_words() {
 #[test]
 fn lost_samples_are_counted_and_never_mixed_into_another_tick() {
     let (_folder, path) = folder();
-    // Of tick 1 only the left arm came through, of tick 2 only the right one and the end.
+    // Of tick 1 only the left arm arrives, of tick 2 only the right one and the end.
     let lossy = TickSample { tick: 2, deadline: deadline(2), dropped: 3, ..TickSample::default() };
     let mut samples = Vec::from(tick(0));
     samples.extend([arm_sample(0, 1), arm_sample(1, 2), Sample::Tick(lossy)]);
@@ -317,10 +317,10 @@ fn a_log_is_never_overwritten() {
 }
 
 #[test]
-fn without_a_log_events_are_told_all_the_same() {
+fn without_a_log_events_are_still_reported() {
     let (mut producer, consumer) = rtrb::RingBuffer::new(64);
-    let told = Told::default();
-    let sink = told.clone();
+    let notices = Notices::default();
+    let sink = notices.clone();
     let on_notice = move |n: Notice<'_>| {
         if let Notice::Event { described, .. } = n {
             sink.lock().unwrap().push(described.kind.to_owned());
@@ -332,5 +332,5 @@ fn without_a_log_events_are_told_all_the_same() {
     tick(0).into_iter().for_each(|s| producer.push(s).unwrap());
     recorder.finish().unwrap();
     assert_eq!(producer.slots(), 64, "the ring is empty");
-    assert_eq!(*told.lock().unwrap(), ["degraded"]);
+    assert_eq!(*notices.lock().unwrap(), ["degraded"]);
 }

@@ -1,22 +1,22 @@
-//! The geometric Jacobian, and what it says about singularities.
+//! Geometric Jacobian, and measures of singularity.
 
 use glamx::{DAffine3, DVec3};
 
 use super::{Kinematics, Motion};
 
-/// What one joint's unit speed does to a link: linear velocity of its origin, then angular velocity, both in the
+/// Velocity of a link at unit speed of one joint: linear velocity of its origin, then angular velocity, both in the
 /// root's frame.
 pub type Column = [f64; 6];
 
 impl Kinematics {
-    /// Fills in one column per joint: the velocity of `link`'s origin and the link's angular velocity at unit speed
-    /// of that joint, in the root's frame. `frames` come from [`Kinematics::forward`].
+    /// Computes one column per joint: the velocity of `link`'s origin and the link's angular velocity at unit speed of
+    /// that joint, in the root's frame. `frames` come from [`Kinematics::forward`].
     pub fn jacobian(&self, link: usize, frames: &[DAffine3], columns: &mut [Column]) {
         let origin = self.link_frame(link, frames).translation;
         self.jacobian_at(self.body_of(link), origin, frames, columns);
     }
 
-    /// The same for any point fixed to a body, given in the root's frame [m].
+    /// Same for any point fixed to a body, given in the root's frame [m].
     pub fn jacobian_at(&self, body: usize, point: DVec3, frames: &[DAffine3], columns: &mut [Column]) {
         columns.fill([0.0; 6]);
         for b in self.ancestors(body) {
@@ -27,7 +27,7 @@ impl Kinematics {
                 Motion::Turn => (axis.cross(point - frame.translation), axis),
                 Motion::Slide => (axis, DVec3::ZERO),
             };
-            // Followers of the same joint add up.
+            // Contributions of mimic joints of the same joint add up.
             for (sum, part) in column.iter_mut().zip(linear.to_array().into_iter().chain(angular.to_array())) {
                 *sum += part;
             }
@@ -35,10 +35,10 @@ impl Kinematics {
     }
 }
 
-/// A symmetric 6 × 6 matrix, of which only the lower half is used.
+/// A symmetric 6 × 6 matrix; only the lower triangle is used.
 pub type Gram = [[f64; 6]; 6];
 
-/// `J·Jᵀ` of a Jacobian given by columns, plus `damping` on the diagonal.
+/// Returns `J·Jᵀ` of a Jacobian given by columns, plus `damping` on the diagonal.
 pub fn gram(columns: &[Column], damping: f64) -> Gram {
     let mut gram = [[0.0; 6]; 6];
     for column in columns {
@@ -54,7 +54,7 @@ pub fn gram(columns: &[Column], damping: f64) -> Gram {
     gram
 }
 
-/// The lower triangle `L` of `L·Lᵀ = gram`; `None` when the matrix is not positive definite.
+/// Returns the lower triangle `L` of `L·Lᵀ = gram`; `None` if the matrix is not positive definite.
 pub fn cholesky(gram: &Gram) -> Option<Gram> {
     let mut l = [[0.0; 6]; 6];
     for i in 0..6 {
@@ -74,7 +74,7 @@ pub fn cholesky(gram: &Gram) -> Option<Gram> {
     Some(l)
 }
 
-/// The `x` of `L·Lᵀ·x = b`.
+/// Returns the `x` of `L·Lᵀ·x = b`.
 pub fn solve(l: &Gram, b: &Column) -> Column {
     let mut x = *b;
     for i in 0..6 {
@@ -92,13 +92,13 @@ pub fn solve(l: &Gram, b: &Column) -> Column {
     x
 }
 
-/// Yoshikawa's measure of how far a configuration is from singular: `sqrt(det(J·Jᵀ))`; 0 for fewer than six joints.
+/// Returns Yoshikawa's manipulability `sqrt(det(J·Jᵀ))`; 0 for fewer than six joints.
 pub fn manipulability(columns: &[Column]) -> f64 {
     cholesky(&gram(columns, 0.0)).map_or(0.0, |l| (0..6).map(|i| l[i][i]).product())
 }
 
-/// The smallest singular value of a Jacobian given by columns, with angular rows weighted by `length` [m] so that
-/// metres and radians can be compared; of the smaller side, so that five joints are not always singular.
+/// Returns the smallest singular value of a Jacobian given by columns, with angular rows weighted by `length` [m] so
+/// that metres and radians are comparable. Uses the smaller side, so that five joints are not always singular.
 pub fn smallest_singular_value(columns: &[Column], length: f64) -> f64 {
     let mut weighted = nalgebra::SMatrix::<f64, 6, 6>::zeros();
     for column in columns {

@@ -1,8 +1,8 @@
-//! Forward kinematics, Jacobians and one damped step, for a choice of joints, without allocation.
+//! Forward kinematics, Jacobians and one damped step, for a selection of joints, without allocation.
 //!
-//! A model is compiled once: everything that fixed joints weld together becomes one *body*, joints outside the choice
-//! stand still at a given position, followers follow, and each body's frame is turned so that its joint moves about
-//! or along z. A query then is one frame per moving joint; links are constant offsets from bodies.
+//! A model is compiled once: links welded by fixed joints become one *body*, joints outside the selection are fixed at
+//! a given position, mimic joints follow, and each body's frame is oriented so that its joint moves about or along z. A
+//! query then computes one frame per moving joint; links are constant offsets from bodies.
 //!
 //! All frames are in the frame of the model's root link.
 
@@ -18,20 +18,20 @@ use serde::{Deserialize, Serialize};
 
 use crate::robot::model::{Joint, JointKind, Limits, RobotModel};
 
-/// What moves a body relative to its parent.
+/// Motion of a body relative to its parent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Motion {
-    /// Turns about z.
+    /// Rotation about z.
     Turn,
-    /// Slides along z.
+    /// Translation along z.
     Slide,
 }
 
-/// Several links that move as one.
+/// Links that move as one.
 #[derive(Debug, Clone, PartialEq)]
 struct Body {
     parent: usize,
-    /// Frame at joint position zero, in the parent body's frame; z is the joint's axis.
+    /// Frame at joint position zero, in the parent body's frame; its z is the joint's axis.
     origin: DAffine3,
     motion: Motion,
     /// `position = multiplier · q[variable] + offset`.
@@ -40,41 +40,41 @@ struct Body {
     offset: f64,
 }
 
-/// Why kinematics cannot be made of a model.
+/// Why kinematics cannot be built from a model.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum KinematicsError {
-    /// A joint has no position of its own.
-    #[error("joint {0:?} does not move on its own: it is {1}")]
+    /// The joint has no position of its own.
+    #[error("joint {0:?} cannot be selected: it is {1}")]
     NotIndependent(String, &'static str),
-    /// A joint is chosen twice.
-    #[error("joint {0:?} is chosen twice")]
+    /// The joint is selected twice.
+    #[error("joint {0:?} is selected twice")]
     Twice(String),
-    /// There is no such joint.
-    #[error("the robot has no joint number {0}")]
+    /// The joint does not exist.
+    #[error("the robot has no joint with index {0}")]
     NoJoint(usize),
 }
 
-/// The kinematics of some joints of a robot; the others stand still.
+/// Kinematics of selected joints of a robot; all others are fixed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "stored::Stored", into = "stored::Stored")]
 pub struct Kinematics {
     names: Vec<String>,
     limits: Vec<Limits>,
     kinds: Vec<JointKind>,
-    /// `bodies[0]` is the root and has no joint: only its place counts.
+    /// `bodies[0]` is the root and has no joint; only its frame is used.
     bodies: Vec<Body>,
     /// For every link of the model: its body, and its frame in the body's frame.
     links: Vec<(usize, DAffine3)>,
 }
 
 impl Kinematics {
-    /// Compiles a model for the independent joints `joints` (indices in the model, in the order of the
-    /// configuration `q`); all others stand at `rest` (positions of all joints, see [`RobotModel::positions`]).
+    /// Compiles a model for the independent joints `joints` (indices in the model, in the order of the configuration
+    /// `q`); all others are fixed at `rest` (positions of all joints, see [`RobotModel::positions`]).
     pub fn new(model: &RobotModel, joints: &[usize], rest: &[f64]) -> Result<Self, KinematicsError> {
         for (i, &j) in joints.iter().enumerate() {
             let joint = model.joints.get(j).ok_or(KinematicsError::NoJoint(j))?;
             if !joint.is_independent() {
-                let why = if joint.is_movable() { "a follower" } else { "fixed" };
+                let why = if joint.is_movable() { "a mimic joint" } else { "fixed" };
                 return Err(KinematicsError::NotIndependent(joint.name.clone(), why));
             }
             if joints[..i].contains(&j) {
@@ -101,7 +101,7 @@ impl Kinematics {
         Ok(made)
     }
 
-    /// The kinematics of all independent joints.
+    /// Compiles a model for all its independent joints.
     pub fn whole(model: &RobotModel) -> Result<Self, KinematicsError> {
         Self::new(model, &model.independent_joints(), &[])
     }
@@ -122,46 +122,46 @@ impl Kinematics {
         self.links.push((self.bodies.len() - 1, DAffine3::from_mat3(turned.matrix3.transpose())));
     }
 
-    /// Number of joints in a configuration.
+    /// Returns the number of joints in a configuration.
     pub fn dof(&self) -> usize {
         self.names.len()
     }
 
-    /// Names of the joints, in the order of a configuration.
+    /// Returns the names of the joints, in the order of a configuration.
     pub fn names(&self) -> &[String] {
         &self.names
     }
 
-    /// Limits of the joints.
+    /// Returns the limits of the joints.
     pub fn limits(&self) -> &[Limits] {
         &self.limits
     }
 
-    /// What each joint lets its child do.
+    /// Returns the kinds of the joints.
     pub fn kinds(&self) -> &[JointKind] {
         &self.kinds
     }
 
-    /// Whether a joint, and all that follows it, comes to the same after a whole turn.
-    fn comes_round(&self, variable: usize) -> bool {
+    /// Returns whether a whole turn of a joint changes no link's pose, mimic joints included.
+    fn is_periodic(&self, variable: usize) -> bool {
         let round = |b: &Body| b.motion == Motion::Turn && b.multiplier.fract() == 0.0;
         self.bodies.iter().skip(1).filter(|b| b.variable == variable).all(round)
     }
 
-    /// Which joints turn without end: they come to the same after a whole turn, and have no limits.
+    /// Returns which joints are continuous: periodic and without limits.
     pub fn turns(&self) -> Vec<bool> {
         let endless = |l: &Limits| l.lower == f64::NEG_INFINITY && l.upper == f64::INFINITY;
-        self.limits.iter().enumerate().map(|(v, l)| endless(l) && self.comes_round(v)).collect()
+        self.limits.iter().enumerate().map(|(v, l)| endless(l) && self.is_periodic(v)).collect()
     }
 
-    /// Turns joints of some kinds by whole turns, as far as their limits let them, to be near: the same pose of every
-    /// link. A joint that is nearest already is left as it is to the last bit.
+    /// Shifts joints of some kinds by whole turns towards `near`, as far as their limits allow: every link keeps its
+    /// pose. A joint that is already nearest keeps its exact value.
     pub fn unwind(&self, q: &mut [f64], near: &[f64], of: impl Fn(JointKind) -> bool) {
         let joints =
-            self.kinds.iter().zip(&self.limits).enumerate().filter(|(v, (k, _))| of(**k) && self.comes_round(*v));
+            self.kinds.iter().zip(&self.limits).enumerate().filter(|(v, (k, _))| of(**k) && self.is_periodic(*v));
         for (v, (_, limits)) in joints {
             let (Some(q), Some(near)) = (q.get_mut(v), near.get(v)) else { continue };
-            // Where the limits end, the last turn that is within them is the nearest.
+            // Where limits interfere, the last whole turn within them is nearest.
             let (most, least) = (((limits.upper - *q) / TAU).floor(), ((limits.lower - *q) / TAU).ceil());
             let whole = ((near - *q) / TAU).round().min(most).max(least);
             if whole != 0.0 && (limits.lower..=limits.upper).contains(&(*q + whole * TAU)) {
@@ -170,22 +170,22 @@ impl Kinematics {
         }
     }
 
-    /// Number of bodies, the root included: the length of a buffer of frames.
+    /// Returns the number of bodies including the root: the length of a buffer of frames.
     pub fn bodies(&self) -> usize {
         self.bodies.len()
     }
 
-    /// Number of links of the model.
+    /// Returns the number of links of the model.
     pub fn links(&self) -> usize {
         self.links.len()
     }
 
-    /// A buffer for [`Kinematics::forward`].
+    /// Returns a buffer for [`Kinematics::forward`].
     pub fn frames(&self) -> Vec<DAffine3> {
         vec![DAffine3::IDENTITY; self.bodies.len()]
     }
 
-    /// Fills in the frame of every body at configuration `q` [rad or m], with the root at `base`.
+    /// Computes the frame of every body at configuration `q` [rad or m], with the root at `base`.
     pub fn forward_from(&self, base: &DAffine3, q: &[f64], frames: &mut [DAffine3]) {
         if let Some(root) = frames.first_mut() {
             *root = *base;
@@ -208,41 +208,41 @@ impl Kinematics {
         }
     }
 
-    /// Fills in the frame of every body at configuration `q` [rad or m].
+    /// Computes the frame of every body at configuration `q` [rad or m].
     pub fn forward(&self, q: &[f64], frames: &mut [DAffine3]) {
         self.forward_from(&DAffine3::IDENTITY, q, frames);
     }
 
-    /// The frame of a link, from frames of bodies.
+    /// Returns the frame of a link, from frames of bodies.
     pub fn link_frame(&self, link: usize, frames: &[DAffine3]) -> DAffine3 {
         let (body, offset) = self.links.get(link).copied().unwrap_or((0, DAffine3::IDENTITY));
         frames.get(body).copied().unwrap_or(DAffine3::IDENTITY) * offset
     }
 
-    /// The body that a link belongs to.
+    /// Returns the body of a link.
     pub fn body_of(&self, link: usize) -> usize {
         self.links.get(link).map_or(0, |l| l.0)
     }
 
-    /// A link's frame in the frame of its body.
-    pub fn place_of(&self, link: usize) -> DAffine3 {
+    /// Returns a link's frame in the frame of its body.
+    pub fn offset_of(&self, link: usize) -> DAffine3 {
         self.links.get(link).map_or(DAffine3::IDENTITY, |l| l.1)
     }
 
-    /// The bodies on the way from a body up to the root, the root itself left out.
+    /// Returns the bodies from a body up to the root, without the root.
     pub fn ancestors(&self, body: usize) -> impl Iterator<Item = usize> + '_ {
         let up = |b: &usize| self.bodies.get(*b).map(|body| body.parent).filter(|p| *p != 0);
         std::iter::successors(Some(body).filter(|b| *b != 0), up)
     }
 
-    /// How a body depends on the configuration: the joint's index in `q` and the factor it is followed with.
+    /// Returns how a body depends on the configuration: the joint's index in `q` and the mimic factor.
     pub fn drive(&self, body: usize) -> Option<(usize, f64)> {
         self.bodies.get(body).filter(|_| body != 0).map(|b| (b.variable, b.multiplier))
     }
 
-    /// For one joint's unit of motion, an upper bound of how far a point of a body can move: `reach` is the distance
-    /// of the point from the body's origin [m]. Holds at every configuration within the limits; one entry per body on
-    /// the way up, as (body, factor), the factor in metres per radian or metres per metre.
+    /// Returns upper bounds of a point's motion per unit of joint motion; `reach` is the distance of the point from the
+    /// body's origin [m]. They hold at every configuration within the limits. One entry per body towards the root:
+    /// (body, factor), in metres per radian or metres per metre.
     pub fn levers(&self, body: usize, reach: f64) -> Vec<(usize, f64)> {
         let mut levers = Vec::new();
         let mut radius = reach;
@@ -260,7 +260,7 @@ impl Kinematics {
         levers
     }
 
-    /// The farthest that a sliding body stands from its origin, within its limits.
+    /// Returns the maximum distance of a sliding body from its origin, within its limits.
     fn travel(&self, body: &Body) -> f64 {
         let limits = &self.limits[body.variable];
         let at = |q: f64| (body.multiplier * q + body.offset).abs();
@@ -268,14 +268,14 @@ impl Kinematics {
     }
 }
 
-/// A pose as rotation matrix and translation.
+/// Converts a pose to a rotation matrix and translation.
 pub fn frame(pose: &Isometry3<f64>) -> DAffine3 {
     let (t, r) = (pose.translation.vector, pose.rotation.to_rotation_matrix());
     let column = |c: usize| DVec3::new(r[(0, c)], r[(1, c)], r[(2, c)]);
     DAffine3 { matrix3: DMat3::from_cols(column(0), column(1), column(2)), translation: DVec3::new(t.x, t.y, t.z) }
 }
 
-/// A rotation matrix and translation as a pose.
+/// Converts a rotation matrix and translation to a pose.
 pub fn pose(frame: &DAffine3) -> Isometry3<f64> {
     let (m, t) = (&frame.matrix3, frame.translation);
     let column = |v: DVec3| nalgebra::Vector3::new(v.x, v.y, v.z);

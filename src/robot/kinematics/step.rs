@@ -1,8 +1,8 @@
-//! One step of a link's motion: the joints' motion for a velocity of the link, within everything that bounds it.
-//! Bounded in time, allocates nothing: made for a control loop.
+//! Differential kinematics for a control loop: the joint motion of one tick for a desired link velocity, within all
+//! limits. Bounded in time, does not allocate.
 //!
-//! Speeds of joints come from damped least squares. What is too fast for a joint, or goes on past the end of its range,
-//! slows down *all* joints by the same factor, early enough to brake, so that the link keeps its direction.
+//! Joint speeds come from damped least squares. If a joint would exceed its speed or its range, *all* joints are slowed
+//! by the same factor, early enough to decelerate, so that the link keeps its direction.
 
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 
@@ -10,19 +10,20 @@ use super::Kinematics;
 use super::jacobian::{Column, cholesky, gram, smallest_singular_value, solve};
 use crate::joint::{Joints, MAX_DOF, braking_speed};
 
-/// A joint this near to the end of its range stands there [rad or m].
-const AT_THE_END: f64 = 1e-5;
-/// Part of the joints' acceleration that braking is planned with: the way to a stop is curved, which needs some, too.
-const BRAKING: f64 = 0.8;
-/// With joints at the end of their ranges, motion may go so far off its direction, as a part of itself.
-const ASTRAY: f64 = 0.1;
+/// Distance from a limit at which a joint counts as being at it [rad or m].
+const LIMIT_TOLERANCE: f64 = 1e-5;
+/// Part of the acceleration limit used to plan the deceleration: the path to the stop is curved, which needs some as
+/// well.
+const DECELERATION_RATIO: f64 = 0.8;
+/// Maximum deviation from the desired direction while joints are at their limits, relative to the motion.
+const MAX_DEVIATION: f64 = 0.1;
 
-/// How a step treats singular configurations.
+/// Settings for singular configurations.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepSettings {
-    /// One radian counts as this many metres [m].
+    /// Length that one radian is weighted with [m].
     pub length: f64,
-    /// Smallest singular value below which motion is damped and slowed down [m/rad].
+    /// Smallest singular value below which motion is damped and slowed [m/rad].
     pub threshold: f64,
     /// Damping at a singularity [m/rad].
     pub damping: f64,
@@ -34,20 +35,20 @@ impl Default for StepSettings {
     }
 }
 
-/// What one joint may do.
+/// Limits of one joint.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct JointBounds {
     /// Lowest position [rad or m].
     pub lower: f64,
     /// Highest position [rad or m].
     pub upper: f64,
-    /// Highest speed [rad/s or m/s].
+    /// Maximum speed [rad/s or m/s].
     pub velocity: f64,
-    /// Highest acceleration [rad/s² or m/s²].
+    /// Maximum acceleration [rad/s² or m/s²].
     pub acceleration: f64,
 }
 
-/// Where the joints are and how they move; entries past the last joint are zero.
+/// Position and velocity of the joints; entries past the last joint are zero.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct JointMotion {
     /// Positions [rad or m].
@@ -56,52 +57,52 @@ pub struct JointMotion {
     pub velocity: Joints,
 }
 
-/// How a link shall move, in the root's frame.
+/// Desired motion of a link, in the root's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Wish {
+pub struct TargetTwist {
     /// Velocity of its origin [m/s].
     pub linear: DVec3,
     /// Angular velocity [rad/s].
     pub angular: DVec3,
-    /// It shall stand still when it has moved like that for so long [s]; ∞ = it goes on.
+    /// The link decelerates to rest after moving like this for this long [s]; ∞: no planned end.
     pub horizon: f64,
 }
 
-impl Wish {
-    /// To stand still.
+impl TargetTwist {
+    /// Rest.
     pub const REST: Self = Self { linear: DVec3::ZERO, angular: DVec3::ZERO, horizon: f64::INFINITY };
 }
 
-/// Why a link moves less than was wished.
+/// What limits the motion of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Bound {
-    /// It does not.
+    /// Nothing.
     #[default]
     None,
-    /// This joint would exceed its speed.
+    /// The velocity limit of this joint.
     Velocity(usize),
-    /// This joint comes to the end of its range.
+    /// A position limit of this joint.
     Position(usize),
-    /// The arm is close to a singularity.
+    /// A singularity nearby.
     Singularity,
-    /// The wish or the configuration is nothing to compute with.
+    /// The target or the configuration is not finite.
     Invalid,
 }
 
-/// What a step came to.
+/// Result of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Step {
-    /// The part of the wished speed that is aimed at, 0–1.
+    /// Part of the desired speed that is commanded, 0–1.
     pub pace: f64,
-    /// What bounds it most.
+    /// The strongest limit.
     pub bound: Bound,
     /// Smallest singular value [m/rad].
     pub singular_value: f64,
-    /// The part of the change of the joints' speeds that their accelerations allowed, 0–1.
+    /// Part of the speed change that the acceleration limits allowed, 0–1.
     pub share: f64,
 }
 
-/// Makes steps for one link; keeps its buffers.
+/// Computes steps of one link; reuses its buffers.
 #[derive(Debug, Clone)]
 pub struct Stepper {
     kinematics: Kinematics,
@@ -112,31 +113,31 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    /// Steps of `link` (index in the model).
+    /// Creates a stepper of `link` (index in the model).
     pub fn new(kinematics: Kinematics, link: usize, settings: StepSettings) -> Self {
         Self { link, settings, frames: kinematics.frames(), columns: [[0.0; 6]; MAX_DOF], kinematics }
     }
 
-    /// The kinematics of its steps.
+    /// Returns the kinematics.
     pub fn kinematics(&self) -> &Kinematics {
         &self.kinematics
     }
 
-    /// The link's frame at a configuration, in the root's frame.
+    /// Returns the link's frame at a configuration, in the root's frame.
     pub fn pose(&mut self, q: &[f64]) -> DAffine3 {
         self.kinematics.forward(q, &mut self.frames);
         self.kinematics.link_frame(self.link, &self.frames)
     }
 
-    /// Moves the joints for `dt` [s] so that the link does what is wished, as well as `bounds` (one entry per joint)
-    /// allow. With nothing to compute with the joints slow down. A joint outside its range may stay or come in.
-    pub fn step(&mut self, joints: &mut JointMotion, wish: &Wish, bounds: &[JointBounds], dt: f64) -> Step {
+    /// Moves the joints for `dt` [s] so that the link follows `wish` as far as `bounds` (one entry per joint) allow. If
+    /// the input is not finite, the joints decelerate. A joint outside its range may stay or move back in.
+    pub fn step(&mut self, joints: &mut JointMotion, wish: &TargetTwist, bounds: &[JointBounds], dt: f64) -> Step {
         let n = self.kinematics.dof().min(MAX_DOF);
         let (mut step, speeds) = match self.speeds(&joints.position, wish, bounds, n) {
             Some((speeds, found)) => (self.pace(&joints.position, &speeds, found, wish, bounds, dt), speeds),
             None => (Step { bound: Bound::Invalid, ..Step::default() }, [0.0; MAX_DOF]),
         };
-        // Joints change their speeds in proportion, as far as the one that needs most for it can.
+        // All joints change speed in proportion, limited by the slowest.
         let mut share: f64 = 1.0;
         for ((speed, v), b) in speeds.iter().zip(&joints.velocity).zip(bounds).take(n) {
             let change = (speed * step.pace - v).abs();
@@ -163,9 +164,9 @@ impl Stepper {
         step
     }
 
-    /// The speeds of the joints for the wish, without any bound but that joints at the end of their ranges stay there;
-    /// and what is known of the configuration. `None`: nothing to compute with.
-    fn speeds(&mut self, q: &Joints, wish: &Wish, bounds: &[JointBounds], n: usize) -> Option<(Joints, Step)> {
+    /// Returns the joint speeds for the target, limited only by joints at the ends of their ranges, and the singularity
+    /// figures; `None` if the input is not finite.
+    fn speeds(&mut self, q: &Joints, wish: &TargetTwist, bounds: &[JointBounds], n: usize) -> Option<(Joints, Step)> {
         let finite = wish.linear.is_finite() && wish.angular.is_finite() && q.iter().all(|x| x.is_finite());
         if !finite || n == 0 || bounds.len() < n || self.kinematics.dof() > MAX_DOF {
             return None;
@@ -185,24 +186,32 @@ impl Stepper {
         let damping = 1e-10 + (self.settings.damping * near).powi(2);
         let mut speeds = [0.0; MAX_DOF];
         let blocked = unblocked(columns, q, bounds, &wanted, damping, &mut speeds)?;
-        // At a singularity the way out must stay open: motion is slowed down to a tenth, never to nothing.
+        // At a singularity, motion away from it must remain possible: speed is reduced to a tenth, never to zero.
         let bound = if near > 0.0 { Bound::Singularity } else { Bound::None };
         let mut found = Step { pace: 1.0 - 0.9 * near, bound, singular_value: value, share: 1.0 };
         if let Some(joint) = blocked
-            && goes_astray(columns, &speeds, &wanted)
+            && deviates(columns, &speeds, &wanted)
         {
             found = Step { pace: 0.0, bound: Bound::Position(joint), ..found };
         }
         Some((speeds, found))
     }
 
-    /// The part of the speeds that all joints can do, and from which all can brake in time.
-    fn pace(&self, q: &Joints, speeds: &Joints, found: Step, wish: &Wish, bounds: &[JointBounds], dt: f64) -> Step {
+    /// Returns the part of the speeds that all joints can follow and decelerate from in time.
+    fn pace(
+        &self,
+        q: &Joints,
+        speeds: &Joints,
+        found: Step,
+        wish: &TargetTwist,
+        bounds: &[JointBounds],
+        dt: f64,
+    ) -> Step {
         let moving = || speeds.iter().zip(q).zip(bounds).enumerate().filter(|(_, ((s, _), _))| s.abs() > 1e-12);
-        // How fast the pace itself may fall [1/s].
+        // Maximum rate at which the part itself may fall [1/s].
         let slowest = moving().map(|(_, ((s, _), b))| b.acceleration / s.abs()).fold(f64::INFINITY, f64::min);
         let braking = |seconds: f64| match slowest.is_finite() && seconds.is_finite() {
-            true => braking_speed(seconds.max(0.0), BRAKING * slowest, dt),
+            true => braking_speed(seconds.max(0.0), DECELERATION_RATIO * slowest, dt),
             false => f64::INFINITY,
         };
         let mut step = found;
@@ -222,8 +231,8 @@ impl Stepper {
     }
 }
 
-/// Fills in the joints' speeds for what is wanted of the link; joints that stand at the end of their range and would go
-/// farther are left out, one after the other. Answers the first of those. `None`: it cannot be computed.
+/// Computes the joint speeds for the desired link motion; fixes joints that are at a limit and would move beyond it,
+/// one after the other. Returns the first of those; `None` if there is no solution.
 fn unblocked(
     columns: &mut [Column],
     q: &[f64],
@@ -241,7 +250,7 @@ fn unblocked(
         {
             let s: f64 = column.iter().zip(&x).map(|(a, b)| a * b).sum();
             *speed = s;
-            let out = (s > 1e-9 && *at >= b.upper - AT_THE_END) || (s < -1e-9 && *at <= b.lower + AT_THE_END);
+            let out = (s > 1e-9 && *at >= b.upper - LIMIT_TOLERANCE) || (s < -1e-9 && *at <= b.lower + LIMIT_TOLERANCE);
             if out && blocked.is_none() {
                 blocked = Some(j);
             }
@@ -255,8 +264,8 @@ fn unblocked(
     None
 }
 
-/// Whether the link would go elsewhere than is wanted, not just more slowly.
-fn goes_astray(columns: &[Column], speeds: &Joints, wanted: &Column) -> bool {
+/// Returns whether the link would leave the desired direction rather than just move more slowly.
+fn deviates(columns: &[Column], speeds: &Joints, wanted: &Column) -> bool {
     let mut done = [0.0; 6];
     for (column, s) in columns.iter().zip(speeds) {
         done.iter_mut().zip(column).for_each(|(d, c)| *d += c * s);
@@ -266,10 +275,10 @@ fn goes_astray(columns: &[Column], speeds: &Joints, wanted: &Column) -> bool {
     let part = dot(&done, wanted) / length;
     let mut across = done;
     across.iter_mut().zip(wanted).for_each(|(a, w)| *a -= part * w);
-    part.is_nan() || part < 0.5 || dot(&across, &across) > ASTRAY * ASTRAY * length * part * part
+    part.is_nan() || part < 0.5 || dot(&across, &across) > MAX_DEVIATION * MAX_DEVIATION * length * part * part
 }
 
-/// The rotation vector [rad] that turns one orientation into another, in the frame both are given in.
+/// Returns the rotation vector [rad] that rotates one orientation into another, in their common frame.
 pub fn rotation_between(from: &DMat3, to: &DMat3) -> DVec3 {
     let turn = DQuat::from_mat3(&(*to * from.transpose()));
     let turn = if turn.w < 0.0 { -turn } else { turn };

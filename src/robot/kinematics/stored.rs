@@ -1,4 +1,4 @@
-//! Kinematics as they stand in a log, so that a run can be run again without its robot's description.
+//! Kinematics as stored in a log, so that a run can be replayed without its robot description.
 
 use glamx::{DAffine3, DMat3, DVec3};
 use serde::{Deserialize, Serialize};
@@ -8,21 +8,21 @@ use crate::joint::MAX_DOF;
 use crate::robot::model::{JointKind, Limits};
 
 /// The columns of a rotation matrix, then the translation [m].
-type Place = [f64; 12];
+type StoredFrame = [f64; 12];
 
-/// See [`Kinematics`].
+/// Stored form of [`Kinematics`].
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Stored {
     joints: Vec<StoredJoint>,
     bodies: Vec<StoredBody>,
-    links: Vec<(usize, Place)>,
+    links: Vec<(usize, StoredFrame)>,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct StoredJoint {
     name: String,
     kind: JointKind,
-    /// Limits as in [`Limits`]; JSON has no infinities, which are absent here.
+    /// Limits as in [`Limits`]; JSON has no infinities, they are left out.
     lower: Option<f64>,
     upper: Option<f64>,
     velocity: Option<f64>,
@@ -34,27 +34,27 @@ struct StoredJoint {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct StoredBody {
     parent: usize,
-    origin: Place,
+    origin: StoredFrame,
     slides: bool,
     variable: usize,
     multiplier: f64,
     offset: f64,
 }
 
-fn put(place: &DAffine3) -> Place {
+fn put(frame: &DAffine3) -> StoredFrame {
     let mut all = [0.0; 12];
-    let columns = [place.matrix3.x_axis, place.matrix3.y_axis, place.matrix3.z_axis, place.translation];
+    let columns = [frame.matrix3.x_axis, frame.matrix3.y_axis, frame.matrix3.z_axis, frame.translation];
     for (to, from) in all.iter_mut().zip(columns.iter().flat_map(|c| c.to_array())) {
         *to = from;
     }
     all
 }
 
-fn get(place: &Place) -> Result<DAffine3, String> {
-    if place.iter().any(|v| !v.is_finite()) {
-        return Err("a place is not finite".to_owned());
+fn get(frame: &StoredFrame) -> Result<DAffine3, String> {
+    if frame.iter().any(|v| !v.is_finite()) {
+        return Err("a frame is not finite".to_owned());
     }
-    let [a, b, c, d, e, f, g, h, i, x, y, z] = *place;
+    let [a, b, c, d, e, f, g, h, i, x, y, z] = *frame;
     let matrix3 = DMat3::from_cols(DVec3::new(a, b, c), DVec3::new(d, e, f), DVec3::new(g, h, i));
     Ok(DAffine3 { matrix3, translation: DVec3::new(x, y, z) })
 }
@@ -85,7 +85,7 @@ impl From<Kinematics> for Stored {
                 })
                 .collect(),
             bodies: bodies.collect(),
-            links: from.links.into_iter().map(|(body, place)| (body, put(&place))).collect(),
+            links: from.links.into_iter().map(|(body, frame)| (body, put(&frame))).collect(),
         }
     }
 }
@@ -93,11 +93,11 @@ impl From<Kinematics> for Stored {
 impl TryFrom<Stored> for Kinematics {
     type Error = String;
 
-    /// A file may say anything: indices must exist, and every body must hang on one before it.
+    /// A file may contain anything: indices must exist, and every body must come after its parent.
     fn try_from(from: Stored) -> Result<Self, String> {
         let (dof, count) = (from.joints.len(), from.bodies.len());
         if dof > MAX_DOF || count == 0 {
-            return Err(format!("{dof} joints and {count} bodies are no kinematics"));
+            return Err(format!("{dof} joints and {count} bodies are not valid kinematics"));
         }
         let mut bodies = Vec::with_capacity(count);
         for (b, body) in from.bodies.iter().enumerate() {
@@ -111,11 +111,11 @@ impl TryFrom<Stored> for Kinematics {
             bodies.push(Body { parent, origin: get(&body.origin)?, motion, variable, multiplier, offset });
         }
         let mut links = Vec::with_capacity(from.links.len());
-        for (body, place) in &from.links {
+        for (body, frame) in &from.links {
             if *body >= count {
                 return Err(format!("a link belongs to body {body} of {count}"));
             }
-            links.push((*body, get(place)?));
+            links.push((*body, get(frame)?));
         }
         let limits = from.joints.iter().map(|j| Limits {
             lower: j.lower.unwrap_or(f64::NEG_INFINITY),

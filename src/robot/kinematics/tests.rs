@@ -1,10 +1,10 @@
 use super::jacobian::{Column, manipulability, smallest_singular_value};
-use super::step::{Bound, JointBounds, JointMotion, Step, StepSettings, Stepper, Wish, rotation_between};
+use super::step::{Bound, JointBounds, JointMotion, Step, StepSettings, Stepper, TargetTwist, rotation_between};
 use super::*;
 use crate::robot::random::Random;
 use crate::robot::urdf::from_text;
 
-/// Seven joints: revolute about odd axes, one prismatic, one follower, one fixed in between.
+/// Seven joints: revolute about odd axes, one prismatic, one mimic, one fixed in between.
 const ROBOT: &str = r#"<robot name="r"><link name="base"/><link name="a"/><link name="b"/><link name="c"/><link name="d"/>
 <link name="e"/><link name="f"/><link name="g"/><link name="h"/><link name="tool"/>
 <joint name="j1" type="revolute"><parent link="base"/><child link="a"/><origin xyz="0 0 0.3" rpy="0.1 0.2 0.3"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
@@ -46,7 +46,7 @@ fn frames_are_those_of_the_plain_product_of_joints() {
 }
 
 #[test]
-fn joints_that_are_not_chosen_stand_where_they_are_told() {
+fn joints_that_are_not_selected_are_fixed_at_their_given_position() {
     let model = robot();
     let rest: Vec<f64> = vec![0.5; model.joints.len()];
     let some = Kinematics::new(&model, &[1, 5], &rest).unwrap();
@@ -93,7 +93,7 @@ fn the_jacobian_is_the_derivative() {
 }
 
 #[test]
-fn no_point_moves_more_than_the_levers_say() {
+fn no_point_moves_more_than_the_lever_bounds() {
     let model = robot();
     let kinematics = Kinematics::whole(&model).unwrap();
     let tool = model.link_index("tool").unwrap();
@@ -134,8 +134,8 @@ fn standing(q: &[f64]) -> JointMotion {
     JointMotion { position: crate::joint::joints_of(q), ..JointMotion::default() }
 }
 
-fn up(speed: f64) -> Wish {
-    Wish { linear: DVec3::new(0.0, 0.0, speed), angular: DVec3::ZERO, horizon: f64::INFINITY }
+fn up(speed: f64) -> TargetTwist {
+    TargetTwist { linear: DVec3::new(0.0, 0.0, speed), angular: DVec3::ZERO, horizon: f64::INFINITY }
 }
 
 #[test]
@@ -146,7 +146,8 @@ fn steps_follow_a_twist_within_speeds_and_limits() {
         let q = random_q(stepper.kinematics(), &mut random);
         let mut joints = standing(&q);
         let start = stepper.pose(&q);
-        let wish = Wish { linear: DVec3::new(random.between(-0.1, 0.1), random.between(-0.1, 0.1), 0.1), ..up(0.0) };
+        let wish =
+            TargetTwist { linear: DVec3::new(random.between(-0.1, 0.1), random.between(-0.1, 0.1), 0.1), ..up(0.0) };
         let step = stepper.step(&mut joints, &wish, &bounds, 0.01);
         for ((x, y), b) in joints.position.iter().zip(&q).zip(&bounds) {
             assert!((x - y).abs() <= 0.5 * 0.01 + 1e-12 && *x <= b.upper && *x >= b.lower);
@@ -165,15 +166,16 @@ fn steps_follow_a_twist_within_speeds_and_limits() {
     assert_eq!((bad.bound, joints), (Bound::Invalid, standing(&[0.0; 6])));
 }
 
-/// Whatever bounds a motion makes it slower, all joints by the same factor.
+/// Any limit slows the motion, all joints by the same factor.
 #[test]
-fn what_is_too_fast_keeps_its_direction() {
+fn a_motion_that_is_too_fast_keeps_its_direction() {
     let (mut fast, wide) = stepper(1e6, 1e9);
     let (mut slow, narrow) = stepper(0.1, 1e9);
     let (mut random, mut bounded) = (Random::new(5), 0);
     for _ in 0..300 {
         let q = random_q(fast.kinematics(), &mut random);
-        let wish = Wish { angular: DVec3::new(random.between(-1.0, 1.0), 0.5, 0.0), ..up(random.between(-0.3, 0.3)) };
+        let wish =
+            TargetTwist { angular: DVec3::new(random.between(-1.0, 1.0), 0.5, 0.0), ..up(random.between(-0.3, 0.3)) };
         let (mut a, mut b) = (standing(&q), standing(&q));
         let free = fast.step(&mut a, &wish, &wide, 0.001);
         let held = slow.step(&mut b, &wish, &narrow, 0.001);
@@ -188,7 +190,7 @@ fn what_is_too_fast_keeps_its_direction() {
 }
 
 #[test]
-fn a_motion_into_a_limit_brakes_before_it_and_leaves_it_again() {
+fn a_motion_into_a_limit_decelerates_before_it_and_can_leave_it() {
     let (mut stepper, bounds) = stepper(1.0, 2.0);
     let mut joints = standing(&[0.0, 1.9, 0.1, 0.3, 0.2, 0.1]);
     let run = |stepper: &mut Stepper, joints: &mut JointMotion, speed: f64| {
@@ -214,13 +216,13 @@ fn a_motion_into_a_limit_brakes_before_it_and_leaves_it_again() {
 }
 
 #[test]
-fn kinematics_come_back_from_a_log_as_they_were() {
+fn kinematics_are_unchanged_by_a_log() {
     let kinematics = Kinematics::whole(&robot()).unwrap();
-    let told = serde_json::to_string(&kinematics).unwrap();
-    let again: Kinematics = serde_json::from_str(&told).unwrap();
+    let json = serde_json::to_string(&kinematics).unwrap();
+    let again: Kinematics = serde_json::from_str(&json).unwrap();
     assert_eq!(again, kinematics);
-    // A body that hangs on a later one would be looked up for ever.
-    let mut odd: serde_json::Value = serde_json::from_str(&told).unwrap();
+    // A body whose parent comes later would loop forever.
+    let mut odd: serde_json::Value = serde_json::from_str(&json).unwrap();
     odd["bodies"][2]["parent"] = serde_json::json!(2);
     assert!(serde_json::from_value::<Kinematics>(odd.clone()).is_err());
     odd["bodies"][2]["parent"] = serde_json::json!(1);

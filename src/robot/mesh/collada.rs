@@ -1,7 +1,7 @@
-//! Collada (`.dae`): the triangles of its scene, in metres.
+//! Collada (`.dae`): the triangles of its visual scene, in metres.
 //!
-//! `unit` is applied. `up_axis` is not: x stays x and z stays z, as in RViz, MoveIt and Gazebo, which every robot
-//! description is made and looked at with (docs/decisions/0024).
+//! `unit` is applied. `up_axis` is not: x stays x and z stays z, as in RViz, MoveIt and Gazebo, for which robot
+//! descriptions are made (docs/decisions/0024).
 
 use std::collections::HashMap;
 
@@ -10,15 +10,15 @@ use roxmltree::{Document, Node, ParsingOptions};
 
 use super::MAX_TRIANGLES;
 
-/// The deepest nesting of nodes, and the most visits to nodes: instances may multiply.
+/// Maximum depth of nodes, and maximum visits to nodes: instances may multiply.
 const MAX_DEPTH: usize = 64;
 const MAX_VISITS: usize = 100_000;
 
 type Triangle = [Point3<f64>; 3];
 
-/// The triangles of a file.
+/// Reads the triangles of a file.
 pub(super) fn read(bytes: &[u8]) -> Result<Vec<Triangle>, String> {
-    let text = std::str::from_utf8(bytes).map_err(|_| "bytes that are not UTF-8".to_owned())?;
+    let text = std::str::from_utf8(bytes).map_err(|_| "the file is not UTF-8".to_owned())?;
     let options = ParsingOptions { nodes_limit: 1_000_000, ..ParsingOptions::default() };
     let xml = Document::parse_with_options(text, options).map_err(|e| format!("not well-formed XML: {e}"))?;
     let root = xml.root_element();
@@ -59,7 +59,7 @@ fn child<'a, 'i: 'a>(node: Node<'a, 'i>, name: &'static str) -> Option<Node<'a, 
 
 fn numbers(node: Node<'_, '_>) -> Result<Vec<f64>, String> {
     let words = node.text().unwrap_or_default().split_ascii_whitespace();
-    words.map(|w| w.parse().map_err(|_| format!("{w:?} is no number"))).collect()
+    words.map(|w| w.parse().map_err(|_| format!("{w:?} is not a number"))).collect()
 }
 
 struct Scene<'a, 'i> {
@@ -71,13 +71,13 @@ struct Scene<'a, 'i> {
 }
 
 impl<'a, 'i: 'a> Scene<'a, 'i> {
-    /// The element that `#id` means.
+    /// Returns the element that `#id` refers to.
     fn target(&self, url: Option<&str>) -> Result<Node<'a, 'i>, String> {
         let id = url.unwrap_or_default().trim_start_matches('#');
-        self.by_id.get(id).copied().ok_or_else(|| format!("nothing has the id {id:?}"))
+        self.by_id.get(id).copied().ok_or_else(|| format!("no element has the id {id:?}"))
     }
 
-    /// The visual scene: the one that `scene` names, or else the first.
+    /// Returns the visual scene: the one that `scene` names, otherwise the first.
     fn root(&self, root: Node<'a, 'i>) -> Option<Node<'a, 'i>> {
         let named = child(root, "scene").and_then(|s| child(s, "instance_visual_scene"));
         let named = named.and_then(|s| self.target(s.attribute("url")).ok());
@@ -87,7 +87,7 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
     fn node(&mut self, node: Node<'a, 'i>, above: &Matrix4<f64>, depth: usize) -> Result<(), String> {
         self.visits += 1;
         if depth > MAX_DEPTH || self.visits > MAX_VISITS {
-            return Err("its nodes are nested too deeply, or refer to each other".to_owned());
+            return Err("nodes are nested too deeply, or refer to each other".to_owned());
         }
         let mut transform = *above;
         for element in node.children().filter(Node::is_element) {
@@ -119,7 +119,7 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
         Ok(())
     }
 
-    /// Adds a geometry's triangles at a place.
+    /// Adds a geometry's triangles with a transform.
     fn place(&mut self, geometry: Node<'a, 'i>, transform: &Matrix4<f64>) -> Result<(), String> {
         if !self.meshes.contains_key(&geometry.id()) {
             let triangles = self.geometry(geometry)?;
@@ -139,7 +139,7 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
     }
 
     fn geometry(&self, geometry: Node<'a, 'i>) -> Result<Vec<Triangle>, String> {
-        // Splines and the like have no triangles.
+        // Splines and other geometry have no triangles.
         let Some(mesh) = child(geometry, "mesh") else { return Ok(Vec::new()) };
         let mut out = Vec::new();
         for primitive in mesh.children().filter(Node::is_element) {
@@ -168,7 +168,7 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
                     polygon.extend_from_slice(these);
                     for [a, b, c] in corners(kind, &polygon) {
                         let (Some(a), Some(b), Some(c)) = (corner(&a), corner(&b), corner(&c)) else {
-                            return Err("a triangle names a vertex that does not exist".to_owned());
+                            return Err("a triangle refers to a missing vertex".to_owned());
                         };
                         out.push([a, b, c]);
                         if out.len() > MAX_TRIANGLES {
@@ -181,8 +181,8 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
         Ok(out)
     }
 
-    /// The positions that a primitive's indices mean, where among its indices theirs stand, and how many stand
-    /// together.
+    /// Returns the positions that a primitive's indices refer to, the offset of their index, and the number of indices
+    /// per vertex.
     #[allow(clippy::type_complexity)]
     fn inputs(&self, primitive: Node<'a, 'i>) -> Result<Option<(Vec<Point3<f64>>, usize, usize)>, String> {
         let number = |node: Node<'_, '_>, name: &str| node.attribute(name).and_then(|t| t.trim().parse::<usize>().ok());
@@ -208,7 +208,7 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
     }
 }
 
-/// One step of a node's transformation; `None` for elements that are none.
+/// Returns one step of a node's transformation; `None` for other elements.
 fn transformation(name: &str, element: Node<'_, '_>) -> Result<Option<Matrix4<f64>>, String> {
     let needed = match name {
         "matrix" => 16,
@@ -233,7 +233,7 @@ fn transformation(name: &str, element: Node<'_, '_>) -> Result<Option<Matrix4<f6
     }))
 }
 
-/// The triangles of one polygon, strip or fan; polygons are taken for convex.
+/// Returns the triangles of one polygon, strip or fan; polygons are assumed convex.
 fn corners(kind: &str, polygon: &[usize]) -> Vec<[usize; 3]> {
     match kind {
         "tristrips" => {

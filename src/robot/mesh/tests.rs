@@ -2,7 +2,7 @@ use super::*;
 
 const ONE: Vector3<f64> = Vector3::new(1.0, 1.0, 1.0);
 
-/// A tetrahedron's corners and triangles, anticlockwise from outside.
+/// Vertices and triangles of a tetrahedron, anticlockwise from outside.
 const POINTS: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]];
 const FACES: [[usize; 3]; 4] = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
 
@@ -35,7 +35,7 @@ fn obj() -> String {
 
 fn dae(unit: &str, axis: &str, nodes: &str) -> String {
     let points = POINTS.iter().flatten().map(f32::to_string).collect::<Vec<_>>().join(" ");
-    // Two indices a corner: of the vertex, and of a normal that is not there.
+    // Two indices per vertex: of its position, and of a missing normal.
     let p = FACES.iter().flatten().map(|i| format!("{i} 0")).collect::<Vec<_>>().join(" ");
     format!(
         "<COLLADA xmlns='http://www.collada.org/2005/11/COLLADASchema' version='1.4.1'>\
@@ -54,7 +54,7 @@ fn read(name: &str, bytes: &[u8], scale: Vector3<f64>) -> Result<Mesh, String> {
     Mesh::from_bytes(bytes, Path::new(name), scale)
 }
 
-/// Six times the volume that the triangles enclose: negative when they are inside out.
+/// Returns six times the enclosed volume: negative if the triangles are inside out.
 fn volume(mesh: &Mesh) -> f64 {
     let corner = |i: u32| mesh.vertices[i as usize].coords;
     mesh.triangles.iter().map(|[a, b, c]| corner(*a).dot(&corner(*b).cross(&corner(*c)))).sum()
@@ -95,7 +95,7 @@ fn units_and_nodes_of_collada_apply() {
     let mesh = read("a.dae", dae("0.01", "Z_UP", nodes).as_bytes(), ONE).unwrap();
     assert_eq!((mesh.vertices.len(), mesh.triangles.len()), (8, 8));
     let (low, high) = mesh.bounds();
-    // The first: twice as large, turned by 90° about z, one metre up. The second: five metres along x.
+    // The first: scaled by two, rotated by 90° about z, one metre up. The second: five metres along x.
     assert!((low - Point3::new(-0.04, 0.0, 0.0)).norm() < 1e-9, "{low}");
     assert!((high - Point3::new(5.01, 0.02, 1.06)).norm() < 1e-9, "{high}");
     let mirrored = "<node><scale>1 1 -1</scale><instance_geometry url='#g'/></node>";
@@ -119,7 +119,7 @@ fn polygons_strips_and_fans_are_triangles() {
 }
 
 #[test]
-fn what_cannot_be_used_is_refused() {
+fn unusable_files_are_rejected() {
     let mut nan = binary_stl(b"");
     nan[96..100].copy_from_slice(&f32::NAN.to_le_bytes());
     let mut short = binary_stl(b"");
@@ -131,11 +131,11 @@ fn what_cannot_be_used_is_refused() {
         ("a.stl", Vec::new(), ""),
         ("a.ply", Vec::new(), "meshes of type `ply` cannot be read"),
         ("a.obj", b"v 1 2 3\nf 1 2 9\n".to_vec(), ""),
-        ("a.obj", b"v 1 2 3\n".to_vec(), "no triangle"),
-        ("a.dae", b"<COLLADA/>".to_vec(), "no triangle"),
+        ("a.obj", b"v 1 2 3\n".to_vec(), "no triangles"),
+        ("a.dae", b"<COLLADA/>".to_vec(), "no triangles"),
         ("a.dae", dae("-1", "Z_UP", "").into_bytes(), "the unit of -1 metres"),
         ("a.dae", dae("1", "Z_UP", own).into_bytes(), "refer to each other"),
-        ("a.dae", dae("1", "Z_UP", "<node><instance_geometry url='#q'/></node>").into_bytes(), "nothing has the id"),
+        ("a.dae", dae("1", "Z_UP", "<node><instance_geometry url='#q'/></node>").into_bytes(), "no element has the id"),
     ] {
         let error = read(name, &bytes, ONE).expect_err(name);
         assert!(error.contains(what), "{what}: {error}");

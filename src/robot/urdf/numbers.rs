@@ -1,4 +1,4 @@
-//! Numbers, vectors and poses in attributes: each finite, and as many as needed.
+//! Numbers, vectors and poses in attributes: each finite, in the required count.
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
@@ -8,7 +8,7 @@ use crate::robot::xml::{Attribute, Element};
 use crate::yaml::quote;
 
 impl Reader<'_> {
-    /// `N` finite numbers from an attribute.
+    /// Returns `N` finite numbers from an attribute.
     pub(super) fn numbers<const N: usize>(&mut self, attribute: &Attribute) -> Option<[f64; N]> {
         let words: Vec<&str> = attribute.value.split_whitespace().collect();
         if words.len() != N {
@@ -29,7 +29,7 @@ impl Reader<'_> {
                     return None;
                 }
                 Err(_) => {
-                    self.error(attribute.at, format!("`{}`: {} is no number", attribute.name, quote(word)));
+                    self.error(attribute.at, format!("`{}`: {} is not a number", attribute.name, quote(word)));
                     return None;
                 }
             }
@@ -37,13 +37,13 @@ impl Reader<'_> {
         Some(values)
     }
 
-    /// A vector that must be there.
+    /// Returns a required vector.
     pub(super) fn vector(&mut self, element: &Element, name: &str) -> Option<[f64; 3]> {
         self.needed(element, name)?;
         element.attribute(name).and_then(|a| self.numbers(a))
     }
 
-    /// A number; another one where it is not stated.
+    /// Returns a number, or a default if it is absent.
     pub(super) fn number_or(&mut self, element: &Element, name: &str, otherwise: f64) -> Option<f64> {
         match element.attribute(name) {
             Some(attribute) => self.numbers::<1>(attribute).map(|[value]| value),
@@ -51,7 +51,7 @@ impl Reader<'_> {
         }
     }
 
-    /// The pose of an `origin` child; identity where there is none.
+    /// Returns the pose of an `origin` child; identity without one.
     pub(super) fn origin(&mut self, element: &Element) -> Option<Isometry3<f64>> {
         let Some(origin) = element.child("origin") else { return Some(Isometry3::identity()) };
         let three = |reader: &mut Self, name: &str| match origin.attribute(name) {

@@ -1,15 +1,15 @@
-//! Shapes, materials and inertia of links. What a link looks like is never worth refusing a robot for: such mistakes
-//! are warnings; what it collides with must be right.
+//! Shapes, materials and inertia of links. Mistakes in visual shapes are warnings; those in collision shapes are
+//! errors.
 
 use nalgebra::Matrix3;
 
 use super::{Meshes, Reader};
 use crate::robot::model::{Geometry, Inertial, MeshFile, Shape};
-use crate::robot::xml::{Element, Place};
+use crate::robot::xml::{Element, SourcePos};
 use crate::yaml::{Diag, quote};
 
 impl Reader<'_> {
-    /// A shape; `None` when it cannot be used, which was reported.
+    /// Returns a shape; `None` if it is not usable, which is reported.
     pub(super) fn shape(&mut self, element: &Element, collides: bool) -> Option<Shape> {
         let origin = self.origin(element);
         let geometry = match element.child("geometry") {
@@ -21,8 +21,8 @@ impl Reader<'_> {
         Some(Shape { name, origin: origin?, geometry: geometry?, color })
     }
 
-    /// Reports a shape that is left out: an error if it collides.
-    fn unusable<T>(&mut self, at: Place, collides: bool, what: String) -> Option<T> {
+    /// Reports an unusable shape: an error for a collision shape.
+    fn unusable<T>(&mut self, at: SourcePos, collides: bool, what: String) -> Option<T> {
         match collides {
             true => self.error(at, what),
             false => self.warn(at, format!("{what}; it is not shown")),
@@ -63,7 +63,7 @@ impl Reader<'_> {
             }
             "mesh" => self.mesh(shape, collides),
             other => {
-                let what = format!("no geometry is named {}", quote(other));
+                let what = format!("unknown geometry {}", quote(other));
                 self.unusable(shape.at, collides, what)
             }
         }
@@ -77,7 +77,7 @@ impl Reader<'_> {
         };
         if scale.contains(&0.0) {
             let at = element.attribute("scale").map_or(element.at, |a| a.at);
-            return self.unusable(at, collides, "a scale of zero makes nothing of this mesh".to_owned());
+            return self.unusable(at, collides, "a scale of zero is not allowed".to_owned());
         }
         let mut path = None;
         if self.meshes == Meshes::Find {
@@ -89,8 +89,8 @@ impl Reader<'_> {
                         None => (why.as_str(), None),
                     };
                     let diag = match collides {
-                        true => Diag::error(format!("the collision mesh cannot be found: {what}")),
-                        false => Diag::warning(format!("the visual mesh cannot be found and is not shown: {what}")),
+                        true => Diag::error(format!("collision mesh not found: {what}")),
+                        false => Diag::warning(format!("visual mesh not found, it is not shown: {what}")),
                     };
                     self.report(at, diag.maybe_hint(hint));
                 }
@@ -99,7 +99,7 @@ impl Reader<'_> {
         Some(Geometry::Mesh(MeshFile { uri: uri.to_owned(), path, scale: scale.into() }))
     }
 
-    /// Notes the colours of all named materials: links may use them before they are defined.
+    /// Collects the colours of all named materials: links may use them before their definition.
     pub(super) fn collect_materials(&mut self, root: &Element) {
         let of_links = root.named("link").flat_map(|link| link.named("visual"));
         let inside = of_links.filter_map(|visual| visual.child("material"));
@@ -129,7 +129,7 @@ impl Reader<'_> {
     pub(super) fn inertial(&mut self, element: &Element) -> Option<Inertial> {
         let origin = self.origin(element);
         let (Some(mass), Some(inertia)) = (element.child("mass"), element.child("inertia")) else {
-            self.warn(element.at, "this inertial lacks `mass` or `inertia` and is passed over");
+            self.warn(element.at, "this inertial lacks `mass` or `inertia` and is ignored");
             return None;
         };
         let kilograms = self.number_or(mass, "value", 0.0)?;

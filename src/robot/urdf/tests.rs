@@ -51,7 +51,7 @@ fn a_tree_is_put_in_order() {
 }
 
 #[test]
-fn mistakes_are_named_at_their_place() {
+fn mistakes_are_reported_with_their_position() {
     let limits = |l: &str| joint("revolute", l);
     let long = robot(&(0..600).map(|i| format!("<link name='l{i}'/>")).collect::<String>());
     for (text, what, place) in [
@@ -59,12 +59,12 @@ fn mistakes_are_named_at_their_place() {
         ("<robot><link name='a'/></robot>".to_owned(), "this `robot` has no `name`", "t.urdf:1:2"),
         (robot(""), "the robot has no links", "t.urdf:1:2"),
         (robot("\n <link/>"), "this `link` has no `name`", "t.urdf:2:3"),
-        (robot(TWO), "the link `b` hangs on nothing, and neither does `a`", "t.urdf:1:45"),
+        (robot(TWO), "the links `b` and `a` both have no parent", "t.urdf:1:45"),
         (robot("<link name='a'/>\n<link name='a'/>"), "two links are named `a`", "t.urdf:2:13"),
         (joint("fixed", "").replace("child link='b'", "child link='c'"), "the child link `c` does not exist", ""),
         (joint("fixed", "").replace("parent link='a'", "parent link='aa'"), "the parent link `aa` does not exist", ""),
-        (joint("fixd", ""), "no joint type is named", "t.urdf:1"),
-        (joint("planar", ""), "joints of type `planar` cannot be driven", ""),
+        (joint("fixd", ""), "unknown joint type", "t.urdf:1"),
+        (joint("planar", ""), "joints of type `planar` are not supported", ""),
         (joint("revolute", ""), "this revolute joint has no `limit`", ""),
         (limits("<limit velocity='1' effort='1'/>"), "neither `lower` nor `upper`", ""),
         (limits("<limit lower='-1' upper='1'/>"), "this limit has no `velocity`", ""),
@@ -72,14 +72,14 @@ fn mistakes_are_named_at_their_place() {
         (limits("<limit lower='-1' upper='1' velocity='-3'/>"), "the velocity limit -3 is negative", ""),
         (limits("<limit lower='nan' upper='1' velocity='3'/>"), "only finite numbers are allowed", ""),
         (limits("<limit lower='1e999' upper='1' velocity='3'/>"), "only finite numbers are allowed", ""),
-        (limits("<limit lower='1,5' upper='2' velocity='3'/>"), "is no number", ""),
+        (limits("<limit lower='1,5' upper='2' velocity='3'/>"), "is not a number", ""),
         (limits(&format!("{LIMIT}<axis xyz='0 0 0'/>")), "this axis is zero", ""),
         (limits(&format!("{LIMIT}<axis xyz='0 1'/>")), "`xyz` takes 3 numbers, found 2", ""),
-        (limits(&format!("{LIMIT}<origin xyz='0 0 x'/>")), "`xyz`: `x` is no number", ""),
-        (limits(&format!("{LIMIT}<mimic joint='k'/>")), "the joint `k` to follow does not exist", ""),
-        (limits(&format!("{LIMIT}<mimic joint='j'/>")), "follow each other in a circle", ""),
+        (limits(&format!("{LIMIT}<origin xyz='0 0 x'/>")), "`xyz`: `x` is not a number", ""),
+        (limits(&format!("{LIMIT}<mimic joint='k'/>")), "the mimic leader `k` does not exist", ""),
+        (limits(&format!("{LIMIT}<mimic joint='j'/>")), "mimic each other in a circle", ""),
         (joint("fixed", "").replace("<parent link='a'/>", ""), "this joint has no `parent`", ""),
-        (long, "512 links at most", ""),
+        (long, "at most 512 links", ""),
         (robot("<link name='a'><collision><geometry/></collision></link>"), "this geometry is empty", ""),
         (
             robot("<link name='a'><collision><geometry><sphere radius='-1'/></geometry></collision></link>"),
@@ -106,7 +106,7 @@ fn loops_and_second_parents_are_found() {
     for (text, what) in [
         (ring, "every link has a parent: the joints form a loop"),
         (two, "the link `b` has two parents"),
-        (apart, "is part of a loop that does not hang on the root `a`"),
+        (apart, "is part of a loop that is not connected to the root `a`"),
         (whole, "every link has a parent"),
     ] {
         let found = report(&text);
@@ -126,7 +126,7 @@ fn everything_wrong_is_reported_at_once() {
 
 #[test]
 fn what_exporters_write_is_accepted() {
-    // SolidWorks: axis and limits of zero on fixed joints. xArm: empty materials. Franka: no inertia at all.
+    // SolidWorks: axis and limits of zero on fixed joints. xArm: empty materials. Franka: no inertia.
     let odd = joint("fixed", "<axis xyz='0 0 0'/><limit lower='0' upper='0' effort='0' velocity='0'/>");
     assert_eq!(report(&odd), "2 links, 1 joints");
     let zero = joint("revolute", "<limit lower='0' upper='1' effort='0' velocity='0'/>");
@@ -146,7 +146,7 @@ fn what_exporters_write_is_accepted() {
 }
 
 #[test]
-fn followers_of_followers_are_resolved() {
+fn mimic_chains_are_resolved() {
     let link = |n: usize| format!("<link name='l{n}'/>");
     let follow = |n: usize, whom: &str| {
         format!(

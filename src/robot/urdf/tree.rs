@@ -1,25 +1,25 @@
-//! Links and joints → one tree, parents first; followers → their leaders.
+//! Links and joints → one tree, parents first; mimic joints → their leaders.
 
 use std::collections::HashMap;
 
 use super::{RawJoint, Reader};
 use crate::robot::model::{Joint, Link, Mimic, RobotModel};
-use crate::robot::xml::Place;
+use crate::robot::xml::SourcePos;
 use crate::yaml::{Diag, did_you_mean};
 
 impl Reader<'_> {
-    /// Puts the robot together. What keeps it from being one tree is reported.
+    /// Assembles the robot. Reports what keeps it from being one tree.
     pub(super) fn assemble(
         &mut self,
         name: String,
-        links: Vec<(Link, Place)>,
+        links: Vec<(Link, SourcePos)>,
         joints: Vec<RawJoint>,
     ) -> Option<RobotModel> {
         let link_at = self.unique("links", links.iter().map(|(link, at)| (link.name.as_str(), *at)));
         let joint_at = self.unique("joints", joints.iter().map(|j| (j.joint.name.as_str(), j.at)));
         let carriers = self.carriers(&joints, &link_at, &links);
         if self.errors > 0 {
-            // What is missing would be taken for a hole in the tree.
+            // Missing elements would look like gaps in the tree.
             return None;
         }
         let root = self.root(&links, &carriers)?;
@@ -45,9 +45,9 @@ impl Reader<'_> {
         (self.errors == 0).then_some(RobotModel { name, links, joints: out })
     }
 
-    /// Indices by name; names that stand twice are reported.
-    fn unique<'n>(&mut self, what: &str, names: impl Iterator<Item = (&'n str, Place)>) -> HashMap<&'n str, usize> {
-        let mut seen: HashMap<&str, (usize, Place)> = HashMap::new();
+    /// Returns indices by name; reports duplicate names.
+    fn unique<'n>(&mut self, what: &str, names: impl Iterator<Item = (&'n str, SourcePos)>) -> HashMap<&'n str, usize> {
+        let mut seen: HashMap<&str, (usize, SourcePos)> = HashMap::new();
         for (i, (name, at)) in names.enumerate() {
             match seen.get(name) {
                 Some((_, first)) => {
@@ -62,12 +62,12 @@ impl Reader<'_> {
         seen.into_iter().map(|(name, (i, _))| (name, i)).collect()
     }
 
-    /// The joint that carries each link. Unknown links and links with two parents are reported.
+    /// Returns the joint that carries each link. Reports unknown links and links with two parents.
     fn carriers(
         &mut self,
         joints: &[RawJoint],
         link_at: &HashMap<&str, usize>,
-        links: &[(Link, Place)],
+        links: &[(Link, SourcePos)],
     ) -> HashMap<usize, usize> {
         let mut carriers: HashMap<usize, usize> = HashMap::new();
         for (i, raw) in joints.iter().enumerate() {
@@ -92,8 +92,8 @@ impl Reader<'_> {
         carriers
     }
 
-    /// The one link that no joint carries.
-    fn root(&mut self, links: &[(Link, Place)], carriers: &HashMap<usize, usize>) -> Option<usize> {
+    /// Returns the one link that no joint carries.
+    fn root(&mut self, links: &[(Link, SourcePos)], carriers: &HashMap<usize, usize>) -> Option<usize> {
         let roots: Vec<usize> = (0..links.len()).filter(|link| !carriers.contains_key(link)).collect();
         let named = |i: usize| links.get(i).map(|(link, at)| (link.name.clone(), *at));
         match roots[..] {
@@ -106,8 +106,7 @@ impl Reader<'_> {
             [first, ..] => {
                 let (first_name, first_at) = named(first)?;
                 for (name, at) in roots.iter().skip(1).filter_map(|i| named(*i)) {
-                    let diag =
-                        Diag::error(format!("the link `{name}` hangs on nothing, and neither does `{first_name}`"));
+                    let diag = Diag::error(format!("the links `{name}` and `{first_name}` both have no parent"));
                     let diag = diag.also(first_at.label().with_text("the other root"));
                     self.report(at, diag.hint("a robot is one tree: join them with a fixed joint, or remove one"));
                 }
@@ -116,11 +115,11 @@ impl Reader<'_> {
         }
     }
 
-    /// Links below the root with the joints that carry them, depth first, in the order of the file.
+    /// Returns the links below the root with the joints that carry them, depth first, in file order.
     fn order(
         &mut self,
         root: usize,
-        links: &[(Link, Place)],
+        links: &[(Link, SourcePos)],
         joints: &[RawJoint],
         link_at: &HashMap<&str, usize>,
     ) -> Option<Vec<(usize, usize)>> {
@@ -136,19 +135,20 @@ impl Reader<'_> {
             order.push((link, joint));
             open.extend(below.remove(&link).unwrap_or_default());
         }
-        // What was not reached has parents, but none of them hangs on the root.
+        // Links not reached have parents, but no path to the root.
         if let Some((_, i)) = below.values().flatten().min_by_key(|(_, i)| *i) {
             let raw = joints.get(*i)?;
             let at = raw.parent.1;
             let root = links.get(root).map(|(link, _)| link.name.clone()).unwrap_or_default();
-            let what = format!("joint `{}` is part of a loop that does not hang on the root `{root}`", raw.joint.name);
+            let what =
+                format!("joint `{}` is part of a loop that is not connected to the root `{root}`", raw.joint.name);
             self.error(at, what);
             return None;
         }
         Some(order)
     }
 
-    /// Whom a joint follows in the end: leaders that follow others are resolved.
+    /// Returns the independent joint that a mimic joint follows; resolves chains.
     fn leader(&mut self, joint: usize, joints: &[RawJoint], joint_at: &HashMap<&str, usize>) -> Option<Mimic> {
         let first = joints.get(joint)?.mimic.as_ref()?;
         let mut mimic: Mimic = (first, 0).into();
@@ -156,14 +156,14 @@ impl Reader<'_> {
         for _ in 0..=joints.len() {
             let Some(next) = joint_at.get(raw.leader.as_str()).copied() else {
                 let hint = did_you_mean(&raw.leader, joints.iter().map(|j| j.joint.name.as_str()), "the joints are");
-                let diag = Diag::error(format!("the joint `{}` to follow does not exist", raw.leader));
+                let diag = Diag::error(format!("the mimic leader `{}` does not exist", raw.leader));
                 self.report(raw.at, diag.maybe_hint(hint));
                 return None;
             };
             mimic.leader = next;
             let leader = joints.get(next)?;
             if !leader.joint.is_movable() {
-                self.error(raw.at, format!("the joint `{}` to follow is fixed", raw.leader));
+                self.error(raw.at, format!("the mimic leader `{}` is fixed", raw.leader));
                 return None;
             }
             let Some(further) = &leader.mimic else { return Some(mimic) };
@@ -171,7 +171,7 @@ impl Reader<'_> {
             mimic.multiplier *= further.multiplier;
             raw = further;
         }
-        self.error(first.at, "these joints follow each other in a circle");
+        self.error(first.at, "these joints mimic each other in a circle");
         None
     }
 }

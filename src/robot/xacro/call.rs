@@ -1,34 +1,34 @@
-//! Macros: defined, found, called.
+//! Macros: definition, lookup, calls.
 
 use std::rc::Rc;
 
 use super::expand::{Env, Expander, insert};
 use super::property::typed;
 use super::scope::{Block, Entry, Macro, MacroEntry, Parameter, parameters};
-use super::{Result, Trouble};
+use super::{ExpansionError, Result};
 use crate::robot::xml::{Element, Node};
 use crate::yaml::{Diag, closest};
 
-/// The work of a call, in steps.
-const CALL: usize = 30;
+/// Work of a call, in steps.
+const CALL_STEPS: usize = 30;
 
 impl Expander<'_> {
     /// `xacro:macro`
     pub(super) fn define(&mut self, element: Element, env: Env) -> Result {
         let at = element.at;
         let Some(name) = element.attribute("name").map(|a| a.value.clone()) else {
-            return Err(Trouble::new("this xacro:macro has no `name`").at(at));
+            return Err(ExpansionError::new("this xacro:macro has no `name`").at(at));
         };
         let name = name.strip_prefix("xacro:").map(str::to_owned).unwrap_or(name);
         if name == "call" {
-            return Err(Trouble::new("Invalid use of macro name 'call'").at(at));
+            return Err(ExpansionError::new("Invalid use of macro name 'call'").at(at));
         }
         if name.contains('.') {
             let what = format!("macro names must not contain '.' (reserved for namespaces): {name}");
-            return Err(Trouble::new(what).at(at));
+            return Err(ExpansionError::new(what).at(at));
         }
         let parameters = match element.attribute("params") {
-            Some(params) => parameters(&params.value).map_err(|e| Trouble::new(e).at(params.at))?,
+            Some(params) => parameters(&params.value).map_err(|e| ExpansionError::new(e).at(params.at))?,
             None => Vec::new(),
         };
         let entry = Macro { name: name.clone(), parameters, body: element };
@@ -40,14 +40,14 @@ impl Expander<'_> {
     pub(super) fn dynamic_call(&mut self, mut element: Element, env: Env) -> Result<Element> {
         let name = self.needed(&element, "macro", env)?;
         if name.is_empty() {
-            return Err(Trouble::new("xacro:call is missing the 'macro' attribute").at(element.at));
+            return Err(ExpansionError::new("xacro:call is missing the 'macro' attribute").at(element.at));
         }
         element.attributes.retain(|a| a.name != "macro");
         element.name = format!("xacro:{name}");
         Ok(element)
     }
 
-    /// The macro of a name, and where its body looks names up: `lib.arm` is the macro `arm` of an include with
+    /// Returns the macro of a name, and the scope of its body: `lib.arm` is the macro `arm` of an include with
     /// `ns="lib"`.
     fn find_macro(&self, name: &str, env: Env) -> Option<(Rc<Macro>, Env)> {
         let found = |env: Env, name: &str| match self.macros.find(env.macros, name) {
@@ -70,7 +70,7 @@ impl Expander<'_> {
         found(inner, name)
     }
 
-    /// Replaces a call by the macro's body.
+    /// Replaces a call with the macro's body.
     pub(super) fn macro_call(
         &mut self,
         mut call: Element,
@@ -84,11 +84,11 @@ impl Expander<'_> {
         let Some((found, outer)) = self.find_macro(&name, env) else {
             let near =
                 closest(&name, self.macros.names(env.macros)).map(|near| format!("did you mean `xacro:{near}`?"));
-            return Err(Trouble::new(format!("unknown macro name: {}", call.name)).at(at).hint(near));
+            return Err(ExpansionError::new(format!("unknown macro name: {}", call.name)).at(at).hint(near));
         };
         self.enter().map_err(|e| e.at(at))?;
-        // A call makes scopes and copies a body: more work than an element.
-        self.charge(CALL).map_err(|e| Trouble::new(e).at(at))?;
+        // A call creates scopes and copies a body: more work than an element.
+        self.charge(CALL_STEPS).map_err(|e| ExpansionError::new(e).at(at))?;
         let inner =
             Env { symbols: self.scopes.below(outer.symbols, false), macros: self.macros.below(Some(outer.macros)) };
         let mut open: Vec<&Parameter> = found.parameters.iter().collect();
@@ -100,7 +100,7 @@ impl Expander<'_> {
                     None => format!("the macro `{name}` takes: {}", known.join(" ")),
                 };
                 let what = format!("Invalid parameter \"{}\"", attribute.name);
-                return Err(Trouble::new(what).at(attribute.at).hint(Some(hint)));
+                return Err(ExpansionError::new(what).at(attribute.at).hint(Some(hint)));
             };
             let parameter = open.remove(at);
             let value = typed(self.text(&attribute.value, env, attribute.at)?);
@@ -110,7 +110,7 @@ impl Expander<'_> {
         self.blocks(&mut open, call, inner)?;
         self.defaults(&mut open, &found, env, inner).map_err(|e| e.at(at))?;
         let mut body = Element { children: found.body.children.clone(), at: found.body.at, ..Element::default() };
-        // The namespaces that the macro's element declares go where its content goes.
+        // Namespaces declared by the macro's element move along with its content.
         body.attributes = found.body.attributes.iter().filter(|a| a.name.starts_with("xmlns:")).cloned().collect();
         let number = self.calls.add(&name, at);
         body.stamp(number);
@@ -122,7 +122,7 @@ impl Expander<'_> {
         Ok(())
     }
 
-    /// Gives the elements inside a call to the parameters that take blocks, in order.
+    /// Assigns the elements inside a call to block parameters, in order.
     fn blocks(&mut self, open: &mut Vec<&Parameter>, call: Element, inner: Env) -> Result {
         let at = call.at;
         let mut elements = call.children.into_iter().filter_map(|node| match node {
@@ -133,7 +133,7 @@ impl Expander<'_> {
             let parameter = open.remove(i);
             let Some(element) = elements.next() else {
                 let name = parameter.name.trim_start_matches('*');
-                return Err(Trouble::new(format!("Not enough blocks: `{name}` is missing")).at(at));
+                return Err(ExpansionError::new(format!("Not enough blocks: `{name}` is missing")).at(at));
             };
             let block = match parameter.name.starts_with("**") {
                 true => Block::Content(element.children, element.at),
@@ -142,12 +142,12 @@ impl Expander<'_> {
             self.scopes.set(inner.symbols, &parameter.name, Entry::Block(Rc::new(block)));
         }
         match elements.next() {
-            Some(element) => Err(Trouble::new(format!("Unused block \"{}\"", element.name)).at(element.at)),
+            Some(element) => Err(ExpansionError::new(format!("Unused block \"{}\"", element.name)).at(element.at)),
             None => Ok(()),
         }
     }
 
-    /// Fills the parameters that were not given.
+    /// Fills in parameters that were not given.
     fn defaults(&mut self, open: &mut Vec<&Parameter>, found: &Macro, env: Env, inner: Env) -> Result {
         let mut missing = Vec::new();
         for parameter in std::mem::take(open) {
@@ -164,30 +164,30 @@ impl Expander<'_> {
                 (Some(value), _) => value,
                 (None, Some(text)) => self.text(text, env, place)?,
                 (None, None) => {
-                    return Err(Trouble::new(format!("Undefined property to forward: {}", parameter.name)));
+                    return Err(ExpansionError::new(format!("Undefined property to forward: {}", parameter.name)));
                 }
             };
             self.scopes.set(inner.symbols, &parameter.name, Entry::Value(typed(value)));
         }
         match missing.is_empty() {
             true => Ok(()),
-            false => Err(Trouble::new(format!("Undefined parameters [{}]", missing.join(",")))
+            false => Err(ExpansionError::new(format!("Undefined parameters [{}]", missing.join(",")))
                 .hint(Some(format!("the macro `{}` needs a value for each", found.name)))),
         }
     }
 
-    /// The value that a name has for the caller.
+    /// Returns the value of a name in the caller's scope.
     fn known(&mut self, name: &str, env: Env) -> Result<Option<super::value::Value>> {
         let own = self.resolve(env.symbols, name, env.macros)?;
         Ok(own.or_else(|| super::functions::global(name)))
     }
 
-    /// Moves namespace declarations of what is replaced to where its content goes.
+    /// Moves namespace declarations of a replaced element to its content.
     pub(super) fn import_namespaces(&mut self, parent: &mut Element, from: &Element) {
         for declared in from.attributes.iter().filter(|a| a.name.starts_with("xmlns:") && a.name != "xmlns:xacro") {
             match parent.attribute(&declared.name) {
                 Some(old) if old.value != declared.value => {
-                    let what = format!("{} means two things: {} and {}", declared.name, old.value, declared.value);
+                    let what = format!("{} has two meanings: {} and {}", declared.name, old.value, declared.value);
                     self.tree.report(Diag::warning(what).at(declared.at.label()));
                 }
                 _ => parent.set(&declared.name, declared.value.clone(), declared.at),

@@ -8,21 +8,21 @@ use super::methods;
 use super::syntax::{Expr, Loop, parse};
 use super::value::{Dict, Value};
 
-/// The longest text or list that an expression may make.
+/// Maximum length of a text or list made by an expression.
 pub(super) const MAX_LENGTH: usize = 1 << 20;
 
-/// Why an expression has no value: Python's words where there are some.
+/// Result of an expression; errors use Python's wording where it exists.
 pub(super) type Evaluated<T = Value> = Result<T, String>;
 
-/// What expressions may ask of their surroundings.
+/// Environment of an expression.
 pub(super) trait Host {
-    /// The value of a name.
+    /// Returns the value of a name.
     fn name(&mut self, name: &str) -> Evaluated<Option<Value>>;
-    /// The value of a name in a namespace.
+    /// Returns the value of a name in a namespace.
     fn member(&mut self, namespace: usize, name: &str) -> Evaluated<Option<Value>>;
-    /// A function that needs files, arguments or messages; `None` if there is no such function.
+    /// Calls a function that needs files, arguments or messages; `None` if there is no such function.
     fn call(&mut self, function: &str, values: &[Value]) -> Option<Evaluated>;
-    /// Counts work; the error says that it is too much.
+    /// Counts work; fails beyond the limit.
     fn charge(&mut self, steps: usize) -> Evaluated<()>;
 }
 
@@ -32,10 +32,10 @@ pub(super) fn evaluate(text: &str, host: &mut dyn Host) -> Evaluated {
     Interpreter { host, locals: Vec::new() }.value(&expr)
 }
 
-/// An expression under evaluation.
+/// Evaluates one expression.
 pub(super) struct Interpreter<'h> {
     pub(super) host: &'h mut dyn Host,
-    /// Names of comprehensions, innermost last.
+    /// Names bound by comprehensions, innermost last.
     locals: Vec<(String, Value)>,
 }
 
@@ -200,7 +200,7 @@ impl Interpreter<'_> {
     }
 
     fn call(&mut self, function: &Expr, values: &[Expr], named: &[(String, Expr)]) -> Evaluated {
-        // A method: its object is no value that could be kept.
+        // A method call: a bound method is not a value.
         if let Expr::Attribute(object, name) = function {
             let object = self.value(object)?;
             if !matches!(object, Value::Module(_) | Value::Namespace(_)) {
@@ -267,7 +267,7 @@ impl Interpreter<'_> {
     }
 }
 
-/// What a value consists of, for loops: items, characters, keys.
+/// Returns the elements that a loop visits: items, characters, keys.
 pub(super) fn items(value: &Value) -> Evaluated<Vec<Value>> {
     match value {
         Value::List(items) | Value::Tuple(items) => Ok(items.to_vec()),
@@ -277,7 +277,7 @@ pub(super) fn items(value: &Value) -> Evaluated<Vec<Value>> {
     }
 }
 
-/// A value that may be a key.
+/// Returns the value if it is hashable.
 pub(super) fn hashable(value: Value) -> Evaluated {
     match value {
         Value::List(_) | Value::Dict(_) => Err(format!("unhashable type: '{}'", value.type_name())),
@@ -285,7 +285,7 @@ pub(super) fn hashable(value: Value) -> Evaluated {
     }
 }
 
-/// How much work making this value was.
+/// Returns the work of making this value.
 fn length(value: &Value) -> usize {
     match value {
         Value::Str(text) => text.len() / 16,
@@ -415,7 +415,7 @@ fn integers(sign: &str, a: i64, b: i64) -> Evaluated {
         "//" if b == 0 => Err("integer division or modulo by zero".to_owned()),
         "%" if b == 0 => Err("integer modulo by zero".to_owned()),
         "/" => Ok(Value::Float(a as f64 / b as f64)),
-        // Rounded down, and the remainder has the divisor's sign.
+        // Rounded down; the remainder has the divisor's sign.
         "//" => whole(a.checked_div(b).map(|q| if (a % b != 0) && ((a < 0) != (b < 0)) { q - 1 } else { q })),
         "%" => whole(a.checked_rem(b).map(|r| if r != 0 && ((r < 0) != (b < 0)) { r + b } else { r })),
         "**" => match u32::try_from(b) {

@@ -1,4 +1,4 @@
-//! The walk over the elements: each is copied, filled in, or replaced by what it stands for.
+//! Walks the elements: each is copied, evaluated, or replaced by its expansion.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
@@ -7,17 +7,17 @@ use std::rc::Rc;
 use super::evaluate::Evaluated;
 use super::scope::{Block, Entry, Macros, Scopes};
 use super::value::Value;
-use super::{Expansion, Result, Trouble};
+use super::{Expansion, ExpansionError, Result};
 use crate::robot::packages::{Packages, absolute, plain};
 use crate::robot::xml::{Calls, Document, Element, Node};
 use crate::yaml::{Diag, Tree, closest};
 
-/// The deepest nesting of elements, macro calls and properties that wait for each other.
+/// Maximum nesting of elements, macro calls and properties under evaluation.
 const MAX_DEPTH: usize = 400;
-/// The most work of one expansion, in elements, attributes and steps of expressions.
+/// Maximum work of one expansion, in elements, attributes and steps of expressions.
 const MAX_STEPS: usize = 3_000_000;
 
-/// Where names are looked up.
+/// Scope in which names are looked up.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Env {
     pub(super) symbols: usize,
@@ -30,22 +30,22 @@ pub(super) struct Expander<'t> {
     pub(super) packages: &'t Packages,
     given: &'t BTreeMap<String, String>,
     pub(super) args: BTreeMap<String, String>,
-    /// Arguments that the files know.
+    /// Arguments declared by the files.
     pub(super) declared: BTreeSet<String>,
     pub(super) scopes: Scopes,
     pub(super) macros: Macros,
     pub(super) calls: Calls,
-    /// The files that are being read, the innermost last.
+    /// Stack of files being read, the innermost last.
     pub(super) files: Vec<PathBuf>,
     pub(super) read: Vec<PathBuf>,
     pub(super) parsed: HashMap<PathBuf, Rc<Document>>,
     /// Folders that files may be read from.
     pub(super) roots: Vec<PathBuf>,
-    /// Properties that are being evaluated, for naming a circle.
+    /// Properties under evaluation, to report a cycle.
     pub(super) pending: Vec<String>,
     depth: usize,
     steps: usize,
-    /// Number of the barrier that stands; earlier ones have moved there.
+    /// Number of the current barrier; earlier ones have moved there.
     barrier: u32,
 }
 
@@ -95,13 +95,13 @@ impl<'t> Expander<'t> {
         Some(Expansion { document, calls: self.calls, files: self.read, unknown_args })
     }
 
-    /// Goes one level deeper; `leave` comes back.
+    /// Enters a level of nesting; `leave` undoes it.
     pub(super) fn enter(&mut self) -> Result {
         self.depth += 1;
-        self.charge(1).map_err(Trouble::new)?;
+        self.charge(1).map_err(ExpansionError::new)?;
         if self.depth > MAX_DEPTH {
             let what = format!("elements and macro calls are nested deeper than {MAX_DEPTH}");
-            return Err(Trouble::new(what).hint(Some("does a macro call itself without end?".to_owned())));
+            return Err(ExpansionError::new(what).hint(Some("does a macro call itself without end?".to_owned())));
         }
         Ok(())
     }
@@ -126,7 +126,7 @@ impl<'t> Expander<'t> {
         Ok(())
     }
 
-    /// Evaluates what an element contains.
+    /// Evaluates an element's content.
     pub(super) fn content(&mut self, element: &mut Element, env: Env) -> Result {
         let nodes = std::mem::take(&mut element.children);
         let count = nodes.len();
@@ -158,10 +158,10 @@ impl<'t> Expander<'t> {
         Ok(())
     }
 
-    /// Evaluates one child; what it comes to goes to `out`.
+    /// Evaluates one child and appends the result to `out`.
     fn child(&mut self, child: Element, parent: &mut Element, out: &mut Vec<Node>, last: bool, env: Env) -> Result {
         let at = child.at;
-        self.charge(1).map_err(|e| Trouble::new(e).at(at))?;
+        self.charge(1).map_err(|e| ExpansionError::new(e).at(at))?;
         match child.name.as_str() {
             "xacro:property" => {
                 self.drop_comments(out, last);
@@ -195,7 +195,7 @@ impl<'t> Expander<'t> {
                 let name = self.needed(&child, "name", env)?;
                 let value = self.needed(&child, "value", env)?;
                 if name.is_empty() {
-                    return Err(Trouble::new("this xacro:attribute has an empty name").at(at));
+                    return Err(ExpansionError::new("this xacro:attribute has an empty name").at(at));
                 }
                 if matches!(parent.name.as_str(), "xacro:if" | "xacro:unless") {
                     let what = "inside a condition xacro:attribute has no effect: the element it would change is gone";
@@ -231,10 +231,10 @@ impl<'t> Expander<'t> {
     ) -> Result {
         let name = self.needed(&child, "xacro:name", env)?;
         if name.is_empty() || name.contains(|c: char| c.is_whitespace() || "<>&\"'/=".contains(c)) {
-            return Err(Trouble::new(format!("`{name}` is no name for an element")).at(child.at));
+            return Err(ExpansionError::new(format!("`{name}` is not an element name")).at(child.at));
         }
         if name == "xacro:element" {
-            return Err(Trouble::new("xacro:element cannot make another xacro:element").at(child.at));
+            return Err(ExpansionError::new("xacro:element cannot make another xacro:element").at(child.at));
         }
         child.attributes.retain(|a| a.name != "xacro:name");
         child.name = name;
@@ -250,12 +250,12 @@ impl<'t> Expander<'t> {
         env: Env,
     ) -> Result {
         let Some(condition) = child.attribute("value").cloned() else {
-            return Err(Trouble::new(format!("this {} has no `value`", child.name)).at(child.at));
+            return Err(ExpansionError::new(format!("this {} has no `value`", child.name)).at(child.at));
         };
         let value = self.text(&condition.value, env, condition.at)?;
-        let holds = boolean(&value, &condition.value).map_err(|e| Trouble::new(e).at(condition.at))?;
+        let holds = boolean(&value, &condition.value).map_err(|e| ExpansionError::new(e).at(condition.at))?;
         if holds == (child.name == "xacro:if") {
-            // What it keeps belongs to the parent; so do namespaces that includes and macros inside declare.
+            // Its content belongs to the parent; so do namespaces declared by includes and macros inside.
             child.attributes.clear();
             self.element(&mut child, env)?;
             for declared in child.attributes.iter().filter(|a| a.name.starts_with("xmlns:")) {
@@ -269,7 +269,7 @@ impl<'t> Expander<'t> {
     fn arg(&mut self, child: &Element, env: Env) -> Result {
         let name = match child.attribute("name") {
             Some(name) => name.value.clone(),
-            None => return Err(Trouble::new("this xacro:arg has no `name`").at(child.at)),
+            None => return Err(ExpansionError::new("this xacro:arg has no `name`").at(child.at)),
         };
         self.declared.insert(name.clone());
         if !self.args.contains_key(&name)
@@ -281,10 +281,10 @@ impl<'t> Expander<'t> {
         Ok(())
     }
 
-    /// The content of an `xacro:insert_block`.
+    /// Returns the content of an `xacro:insert_block`.
     fn block(&mut self, child: &Element, env: Env) -> Result<Vec<Node>> {
         let Some(name) = child.attribute("name") else {
-            return Err(Trouble::new("this xacro:insert_block has no `name`").at(child.at));
+            return Err(ExpansionError::new("this xacro:insert_block has no `name`").at(child.at));
         };
         let find = |prefix: &str| match self.scopes.find(env.symbols, &format!("{prefix}{}", name.value)) {
             Some(Entry::Block(block)) => Some(block.clone()),
@@ -292,7 +292,7 @@ impl<'t> Expander<'t> {
         };
         let block = find("**").or_else(|| find("*"));
         let Some(block) = block else {
-            return Err(Trouble::new(format!("Undefined block \"{}\"", name.value)).at(name.at));
+            return Err(ExpansionError::new(format!("Undefined block \"{}\"", name.value)).at(name.at));
         };
         match &*block {
             Block::Whole(element) => {
@@ -308,7 +308,7 @@ impl<'t> Expander<'t> {
         }
     }
 
-    /// Comments right before an element of xacro's go with it. A barrier keeps those that were decided on.
+    /// Removes comments right before an xacro element, up to the last barrier.
     pub(super) fn drop_comments(&mut self, out: &mut Vec<Node>, last: bool) {
         let mut at = out.len();
         loop {
@@ -334,12 +334,12 @@ impl<'t> Expander<'t> {
         }
     }
 
-    /// The folder of the file that is being read.
+    /// Returns the folder of the file being read.
     pub(super) fn folder(&self) -> PathBuf {
         self.files.last().and_then(|file| file.parent()).map(Path::to_owned).unwrap_or_default()
     }
 
-    /// A path beside the file that is being read, made plain.
+    /// Resolves a path relative to the file being read and normalizes it.
     pub(super) fn beside(&self, path: &str) -> PathBuf {
         plain(&self.folder().join(path))
     }
@@ -347,24 +347,24 @@ impl<'t> Expander<'t> {
     pub(super) fn charge(&mut self, steps: usize) -> Evaluated<()> {
         self.steps += steps;
         match self.steps > MAX_STEPS {
-            true => Err("the expansion is too much work\nhint: does a macro call itself without end?".to_owned()),
+            true => Err("the expansion takes too many steps\nhint: does a macro call itself without end?".to_owned()),
             false => Ok(()),
         }
     }
 }
 
-/// Whether a text between elements is a blank with one line break at most.
+/// Returns whether a text between elements is blank with at most one line break.
 fn is_small_gap(text: &str) -> bool {
     !text.is_empty() && text.trim().is_empty() && text.matches('\n').count() <= 1
 }
 
-/// Puts content where an element of xacro's stood: before the barrier that was set for it.
+/// Inserts content in place of an xacro element: before its barrier.
 pub(super) fn insert(out: &mut Vec<Node>, content: Vec<Node>, last: bool) {
     let at = if !last && matches!(out.last(), Some(Node::Barrier(_))) { out.len() - 1 } else { out.len() };
     out.splice(at..at, content);
 }
 
-/// The truth of a condition: xacro takes fewer texts for booleans than Python does.
+/// Returns a condition's value: xacro accepts fewer texts as booleans than Python.
 pub(super) fn boolean(value: &Value, condition: &str) -> std::result::Result<bool, String> {
     let Value::Str(text) = value else { return Ok(value.truth()) };
     match &**text {

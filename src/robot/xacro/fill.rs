@@ -1,4 +1,4 @@
-//! What texts come to: `${…}` with the names that it knows, `$(…)`, and both inside a text.
+//! Evaluates texts: `${…}` with the names in scope, `$(…)`, and both inside a text.
 
 use std::path::Path;
 
@@ -6,29 +6,29 @@ use super::evaluate::{Evaluated, Host, evaluate};
 use super::expand::{Env, Expander};
 use super::text::{Part, Substitution, converted, parts, substitution};
 use super::value::Value;
-use super::{Result, Trouble, functions};
+use super::{ExpansionError, Result, functions};
 use crate::robot::packages::absolute;
-use crate::robot::xml::{Element, Place};
+use crate::robot::xml::{Element, SourcePos};
 use crate::yaml::{Diag, closest};
 
-/// The longest text that an attribute may come to [bytes].
+/// Maximum length of an evaluated attribute [bytes].
 const MAX_TEXT: usize = 1 << 20;
 
 impl Expander<'_> {
-    /// An attribute that must be there, evaluated.
+    /// Returns a required attribute, evaluated.
     pub(super) fn needed(&mut self, element: &Element, name: &str, env: Env) -> Result<String> {
         match element.attribute(name).cloned() {
             Some(attribute) => Ok(self.text(&attribute.value, env, attribute.at)?.text()),
-            None => Err(Trouble::new(format!("{}: missing attribute '{name}'", element.name)).at(element.at)),
+            None => Err(ExpansionError::new(format!("{}: missing attribute '{name}'", element.name)).at(element.at)),
         }
     }
 
-    /// The value of a text. A text that is nothing but one expression keeps the expression's type.
-    pub(super) fn text(&mut self, text: &str, env: Env, at: Place) -> Result<Value> {
+    /// Evaluates a text. A text that is a single expression keeps the expression's type.
+    pub(super) fn text(&mut self, text: &str, env: Env, at: SourcePos) -> Result<Value> {
         if !text.contains('$') {
             return Ok(text.into());
         }
-        let parts = parts(text).map_err(|e| Trouble::new(e).at(at))?;
+        let parts = parts(text).map_err(|e| ExpansionError::new(e).at(at))?;
         let mut values = Vec::with_capacity(parts.len());
         for part in parts {
             values.push(match part {
@@ -36,7 +36,7 @@ impl Expander<'_> {
                 Part::Expression(inside) => self.expression(&inside, env, at)?,
                 Part::Substitution(inside) => {
                     let inside = self.text(&inside, env, at)?.text();
-                    self.substitution(&inside).map_err(|e| Trouble::new(e).at(at))?.into()
+                    self.substitution(&inside).map_err(|e| ExpansionError::new(e).at(at))?.into()
                 }
             });
         }
@@ -47,13 +47,13 @@ impl Expander<'_> {
         for value in values {
             out.push_str(&value.text());
             if out.len() > MAX_TEXT {
-                return Err(Trouble::new(format!("a text is longer than {MAX_TEXT} bytes")).at(at));
+                return Err(ExpansionError::new(format!("a text is longer than {MAX_TEXT} bytes")).at(at));
             }
         }
         Ok(out.into())
     }
 
-    fn expression(&mut self, inside: &str, env: Env, at: Place) -> Result<Value> {
+    fn expression(&mut self, inside: &str, env: Env, at: SourcePos) -> Result<Value> {
         let expression = self.text(inside, env, at)?.text();
         let mut host = Names { expander: self, env, trouble: None };
         let value = evaluate(&expression, &mut host);
@@ -68,18 +68,18 @@ impl Expander<'_> {
             };
             let hint = hint.or_else(|| self.near_name(&what, env));
             let shown: String = expression.chars().take(120).collect();
-            Trouble::new(format!("{what}, when evaluating the expression '{}'", shown.trim())).at(at).hint(hint)
+            ExpansionError::new(format!("{what}, when evaluating the expression '{}'", shown.trim())).at(at).hint(hint)
         })
     }
 
-    /// A name close to one that is not defined.
+    /// Returns a name similar to an undefined one.
     fn near_name(&self, what: &str, env: Env) -> Option<String> {
         let name = what.strip_prefix("name '")?.strip_suffix("' is not defined")?;
         let near = closest(name, self.scopes.names(env.symbols))?;
         Some(format!("did you mean `{near}`?"))
     }
 
-    /// The text of a `$(…)`.
+    /// Returns the text of a `$(…)`.
     fn substitution(&mut self, inside: &str) -> Evaluated<String> {
         match substitution(inside)? {
             Substitution::Arg(name) => self.argument(name),
@@ -117,12 +117,12 @@ impl Expander<'_> {
     }
 }
 
-/// Names of `${…}`: properties, then built-in ones.
+/// Names in `${…}`: properties, then built-in ones.
 struct Names<'e, 't> {
     expander: &'e mut Expander<'t>,
     env: Env,
-    /// What went wrong in a property, with its own place.
-    trouble: Option<Box<Trouble>>,
+    /// Error in a property, with its own position.
+    trouble: Option<Box<ExpansionError>>,
 }
 
 impl Host for Names<'_, '_> {
@@ -163,7 +163,7 @@ impl Host for Names<'_, '_> {
     }
 }
 
-/// Names of `$(eval …)`: arguments and built-in ones, no properties.
+/// Names in `$(eval …)`: arguments and built-in ones, no properties.
 struct Arguments<'e, 't> {
     expander: &'e mut Expander<'t>,
 }

@@ -1,12 +1,12 @@
-//! `'%.3f' % x`: numbers and texts laid out by Python's old format signs.
+//! `'%.3f' % x`: Python's printf-style formatting.
 
 use super::evaluate::Evaluated;
 use super::value::{Value, float_repr};
 
-/// The widest field, and the most decimals.
+/// Maximum field width and number of decimals.
 const MAX_WIDTH: usize = 200;
 
-/// The text of a format with its values.
+/// Formats values.
 pub(super) fn percent(format: &str, values: &Value) -> Evaluated<String> {
     let mut values = match values {
         Value::Tuple(items) => items.to_vec(),
@@ -102,7 +102,7 @@ impl Field {
     }
 }
 
-/// The name of a number that has no digits.
+/// Returns the text of a number without digits (`inf`, `nan`).
 fn named(value: f64) -> Option<String> {
     (!value.is_finite()).then(|| float_repr(value))
 }

@@ -1,4 +1,4 @@
-//! Built-in functions and constants: those of Python that xacro shows, and the `math` module.
+//! Built-in functions and constants: the Python built-ins that xacro exposes, and the `math` module.
 
 use std::f64::consts;
 use std::rc::Rc;
@@ -6,7 +6,7 @@ use std::rc::Rc;
 use super::evaluate::{Evaluated, Interpreter, MAX_LENGTH, hashable, items};
 use super::value::{Dict, Value, integer};
 
-/// Names that every expression may use, and those of the module `python`.
+/// Names available to every expression, and in the module `python`.
 const PYTHON: &[&str] = &[
     "list",
     "dict",
@@ -78,7 +78,7 @@ const MATH: &[&str] = &[
     "tanh",
     "trunc",
 ];
-/// Functions of the module `xacro`; the host answers all but `dotify` and `tokenize`.
+/// Functions of the module `xacro`; the host implements all but `dotify` and `tokenize`.
 const XACRO: &[&str] = &[
     "load_yaml",
     "abs_filename",
@@ -91,16 +91,16 @@ const XACRO: &[&str] = &[
     "print_location",
     "tokenize",
 ];
-/// Functions of `xacro` that old files call without its name.
+/// Functions of `xacro` that old files call without the module name.
 const BARE: &[&str] = &["load_yaml", "abs_filename", "dotify"];
 
-/// A name that every expression knows.
+/// Returns a global name.
 pub(super) fn global(name: &str) -> Option<Value> {
     let module = ["math", "python", "xacro"].into_iter().find(|m| *m == name).map(Value::Module);
     module.or_else(|| find(PYTHON, name)).or_else(|| in_module("math", name)).or_else(|| find(BARE, name))
 }
 
-/// A name of a module.
+/// Returns a name of a module.
 pub(super) fn in_module(module: &str, name: &str) -> Option<Value> {
     match module {
         "python" => find(PYTHON, name),
@@ -249,7 +249,7 @@ fn dict(values: &[Value], named: &[(String, Value)]) -> Evaluated {
     Ok(Value::Dict(Rc::new(out)))
 }
 
-/// A dictionary whose keys, and those of all below, can be read as attributes.
+/// Converts a dictionary so that its keys, at all levels, are also attributes.
 fn dotify(value: &Value) -> Evaluated {
     fn dotted(value: &Value) -> Value {
         match value {
@@ -316,7 +316,7 @@ fn extreme(name: &str, values: &[Value]) -> Evaluated {
     Ok(best)
 }
 
-/// Python rounds halves to even, and by the exact value of the number.
+/// Python rounds halves to even, by the exact value of the number.
 fn round(value: &Value, digits: Option<&Value>) -> Evaluated {
     if let (Some(whole), None) = (value.as_int(), digits) {
         return Ok(Value::Int(whole));

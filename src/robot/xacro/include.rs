@@ -1,5 +1,5 @@
-//! Files that a description reads: `xacro:include`, `load_yaml`. Only from its own package and from packages that it
-//! was given or that ROS knows.
+//! Files that a description reads: `xacro:include`, `load_yaml`. Only from its own package, given packages, and
+//! packages known to ROS.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,21 +10,21 @@ use super::expand::{Env, Expander, boolean};
 use super::scope::{Entry, MacroEntry};
 use super::value::Value;
 use super::yaml11;
-use super::{Result, Trouble};
+use super::{ExpansionError, Result};
 use crate::robot::xml::{self, Document, Element, Node};
 
-/// The deepest nesting of includes.
+/// Maximum nesting of includes.
 const MAX_DEPTH: usize = 16;
-/// The most files of one expansion.
+/// Maximum number of files per expansion.
 const MAX_FILES: usize = 1000;
 
 impl Expander<'_> {
-    /// `xacro:include`: what the file contains.
+    /// `xacro:include`: inserts the file's content.
     pub(super) fn include(&mut self, element: &Element, parent: &mut Element, env: Env) -> Result<Vec<Node>> {
         let at = element.attribute("filename").map_or(element.at, |a| a.at);
         let name = self.needed(element, "filename", env)?;
         let optional = match element.attribute("optional") {
-            Some(a) => boolean(&a.value.as_str().into(), &a.value).map_err(|e| Trouble::new(e).at(a.at))?,
+            Some(a) => boolean(&a.value.as_str().into(), &a.value).map_err(|e| ExpansionError::new(e).at(a.at))?,
             None => false,
         };
         let inner = match element.attribute("ns").filter(|ns| !ns.value.is_empty()) {
@@ -40,15 +40,15 @@ impl Expander<'_> {
         let path = self.beside(&name);
         let mut content = Vec::new();
         for path in matching(&path) {
-            self.allowed(&path).map_err(|e| Trouble::new(e).at(at))?;
+            self.allowed(&path).map_err(|e| ExpansionError::new(e).at(at))?;
             if !path.is_file() {
                 if optional {
                     continue;
                 }
-                return Err(Trouble::new(format!("No such file or directory: {}", path.display())).at(at));
+                return Err(ExpansionError::new(format!("No such file or directory: {}", path.display())).at(at));
             }
             if self.files.len() > MAX_DEPTH {
-                return Err(Trouble::new(format!("includes are nested deeper than {MAX_DEPTH}")).at(at));
+                return Err(ExpansionError::new(format!("includes are nested deeper than {MAX_DEPTH}")).at(at));
             }
             let document = self.parse(&path).map_err(|e| e.at(at))?;
             self.files.push(path);
@@ -62,7 +62,7 @@ impl Expander<'_> {
         Ok(content)
     }
 
-    /// Refuses files that belong to none of the packages.
+    /// Rejects files outside the allowed packages.
     fn allowed(&self, path: &Path) -> Evaluated<()> {
         if self.roots.iter().any(|root| path.starts_with(root)) {
             return Ok(());
@@ -79,17 +79,17 @@ impl Expander<'_> {
         if let Some(known) = self.parsed.get(path) {
             return Ok(known.clone());
         }
-        let text = self.content_of(path, xml::MAX_BYTES as u64).map_err(Trouble::new)?;
+        let text = self.content_of(path, xml::MAX_BYTES as u64).map_err(ExpansionError::new)?;
         let source = self.tree.add_source(path.display().to_string(), text);
         let Some(document) = xml::parse(self.tree, source) else {
-            return Err(Trouble::new(format!("the included file cannot be read: {}", path.display())));
+            return Err(ExpansionError::new(format!("cannot read the included file: {}", path.display())));
         };
         let document = Rc::new(document);
         self.parsed.insert(path.to_owned(), document.clone());
         Ok(document)
     }
 
-    /// The text of a file; it counts as read.
+    /// Reads a file and counts it.
     fn content_of(&mut self, path: &Path, most: u64) -> Evaluated<String> {
         let named = |what: String| format!("{}: {what}", path.display());
         if self.read.len() >= MAX_FILES {
@@ -100,7 +100,7 @@ impl Expander<'_> {
             return Err(named(format!("the file is larger than {} MiB", most >> 20)));
         }
         let bytes = fs::read(path).map_err(|e| named(e.to_string()))?;
-        let text = String::from_utf8(bytes).map_err(|_| named("bytes that are not UTF-8".to_owned()))?;
+        let text = String::from_utf8(bytes).map_err(|_| named("the file is not UTF-8".to_owned()))?;
         self.read.push(path.to_owned());
         Ok(text)
     }
@@ -117,15 +117,15 @@ impl Expander<'_> {
         let mut number = |text: &str| {
             let value = evaluate(text, &mut Numbers)?;
             match value {
-                Value::Str(text) => text.trim().parse().map_err(|_| format!("{text:?} is no number")),
-                value => value.as_float().ok_or_else(|| format!("{text:?} is no number")),
+                Value::Str(text) => text.trim().parse().map_err(|_| format!("{text:?} is not a number")),
+                value => value.as_float().ok_or_else(|| format!("{text:?} is not a number")),
             }
         };
         yaml11::load(&text, &mut number).map_err(|what| format!("{}: {what}", path.display()))
     }
 }
 
-/// Expressions of units in YAML know built-in names only.
+/// Expressions of units in YAML see built-in names only.
 struct Numbers;
 
 impl super::evaluate::Host for Numbers {
@@ -146,7 +146,8 @@ impl super::evaluate::Host for Numbers {
     }
 }
 
-/// The files that a name means: with `*` and `?` in its last part all that match, in order; otherwise itself.
+/// Returns the files that match a name: with `*` and `?` in its last part all matches, sorted; otherwise the name
+/// itself.
 fn matching(path: &Path) -> Vec<PathBuf> {
     let pattern = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     if !pattern.contains(['*', '?']) {
@@ -159,11 +160,11 @@ fn matching(path: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Whether a name fits a pattern with `*` and `?`.
+/// Returns whether a name matches a pattern with `*` and `?`.
 fn fits(pattern: &str, name: &str) -> bool {
     let (pattern, name): (Vec<char>, Vec<char>) = (pattern.chars().collect(), name.chars().collect());
     let (mut p, mut n) = (0, 0);
-    // Where the last star stood, and the character it was tried up to.
+    // Position of the last star, and of the character tried with it.
     let mut star: Option<(usize, usize)> = None;
     while n < name.len() {
         match pattern.get(p) {

@@ -1,4 +1,4 @@
-//! Methods of texts, lists and dictionaries that leave their object as it is.
+//! Methods of texts, lists and dictionaries that do not modify their object.
 
 use std::rc::Rc;
 
@@ -24,7 +24,7 @@ fn text_at<'v>(values: &'v [Value], at: usize, name: &str) -> Evaluated<&'v str>
     }
 }
 
-/// The characters that a `strip` takes away.
+/// Removes the characters that a `strip` names.
 fn stripped<'t>(text: &'t str, name: &str, values: &[Value]) -> Evaluated<&'t str> {
     let wanted: Option<Vec<char>> = match values.first() {
         Some(Value::Str(chars)) => Some(chars.chars().collect()),
@@ -41,7 +41,7 @@ fn stripped<'t>(text: &'t str, name: &str, values: &[Value]) -> Evaluated<&'t st
 fn of_text(text: &str, name: &str, values: &[Value], named: &[(String, Value)]) -> Option<Evaluated> {
     let text_value = |text: &str| Ok(Value::from(text));
     let chars = |byte: usize| text[..byte].chars().count() as i64;
-    // `startswith` and `endswith` take several ends as a tuple.
+    // `startswith` and `endswith` accept a tuple.
     let any = |test: &dyn Fn(&str) -> bool| match values.first() {
         Some(Value::Tuple(ends)) => Ok(Value::Bool(ends.iter().any(|end| matches!(end, Value::Str(e) if test(e))))),
         _ => text_at(values, 0, name).map(|end| Value::Bool(test(end))),

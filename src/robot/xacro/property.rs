@@ -1,4 +1,4 @@
-//! Properties: set, looked up when needed, evaluated once.
+//! Properties: set, looked up on use, evaluated once.
 
 use std::rc::Rc;
 
@@ -7,7 +7,7 @@ use super::functions;
 use super::scope::{Block, Entry};
 use super::tokens::is_identifier;
 use super::value::{Value, literal};
-use super::{Result, Trouble};
+use super::{ExpansionError, Result};
 use crate::robot::xml::{Attribute, Element};
 use crate::yaml::Diag;
 
@@ -17,15 +17,17 @@ impl Expander<'_> {
         let at = element.at;
         let name = self.needed(&element, "name", env)?;
         if !is_identifier(&name) {
-            return Err(Trouble::new(format!("Property names must be valid python identifiers: {name}")).at(at));
+            return Err(ExpansionError::new(format!("Property names must be valid python identifiers: {name}")).at(at));
         }
         if name.starts_with("__") {
-            return Err(Trouble::new(format!("Property names must not start with double underscore: {name}")).at(at));
+            return Err(
+                ExpansionError::new(format!("Property names must not start with double underscore: {name}")).at(at)
+            );
         }
         let flag = |expander: &mut Self, key: &str, otherwise: bool| match element.attribute(key).cloned() {
             Some(a) => {
                 let value = expander.text(&a.value, env, a.at)?;
-                boolean(&value, &a.value).map_err(|e| Trouble::new(e).at(a.at))
+                boolean(&value, &a.value).map_err(|e| ExpansionError::new(e).at(a.at))
             }
             None => Ok(otherwise),
         };
@@ -34,7 +36,7 @@ impl Expander<'_> {
         let default = element.attribute("default").cloned();
         if usize::from(value.is_some()) + usize::from(default.is_some()) + usize::from(remove) > 1 {
             let what = format!("Property attributes default, value, and remove are mutually exclusive: {name}");
-            return Err(Trouble::new(what).at(at));
+            return Err(ExpansionError::new(what).at(at));
         }
         let known = self.scopes.find(env.symbols, &name).is_some() || functions::global(&name).is_some();
         if remove && known {
@@ -71,7 +73,7 @@ impl Expander<'_> {
     fn assign(&mut self, target: usize, name: &str, value: &Attribute, lazy: bool, env: Env) -> Result {
         let entry = if lazy {
             match literal(&value.value) {
-                // No literal: evaluated when it is used.
+                // Not a literal: evaluated on first use.
                 Value::Str(text) => Entry::Lazy(text.to_string(), value.at),
                 other => Entry::Value(other),
             }
@@ -82,7 +84,7 @@ impl Expander<'_> {
         Ok(())
     }
 
-    /// The value of a name from a scope upwards. A lazy property is evaluated in the scope that it stands in.
+    /// Returns the value of a name from a scope upwards. A lazy property is evaluated in its own scope.
     pub(super) fn resolve(&mut self, scope: usize, name: &str, macros: usize) -> Result<Option<Value>> {
         let Some(owner) = self.scopes.owner(scope, name) else { return Ok(None) };
         let (text, at) = match self.scopes.find(owner, name) {
@@ -91,8 +93,10 @@ impl Expander<'_> {
             Some(Entry::Pending) => {
                 let from = self.pending.iter().position(|p| p == name).unwrap_or(0);
                 let circle = self.pending.get(from..).unwrap_or_default().join(" -> ");
-                let hint = "lazy_eval=\"false\" evaluates a property where it stands".to_owned();
-                return Err(Trouble::new(format!("circular variable definition: {circle} -> {name}")).hint(Some(hint)));
+                let hint = "lazy_eval=\"false\" evaluates a property at its definition".to_owned();
+                return Err(
+                    ExpansionError::new(format!("circular variable definition: {circle} -> {name}")).hint(Some(hint))
+                );
             }
             Some(Entry::Block(_)) | None => return Ok(None),
         };
@@ -107,7 +111,7 @@ impl Expander<'_> {
     }
 }
 
-/// A value with texts that are numbers or booleans turned into these.
+/// Converts texts that are numbers or booleans.
 pub(super) fn typed(value: Value) -> Value {
     match value {
         Value::Str(text) => literal(&text),

@@ -1,30 +1,30 @@
-//! Where names live: scopes of properties, and tables of macros. Each may have a parent that is looked at next.
+//! Name lookup: scopes of properties, and tables of macros. Each may have a parent that is searched next.
 
 use std::collections::HashMap;
 use std::rc::Rc;
 
 use super::value::Value;
-use crate::robot::xml::{Element, Node, Place};
+use crate::robot::xml::{Element, Node, SourcePos};
 
-/// What a name stands for.
+/// Meaning of a name.
 #[derive(Debug, Clone)]
 pub(super) enum Entry {
     Value(Value),
-    /// A text that is evaluated when it is first used.
-    Lazy(String, Place),
-    /// Being evaluated: met again, it is circular.
+    /// A text, evaluated on first use.
+    Lazy(String, SourcePos),
+    /// Under evaluation: a second visit is a cycle.
     Pending,
-    /// XML: the content of a property, or a block given to a macro.
+    /// XML: the content of a property, or a block passed to a macro.
     Block(Rc<Block>),
 }
 
-/// XML that can be inserted.
+/// XML for insertion.
 #[derive(Debug)]
 pub(super) enum Block {
     /// An element itself.
     Whole(Element),
-    /// What an element contains.
-    Content(Vec<Node>, Place),
+    /// The content of an element.
+    Content(Vec<Node>, SourcePos),
 }
 
 #[derive(Debug, Default)]
@@ -34,7 +34,7 @@ struct Scope {
     namespace: bool,
 }
 
-/// All scopes; number 0 is the global one.
+/// All scopes; index 0 is the global one.
 #[derive(Debug)]
 pub(super) struct Scopes(Vec<Scope>);
 
@@ -43,18 +43,18 @@ impl Scopes {
         Self(vec![Scope::default()])
     }
 
-    /// A new scope below another.
+    /// Creates a scope below another.
     pub(super) fn below(&mut self, parent: usize, namespace: bool) -> usize {
         self.0.push(Scope { names: HashMap::new(), parent: Some(parent), namespace });
         self.0.len() - 1
     }
 
-    /// The scope that has a name, from `scope` upwards.
+    /// Returns the scope that has a name, from `scope` upwards.
     pub(super) fn owner(&self, scope: usize, name: &str) -> Option<usize> {
         self.chain(scope).find(|s| self.0.get(*s).is_some_and(|scope| scope.names.contains_key(name)))
     }
 
-    /// What a name stands for, from `scope` upwards.
+    /// Returns the meaning of a name, from `scope` upwards.
     pub(super) fn find(&self, scope: usize, name: &str) -> Option<&Entry> {
         self.owner(scope, name).and_then(|s| self.0.get(s)).and_then(|scope| scope.names.get(name))
     }
@@ -65,7 +65,7 @@ impl Scopes {
         }
     }
 
-    /// Forgets a name in a scope and all above it.
+    /// Removes a name from a scope and its ancestors.
     pub(super) fn remove(&mut self, scope: usize, name: &str) {
         for scope in self.chain(scope).collect::<Vec<_>>() {
             if let Some(scope) = self.0.get_mut(scope) {
@@ -74,7 +74,7 @@ impl Scopes {
         }
     }
 
-    /// The scope that `scope="parent"` means: the caller's, which is no namespace.
+    /// Returns the scope of `scope="parent"`: the caller's, which is not a namespace.
     pub(super) fn parent(&self, scope: usize) -> Option<usize> {
         let own = self.0.get(scope)?;
         let mut parent = own.parent?;
@@ -84,7 +84,7 @@ impl Scopes {
         Some(parent)
     }
 
-    /// The names of a scope and all above, for hints.
+    /// Returns the names of a scope and its ancestors, for hints.
     pub(super) fn names(&self, scope: usize) -> Vec<&str> {
         let scopes = self.chain(scope).filter_map(|s| self.0.get(s));
         scopes.flat_map(|s| s.names.keys()).map(String::as_str).collect()
@@ -100,27 +100,27 @@ impl Scopes {
 pub(super) struct Macro {
     pub(super) name: String,
     pub(super) parameters: Vec<Parameter>,
-    /// Its element: what it contains is the body.
+    /// Its element; the content is the body.
     pub(super) body: Element,
 }
 
-/// A parameter of a macro. One whose name starts with `*` takes an element, with `**` what an element contains.
+/// A parameter of a macro. `*name` takes an element, `**name` the content of an element.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Parameter {
     pub(super) name: String,
     pub(super) default: Option<Default>,
 }
 
-/// What a parameter is when it is not given.
+/// Default of a parameter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Default {
-    /// The caller's value of the same name comes first.
+    /// The caller's value of the same name has priority.
     pub(super) forward: bool,
     /// A text to evaluate.
     pub(super) text: Option<String>,
 }
 
-/// What a table of macros holds.
+/// Entry of a table of macros.
 #[derive(Debug, Clone)]
 pub(super) enum MacroEntry {
     Macro(Rc<Macro>),
@@ -128,7 +128,7 @@ pub(super) enum MacroEntry {
     Namespace(usize),
 }
 
-/// All tables of macros; number 0 is the global one.
+/// All tables of macros; index 0 is the global one.
 #[derive(Debug)]
 pub(super) struct Macros(Vec<(HashMap<String, MacroEntry>, Option<usize>)>);
 
@@ -137,7 +137,7 @@ impl Macros {
         Self(vec![(HashMap::new(), None)])
     }
 
-    /// A new table; that of an include with `ns` has no parent.
+    /// Creates a table; that of an include with `ns` has no parent.
     pub(super) fn below(&mut self, parent: Option<usize>) -> usize {
         self.0.push((HashMap::new(), parent));
         self.0.len() - 1
@@ -154,7 +154,7 @@ impl Macros {
         }
     }
 
-    /// The names of a table and all above, for hints.
+    /// Returns the names of a table and its ancestors, for hints.
     pub(super) fn names(&self, table: usize) -> Vec<&str> {
         let tables = std::iter::successors(self.0.get(table), |(_, parent)| parent.and_then(|p| self.0.get(p)));
         tables.flat_map(|(names, _)| names.keys()).map(String::as_str).collect()
@@ -191,14 +191,14 @@ pub(super) fn parameters(text: &str) -> Result<Vec<Parameter>, String> {
                 Some(Default { forward, text: Some(text.to_owned()).filter(|t| !t.is_empty()) })
             }
         };
-        // A default of nothing is none: the empty text is written ''.
+        // An empty default is no default: the empty text is written ''.
         let default = default.filter(|d| d.forward || d.text.is_some());
         out.push(Parameter { name: name.to_owned(), default });
     }
     Ok(out)
 }
 
-/// How long a default value is: up to a space that is not inside `${…}`, `$(…)` or quotes.
+/// Returns the length of a default value: up to a space outside `${…}`, `$(…)` and quotes.
 fn default_length(text: &str) -> Result<usize, String> {
     let mut at = 0;
     while let Some(c) = text[at..].chars().next() {
@@ -239,7 +239,7 @@ mod tests {
                 of("d", Some((true, None))),
                 of("e", Some((true, Some("${1 + 2}")))),
                 of("f", Some((false, Some("old")))),
-                // As the original has it: blanks after `:=` are skipped.
+                // As in the original: blanks after `:=` are skipped.
                 of("g", Some((false, Some("*h")))),
                 of("**i", None),
                 of("j", Some((false, Some("$(arg x)_y")))),

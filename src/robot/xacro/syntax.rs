@@ -3,11 +3,11 @@
 use super::tokens::{KEYWORDS, Token, is_identifier, number, shown, tokens};
 use super::value::Value;
 
-/// The longest expression [bytes].
+/// Maximum length of an expression [bytes].
 const MAX_LENGTH: usize = 16 << 10;
-/// The most tokens: the tree, and what walks it, is at most that deep.
+/// Maximum number of tokens: bounds the depth of the tree and of its evaluation.
 const MAX_TOKENS: usize = 2000;
-/// The deepest nesting of parentheses.
+/// Maximum nesting of parentheses.
 const MAX_DEPTH: usize = 60;
 
 /// An expression.
@@ -43,7 +43,7 @@ pub(super) struct Loop {
     pub(super) conditions: Vec<Expr>,
 }
 
-/// Reads an expression. The error says what is wrong with it.
+/// Parses an expression. The error describes what is wrong.
 pub(super) fn parse(text: &str) -> Result<Expr, String> {
     if text.len() > MAX_LENGTH {
         return Err(format!("the expression is longer than {MAX_LENGTH} bytes"));
@@ -101,7 +101,7 @@ impl Parser {
         })
     }
 
-    /// One expression, or several with commas.
+    /// Parses one expression, or several separated by commas.
     fn tuple(&mut self) -> Parsed {
         let first = self.ternary()?;
         if !matches!(self.peek(), Some(Token::Sign(","))) {
@@ -369,7 +369,7 @@ impl Parser {
         Ok(Expr::Dict(entries))
     }
 
-    /// The loops after an item.
+    /// Parses the loops after an item.
     fn each(&mut self, item: Expr) -> Parsed {
         let mut loops = Vec::new();
         while self.word("for") {
@@ -401,7 +401,7 @@ impl Parser {
     }
 }
 
-/// Names with two underscores lead into Python's insides: xacro refuses them.
+/// Rejects names with two underscores, like xacro: they lead into Python's internals.
 fn allowed(name: String) -> Result<String, String> {
     if name.starts_with("__") { Err(format!("Use of invalid name(s): {name}")) } else { Ok(name) }
 }

@@ -1,9 +1,9 @@
-//! Texts with `${expressions}` and `$(substitutions)` in them, taken apart.
+//! Splits texts with `${expressions}` and `$(substitutions)`.
 
 /// A part of a text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Part {
-    /// As it is.
+    /// Literal text.
     Plain(String),
     /// Inside `${…}`.
     Expression(String),
@@ -11,8 +11,7 @@ pub(super) enum Part {
     Substitution(String),
 }
 
-/// Takes a text apart. `$${` and `$$(` stand for themselves with one dollar less; a dollar before anything else is
-/// just a dollar.
+/// Splits a text. `$${` and `$$(` stand for themselves with one dollar less; a dollar before anything else is literal.
 pub(super) fn parts(text: &str) -> Result<Vec<Part>, String> {
     let mut out = Vec::new();
     let mut rest = text;
@@ -50,7 +49,7 @@ fn unclosed(text: &str, sign: char) -> String {
     format!("invalid expression: `{sign}` is missing after `{shown}`")
 }
 
-/// What a `$(…)` asks for.
+/// A `$(…)` command.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Substitution<'t> {
     Arg(&'t str),
@@ -62,7 +61,7 @@ pub(super) enum Substitution<'t> {
     Eval(&'t str),
 }
 
-/// Reads the inside of a `$(…)`.
+/// Parses the inside of a `$(…)`.
 pub(super) fn substitution(inside: &str) -> Result<Substitution<'_>, String> {
     if let Some(expression) = inside.strip_prefix("eval ") {
         return Ok(Substitution::Eval(expression));
@@ -79,12 +78,12 @@ pub(super) fn substitution(inside: &str) -> Result<Substitution<'_>, String> {
         ["optenv"] => Err("$(optenv …) needs the name of a variable".to_owned()),
         [] => Err("$() is empty".to_owned()),
         [other, ..] => Err(format!(
-            "Unknown substitution command [{other}]: there are arg, find, env, optenv, dirname, eval and cwd"
+            "Unknown substitution command [{other}]: the commands are arg, find, env, optenv, dirname, eval and cwd"
         )),
     }
 }
 
-/// What the text of an argument means inside `$(eval …)`.
+/// Converts an argument's text as `$(eval …)` does.
 pub(super) fn converted(text: &str) -> super::value::Value {
     use super::value::{Value, integer};
     let number = match text.contains('.') {

@@ -2,7 +2,7 @@
 
 use super::value::Value;
 
-/// A word of an expression.
+/// A token.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Token {
     Number(String),
@@ -21,7 +21,7 @@ pub(super) const KEYWORDS: &[&str] = &[
     "return", "try", "while", "with", "yield", "None", "True", "False",
 ];
 
-/// Whether a text can name a property.
+/// Returns whether a text is a valid property name.
 pub(super) fn is_identifier(text: &str) -> bool {
     let mut chars = text.chars();
     chars.next().is_some_and(|c| c.is_alphabetic() || c == '_')
@@ -89,7 +89,7 @@ fn number_length(text: &str) -> usize {
     length
 }
 
-/// A quoted text and its length in the source.
+/// Returns a quoted text and its length in the source.
 fn quoted(text: &str, raw: bool) -> Result<(String, usize), String> {
     let mut chars = text.char_indices();
     let quote = chars.next().map_or('\'', |(_, c)| c);
@@ -110,7 +110,7 @@ fn quoted(text: &str, raw: bool) -> Result<(String, usize), String> {
         }
         let code = |n: usize, chars: &mut std::str::CharIndices<'_>| {
             let hex: String = chars.take(n).map(|(_, c)| c).collect();
-            u32::from_str_radix(&hex, 16).ok().and_then(char::from_u32).ok_or("invalid syntax: a wrong escape")
+            u32::from_str_radix(&hex, 16).ok().and_then(char::from_u32).ok_or("invalid syntax: invalid escape sequence")
         };
         match escaped {
             'n' => out.push('\n'),
@@ -130,7 +130,7 @@ fn quoted(text: &str, raw: bool) -> Result<(String, usize), String> {
 }
 
 pub(super) fn number(text: &str) -> Result<Value, String> {
-    let wrong = || format!("invalid syntax: `{text}` is no number");
+    let wrong = || format!("invalid syntax: `{text}` is not a number");
     let plain = text.replace('_', "");
     if text.starts_with('_') || text.ends_with('_') || text.contains("__") {
         return Err(wrong());
@@ -143,7 +143,7 @@ pub(super) fn number(text: &str) -> Result<Value, String> {
     }
     if plain.bytes().all(|b| b.is_ascii_digit()) {
         if plain.len() > 1 && plain.starts_with('0') && plain.bytes().any(|b| b != b'0') {
-            return Err(format!("{}: numbers do not start with 0 in expressions", wrong()));
+            return Err(format!("{}: numbers in expressions must not start with 0", wrong()));
         }
         return plain.parse().map(Value::Int).map_err(|_| format!("the number {text} is too large"));
     }

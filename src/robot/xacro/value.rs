@@ -19,15 +19,15 @@ pub(super) enum Value {
     Function(&'static str),
     /// `math`, `python` or `xacro`.
     Module(&'static str),
-    /// What an include with `ns` defined: a scope.
+    /// The definitions of an include with `ns`: a scope.
     Namespace(usize),
 }
 
-/// A dictionary, in the order it was written.
+/// A dictionary, in order of insertion.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Dict {
     pub(super) entries: Vec<(Value, Value)>,
-    /// Whether keys can be read as attributes too.
+    /// Whether keys are attributes too.
     pub(super) dotted: bool,
 }
 
@@ -61,7 +61,7 @@ impl Value {
         Self::List(Rc::new(items))
     }
 
-    /// Python's name of its type.
+    /// Returns Python's name of its type.
     pub(super) fn type_name(&self) -> &'static str {
         match self {
             Self::None => "NoneType",
@@ -77,7 +77,7 @@ impl Value {
         }
     }
 
-    /// Whether it counts as true.
+    /// Returns its truth value.
     pub(super) fn truth(&self) -> bool {
         match self {
             Self::None => false,
@@ -91,7 +91,7 @@ impl Value {
         }
     }
 
-    /// As an integer; booleans count as 0 and 1.
+    /// Returns it as an integer; booleans count as 0 and 1.
     pub(super) fn as_int(&self) -> Option<i64> {
         match self {
             Self::Bool(b) => Some(i64::from(*b)),
@@ -100,7 +100,7 @@ impl Value {
         }
     }
 
-    /// As a number.
+    /// Returns it as a number.
     pub(super) fn as_float(&self) -> Option<f64> {
         match self {
             Self::Float(f) => Some(*f),
@@ -127,7 +127,7 @@ impl Value {
         }
     }
 
-    /// `<`, `>`: `None` where Python refuses; not-a-number is no order either.
+    /// `<`, `>`: outer `None` if Python raises a TypeError, inner `None` for NaN.
     pub(super) fn compare(&self, other: &Self) -> Option<Option<Ordering>> {
         match (self, other) {
             (Self::Str(a), Self::Str(b)) => Some(Some(a.cmp(b))),
@@ -207,7 +207,7 @@ impl Value {
     }
 }
 
-/// A text in Python's quotes.
+/// Writes a text in Python's quotes.
 fn write_quoted(text: &str, out: &mut String) {
     let quote = if text.contains('\'') && !text.contains('"') { '"' } else { '\'' };
     out.push(quote);
@@ -230,7 +230,7 @@ fn write_quoted(text: &str, out: &mut String) {
     out.push(quote);
 }
 
-/// A float as Python prints it: the shortest text that reads back the same, `.0` on whole numbers, an exponent
+/// Formats a float as Python does: the shortest text that reads back the same, `.0` on whole numbers, an exponent
 /// outside 1e-4 … 1e16.
 pub(super) fn float_repr(value: f64) -> String {
     if value.is_nan() {
@@ -250,15 +250,15 @@ pub(super) fn float_repr(value: f64) -> String {
     if text.contains('.') { text } else { text + ".0" }
 }
 
-/// What a text means as the value of a property or parameter: quotes mark a text, else an integer, a float, a
-/// boolean, or the text itself.
+/// Converts the text of a property or parameter: a quoted text, an integer, a float, a boolean, otherwise the text
+/// itself.
 pub(super) fn literal(text: &str) -> Value {
     if text.len() >= 2
         && let Some(inside) = text.strip_prefix('\'').and_then(|t| t.strip_suffix('\''))
     {
         return inside.into();
     }
-    // Python would read `1_0` as 10; names with numbers are meant.
+    // Python reads `1_0` as 10; here it is a name.
     if text.contains('_') {
         return text.into();
     }
@@ -266,7 +266,7 @@ pub(super) fn literal(text: &str) -> Value {
         return Value::Int(number);
     }
     if let Ok(number) = text.trim().parse() {
-        // An integer too large for us keeps its digits.
+        // An integer beyond our range keeps its digits.
         let digits = text.trim().trim_start_matches(['-', '+']);
         return if digits.bytes().all(|b| b.is_ascii_digit()) { text.into() } else { Value::Float(number) };
     }

@@ -1,5 +1,5 @@
-//! YAML as xacro's `load_yaml` reads it: version 1.1 by PyYAML's rules (`on` is a boolean, `1e-3` is a text), and
-//! units (`!degrees 90`).
+//! YAML as xacro's `load_yaml` reads it: version 1.1 by PyYAML's rules (`on` is a boolean, `1e-3` a text), with units
+//! (`!degrees 90`).
 
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -8,15 +8,15 @@ use granit_parser::{Event, Parser, ScalarStyle, Tag};
 
 use super::value::{Dict, Value};
 
-/// The largest file [bytes], and the most values after aliases were expanded.
+/// Maximum file size [bytes], and maximum number of values after expanding aliases.
 pub(super) const MAX_BYTES: u64 = 1 << 20;
 const MAX_VALUES: usize = 200_000;
 const MAX_DEPTH: usize = 32;
 
-/// Evaluates an expression of a unit's value.
+/// Evaluates the expression of a value with a unit.
 pub(super) type Number<'a> = dyn FnMut(&str) -> Result<f64, String> + 'a;
 
-/// Reads a document; the error says where.
+/// Reads a document; the error names the line.
 pub(super) fn load(text: &str, number: &mut Number<'_>) -> Result<Value, String> {
     let mut options = granit_parser::Options::default();
     options.set_emit_comments(false);
@@ -33,7 +33,7 @@ pub(super) fn load(text: &str, number: &mut Number<'_>) -> Result<Value, String>
     Ok(reader.root)
 }
 
-/// A list or dictionary that is being read.
+/// A list or dictionary under construction.
 struct Open {
     anchor: usize,
     content: Content,
@@ -52,7 +52,7 @@ struct Reader<'a, 'n> {
     number: &'a mut Number<'n>,
 }
 
-/// Stands for the key `<<`.
+/// Placeholder for the key `<<`.
 const MERGE: Value = Value::Function("<<");
 
 impl Reader<'_, '_> {
@@ -70,7 +70,7 @@ impl Reader<'_, '_> {
             }
             Event::SequenceEnd | Event::MappingEnd => self.end(),
             Event::Alias(id) => {
-                let value = self.anchors.get(&id).cloned().ok_or("an alias of something that is not finished")?;
+                let value = self.anchors.get(&id).cloned().ok_or("an alias of an unfinished value")?;
                 self.put(value)
             }
             _ => Ok(()),
@@ -134,7 +134,7 @@ impl Reader<'_, '_> {
                 ("str", _) => Ok(text.into()),
                 ("float", value) => {
                     let number = value.as_float().or_else(|| text.trim().parse().ok());
-                    number.map(Value::Float).ok_or_else(|| format!("{text:?} is no float"))
+                    number.map(Value::Float).ok_or_else(|| format!("{text:?} is not a float"))
                 }
                 (_, value) => Ok(value),
             };
@@ -145,13 +145,13 @@ impl Reader<'_, '_> {
             "!millimeters" => 0.001,
             "!foot" => 0.3048,
             "!inches" => 0.0254,
-            other => return Err(format!("the tag {other} has no meaning")),
+            other => return Err(format!("unknown tag {other}")),
         };
         (self.number)(text).map(|value| Value::Float(value * factor))
     }
 }
 
-/// How many values a value holds, so that aliases cannot multiply without end.
+/// Returns the number of values in a value; limits the growth by aliases.
 fn size(value: &Value) -> usize {
     match value {
         Value::List(items) => 1 + items.iter().map(size).sum::<usize>(),
@@ -160,7 +160,7 @@ fn size(value: &Value) -> usize {
     }
 }
 
-/// What a plain word means in YAML 1.1.
+/// Returns the meaning of a plain scalar in YAML 1.1.
 fn resolved(text: &str) -> Value {
     match text {
         "" | "~" | "null" | "Null" | "NULL" => return Value::None,
@@ -192,7 +192,7 @@ fn whole(digits: &str) -> Option<i64> {
         return i64::from_str_radix(hex, 16).ok();
     }
     if plain.contains(':') {
-        // Sixties: 1:30 is 90.
+        // Sexagesimal: 1:30 is 90.
         let mut parts = plain.split(':');
         let start = parts.next().filter(|_| first != b'0')?.parse().ok()?;
         return parts.try_fold(start, |sum: i64, part| {

@@ -144,11 +144,11 @@ mod tests {
     use crate::hardware::sim::arm::{PLAYABLE, SimArm, SimOptions};
     use crate::joint::{JointLimits, MAX_DOF};
     use crate::planning::config::{ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-    use crate::planning::setup::Setup;
+    use crate::planning::planning_scene::PlanningScene;
     use nalgebra::Isometry3;
 
     /// The arm beside the table of the template's blueprint.
-    fn setup(dof: u8, folder: &std::path::Path) -> Setup {
+    fn setup(dof: u8, folder: &std::path::Path) -> PlanningScene {
         let path = folder.join(format!("{dof}.urdf"));
         std::fs::write(&path, urdf("acme", "Acme", dof, "src/lib.rs")).unwrap();
         let loaded = crate::robot::load(&crate::robot::Source::new(&path));
@@ -185,7 +185,7 @@ mod tests {
             pose: Isometry3::translation(0.0, 0.0, -0.02),
             padding: 0.0,
         };
-        Setup::load(&PlannerConfig {
+        PlanningScene::load(&PlannerConfig {
             timeout: Duration::from_secs(1),
             padding: 0.0,
             robots: vec![robot],

@@ -1,4 +1,4 @@
-//! What is read in place of a key that is missing.
+//! Placeholder value for a missing key.
 
 use serde::de::value::U32Deserializer;
 use serde::de::{DeserializeSeed, Deserializer, IntoDeserializer, SeqAccess, Visitor};
@@ -8,14 +8,14 @@ use crate::yaml::error::ReadError;
 use crate::yaml::located::LOCATED;
 use crate::yaml::tree::NodeId;
 
-/// Answers for a key that is missing, so that the rest can be read: zero, empty, none. It must not make mistakes of
-/// its own; where it is refused, the group around it is left out.
+/// Deserializes as zero, empty or none in place of a missing key, so that the rest can be read. It must not cause
+/// errors of its own; if it is rejected, the group around it is skipped.
 #[derive(Clone, Copy)]
-pub(super) struct StandIn {
+pub(super) struct Placeholder {
     pub(super) node: NodeId,
 }
 
-impl<'a> Deserializer<'a> for StandIn {
+impl<'a> Deserializer<'a> for Placeholder {
     type Error = ReadError;
 
     fn deserialize_any<V: Visitor<'a>>(self, visitor: V) -> Result<V::Value, ReadError> {
@@ -68,7 +68,7 @@ impl<'a> Deserializer<'a> for StandIn {
 
     fn deserialize_newtype_struct<V: Visitor<'a>>(self, name: &'static str, visitor: V) -> Result<V::Value, ReadError> {
         match name {
-            LOCATED => visitor.visit_seq(StandInPlaced { stand_in: self, step: 0 }),
+            LOCATED => visitor.visit_seq(LocatedPlaceholder { placeholder: self, step: 0 }),
             _ => visitor.visit_newtype_struct(self),
         }
     }
@@ -80,22 +80,22 @@ impl<'a> Deserializer<'a> for StandIn {
     }
 }
 
-struct StandInPlaced {
-    stand_in: StandIn,
+struct LocatedPlaceholder {
+    placeholder: Placeholder,
     step: u8,
 }
 
-impl<'a> SeqAccess<'a> for StandInPlaced {
+impl<'a> SeqAccess<'a> for LocatedPlaceholder {
     type Error = ReadError;
 
     fn next_element_seed<T: DeserializeSeed<'a>>(&mut self, seed: T) -> Result<Option<T::Value>, ReadError> {
         self.step += 1;
         match self.step {
             1 => {
-                let at: U32Deserializer<ReadError> = self.stand_in.node.into_deserializer();
+                let at: U32Deserializer<ReadError> = self.placeholder.node.into_deserializer();
                 seed.deserialize(at).map(Some)
             }
-            2 => seed.deserialize(self.stand_in).map(Some),
+            2 => seed.deserialize(self.placeholder).map(Some),
             _ => Ok(None),
         }
     }

@@ -1,5 +1,5 @@
-//! From a planner's configuration to robots and a world that can be planned in: descriptions read, joints and links
-//! found, shapes made.
+//! Planning scene: robots and world, built from a planner's configuration. Reads descriptions, finds joints and links,
+//! builds collision geometry.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -7,9 +7,9 @@ use std::sync::Arc;
 use glamx::DVec3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-use super::idle::{Measured, idle};
 use super::timing::DEFAULT_ACCELERATION;
-use crate::collision::always::always_touching;
+use super::unplanned_joints::{Measured, idle};
+use crate::collision::allowed_pairs::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
@@ -19,48 +19,48 @@ use crate::robot::load;
 use crate::robot::mesh::Mesh;
 use crate::robot::model::{Limits, RobotModel};
 
-/// Poses that are looked at for pairs of links that always touch.
+/// Sampled configurations for the search of links that always touch.
 const SAMPLES: usize = 200;
-/// Links that touch in more than this part of the poses are taken to touch always.
-const ALWAYS: f64 = 0.99;
+/// Links that touch in more than this part of the configurations count as always touching.
+const ALWAYS_RATIO: f64 = 0.99;
 
-/// Largest file of a point cloud [bytes].
+/// Maximum size of a point cloud file [bytes].
 const MAX_CLOUD: u64 = 256 << 20;
 
-/// A robot that can be planned for.
+/// A planned robot.
 #[derive(Debug, Clone)]
 pub struct PlannedRobot {
-    /// What it was made from.
+    /// Its configuration.
     pub config: RobotConfig,
-    /// Its description, with the configuration's limits on top of its own.
+    /// Its model, limited further by the configuration.
     pub model: Arc<RobotModel>,
     /// Indices of the planned joints in the model.
     pub joints: Vec<usize>,
-    /// Index of the link that pose goals are for.
+    /// Index of the link that pose goals refer to.
     pub end_effector: usize,
     /// Limits of the planned joints.
     pub limits: Vec<Limits>,
-    /// Where the joints that are not planned are, among positions of all joints of the model [rad or m].
+    /// Positions of the joints that are not planned, among those of all joints of the model [rad or m].
     pub rest: Vec<f64>,
-    /// As it stands in the world, with all its planned joints.
+    /// Its collision geometry at its base pose, with all planned joints.
     pub body: Robot,
 }
 
-/// Robots and the world around them.
+/// All robots and the world around them.
 #[derive(Debug, Clone)]
-pub struct Setup {
-    /// The robots, in the configuration's order.
+pub struct PlanningScene {
+    /// The robots, in the order of the configuration.
     pub robots: Vec<PlannedRobot>,
-    /// The world as it is at the start. Its robots are those above, in the same order.
+    /// The initial world. Its robots are those above, in the same order.
     pub world: World,
     /// Distance that plans keep from obstacles and other arms [m].
     pub padding: f64,
-    /// Pairs of links that touch in every pose, with their robot's name; they are not checked.
+    /// Pairs of links that touch in every configuration, with the robot's name; they are not checked.
     pub always_touching: Vec<(String, [String; 2])>,
 }
 
-impl Setup {
-    /// Reads everything. An error says which robot or object, and all that is wrong with its description.
+impl PlanningScene {
+    /// Loads all descriptions. The error names the robot or object and lists everything wrong with its description.
     pub fn load(config: &PlannerConfig) -> Result<Self, String> {
         let mut world = World::new();
         let mut robots = Vec::new();
@@ -74,12 +74,12 @@ impl Setup {
             added.map_err(|e| format!("object {:?} of the world: {e}", object.name))?;
         }
         let mut setup = Self { robots, world, padding: config.padding, always_touching: Vec::new() };
-        setup.leave_out_what_always_touches();
+        setup.allow_always_touching_pairs();
         Ok(setup)
     }
 
-    /// The same with the limits of those who execute the motions on top of its own, by the coordinator's joint names:
-    /// what is planned is then never refused for a limit. An error names the joint that is left no room.
+    /// Adds the limits of the arms that execute the motions, by the coordinator's joint names, so that no plan exceeds
+    /// them. The error names a joint whose limits do not overlap.
     pub fn within(mut self, bounds: &BTreeMap<String, JointBounds>) -> Result<Self, String> {
         for robot in &mut self.robots {
             robot.narrow(bounds).map_err(|e| format!("robot {:?}: {e}", robot.config.name))?;
@@ -88,14 +88,14 @@ impl Setup {
         Ok(self)
     }
 
-    /// The robot of a name.
+    /// Returns the index of a robot by name.
     pub fn robot(&self, name: &str) -> Option<usize> {
         self.robots.iter().position(|robot| robot.config.name == name)
     }
 
-    /// Pairs of links that touch in every pose can only be what the description means: checking them would forbid
-    /// every motion. They are told by name, never left out in silence.
-    fn leave_out_what_always_touches(&mut self) {
+    /// Allows pairs of links that touch in every configuration: checking them would forbid all motion. They are
+    /// reported by name.
+    fn allow_always_touching_pairs(&mut self) {
         for robot in &mut self.robots {
             for pair in always_touch(&robot.body) {
                 self.always_touching.push((robot.config.name.clone(), pair.clone()));
@@ -106,21 +106,21 @@ impl Setup {
     }
 }
 
-/// The pairs of links of one robot that touch in every pose although nothing says that they may, by name.
+/// Returns the pairs of links of one robot that touch in every configuration without being allowed, by name.
 pub fn always_touch(robot: &Robot) -> Vec<[String; 2]> {
     let mut alone = World::new();
-    // Without its name before them, links have their own names.
+    // Without the robot's name, links keep their own names.
     if alone.add_robot(Robot { name: String::new(), ..robot.clone() }).is_err() {
         return Vec::new();
     }
-    // A pose in the middle of things: zero, or where zero is outside the limits the nearest that is inside.
+    // Reference configuration: zero, clamped to the limits.
     let home: Vec<f64> = robot.kinematics.limits().iter().map(|l| 0.0_f64.max(l.lower).min(l.upper)).collect();
     let suspects = always_touching(&alone.snapshot(), &home, SAMPLES, 0).into_iter();
-    let always = suspects.filter(|suspect| suspect.share > ALWAYS);
+    let always = suspects.filter(|suspect| suspect.share > ALWAYS_RATIO);
     always.map(|suspect| [suspect.contact.link, suspect.contact.other]).collect()
 }
 
-/// A robot of which all independent joints are planned for, alone in the world.
+/// Builds a robot with all independent joints planned, alone in the world.
 pub fn whole(model: RobotModel, allowed: Vec<(String, String)>) -> Result<Robot, String> {
     Ok(Robot {
         name: String::new(),
@@ -140,7 +140,7 @@ impl PlannedRobot {
         let mut model = loaded.into_model()?;
         if let Some((link, mesh)) = model.collada_collision().filter(|_| !config.convert_meshes) {
             return Err(format!(
-                "link {:?} collides by {:?}, and Collada files are not converted",
+                "link {:?} has the collision mesh {:?}, and Collada files are not converted",
                 link.name, mesh.uri
             ));
         }
@@ -185,7 +185,7 @@ impl PlannedRobot {
             }
         }
         let mut config = config.clone();
-        // Poses of an SRDF that this robot cannot take are none of its own; what the configuration says goes first.
+        // Skips named poses of the SRDF that this robot cannot take; those of the configuration win.
         for (name, pose) in semantics.poses_of(&config.joints).into_iter().filter(|(_, pose)| outside(pose).is_none()) {
             config.named_poses.entry(name.to_owned()).or_insert(pose);
         }
@@ -199,7 +199,7 @@ impl PlannedRobot {
             let (own, [lower, upper]) = (joint.limits, b.position);
             if own.upper.min(upper) <= own.lower.max(lower) {
                 return Err(format!(
-                    "{name} goes from {:.3} to {:.3} rad in the model and from {lower:.3} to {upper:.3} rad in the \
+                    "{name} ranges from {:.3} to {:.3} rad in the model and from {lower:.3} to {upper:.3} rad in the \
                      coordinator: nothing is in both",
                     own.lower, own.upper
                 ));
@@ -217,8 +217,8 @@ impl PlannedRobot {
         Ok(())
     }
 
-    /// The robot as it stands in the world while it does not move: no joint of it is planned.
-    pub fn standing(&self, positions: &[f64]) -> Result<Robot, String> {
+    /// Builds the robot's collision geometry with all joints fixed at these positions.
+    pub fn fixed_at(&self, positions: &[f64]) -> Result<Robot, String> {
         let mut named: HashMap<String, f64> =
             self.model.joints.iter().zip(&self.rest).map(|(joint, q)| (joint.name.clone(), *q)).collect();
         named.extend(self.config.joints.iter().cloned().zip(positions.iter().copied()));
@@ -234,7 +234,7 @@ fn joint(model: &RobotModel, name: &str) -> Result<usize, String> {
     model.joint_index(name).ok_or_else(|| format!("there is no joint {name:?}; {}", hint()))
 }
 
-/// An obstacle from its description. Reads its file, where it has one.
+/// Builds an obstacle from its description; reads its file if it has one.
 pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
     let at = frame(&object.pose);
     let solid = match &object.shape {

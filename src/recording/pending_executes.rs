@@ -1,5 +1,5 @@
-//! Requests to follow a trajectory, kept until the tick has answered: a refused one is logged without the points that
-//! the tick did not look at, so that a program that asks in vain, again and again, does not fill the disk.
+//! Trajectory requests waiting for the tick's answer. A rejected one is logged without the points that the tick did not
+//! check, so that a client that retries forever does not fill the disk.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,12 +9,12 @@ use serde_json::json;
 use crate::clock::Mono;
 use crate::trajectory::JointTrajectory;
 
-/// Requests that are kept. The tick answers within a period; what is older lost its answer.
-const MAX_KEPT: usize = 64;
-/// Points of a refused trajectory that are logged: two make a trajectory, and the tick judges by the first.
-const POINTS: usize = 2;
+/// Maximum number of pending requests. The tick answers within a period; an older one has lost its answer.
+const MAX_PENDING: usize = 64;
+/// Points logged of a rejected trajectory: two make a trajectory, and the tick decides by the first.
+const REJECTED_POINTS: usize = 2;
 
-/// A request to follow a trajectory.
+/// A trajectory request.
 #[derive(Debug)]
 pub(super) struct Execute {
     pub stamp: Mono,
@@ -24,39 +24,39 @@ pub(super) struct Execute {
 }
 
 impl Execute {
-    /// As it was asked.
+    /// Returns the request as received.
     pub fn whole(&self) -> String {
         let Self { task, motion, trajectory, .. } = self;
         json!({"execute": {"task": task, "motion": motion, "trajectory": **trajectory}}).to_string()
     }
 
-    /// As much as the tick looked at to refuse it, and how many points are left out.
+    /// Returns the part that the tick checked, and the number of points left out.
     pub fn refused(&self) -> String {
         let Self { task, motion, trajectory, .. } = self;
-        let points: Vec<_> = trajectory.points.iter().take(POINTS).collect();
+        let points: Vec<_> = trajectory.points.iter().take(REJECTED_POINTS).collect();
         let left_out = trajectory.points.len() - points.len();
         let start = json!({"joint_names": trajectory.joint_names, "points": points});
         json!({"execute": {"task": task, "motion": motion, "trajectory": start, "left_out": left_out}}).to_string()
     }
 }
 
-/// Those that the tick has not answered yet, by their ids.
+/// Pending requests by id.
 #[derive(Debug, Default)]
-pub(super) struct Executes(BTreeMap<u64, Execute>);
+pub(super) struct PendingExecutes(BTreeMap<u64, Execute>);
 
-impl Executes {
-    /// Keeps a request. Gives back one whose answer will not come any more.
+impl PendingExecutes {
+    /// Adds a request. Returns one whose answer was lost, if any.
     pub fn asked(&mut self, id: u64, execute: Execute) -> Option<(u64, Execute)> {
         self.0.insert(id, execute);
-        if self.0.len() > MAX_KEPT { self.0.pop_first() } else { None }
+        if self.0.len() > MAX_PENDING { self.0.pop_first() } else { None }
     }
 
-    /// The request that was answered.
+    /// Removes and returns the answered request.
     pub fn answered(&mut self, id: u64) -> Option<Execute> {
         self.0.remove(&id)
     }
 
-    /// What is left, in order.
+    /// Returns the remaining requests in order.
     pub fn into_unanswered(self) -> impl Iterator<Item = (u64, Execute)> {
         self.0.into_iter()
     }

@@ -1,39 +1,39 @@
-//! Which motions are alive: a key that is held keeps its motion, and nothing else does.
+//! Active motions: a motion is active only while its key is held.
 //!
-//! A terminal has no key-up. What it has is repeat: a held key comes again 10 to 40 times a second, after a first pause
-//! of a quarter to two thirds of a second. So a motion lives for [`FULL`] after its last key, and has faded by [`GONE`]:
-//! a tap is a nudge, a held key a nudge and then a motion. Where the terminal does tell that keys go up (the kitty
-//! keyboard protocol), a motion lives until then; a key-up that gets lost costs [`SILENCE`].
+//! A terminal reports no key-up, but key repeats: 10 to 40 times a second, after an initial delay of a quarter to two
+//! thirds of a second. So a motion continues for [`SUSTAIN`] after its last key event and has faded to zero at
+//! [`FADED_AFTER`]: a tap is a short nudge, a held key a nudge followed by a motion. If the terminal does report
+//! key-ups (kitty keyboard protocol), a motion lasts until then; a lost key-up costs [`KEY_TIMEOUT`].
 
 use std::time::{Duration, Instant};
 
 use super::keys::Motion;
 
-/// After a key's last repeat its motion goes on as it was for so long.
-pub const FULL: Duration = Duration::from_millis(150);
-/// After a key's last repeat its motion has faded to nothing.
-pub const GONE: Duration = Duration::from_millis(250);
-/// Where key-ups are told: with no key at all for so long, all motions end. Longer than the usual pause before repeat.
-pub const SILENCE: Duration = Duration::from_secs(1);
+/// Time after a key's last repeat during which its motion continues at full speed.
+pub const SUSTAIN: Duration = Duration::from_millis(150);
+/// Time after a key's last repeat at which its motion has faded to zero.
+pub const FADED_AFTER: Duration = Duration::from_millis(250);
+/// With key-ups: all motions end after this time without any key event. Longer than the usual delay before repeat.
+pub const KEY_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// The motions that are alive.
+/// The active motions.
 #[derive(Debug, Default)]
-pub struct Held {
+pub struct ActiveMotions {
     keys: Vec<(Motion, Instant)>,
-    /// Whether the terminal tells when keys go up: known by the first that does.
+    /// Whether the terminal reports key-ups: known from the first one.
     releases: bool,
     heard: Option<Instant>,
 }
 
-impl Held {
-    /// A key came, first or again.
+impl ActiveMotions {
+    /// Handles a key press or repeat.
     pub fn press(&mut self, motion: Motion, now: Instant) {
         self.heard = Some(now);
         self.keys.retain(|(held, _)| *held != motion && *held != motion.opposite());
         self.keys.push((motion, now));
     }
 
-    /// A key came again. One that was let go of in between, as at a stop, must be pressed anew.
+    /// Handles a repeat. A key released in between, as at a stop, must be pressed again.
     pub fn repeat(&mut self, motion: Motion, now: Instant) {
         self.heard = Some(now);
         if let Some((_, last)) = self.keys.iter_mut().find(|(held, _)| *held == motion) {
@@ -41,31 +41,31 @@ impl Held {
         }
     }
 
-    /// A key went up.
+    /// Handles a key-up.
     pub fn release(&mut self, motion: Motion, now: Instant) {
         self.releases = true;
         self.heard = Some(now);
         self.keys.retain(|(held, _)| *held != motion);
     }
 
-    /// Lets go of all keys.
+    /// Releases all keys.
     pub fn clear(&mut self) {
         self.keys.clear();
     }
 
-    /// Whether the terminal tells when keys go up.
+    /// Returns whether the terminal reports key-ups.
     pub fn knows_releases(&self) -> bool {
         self.releases
     }
 
-    /// The motions that are alive, and how strong each is (0–1).
+    /// Returns the active motions and their strength (0–1).
     pub fn alive(&mut self, now: Instant) -> Vec<(Motion, f64)> {
-        let silent = self.heard.is_none_or(|at| now.saturating_duration_since(at) > SILENCE);
+        let silent = self.heard.is_none_or(|at| now.saturating_duration_since(at) > KEY_TIMEOUT);
         let releases = self.releases;
         let strength = |last: &Instant| match now.saturating_duration_since(*last) {
             _ if releases => f64::from(!silent),
-            age if age <= FULL => 1.0,
-            age => 1.0 - ((age - FULL).as_secs_f64() / (GONE - FULL).as_secs_f64()).min(1.0),
+            age if age <= SUSTAIN => 1.0,
+            age => 1.0 - ((age - SUSTAIN).as_secs_f64() / (FADED_AFTER - SUSTAIN).as_secs_f64()).min(1.0),
         };
         self.keys.retain(|(_, last)| strength(last) > 0.0);
         self.keys.iter().map(|(motion, last)| (*motion, strength(last))).collect()
@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn a_motion_fades_after_its_last_key() {
-        let (mut held, start) = (Held::default(), Instant::now());
+        let (mut held, start) = (ActiveMotions::default(), Instant::now());
         held.press(UP, start);
         assert_eq!(held.alive(start + ms(150)), [(UP, 1.0)]);
         let half = held.alive(start + ms(200))[0].1;
@@ -94,12 +94,12 @@ mod tests {
         assert_eq!(held.alive(start + ms(340)), [(UP, 1.0)], "a repeat keeps it");
         assert_eq!(held.alive(start + ms(450)), []);
         held.repeat(UP, start + ms(460));
-        assert_eq!(held.alive(start + ms(460)), [], "what has ended begins with a press only");
+        assert_eq!(held.alive(start + ms(460)), [], "a repeat does not restart an ended motion");
     }
 
     #[test]
     fn the_opposite_key_takes_over_and_two_axes_add_up() {
-        let (mut held, start) = (Held::default(), Instant::now());
+        let (mut held, start) = (ActiveMotions::default(), Instant::now());
         held.press(UP, start);
         held.press(SIDE, start);
         assert_eq!(held.alive(start).len(), 2);
@@ -110,15 +110,15 @@ mod tests {
     }
 
     #[test]
-    fn where_releases_are_told_they_count_and_silence_ends_all() {
-        let (mut held, start) = (Held::default(), Instant::now());
+    fn with_key_ups_they_end_motions_and_a_timeout_ends_all() {
+        let (mut held, start) = (ActiveMotions::default(), Instant::now());
         held.release(SIDE, start);
         assert!(held.knows_releases());
         held.press(UP, start);
-        assert_eq!(held.alive(start + ms(900)), [(UP, 1.0)], "the pause before repeat is no end");
+        assert_eq!(held.alive(start + ms(900)), [(UP, 1.0)], "the delay before repeat does not end it");
         held.repeat(UP, start + ms(900));
         assert_eq!(held.alive(start + ms(1800)), [(UP, 1.0)]);
-        assert_eq!(held.alive(start + ms(1901)), [], "a key-up that got lost");
+        assert_eq!(held.alive(start + ms(1901)), [], "a lost key-up");
         held.press(UP, start + ms(2000));
         held.release(UP, start + ms(2010));
         assert_eq!(held.alive(start + ms(2010)), []);

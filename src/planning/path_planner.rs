@@ -1,4 +1,4 @@
-//! One plan: from a start to the nearest goal that can be reached, as a path that is free at the checker's resolution.
+//! Path search: from a start to the nearest reachable goal, collision-free at the checker's resolution.
 
 use std::time::{Duration, Instant};
 
@@ -6,24 +6,24 @@ use crate::collision::checker::{CollisionChecker, Stop};
 use crate::collision::report::Contact;
 use crate::robot::random::Random;
 
-use super::leaving::CONTACT;
 use super::path::{Path, between, distance, length, unwind};
 use super::rrt_connect::{Ended, RrtSettings, SearchCount, search};
 use super::sampler::Sampler;
 use super::shortcut::{ShortcutSettings, shorten};
+use super::start_contact::MAX_START_DEPTH;
 
-/// How a plan is made.
+/// Settings of the path search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlanSettings {
-    /// What all randomness comes from.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// How the search goes.
+    /// Settings of the tree search.
     pub search: RrtSettings,
-    /// How the path is shortened.
+    /// Settings of the shortcutting.
     pub shortcut: ShortcutSettings,
-    /// A start may be this far outside its limits [rad or m]: the motion first brings it back.
+    /// Maximum violation of a limit at the start [rad or m]; the motion begins by moving back inside.
     pub limit_tolerance: f64,
-    /// A start may overlap by this depth [m]: the motion first brings it out.
+    /// Maximum penetration depth at the start [m]; the motion begins by moving out of contact.
     pub contact_tolerance: f64,
 }
 
@@ -34,40 +34,40 @@ impl Default for PlanSettings {
             search: RrtSettings::default(),
             shortcut: ShortcutSettings::default(),
             limit_tolerance: 0.02,
-            contact_tolerance: CONTACT,
+            contact_tolerance: MAX_START_DEPTH,
         }
     }
 }
 
-/// A path and how it was found.
+/// A path and statistics of its search.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// Configurations to be joined by straight lines, from the start to one of the goals.
+    /// Configurations joined by straight lines, from the start to one of the goals.
     pub path: Path,
     /// Its length [rad].
     pub length: f64,
     /// Whether the straight line was free.
     pub straight: bool,
-    /// The seed it came from.
+    /// The seed used.
     pub seed: u64,
-    /// What the search did.
+    /// Statistics of the tree search.
     pub count: SearchCount,
-    /// Configurations that were looked at.
-    pub looks: u64,
-    /// Time to find a path.
+    /// Collision checks made.
+    pub checks: u64,
+    /// Duration of the search.
     pub search_time: Duration,
-    /// Time to shorten it.
+    /// Duration of the shortcutting.
     pub shorten_time: Duration,
 }
 
-/// Why there is no plan.
+/// Why no path was found.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// A configuration has the wrong number of joints, or one that is not finite.
-    #[error("the {0} is no configuration of {1} joints with finite positions")]
+    /// A configuration has the wrong number of joints or a position that is not finite.
+    #[error("the {0} is not a configuration of {1} joints with finite positions")]
     Shape(&'static str, usize),
-    /// No goal is given.
-    #[error("no goal is given")]
+    /// The list of goals is empty.
+    #[error("no goal given")]
     NoGoal,
     /// A position is outside its limits.
     #[error("joint {joint} of the {which} is at {position:.4}, outside {lower:.4} to {upper:.4}")]
@@ -76,41 +76,40 @@ pub enum PlanError {
         which: &'static str,
         /// Index of the joint.
         joint: usize,
-        /// Where it is [rad or m].
+        /// Its position [rad or m].
         position: f64,
         /// Lowest position.
         lower: f64,
         /// Highest position.
         upper: f64,
     },
-    /// Something touches.
-    #[error("the {which} collides: {}", said(.contacts))]
+    /// The start or every goal collides.
+    #[error("the {which} collides: {}", describe_contacts(.contacts))]
     Collides {
         /// "start" or "goal".
         which: &'static str,
-        /// What touches, the deepest first.
+        /// The contacts, the deepest first.
         contacts: Vec<Contact>,
     },
-    /// The time is up.
+    /// The timeout was reached.
     #[error("no path found in time, after {} samples and {} nodes", .0.samples, .0.nodes)]
     Timeout(SearchCount),
-    /// Somebody cancelled it.
+    /// The request was cancelled.
     #[error("cancelled")]
     Cancelled,
-    /// The search used up its samples or nodes.
+    /// The search reached its maximum number of samples or nodes.
     #[error("no path found with {} samples and {} nodes", .0.samples, .0.nodes)]
     Exhausted(SearchCount),
 }
 
-fn said(contacts: &[Contact]) -> String {
+fn describe_contacts(contacts: &[Contact]) -> String {
     let first: Vec<String> = contacts.iter().take(3).map(Contact::to_string).collect();
     let more = contacts.len().saturating_sub(3);
     first.join("; ") + &if more > 0 { format!("; and {more} more") } else { String::new() }
 }
 
-/// Plans from `start` to one of `goals`, or to one that is the same but for whole turns of joints that turn without
-/// end, the nearest first. The same checker, settings and goals give the same path, as
-/// long as time does not run out.
+/// Plans from `start` to the nearest reachable one of `goals`; for continuous joints, positions a whole turn apart are
+/// the same goal. The same checker, settings and goals give the same path unless the timeout is reached.
 pub fn plan<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
@@ -119,7 +118,7 @@ pub fn plan<C: CollisionChecker>(
     stop: &Stop,
 ) -> Result<Plan, PlanError> {
     let began = Instant::now();
-    let looked = checker.looks();
+    let looked = checker.checks();
     let lead = lead_in(checker, start, settings, stop)?;
     let from = lead.last().map_or(start, Vec::as_slice).to_vec();
     let goals = usable_goals(checker, &from, goals)?;
@@ -147,13 +146,13 @@ pub fn plan<C: CollisionChecker>(
         straight: straight.is_some(),
         seed: settings.seed,
         count,
-        looks: checker.looks() - looked,
+        checks: checker.checks() - looked,
         search_time,
         shorten_time: began.elapsed() - search_time,
     })
 }
 
-/// The way from the start to a configuration inside the limits where nothing touches: the start alone, mostly.
+/// Returns the path from the start to a configuration inside the limits and free of contact: usually just the start.
 fn lead_in<C: CollisionChecker>(
     checker: &mut C,
     start: &[f64],
@@ -176,7 +175,7 @@ fn lead_in<C: CollisionChecker>(
     }
     let contacts = checker.contacts(&inside);
     let depth = contacts.first().map_or(0.0, |c| -c.distance);
-    match (depth <= settings.contact_tolerance).then(|| way_out(checker, &inside, depth, settings.seed, stop)).flatten()
+    match (depth <= settings.contact_tolerance).then(|| escape(checker, &inside, depth, settings.seed, stop)).flatten()
     {
         Some(free) => {
             lead.push(free);
@@ -186,8 +185,8 @@ fn lead_in<C: CollisionChecker>(
     }
 }
 
-/// A free configuration close by that is reached without going deeper.
-fn way_out<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed: u64, stop: &Stop) -> Option<Vec<f64>> {
+/// Returns a free configuration close by that is reached without deeper penetration.
+fn escape<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed: u64, stop: &Stop) -> Option<Vec<f64>> {
     let mut random = Random::new(seed);
     let mut at = from.to_vec();
     for k in 0..200 {
@@ -210,8 +209,8 @@ fn way_out<C: CollisionChecker>(checker: &mut C, from: &[f64], depth: f64, seed:
     None
 }
 
-/// The goals that are inside the limits and free, the nearest first; if there are none, why. Of a joint that turns
-/// without end all positions a whole turn apart are the same goal: the nearest is taken.
+/// Returns the goals inside the limits and free, the nearest first, or why there are none. For continuous joints, the
+/// nearest of the equivalent positions is used.
 fn usable_goals<C: CollisionChecker>(checker: &mut C, from: &[f64], goals: &[Vec<f64>]) -> Result<Path, PlanError> {
     let mut usable: Path = Vec::new();
     let mut why = PlanError::NoGoal;

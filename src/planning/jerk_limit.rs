@@ -1,38 +1,38 @@
-//! Bounded jerk along a curve: `s(t)` averaged over a window of time.
+//! Jerk limiting along a curve: `s(t)` is averaged over a time window.
 //!
-//! The average of a motion from rest to rest is one from rest to rest, along the same curve, longer by the window `W`;
-//! its acceleration is `(ṡ(t) − ṡ(t − W)) / W`, so it has no jumps, and its jerk is `(s̈(t) − s̈(t − W)) / W`: constant
-//! between the times where `s̈` jumps now or jumped a window ago. So the average is walked through from one of these
-//! times to the next, in exact cubics.
+//! The average of a rest-to-rest motion is a rest-to-rest motion along the same curve, longer by the window `W`. Its
+//! acceleration is `(ṡ(t) − ṡ(t − W)) / W`, which has no jumps. Its jerk is `(s̈(t) − s̈(t − W)) / W`, constant between
+//! the times at which `s̈` jumps now or jumped a window ago. So the average is evaluated from one of these times to the
+//! next, in exact cubics.
 //!
-//! What is averaged is found in two ways, and the shorter motion is taken: [`steady`] keeps the limits by construction
-//! and is good where lines are long. Else it is the fastest motion without jerk limits. Its average is faster than
-//! itself where that is slowest, in a corner, and pieces where it uses more than the limits get a slower pace, a few
-//! times; what is left then slows down the whole.
+//! Two candidates are averaged, and the shorter result is used. [`constant_corner_speed`] keeps the limits by
+//! construction; it is good for long lines. The other is the time-optimal motion without jerk limits. Its average is
+//! faster than the motion where that is slowest, in a corner: pieces that exceed the limits get a lower pace, in a few
+//! rounds; any remaining excess slows down the whole motion.
 
 use crate::trajectory::TrajectoryPoint;
 
 use super::blend::{Curve, Piece};
-use super::steady::steady;
-use super::topp::{GridPoint, JointBound, Pace, course};
+use super::constant_corner_speed::constant_corner_speed;
+use super::topp::{GridPoint, JointBound, Pace, speed_grid};
 use super::verify::Excess;
 
-/// Times that the paces are corrected.
+/// Maximum rounds of pace correction.
 const ROUNDS: usize = 5;
-/// More than this part of the limits is corrected.
-const ENOUGH: f64 = 1.01;
-/// Knots closer in time than this are one [s]: polynomials through closer ones would show the rounding of positions.
-const CLOSE: f64 = 1e-4;
+/// Excess above this part of the limits is corrected.
+const CORRECTION_RATIO: f64 = 1.01;
+/// Minimum time between knots [s]: polynomials through closer ones would amplify rounding errors of positions.
+const MIN_KNOT_INTERVAL: f64 = 1e-4;
 
-/// The knots of a curve's motion, to be joined by quintics.
+/// Returns the knots of a curve's motion, to be joined by quintics.
 pub(super) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Vec<TrajectoryPoint> {
     let gauge = Gauge::new(curve, bounds);
-    // From no acceleration to all of it.
+    // Time from zero to full acceleration.
     let window = bounds.iter().filter(|b| b.jerk.is_finite()).map(|b| b.acceleration / b.jerk).fold(1e-6, f64::max);
-    let steady = steady(curve, bounds, window).map(|points| Motion { phases: phases(&points), window });
+    let steady = constant_corner_speed(curve, bounds, window).map(|points| Motion { phases: phases(&points), window });
     let mut best: Option<(f64, Motion)> = steady.map(|motion| (motion.needed(&gauge), motion));
-    // Twice the window: from all of it forwards to all of it backwards. Where a line is so short that it never is all of
-    // it, half of that will do.
+    // Twice the window: from full acceleration to full deceleration. Where a line is too short for full acceleration,
+    // half of that suffices.
     let windows: &[f64] = if curve.len() > 1 { &[2.0] } else { &[1.0, 2.0] };
     for factor in windows {
         let most = best.as_ref().map_or(f64::INFINITY, |b| b.0);
@@ -43,22 +43,23 @@ pub(super) fn averaged(curve: &Curve, bounds: &[JointBound]) -> Vec<TrajectoryPo
     best.map(|(_, motion)| motion.knots(curve)).unwrap_or_default()
 }
 
-/// The fastest motion with paces at which its average keeps the limits, mostly; nothing where it takes longer than
-/// `most` [s].
+/// Returns the time-optimal motion with paces at which its average approximately keeps the limits; `None` if it takes
+/// longer than `most` [s].
 fn paced(curve: &Curve, bounds: &[JointBound], gauge: &Gauge<'_>, window: f64, most: f64) -> Option<Motion> {
-    let (walls, course) = course(curve, bounds);
+    let (constraints, speed_grid) = speed_grid(curve, bounds);
     let mut paces = vec![Pace::FULL; curve.len()];
     let mut slower = vec![1.0; curve.len()];
     let mut rounds = 0;
     loop {
-        let motion = Motion { phases: phases(&course.timed(&course.fastest(&walls, &paces), &paces)), window };
+        let motion =
+            Motion { phases: phases(&speed_grid.timed(&speed_grid.fastest(&constraints, &paces), &paces)), window };
         if motion.duration() > most {
             return None;
         }
         slower.fill(1.0);
         for leg in motion.walk(curve) {
             let factor = gauge.slower(&leg);
-            if factor > ENOUGH {
+            if factor > CORRECTION_RATIO {
                 slower[leg.sources.0..=leg.sources.1].iter_mut().for_each(|s| *s = f64::max(*s, factor));
             }
         }
@@ -73,75 +74,75 @@ fn paced(curve: &Curve, bounds: &[JointBound], gauge: &Gauge<'_>, window: f64, m
     }
 }
 
-/// A motion, and the window it is averaged over [s].
+/// A motion and its averaging window [s].
 struct Motion {
     phases: Vec<Phase>,
     window: f64,
 }
 
 impl Motion {
-    /// Time that the average takes when it is so slow that it keeps all limits [s].
+    /// Duration of the average after slowing it down to keep all limits [s].
     fn needed(&self, gauge: &Gauge<'_>) -> f64 {
         self.duration() * self.walk(gauge.curve).map(|leg| gauge.slower(&leg)).fold(1.0, f64::max)
     }
 
-    /// Time that the average takes [s].
+    /// Duration of the average [s].
     fn duration(&self) -> f64 {
         self.phases.last().map_or(0.0, |phase| phase.end) + self.window
     }
 
     fn walk<'a>(&'a self, curve: &'a Curve) -> Walk<'a> {
-        Walk { phases: &self.phases, curve, window: self.window, now: 0, before: 0, time: 0.0, here: Place::default() }
+        Walk { phases: &self.phases, curve, window: self.window, now: 0, before: 0, time: 0.0, here: Knot::default() }
     }
 
-    /// The average at the ends of its legs.
+    /// Returns the average at the ends of its legs.
     fn knots(&self, curve: &Curve) -> Vec<TrajectoryPoint> {
         let mut points: Vec<TrajectoryPoint> = Vec::with_capacity(2 * self.phases.len() + curve.len());
-        points.push(knot(curve, &Place::default(), 0.0));
+        points.push(point(curve, &Knot::default(), 0.0));
         let (mut last, mut end) = (0.0, None);
         for leg in self.walk(curve) {
-            if leg.time - last >= CLOSE {
-                points.push(knot(curve, &leg.to, leg.time));
+            if leg.time - last >= MIN_KNOT_INTERVAL {
+                points.push(point(curve, &leg.to, leg.time));
                 last = leg.time;
             }
             end = Some(leg);
         }
-        // It ends where it ends, at rest.
+        // The last knot is the end, at rest.
         if let Some(leg) = end {
             if points.len() > 1 {
                 points.pop();
             }
-            points.push(knot(curve, &Place { v: 0.0, a: 0.0, ..leg.to }, leg.time));
+            points.push(point(curve, &Knot { v: 0.0, a: 0.0, ..leg.to }, leg.time));
         }
         points
     }
 }
 
-fn knot(curve: &Curve, place: &Place, time: f64) -> TrajectoryPoint {
-    let piece = &curve[place.piece];
+fn point(curve: &Curve, knot: &Knot, time: f64) -> TrajectoryPoint {
+    let piece = &curve[knot.piece];
     let empty = || Vec::with_capacity(piece.start.len());
     let mut point =
         TrajectoryPoint { time_from_start: time, positions: empty(), velocities: empty(), accelerations: empty() };
-    for jet in piece.jets(place.at) {
+    for jet in piece.jets(knot.at) {
         point.positions.push(jet.q);
-        point.velocities.push(jet.d1 * place.v);
-        point.accelerations.push(jet.d2 * place.v * place.v + jet.d1 * place.a);
+        point.velocities.push(jet.d1 * knot.v);
+        point.accelerations.push(jet.d2 * knot.v * knot.v + jet.d1 * knot.a);
     }
     point
 }
 
-/// A time of constant acceleration of the parameter.
+/// A phase of constant acceleration of the parameter.
 #[derive(Debug, Clone, Copy)]
 struct Phase {
     /// Time at its end [s].
     end: f64,
     /// The acceleration.
     u: f64,
-    /// The piece it is on.
+    /// Index of its piece.
     piece: usize,
 }
 
-/// The phases between the points of a motion.
+/// Returns the phases between the grid points of a motion.
 fn phases(grid: &[GridPoint]) -> Vec<Phase> {
     let phase = |pair: &[GridPoint]| {
         let (a, b) = (&pair[0], &pair[1]);
@@ -151,38 +152,38 @@ fn phases(grid: &[GridPoint]) -> Vec<Phase> {
     grid.windows(2).filter_map(phase).collect()
 }
 
-/// Where the average is, and how it moves.
+/// Position along the curve, and its derivatives.
 #[derive(Debug, Clone, Copy, Default)]
-struct Place {
+struct Knot {
     piece: usize,
     at: f64,
     v: f64,
     a: f64,
 }
 
-/// From one knot to the next: constant jerk.
+/// A leg between two knots: constant jerk.
 #[derive(Debug, Clone, Copy)]
 struct Leg {
-    from: Place,
+    from: Knot,
     /// On the piece of `from`.
-    to: Place,
+    to: Knot,
     jerk: f64,
     /// Time at its end [s].
     time: f64,
-    /// The pieces whose motion is averaged in it, first and last.
+    /// First and last piece whose motion is averaged in it.
     sources: (usize, usize),
 }
 
-/// Goes along the average, leg by leg.
+/// Iterates over the legs of the average.
 struct Walk<'a> {
     phases: &'a [Phase],
     curve: &'a Curve,
     window: f64,
-    /// Index of the phase now, and of that a window ago, one more: 0 is the rest before the start.
+    /// Index of the current phase, and one more than that of the phase a window ago: 0 is the rest before the start.
     now: usize,
     before: usize,
     time: f64,
-    here: Place,
+    here: Knot,
 }
 
 impl Iterator for Walk<'_> {
@@ -204,12 +205,12 @@ impl Iterator for Walk<'_> {
             (self.phases[self.before.saturating_sub(1).min(last)].piece, self.phases[self.now.min(last)].piece);
         let sources = (sources.0.min(from.piece), sources.1.max(from.piece));
         if to.at > length && from.piece + 1 < self.curve.len() {
-            // Into the next piece before that.
+            // Ends earlier if it enters the next piece.
             let part = crossing(&from, jerk, step, length);
             to = moved(&from, jerk, part);
             to.at = length;
             self.time += part;
-            self.here = Place { piece: from.piece + 1, at: 0.0, ..to };
+            self.here = Knot { piece: from.piece + 1, at: 0.0, ..to };
             return Some(Leg { from, to, jerk, time: self.time, sources });
         }
         self.time = time;
@@ -224,9 +225,9 @@ impl Iterator for Walk<'_> {
     }
 }
 
-/// A place some time later, at constant jerk.
-fn moved(from: &Place, jerk: f64, t: f64) -> Place {
-    Place {
+/// Returns the state after time `t` at constant jerk.
+fn moved(from: &Knot, jerk: f64, t: f64) -> Knot {
+    Knot {
         piece: from.piece,
         at: from.at + t * (from.v + t * (0.5 * from.a + t * jerk / 6.0)),
         v: from.v + t * (from.a + 0.5 * t * jerk),
@@ -234,12 +235,12 @@ fn moved(from: &Place, jerk: f64, t: f64) -> Place {
     }
 }
 
-/// When a motion comes to `at`, which it does before `most`.
-fn crossing(from: &Place, jerk: f64, most: f64, at: f64) -> f64 {
+/// Returns when a motion reaches `at`, which it does before `most`.
+fn crossing(from: &Knot, jerk: f64, most: f64, at: f64) -> f64 {
     let (mut low, mut high, mut t) = (0.0, most, most);
     for _ in 0..60 {
-        let place = moved(from, jerk, t);
-        let over = place.at - at;
+        let knot = moved(from, jerk, t);
+        let over = knot.at - at;
         if over > 0.0 {
             high = t;
         } else {
@@ -248,18 +249,18 @@ fn crossing(from: &Place, jerk: f64, most: f64, at: f64) -> f64 {
         if over.abs() <= 1e-15 || high - low <= 1e-15 {
             break;
         }
-        let newton = t - over / place.v;
+        let newton = t - over / knot.v;
         t = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
     }
     t
 }
 
-/// What a motion along a curve uses of the limits.
+/// Measures how much of the limits a motion along a curve uses.
 struct Gauge<'a> {
     curve: &'a Curve,
-    /// One over each limit.
+    /// Inverse of each limit.
     inverse: Vec<JointBound>,
-    /// On each line, the largest part of each limit that a parameter's speed, acceleration and jerk of 1 takes.
+    /// For each line, the largest part of each limit that a unit speed, acceleration and jerk of the parameter uses.
     lines: Vec<[f64; 3]>,
 }
 
@@ -281,19 +282,19 @@ impl<'a> Gauge<'a> {
         Self { curve, inverse, lines }
     }
 
-    /// By which factor a leg must be slower to keep the limits.
+    /// Returns the factor by which a leg must be slowed down to keep the limits.
     fn slower(&self, leg: &Leg) -> f64 {
         let piece = &self.curve[leg.from.piece];
         let mut most = [0.0_f64; 3];
         let mut see = |used: [f64; 3]| most.iter_mut().zip(used).for_each(|(m, u)| *m = if u > *m { u } else { *m });
-        for place in [&leg.from, &leg.to] {
-            let (v, a, j) = (place.v, place.a, leg.jerk);
+        for knot in [&leg.from, &leg.to] {
+            let (v, a, j) = (knot.v, knot.a, leg.jerk);
             if !piece.bends {
                 let [velocity, acceleration, jerk] = self.lines[leg.from.piece];
                 see([velocity * v, acceleration * a.abs(), jerk * j.abs()]);
                 continue;
             }
-            let t = piece.turned(place.at);
+            let t = piece.progress(knot.at);
             let (curved, changed) = (t.d1 * v * v, v * (3.0 * t.d1 * a + t.d2 * v * v));
             for ((direction, turn), inverse) in piece.direction.iter().zip(&piece.turn).zip(&self.inverse) {
                 let d1 = direction + turn * t.part;

@@ -1,5 +1,5 @@
-//! `dimos move ARM …`: a motion to joint positions, a pose or a named pose, of one arm or of several together. With a planner in the run it is planned and
-//! collision-free; without one it is direct.
+//! `dimos move ARM …`: moves one arm or several together to joint positions, a pose or a named pose. With a planner in
+//! the run the motion is planned and collision-free; without one it is direct.
 
 use super::arguments::Target;
 use super::exit::{Exit, Failure, Result};
@@ -12,19 +12,19 @@ use crate::rpc::client::Client;
 /// Arguments of `move`.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The arm's hardware_id, which is also the robot's name in the planner; several have --goal each
+    /// Name of the arm (hardware_id), also its robot's name in the planner; with several arms use --goal for each
     #[arg(required_unless_present = "several", conflicts_with = "several")]
     pub arm: Option<String>,
-    /// Where it shall go
+    /// Goal of the motion
     #[command(flatten)]
     pub goal: Goal,
-    /// How to search
+    /// Settings of the search
     #[command(flatten)]
     pub search: Search,
-    /// Move straight in joint space although the run has a planner: not collision-checked
+    /// Move straight in joint space even if the run has a planner: not collision-checked
     #[arg(long, conflicts_with_all = ["pose", "named", "several"])]
     pub direct: bool,
-    /// Plan again and go on when the motion has to end before something that got in its way
+    /// If an obstacle blocks the motion, stop, plan again and continue
     #[arg(long, conflicts_with_all = ["direct", "no_wait"])]
     pub replan: bool,
     /// Return when the motion has begun
@@ -67,7 +67,7 @@ fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result
 
 fn begin_direct(args: &Args, client: &mut Client) -> Result<Begun> {
     let (Some(arm), Some(target)) = (&args.arm, args.goal.joints()) else {
-        let failure = Failure::new(Exit::Failed, "this run has no planner, which poses, names and --goal need");
+        let failure = Failure::new(Exit::Failed, "poses, names and --goal need a planner, and this run has none");
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
     let begun = client.call(Move { arm: arm.clone(), target: target.to_vec(), speed: args.search.speed })?;

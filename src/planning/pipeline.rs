@@ -1,4 +1,4 @@
-//! One request, from where the robots are to a timed motion: goals found, searched, timed, checked.
+//! Planning pipeline: one request, from the robots' positions to a verified trajectory.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -6,11 +6,11 @@ use std::time::Instant;
 use nalgebra::{Isometry3, Vector3};
 
 use super::goals;
-use super::leaving::{Leaving, passes};
-use super::padded::{GivenUp, Padded, Place};
+use super::padded::{GivenUp, Near, Padded};
 use super::path::{Path, between, distance, length, unwind};
-use super::planner::{PlanError, PlanSettings, plan};
-use super::setup::{PlannedRobot, Setup};
+use super::path_planner::{PlanError, PlanSettings, plan};
+use super::planning_scene::{PlannedRobot, PlanningScene};
+use super::start_contact::{EscapePath, passes};
 use super::timing::{TimingSettings, bounds, time};
 use crate::collision::world::World;
 use crate::collision::{CollisionChecker, Stop};
@@ -18,81 +18,81 @@ use crate::robot::kinematics::frame;
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};
 
-/// Distance between two looks for the clearance of a path [rad].
+/// Distance between clearance checks along a path [rad].
 const CLEARANCE_STEP: f64 = 0.05;
-/// A path shorter than this is none: the robots are there already [rad].
-const THERE: f64 = 1e-6;
-/// Configurations as close as this are the same [rad].
-const SAME: f64 = 1e-3;
-/// Searched with as much more padding [m]: between the points of its trajectory a motion is not exactly what was proved,
-/// and must still keep the padding when it is looked at again.
-const SPARE: f64 = 2e-4;
-/// How long the motion of robots takes that are there already [s].
-const MOMENT: f64 = 0.1;
+/// A path shorter than this needs no motion [rad].
+const GOAL_TOLERANCE: f64 = 1e-6;
+/// Configurations closer than this count as the same [rad].
+const SAME_CONFIGURATION: f64 = 1e-3;
+/// Additional padding during the search [m]: between the points of its trajectory, a motion deviates slightly from the
+/// checked path and must still pass a later check.
+const EXTRA_PADDING: f64 = 2e-4;
+/// Duration of the motion of robots that are already at the goal [s].
+const STATIONARY_DURATION: f64 = 0.1;
 
-/// Where a robot shall go.
+/// Goal of a robot.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Goal {
-    /// To joint positions [rad], in the order of its planned joints.
+    /// Joint positions [rad], in the order of its planned joints.
     Joints(Vec<f64>),
-    /// With its end effector to a pose in the frame `map`.
+    /// Pose of the end effector in the frame `map`.
     Pose(Isometry3<f64>),
-    /// With its end effector to a place in the frame `map` [m], in any orientation.
-    Place(Vector3<f64>),
-    /// With its end effector on a straight line to a pose in the frame `map`.
+    /// Position of the end effector in the frame `map` [m], in any orientation.
+    Position(Vector3<f64>),
+    /// Pose of the end effector in the frame `map`, reached on a straight line.
     Line(Isometry3<f64>),
 }
 
-/// What is to be planned.
+/// A planning request.
 #[derive(Debug, Clone)]
-pub struct Request {
-    /// Where robots shall go, by their index; the others stay where they are.
+pub struct PlanRequest {
+    /// Goals of robots, by their index; the other robots stay where they are.
     pub goals: Vec<(usize, Goal)>,
-    /// Where all robots are [rad], in the setup's order.
+    /// Current positions of all robots [rad], in the order of the scene.
     pub positions: Vec<Vec<f64>>,
-    /// Part of the limits' speed and acceleration, above 0 and at most 1.
+    /// Part of the limits for speed and acceleration, above 0 and at most 1.
     pub speed: f64,
-    /// What all randomness comes from.
+    /// Seed of all random numbers.
     pub seed: u64,
 }
 
-/// A motion that was found.
+/// A planned motion.
 #[derive(Debug, Clone)]
-pub struct Found {
+pub struct PlannedMotion {
     /// The robots that move, by index.
     pub robots: Vec<usize>,
-    /// The path: positions of all joints that move, robot after robot.
+    /// The path: positions of all moving joints, robot after robot.
     pub path: Path,
-    /// The motion, with the coordinator's joint names.
+    /// The trajectory, with the coordinator's joint names.
     pub trajectory: JointTrajectory,
-    /// Smallest distance on the path [m], and between which two; none where there is nothing to be near to, or where
-    /// time was up before it was known.
+    /// Minimum clearance on the path [m] and its pair; `None` if there is nothing to collide with, or if the timeout
+    /// was reached before it was computed.
     pub clearance: Option<(f64, [String; 2])>,
-    /// The way out of its start, where that touches something.
-    pub leaving: Option<Leaving>,
-    /// Distance that it keeps [m].
+    /// The escape path, if the start is in contact.
+    pub escape_path: Option<EscapePath>,
+    /// Padding [m].
     pub padding: f64,
-    /// Where it does not.
+    /// Exceptions from the padding.
     pub given_up: Vec<GivenUp>,
-    /// Of a straight line, the part that can be done.
+    /// The part of a straight line that was followed.
     pub fraction: Option<f64>,
-    /// What took how long [s].
+    /// Duration of each stage [s].
     pub times: BTreeMap<String, f64>,
 }
 
 /// Why there is no motion.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Failure {
-    /// In a sentence without full stop.
+pub struct PlanFailure {
+    /// A sentence without full stop.
     pub what: String,
-    /// What to do about it.
+    /// What the user can do about it.
     pub hint: Option<String>,
-    /// Whether somebody cancelled the request.
+    /// Whether the request was cancelled.
     pub cancelled: bool,
 }
 
-impl Failure {
-    /// A failure without a hint.
+impl PlanFailure {
+    /// Creates a failure without a hint.
     pub fn new(what: impl Into<String>) -> Self {
         Self { what: what.into(), hint: None, cancelled: false }
     }
@@ -102,28 +102,33 @@ impl Failure {
     }
 }
 
-/// The part of the world that one request is about: the robots that move, planned; the others, standing.
+/// The scene of one request: moving robots are planned, the others are fixed.
 pub(super) struct Stage<'a> {
     /// The robots that move.
     pub robots: Vec<&'a PlannedRobot>,
-    /// Their indices in the setup.
+    /// Their indices in the scene.
     pub indices: Vec<usize>,
     /// Names of their joints in the coordinator, robot after robot.
     pub joints: Vec<String>,
-    /// Limits of the same.
+    /// Limits of the same joints.
     pub limits: Vec<Limits>,
-    /// Where they are [rad].
+    /// Their positions [rad].
     pub start: Vec<f64>,
-    /// Knows all robots and obstacles.
+    /// Checker of all robots and obstacles.
     pub checker: Padded,
 }
 
-/// Plans a motion. The same setup, world and request give the same motion, as long as time does not run out.
-pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Result<Found, Failure> {
+/// Plans a motion. The same scene, world and request give the same motion unless the timeout is reached.
+pub fn solve(
+    setup: &PlanningScene,
+    world: &World,
+    request: &PlanRequest,
+    stop: &Stop,
+) -> Result<PlannedMotion, PlanFailure> {
     let mut times = BTreeMap::new();
     let moving: Vec<usize> = request.goals.iter().map(|(robot, _)| *robot).collect();
-    let mut stage = stage(setup, world, &moving, &request.positions, setup.padding + SPARE)?;
-    stage.checker.give_up(Place::Start, &stage.start);
+    let mut stage = stage(setup, world, &moving, &request.positions, setup.padding + EXTRA_PADDING)?;
+    stage.checker.give_up(Near::Start, &stage.start);
     let began = Instant::now();
     let lap = |times: &mut BTreeMap<String, f64>, name: &str, since: Instant| {
         times.insert(name.to_owned(), since.elapsed().as_secs_f64());
@@ -136,56 +141,59 @@ pub fn solve(setup: &Setup, world: &World, request: &Request, stop: &Stop) -> Re
             (path, Some(fraction))
         }
         several if several.iter().any(|(_, goal)| matches!(goal, Goal::Line(_))) => {
-            return Err(Failure::new("a straight line is planned for one robot at a time"));
+            return Err(PlanFailure::new("a straight line is planned for one robot at a time"));
         }
         wanted => {
             let goals = goals::configurations(&mut stage, wanted, request.seed, stop)?;
             for goal in &goals {
                 let mut goal = goal.clone();
                 unwind(&mut goal, &stage.start, stage.checker.turns());
-                stage.checker.give_up(Place::Goal, &goal);
+                stage.checker.give_up(Near::Goal, &goal);
             }
             lap(&mut times, "ik", began);
             let settings = PlanSettings { seed: request.seed, ..PlanSettings::default() };
             let start = stage.start.clone();
-            let found = plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| told(&stage, &e))?;
+            let found =
+                plan(&mut stage.checker, &start, &goals, &settings, stop).map_err(|e| failure_for(&stage, &e))?;
             times.insert("search".into(), found.search_time.as_secs_f64());
             times.insert("shorten".into(), found.shorten_time.as_secs_f64());
             (found.path, None)
         }
     };
     let timing = Instant::now();
-    let trajectory = match length(&path) < THERE {
+    let trajectory = match length(&path) < GOAL_TOLERANCE {
         true => rest(&stage.joints, &path),
         false => timed(&mut stage, &path, request.speed, fraction.is_some(), stop)?,
     };
     let looking = lap(&mut times, "timing", timing);
     let clearance = clearance(&mut stage.checker, &path, stop);
     lap(&mut times, "clearance", looking);
-    let leaving = Leaving::of(&mut stage.checker, &path);
-    // Of several goals one was reached.
-    let reached = |center: &[f64]| path.last().is_some_and(|end| distance(end, center) < SAME);
-    let at_end = |given_up: &&GivenUp| given_up.place != Place::Goal || reached(&given_up.center);
+    let escape_path = EscapePath::of(&mut stage.checker, &path);
+    // Only one of several goals was reached.
+    let reached = |center: &[f64]| path.last().is_some_and(|end| distance(end, center) < SAME_CONFIGURATION);
+    let at_end = |given_up: &&GivenUp| given_up.near != Near::Goal || reached(&given_up.center);
     let given_up = stage.checker.given_up().iter().filter(at_end).cloned().collect();
     let (robots, padding) = (stage.indices, setup.padding);
-    Ok(Found { robots, path, trajectory, clearance, leaving, padding, given_up, fraction, times })
+    Ok(PlannedMotion { robots, path, trajectory, clearance, escape_path, padding, given_up, fraction, times })
 }
 
-/// The world of one request: robots that move, by index, and all others where they are [rad]; `padding` is kept [m].
+/// Builds the scene of one request: `moving` robots by index, all others fixed at their positions [rad], with `padding`
+/// [m].
 pub(super) fn stage<'a>(
-    setup: &'a Setup,
+    setup: &'a PlanningScene,
     world: &World,
     moving: &[usize],
     positions: &[Vec<f64>],
     padding: f64,
-) -> Result<Stage<'a>, Failure> {
+) -> Result<Stage<'a>, PlanFailure> {
     let (mut robots, mut indices, mut bodies) = (Vec::new(), Vec::new(), Vec::new());
     let (mut joints, mut limits, mut start) = (Vec::new(), Vec::new(), Vec::new());
     for (index, robot) in setup.robots.iter().enumerate() {
         let at = positions.get(index).filter(|at| at.len() == robot.joints.len());
-        let at = at.ok_or_else(|| Failure::new(format!("the positions of {} are not known", robot.config.name)))?;
+        let at =
+            at.ok_or_else(|| PlanFailure::new(format!("the joint positions of {} are unknown", robot.config.name)))?;
         if !moving.contains(&index) {
-            bodies.push(robot.standing(at).map_err(Failure::new)?);
+            bodies.push(robot.fixed_at(at).map_err(PlanFailure::new)?);
             continue;
         }
         bodies.push(robot.body.clone());
@@ -199,29 +207,29 @@ pub(super) fn stage<'a>(
     Ok(Stage { robots, indices, joints, limits, start, checker })
 }
 
-/// A planner's error in the user's words: joints by name.
-fn told(stage: &Stage<'_>, error: &PlanError) -> Failure {
+/// Converts a path planner's error to a failure with joint names.
+fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
     match error {
         PlanError::Outside { which, joint, position, lower, upper } => {
             let name = stage.joints.get(*joint).map_or("a joint", String::as_str);
             let kinds = stage.robots.iter().flat_map(|robot| robot.body.kinematics.kinds());
             let unit = { kinds }.nth(*joint).map_or("rad", |kind| kind.unit());
             let limits = format!("{lower:.4} … {upper:.4} {unit}");
-            Failure::new(format!("{which}: {name} at {position:.4} {unit} is outside its limits {limits}"))
-                .hint("limits are the model's and the arm's, the narrower counts, and commands stay 0.01 rad inside the arm's; `dimos state` shows where the joints are")
+            PlanFailure::new(format!("{which}: {name} at {position:.4} {unit} is outside its limits {limits}"))
+                .hint("the narrower limits of model and arm apply, and commands stay 0.01 rad inside those of the arm; `dimos state` shows the joint positions")
         }
-        PlanError::Collides { which: "start", .. } => Failure::new(error.to_string())
-            .hint("move out of it with `dimos move … --direct` or by hand, or correct the world"),
-        PlanError::Collides { .. } => Failure::new(error.to_string()).hint("choose another goal, or correct the world"),
-        PlanError::Timeout(_) => {
-            Failure::new(error.to_string()).hint("give it more time with --timeout, or another --seed")
+        PlanError::Collides { which: "start", .. } => PlanFailure::new(error.to_string())
+            .hint("move the arm out of contact with `dimos move … --direct` or by hand, or correct the world"),
+        PlanError::Collides { .. } => {
+            PlanFailure::new(error.to_string()).hint("choose another goal, or correct the world")
         }
-        PlanError::Cancelled => Failure { cancelled: true, ..Failure::new("cancelled") },
-        _ => Failure::new(error.to_string()),
+        PlanError::Timeout(_) => PlanFailure::new(error.to_string()).hint("increase --timeout, or try another --seed"),
+        PlanError::Cancelled => PlanFailure { cancelled: true, ..PlanFailure::new("cancelled") },
+        _ => PlanFailure::new(error.to_string()),
     }
 }
 
-/// The motion of robots that are there already: they stand for a moment.
+/// Returns the trajectory of robots that are already at the goal: a short rest.
 fn rest(joints: &[String], path: &Path) -> JointTrajectory {
     let still = vec![0.0; joints.len()];
     let at = |time| TrajectoryPoint {
@@ -230,13 +238,19 @@ fn rest(joints: &[String], path: &Path) -> JointTrajectory {
         velocities: still.clone(),
         accelerations: still.clone(),
     };
-    JointTrajectory { joint_names: joints.to_vec(), points: vec![at(0.0), at(MOMENT)] }
+    JointTrajectory { joint_names: joints.to_vec(), points: vec![at(0.0), at(STATIONARY_DURATION)] }
 }
 
-/// Times a path within the joints' limits, and checks the timed motion.
-fn timed(stage: &mut Stage<'_>, path: &Path, speed: f64, line: bool, stop: &Stop) -> Result<JointTrajectory, Failure> {
-    let bounds = bounds(&stage.joints, &stage.limits).map_err(|e| Failure::new(e.to_string()))?;
-    // Half the speed means half the velocity and half the acceleration, as a direct move has it.
+/// Times a path within the joints' limits, and verifies the trajectory.
+fn timed(
+    stage: &mut Stage<'_>,
+    path: &Path,
+    speed: f64,
+    line: bool,
+    stop: &Stop,
+) -> Result<JointTrajectory, PlanFailure> {
+    let bounds = bounds(&stage.joints, &stage.limits).map_err(|e| PlanFailure::new(e.to_string()))?;
+    // Half the speed means half the velocity and half the acceleration, as in a direct move.
     let bounds: Vec<_> = bounds
         .into_iter()
         .map(|mut b| {
@@ -246,26 +260,26 @@ fn timed(stage: &mut Stage<'_>, path: &Path, speed: f64, line: bool, stop: &Stop
             b
         })
         .collect();
-    // The corners of a line are so flat that cutting them keeps to it.
+    // The corners of a line are so flat that blending keeps to the line.
     let deviation = if line { 1e-3 } else { TimingSettings::default().deviation };
     let settings = TimingSettings { deviation, speed: 1.0 };
     let checker = &mut stage.checker;
-    let leaving = Leaving::of(checker, path);
-    let free = |a: &[f64], b: &[f64]| passes(checker, leaving.as_ref(), a, b, stop);
+    let escape_path = EscapePath::of(checker, path);
+    let free = |a: &[f64], b: &[f64]| passes(checker, escape_path.as_ref(), a, b, stop);
     let timed = time(&stage.joints, path, &bounds, &settings, free);
-    timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| Failure::new(e.to_string())))
+    timed.map(|timed| timed.trajectory).map_err(|e| late(stop).unwrap_or_else(|| PlanFailure::new(e.to_string())))
 }
 
-/// What failed because it was cancelled, or because time was up.
-pub(super) fn late(stop: &Stop) -> Option<Failure> {
+/// Returns the failure if the request was cancelled or its timeout was reached.
+pub(super) fn late(stop: &Stop) -> Option<PlanFailure> {
     match (stop.is_cancelled(), stop.is_over()) {
-        (true, _) => Some(Failure { cancelled: true, ..Failure::new("cancelled") }),
-        (_, true) => Some(Failure::new("no motion was found in time").hint("give it more time with --timeout")),
+        (true, _) => Some(PlanFailure { cancelled: true, ..PlanFailure::new("cancelled") }),
+        (_, true) => Some(PlanFailure::new("no motion found before the timeout").hint("increase --timeout")),
         _ => None,
     }
 }
 
-/// The smallest distance on a path, and between which two. A figure for people: without it where time is up.
+/// Returns the minimum clearance on a path and its pair; `None` if the timeout is reached first.
 fn clearance(checker: &mut Padded, path: &Path, stop: &Stop) -> Option<(f64, [String; 2])> {
     let mut least: Option<(f64, [String; 2])> = None;
     let mut q = path.first()?.clone();

@@ -1,37 +1,36 @@
-//! Reading that does not stop at the first mistake: note it, work round it, read again. One pass for each mistake.
+//! Error recovery: reads again after each mistake until none is left. One pass per mistake.
 //!
-//! * an unknown key: leave it out;
-//! * a bad value: leave its entry out, so that its default steps in;
-//! * a missing key: put a stand-in for it;
-//! * the stand-in is refused: leave the group around it out.
+//! * unknown key: skip it;
+//! * bad value: skip its entry, so that its default applies;
+//! * missing key: use a placeholder;
+//! * rejected placeholder: skip the group around it.
 //!
-//! A mistake that only follows from one of these is not reported.
+//! Mistakes that only follow from these are not reported.
 
 use std::collections::{HashMap, HashSet};
 
 use serde::de::DeserializeOwned;
 
-use crate::yaml::de::{De, Detour};
+use crate::yaml::de::{De, Workaround};
 use crate::yaml::diag::Diag;
 use crate::yaml::error::{ReadError, What};
 use crate::yaml::scalar::number_hint;
 use crate::yaml::suggest::{closest, did_you_mean, quote};
 use crate::yaml::tree::{Kind, NodeId, Tree};
 
-/// More mistakes than these are not looked for.
+/// Maximum number of passes, and so of mistakes.
 const MAX_PASSES: usize = 100;
 
-/// Whether a missing key is a mistake: not when a part of the file could not be read.
+/// Whether a missing key is a mistake: not if part of the file could not be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Missing {
-    /// It is.
+    /// It is a mistake.
     Report,
-    /// It may be in the part that could not be read.
+    /// It may be in the unreadable part.
     Ignore,
 }
 
-/// What a read had to leave out. Whoever checks the meaning afterwards asks here, to not complain of the absence of
-/// something that is there but wrong.
+/// Nodes that a read skipped. Later checks consult it to avoid complaints about values that are present but wrong.
 #[derive(Debug, Clone, Default)]
 pub struct Lost {
     nodes: HashSet<NodeId>,
@@ -40,22 +39,22 @@ pub struct Lost {
 }
 
 impl Lost {
-    /// Whether something in or under a node was left out.
+    /// Returns whether something in or under a node was skipped.
     pub fn contains(&self, node: NodeId) -> bool {
         self.nodes.contains(&node)
     }
 
-    /// Whether a value was left out as a whole.
+    /// Returns whether a value was skipped as a whole.
     pub fn dropped(&self, node: NodeId) -> bool {
         self.dropped.contains(&node)
     }
 
-    /// Whether a key of a group was left out, or what was left out was probably meant to be this key.
+    /// Returns whether a key of a group was skipped, or a skipped one was probably meant to be this key.
     pub fn key(&self, map: NodeId, key: &str) -> bool {
         self.keys.get(&map).is_some_and(|keys| keys.contains(key))
     }
 
-    /// Adds what another read left out.
+    /// Adds the nodes skipped by another read.
     pub fn extend(&mut self, other: Lost) {
         self.nodes.extend(other.nodes);
         self.dropped.extend(other.dropped);
@@ -73,35 +72,38 @@ impl Lost {
     }
 }
 
-/// Reads `root` as `T` and reports every mistake. Gives `None` when nothing of the kind could be made of it.
+/// Reads `root` as `T` and reports every mistake. Returns `None` if no value could be built.
 pub fn read<T: DeserializeOwned>(tree: &mut Tree, root: NodeId, missing: Missing) -> (Option<T>, Lost) {
-    let mut healer =
-        Healer { detour: Detour::default(), lost: Lost { nodes: tree.damaged.clone(), ..Lost::default() }, missing };
+    let mut recovery = Recovery {
+        workaround: Workaround::default(),
+        lost: Lost { nodes: tree.damaged.clone(), ..Lost::default() },
+        missing,
+    };
     for _ in 0..MAX_PASSES {
-        let de = De { tree, detour: &healer.detour, node: root, key: false };
+        let de = De { tree, workaround: &recovery.workaround, node: root, key: false };
         match T::deserialize(de) {
-            Ok(value) => return (Some(value), healer.lost),
+            Ok(value) => return (Some(value), recovery.lost),
             Err(error) => {
-                if !healer.work_round(tree, error.inside(root)) {
-                    return (None, healer.lost);
+                if !recovery.recover(tree, error.inside(root)) {
+                    return (None, recovery.lost);
                 }
             }
         }
     }
     tree.unlisted += 1;
-    healer.lost.note(&[root]);
-    (None, healer.lost)
+    recovery.lost.note(&[root]);
+    (None, recovery.lost)
 }
 
-struct Healer {
-    detour: Detour,
+struct Recovery {
+    workaround: Workaround,
     lost: Lost,
     missing: Missing,
 }
 
-impl Healer {
-    /// Reports a mistake and arranges that the next pass does not meet it; `false` when that is not possible.
-    fn work_round(&mut self, tree: &mut Tree, error: ReadError) -> bool {
+impl Recovery {
+    /// Reports a mistake and makes the next pass avoid it; `false` if that is impossible.
+    fn recover(&mut self, tree: &mut Tree, error: ReadError) -> bool {
         let ReadError { what, trail } = error;
         let Some(&at) = trail.first() else { return false };
         match what {
@@ -123,14 +125,14 @@ impl Healer {
                 }
                 self.lost.note(&trail);
                 self.lost.note_key(at, key);
-                let stand_ins = self.detour.stand_ins.entry(at).or_default();
-                if stand_ins.contains(&key) {
+                let placeholders = self.workaround.placeholders.entry(at).or_default();
+                if placeholders.contains(&key) {
                     return self.drop_innermost(tree, &trail);
                 }
-                stand_ins.push(key);
+                placeholders.push(key);
                 true
             }
-            What::StandIn => self.drop_innermost(tree, &trail),
+            What::Placeholder => self.drop_innermost(tree, &trail),
             What::Value { message, hint } => {
                 self.report_value(tree, &trail, message, hint);
                 self.drop_innermost(tree, &trail)
@@ -145,8 +147,8 @@ impl Healer {
         }
     }
 
-    /// Reports a bad value, unless something in it was left out before, or another read of the same place
-    /// has reported it: then this is only a consequence.
+    /// Reports a bad value, unless something inside was skipped or another read already reported this position: then it
+    /// is only a consequence.
     fn report_value(&self, tree: &mut Tree, trail: &[NodeId], message: String, hint: Option<String>) {
         let Some(&at) = trail.first() else { return };
         if self.lost.contains(at) || tree.has_report_at(at) {
@@ -158,7 +160,7 @@ impl Healer {
         tree.report(Diag::error(message).at(tree.label(at)).maybe_hint(hint));
     }
 
-    /// ` in …`, where the group has a name.
+    /// Returns ` in …` if the group has a name.
     fn context(&self, tree: &Tree, trail: &[NodeId]) -> String {
         match name_of(tree, trail) {
             name if name.is_empty() => String::new(),
@@ -166,11 +168,11 @@ impl Healer {
         }
     }
 
-    /// Leaves the innermost entry or element out; `false` when the mistake is in the root itself.
+    /// Skips the innermost entry or element; `false` if the mistake is in the root itself.
     fn drop_innermost(&mut self, tree: &Tree, trail: &[NodeId]) -> bool {
         self.lost.note(trail);
         let (value, parent) = match *trail {
-            // The mistake is in a key: leave its value out with it.
+            // The mistake is in a key: skip its value too.
             [key, value, map, ..] if tree.entries(map).contains(&(key, value)) => (value, map),
             [value, parent, ..] => (value, parent),
             _ => return false,
@@ -181,17 +183,17 @@ impl Healer {
             self.lost.note_key(parent, key);
         }
         self.lost.dropped.insert(value);
-        self.detour.dropped.insert(value)
+        self.workaround.dropped.insert(value)
     }
 }
 
-/// What to do about an unknown key.
+/// Returns the hint for an unknown key.
 fn unknown_key_hint(tree: &Tree, given: &str, known: &[&'static str]) -> Option<String> {
     if given == "<<" {
         return Some("YAML 1.2 has no merge keys; repeat the keys, or use `include`".to_owned());
     }
     if !given.is_empty() && given.chars().all(|c| c.is_ascii_digit()) {
-        return Some(format!("if this is part of a number, write a point: 0.{given}"));
+        return Some(format!("if this is part of a number, use a decimal point: 0.{given}"));
     }
     if closest(given, known.iter().copied()).is_none()
         && let Some(home) = tree.home_of(given)
@@ -207,7 +209,7 @@ fn unknown_key_hint(tree: &Tree, given: &str, known: &[&'static str]) -> Option<
     }
 }
 
-/// What to do about a value of the wrong kind, where the Deserializer did not know better.
+/// Returns the hint for a value of the wrong kind, if the Deserializer gave none.
 fn value_hint(tree: &Tree, at: NodeId, message: &str) -> Option<String> {
     let wanted = message.strip_prefix("expected ")?.split(", found").next()?;
     let general = match () {
@@ -216,7 +218,7 @@ fn value_hint(tree: &Tree, at: NodeId, message: &str) -> Option<String> {
         _ if wanted.contains("group") => "write its keys below it: `key: value`",
         _ if wanted.contains("list") => "write the values in brackets: [A, B]",
         _ if wanted.contains("text") => "write a word, or a text in quotes",
-        _ => "see docs/blueprint-reference.md for what may stand here",
+        _ => "see docs/blueprint-reference.md for the allowed values",
     };
     let specific = match tree.node(at).map(|n| &n.kind) {
         Some(Kind::Scalar { text, plain }) if wanted.contains("number") => number_hint(text, *plain),
@@ -231,7 +233,7 @@ fn value_hint(tree: &Tree, at: NodeId, message: &str) -> Option<String> {
     specific.or_else(|| Some(general.to_owned()))
 }
 
-/// How the innermost node of a trail is called: its key, or `key[2]` for an element of a list.
+/// Returns the name of the innermost node: its key, or `key[2]` for an element of a list.
 fn name_of(tree: &Tree, trail: &[NodeId]) -> String {
     let mut suffix = String::new();
     for pair in trail.windows(2) {

@@ -1,4 +1,4 @@
-//! What a log needs of its disk: room, and that nobody removes it.
+//! Checks a log's disk: enough free space, and the file still in place.
 
 use std::fs::File;
 use std::io;
@@ -7,8 +7,8 @@ use std::path::Path;
 
 use super::recorder::RecordError;
 
-/// Refuses a log where less than `min_free` bytes are free. Its folder need not exist yet. What the file system does not
-/// tell refuses nothing.
+/// Fails if less than `min_free` bytes are free. The folder need not exist yet. Passes if the file system reports no
+/// figures.
 pub fn check(log: &Path, min_free: u64) -> Result<(), RecordError> {
     match free(log) {
         Ok(free) if free < min_free => {
@@ -19,7 +19,7 @@ pub fn check(log: &Path, min_free: u64) -> Result<(), RecordError> {
     }
 }
 
-/// Why a log that is being written must end: its disk is nearly full, or it is not there any more.
+/// Returns why the current log must end: its disk is nearly full, or the file is gone.
 pub(super) fn watch(log: &Path, file: &File, min_free: u64) -> Result<(), RecordError> {
     let gone = || RecordError::Removed { path: log.to_owned() };
     match (file.metadata(), std::fs::metadata(log)) {
@@ -30,7 +30,7 @@ pub(super) fn watch(log: &Path, file: &File, min_free: u64) -> Result<(), Record
     check(log, min_free)
 }
 
-/// Room on the disk of a path [bytes].
+/// Returns the free space on the disk of a path [bytes].
 fn free(path: &Path) -> io::Result<u64> {
     let absolute = std::path::absolute(path)?;
     let existing = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
@@ -53,12 +53,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn too_little_room_is_refused_with_the_figures() {
+    fn too_little_space_is_rejected_with_the_figures() {
         let folder = tempfile::tempdir().unwrap();
         let log = folder.path().join("not/yet/there/run.mcap");
         check(&log, 0).unwrap();
         let refused = check(&log, u64::MAX).unwrap_err().to_string();
-        assert!(refused.contains("MB are free") && refused.contains("hint: "), "{refused}");
+        assert!(refused.contains("MB free") && refused.contains("hint: "), "{refused}");
     }
 
     #[test]

@@ -1,29 +1,29 @@
-//! Joints of a model that are not planned. They are where they are measured: a gripper's joint where the opening says
-//! (`gripper_joint`), a joint that an arm of the run has under its name where that is. Of a gripper of which nothing is
-//! known the widest opening is taken; all others are at zero.
+//! Joints of a model that are not planned, at their measured positions: a gripper's joint (`gripper_joint`) from the
+//! gripper's opening, others by their names in the run. A gripper without a measurement is taken as fully open; all
+//! other joints are at zero.
 
 use std::collections::{BTreeMap, HashMap};
 
 use super::config::RobotConfig;
-use super::setup::{PlannedRobot, Setup};
+use super::planning_scene::{PlannedRobot, PlanningScene};
 use crate::collision::world::Robot;
 use crate::robot::kinematics::Kinematics;
 use crate::robot::model::RobotModel;
 
-/// Smaller changes of a joint that is not planned are noise [rad or m].
+/// Changes below this are measurement noise [rad or m].
 const NOISE: f64 = 2e-4;
 
-/// What is measured besides the planned joints.
+/// Measurements besides the planned joints.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Measured {
-    /// Positions of joints, by the coordinator's name [rad or m].
+    /// Joint positions by the coordinator's name [rad or m].
     pub positions: BTreeMap<String, f64>,
-    /// How far the gripper of an arm is open, 0–1, by each of the arm's joints.
+    /// Opening of an arm's gripper, 0–1, by each of the arm's joints.
     pub grippers: BTreeMap<String, f64>,
 }
 
-impl Setup {
-    /// The same with the joints that are not planned where they are measured; `None`: they are there already.
+impl PlanningScene {
+    /// Returns the scene with the joints that are not planned at their measured positions; `None` if nothing changed.
     pub fn with_idle_joints(&self, measured: &Measured) -> Option<Self> {
         let mut changed = false;
         let mut now = self.clone();
@@ -42,7 +42,7 @@ impl Setup {
 }
 
 impl PlannedRobot {
-    /// Gripper joints of which nothing says where they are, with their position at the widest opening [rad or m].
+    /// Returns gripper joints without a measurement, with the fully open position that is assumed [rad or m].
     pub fn taken_as_open(&self) -> Vec<(String, f64)> {
         let known = |name: &String| self.config.gripper_joint.as_ref().is_some_and(|gripper| gripper.joint == *name);
         let unplanned = self.model.independent_joints().into_iter().filter(|joint| !self.joints.contains(joint));
@@ -52,7 +52,7 @@ impl PlannedRobot {
     }
 }
 
-/// Positions of the independent joints that are not planned, by the model's names.
+/// Returns the positions of the independent joints that are not planned, by the model's names.
 pub(super) fn idle(
     config: &RobotConfig,
     model: &RobotModel,
@@ -79,7 +79,7 @@ pub(super) fn idle(
     positions
 }
 
-/// Whether a joint moves something that the planned joints carry, and carries none of them.
+/// Returns whether a joint moves only links carried by the planned joints.
 fn is_of_gripper(model: &RobotModel, planned: &[usize], joint: usize) -> bool {
     let above = |joint: usize| {
         std::iter::successors(model.joints.get(joint), |j| model.parent_joint(j.parent)).map(|joint| joint.child)
@@ -88,7 +88,8 @@ fn is_of_gripper(model: &RobotModel, planned: &[usize], joint: usize) -> bool {
     planned.iter().any(|p| carries(*p, joint)) && !planned.iter().any(|p| carries(joint, *p))
 }
 
-/// The end of a joint's range at which the links that it moves are farthest from each other and from what carries them.
+/// Returns the end of a joint's range at which the links it moves are farthest apart from each other and from their
+/// parent.
 fn widest(model: &RobotModel, joint: usize) -> f64 {
     let Some(own) = model.joints.get(joint) else { return 0.0 };
     if !own.limits.lower.is_finite() || !own.limits.upper.is_finite() {
@@ -100,7 +101,7 @@ fn widest(model: &RobotModel, joint: usize) -> f64 {
     let spread = |position: f64| {
         let named = HashMap::from([(own.name.clone(), position)]);
         let poses = model.link_poses(&model.positions(&named));
-        // Where the middles of the shapes are; links without shapes count as their frames.
+        // Centres of the shapes; a link without shapes counts with its frame.
         let middle = |link: usize| {
             let pose = poses.get(link).copied().unwrap_or_default();
             let shapes = model.links.get(link).map(|link| link.collisions.as_slice()).unwrap_or_default();
