@@ -3,8 +3,8 @@
 #[path = "../support/mod.rs"]
 mod support;
 
-/// Whether programs that tests start may schedule in real time: they run one beside another.
-const REALTIME: bool = false;
+/// Whether programs that tests start may schedule in real time.
+const REALTIME: bool = true;
 
 mod adapter_emulate;
 mod adapter_new;
