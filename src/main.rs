@@ -1,4 +1,4 @@
-//! The program: the command line with the arms in the box.
+//! The program: the command line with the built-in arms.
 
 use std::process::ExitCode;
 

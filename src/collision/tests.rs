@@ -173,14 +173,14 @@ fn a_free_motion_is_free_between_samples() {
         for _ in 0..40 {
             let mut q = || -> Vec<f64> { (0..3).map(|_| random.between(-3.0, 3.0)).collect() };
             let (a, b) = (q(), q());
-            let free = checker.motion_is_free(&a, &b, &Stop::never());
+            let is_free = checker.motion_is_free(&a, &b, &Stop::never());
             let steps = 1500;
             let mut touches = (0..=steps).filter(|k| {
                 let t = f64::from(*k) / f64::from(steps);
                 let at: Vec<f64> = a.iter().zip(&b).map(|(a, b)| a + (b - a) * t).collect();
                 !checker.is_free(&at)
             });
-            if free {
+            if is_free {
                 free += 1;
                 assert_eq!(touches.next(), None, "round {round}: {a:?} {b:?}");
             } else {

@@ -62,7 +62,7 @@ impl Packages {
         }
         Err(format!(
             "unknown package `{package}`\nhint: give its folder: --package {package}=FOLDER, or \
-             `package_paths` in a blueprint; ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are looked at too"
+             `package_paths` in a blueprint; ROS_PACKAGE_PATH and AMENT_PREFIX_PATH are searched too"
         ))
     }
 
