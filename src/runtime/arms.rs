@@ -7,7 +7,7 @@ use super::StartError;
 use super::device_lock::{self, DeviceLock};
 use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
-use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::clock::MonotonicClock;
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
 use crate::hardware::spec::AdapterError;
@@ -22,7 +22,7 @@ const ENABLE_LIMIT: Duration = Duration::from_secs(10);
 /// How long all arms together get to be released.
 const RELEASE_LIMIT: Duration = Duration::from_secs(2);
 
-/// The arms of a run.
+/// The arms of a run. Dropped, they are released.
 pub struct Arms {
     /// Their device threads, in the blueprint's order.
     pub devices: Vec<Arc<Device>>,
@@ -100,10 +100,7 @@ pub fn bring_up(
                 }
                 connected.push(pair);
             }
-            Err(error) => {
-                arms.release();
-                return Err(error);
-            }
+            Err(error) => return Err(error),
         }
     }
     Ok(BroughtUp { arms, slots, connected })
@@ -212,11 +209,6 @@ fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartEr
 }
 
 impl Arms {
-    /// The time that the device threads use.
-    pub fn now(&self) -> Mono {
-        MonotonicClock.now()
-    }
-
     /// Enables the given arms, all at once; answers the first that could not be.
     pub fn enable(&self, blueprint: &Blueprint, which: impl Iterator<Item = usize>) -> Result<(), StartError> {
         let answers: Vec<_> = which.filter_map(|i| Some((i, self.devices.get(i)?.activate()))).collect();
@@ -245,5 +237,13 @@ impl Arms {
         }
         self.devices.clear();
         troubles
+    }
+}
+
+impl Drop for Arms {
+    fn drop(&mut self) {
+        for trouble in self.release() {
+            tracing::warn!("{trouble}");
+        }
     }
 }

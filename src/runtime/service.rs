@@ -15,6 +15,7 @@ use super::motions::Motions;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
 use super::repeats::Repeats;
+use super::waiting::Progress;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
 use crate::clock::{Mono, WallOffset};
@@ -34,8 +35,6 @@ use crate::rt::slot::SlotReader;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 
-/// How long a device takes to refuse an opening of its gripper.
-const GRIPPER_REPLY: Duration = Duration::from_millis(20);
 /// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
 pub(super) const STANDSTILL: f64 = 0.02;
 
@@ -67,6 +66,9 @@ pub struct Service {
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
     pub(super) repeats: Repeats,
     pub(super) late_stops: LateStops,
+    pub(super) progress: Progress,
+    /// One gripper order at a time and arm, so that each has its own answer.
+    pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
     /// Ticks done when the joint state was published last.
     pub(super) published: AtomicU64,
     /// The planner that is attached, or was.
@@ -83,6 +85,8 @@ pub struct Service {
 impl Service {
     pub fn new(parts: ServiceParts, me: Weak<Self>) -> Self {
         Self {
+            progress: Progress::default(),
+            grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             parts,
             started: Instant::now(),
             motions: Mutex::default(),
@@ -240,24 +244,6 @@ impl Service {
         // Behind what moves: a planner in another process may take its time.
         let planning = call.task.is_none() && self.cancel_planning().await;
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
-    }
-
-    async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
-        if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
-            return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
-        }
-        let device = self.device(arm)?;
-        let refusals = device.health().write_errors.load(Ordering::Relaxed);
-        self.ask(Request::Gripper { arm, opening: call.position }).await?;
-        // The tick hands the opening over without knowing what the gripper can do; the arm says so at once.
-        tokio::time::sleep(self.period() + GRIPPER_REPLY).await;
-        if device.health().write_errors.load(Ordering::Relaxed) > refusals {
-            let why = device.health().episodes().pop().map_or_else(String::new, |e| e.text);
-            let error = RpcError::new(Code::DeviceRefused, format!("{}: {why}", call.arm));
-            return Err(error.hint("`dimos state` shows the gripper's opening now, in metres"));
-        }
-        Ok(Reply::Gripper(Done {}))
     }
 
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {

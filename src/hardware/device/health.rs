@@ -2,9 +2,11 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use crate::clock::Mono;
+use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::rt::wake::Wake;
 
 /// Episodes that are remembered.
 const EPISODES: usize = 16;
@@ -55,6 +57,10 @@ pub struct Health {
     /// Mean time between states [ns]; a mean of rates would count short pauses for too much.
     interval_ns: AtomicU64,
     text: Mutex<Text>,
+    /// `ArmCommand::gripper_seq` of the last gripper order that was answered, and the answer.
+    gripper: Mutex<Option<(u32, AdapterResult<()>)>>,
+    /// Raised when an order that came with a command has its answer.
+    listener: OnceLock<Wake>,
 }
 
 #[derive(Debug, Default)]
@@ -81,6 +87,36 @@ impl Health {
             let (old, new) = (self.interval_ns.load(Ordering::Relaxed) as f64, interval * 1e9);
             let mean = if old > 0.0 { old + 0.05 * (new - old) } else { new };
             self.interval_ns.store(mean.max(1.0) as u64, Ordering::Relaxed);
+        }
+    }
+
+    /// Raises `wake` whenever an order that came with a command (a stop, a gripper opening) has its answer.
+    pub fn wake_on_answers(&self, wake: Wake) {
+        let _ = self.listener.set(wake);
+    }
+
+    /// What the arm answered to the gripper order with this `ArmCommand::gripper_seq`; `None`: nothing yet.
+    pub fn gripper_answer(&self, order: u32) -> Option<AdapterResult<()>> {
+        let last = self.gripper.lock().unwrap_or_else(PoisonError::into_inner);
+        match last.as_ref()? {
+            (answered, result) if *answered == order => Some(result.clone()),
+            // Sequence numbers wrap around: the nearer half of them is newer.
+            (answered, _) if answered.wrapping_sub(order) < u32::MAX / 2 => {
+                Some(Err(AdapterError::Rejected("a newer gripper order replaced it".to_owned())))
+            }
+            _ => None,
+        }
+    }
+
+    pub(super) fn answer_gripper(&self, order: u32, result: AdapterResult<()>) {
+        *self.gripper.lock().unwrap_or_else(PoisonError::into_inner) = Some((order, result));
+        self.answered();
+    }
+
+    /// An order that came with a command has its answer.
+    pub(super) fn answered(&self) {
+        if let Some(listener) = self.listener.get() {
+            listener.raise();
         }
     }
 
@@ -138,6 +174,21 @@ impl Health {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_gripper_order_has_its_own_answer() {
+        let (health, wake) = (Health::default(), Wake::new().unwrap());
+        health.wake_on_answers(wake.clone());
+        assert_eq!(health.gripper_answer(1), None);
+        health.answer_gripper(1, Err(AdapterError::Unsupported));
+        assert!(wake.wait(std::time::Duration::ZERO));
+        assert_eq!(health.gripper_answer(1), Some(Err(AdapterError::Unsupported)));
+        assert_eq!(health.gripper_answer(2), None, "the answer to the order before says nothing about this one");
+        health.answer_gripper(3, Ok(()));
+        assert!(matches!(health.gripper_answer(2), Some(Err(AdapterError::Rejected(_)))), "it never reached the arm");
+        health.answer_gripper(u32::MAX, Ok(()));
+        assert_eq!(health.gripper_answer(0), None, "numbers wrap around");
+    }
 
     #[test]
     fn trouble_is_told_once_until_it_is_over() {

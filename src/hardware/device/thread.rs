@@ -28,6 +28,9 @@ const MAX_IN_FLIGHT: u32 = 2;
 const INTERFERENCE_READINGS: u32 = 2;
 /// The longest delay of this thread that does not count for the tick's silence.
 const LONGEST_DELAY: Duration = Duration::from_millis(100);
+/// In which cycle of five the error code is read, and in which the motors' state, where each costs a round trip.
+const ERROR_TURN: u8 = 0;
+const ENABLED_TURN: u8 = 1;
 /// Waits between two attempts to connect again.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(5));
 /// How long an arm may refuse a change of mode because it still moves.
@@ -196,8 +199,11 @@ impl Worker {
                     self.pass_on_command(adapter);
                 }
             }
-        } else if self.wanted && self.config.clock.now() >= self.reconnect.0 {
-            self.connect_again(adapter);
+        } else {
+            self.skip_command();
+            if self.wanted && self.config.clock.now() >= self.reconnect.0 {
+                self.connect_again(adapter);
+            }
         }
         false
     }
@@ -213,6 +219,7 @@ impl Worker {
             Order::Disable(reply) => {
                 self.expect_nothing(Some(false));
                 let result = self.while_connected(adapter, |a| a.write_enable(false));
+                self.turn = ENABLED_TURN;
                 self.read(adapter);
                 let _ = reply.send(result);
             }
@@ -220,6 +227,7 @@ impl Worker {
                 self.write_errors = 0;
                 self.expect_nothing(Some(self.state.enabled));
                 let result = self.while_connected(adapter, |a| a.write_clear_errors());
+                self.turn = ERROR_TURN;
                 self.read(adapter);
                 let _ = reply.send(result);
             }
@@ -267,7 +275,7 @@ impl Worker {
         if self.speed == 0.0 {
             self.set_limits(&limits);
         }
-        self.take_command();
+        self.skip_command();
         self.read(adapter);
         let write_period = self.config.write_period(adapter.set_point_period());
         self.guard.set_period(write_period);
@@ -382,6 +390,14 @@ impl Worker {
         std::mem::replace(&mut self.last, command)
     }
 
+    /// Takes the newest command while there is no connection: a stop is kept for later, a gripper order is refused.
+    fn skip_command(&mut self) {
+        let before = self.take_command();
+        if self.last.gripper_seq != before.gripper_seq {
+            self.health.answer_gripper(self.last.gripper_seq, Err(AdapterError::NotConnected));
+        }
+    }
+
     /// Whether the arm is being moved by commands, as far as this thread lets them through.
     fn moving(&self) -> bool {
         self.connected && self.last.mode.is_some() && !self.state.self_held
@@ -398,10 +414,13 @@ impl Worker {
         if adapter.state_fd().is_none() {
             self.read_before(command.next_tick);
         }
-        if self.state.self_held {
+        if command.gripper_seq != before.gripper_seq {
+            self.move_gripper(adapter, &command);
+        }
+        if self.state.self_held || !self.connected {
             return;
         }
-        match self.write(adapter, &before, &command) {
+        match self.write(adapter, &command) {
             Ok(()) if self.stop_owed => {}
             Ok(()) => self.write_errors = 0,
             // Not sent, and no failure: the tick sees that it was not written.
@@ -415,6 +434,30 @@ impl Worker {
         }
         // At once: the next tick continues from what was written.
         self.states.write(&self.state);
+    }
+
+    /// Commands the gripper and answers that order. A refusal costs the joints nothing.
+    fn move_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter, command: &ArmCommand) {
+        let result = if self.state.self_held {
+            Err(AdapterError::Rejected("the arm is held; `arm enable` makes it ready again".to_owned()))
+        } else {
+            self.gripper_stop.end();
+            adapter.write_gripper_position(command.gripper)
+        };
+        match &result {
+            Ok(()) => {}
+            Err(error @ (AdapterError::Rejected(_) | AdapterError::Unsupported | AdapterError::Fault { .. })) => {
+                self.health.write_errors.fetch_add(1, Relaxed);
+                self.trouble(&format!("the gripper did not take its order: {error}"));
+            }
+            Err(error) => {
+                if matches!(error, AdapterError::Timeout(_)) {
+                    self.in_flight += 1;
+                }
+                self.not_taken(adapter, "the gripper did not take its order", error);
+            }
+        }
+        self.health.answer_gripper(command.gripper_seq, result);
     }
 
     /// Set points that the arm did not acknowledge must not reach it later: with two of them, or with one and no state,
@@ -453,32 +496,19 @@ impl Worker {
         self.next_read = self.next_read.min(next_tick.before(lead)).max(earliest);
     }
 
-    fn write(
-        &mut self,
-        adapter: &mut dyn ManipulatorAdapter,
-        before: &ArmCommand,
-        command: &ArmCommand,
-    ) -> AdapterResult<()> {
-        // A refused gripper costs the joints nothing.
-        let gripper = match command.gripper_seq == before.gripper_seq {
-            true => Ok(()),
-            false => {
-                self.gripper_stop.end();
-                adapter.write_gripper_position(command.gripper)
-            }
-        };
-        let Some(mode) = command.mode else { return gripper };
+    fn write(&mut self, adapter: &mut dyn ManipulatorAdapter, command: &ArmCommand) -> AdapterResult<()> {
+        let Some(mode) = command.mode else { return Ok(()) };
         // Another mode than the one that was ordered is somebody else's: it is left alone, and shows in the next state.
         let foreign = self.ordered_mode == Some(mode) && adapter.get_control_mode() != mode;
         if foreign || self.state.interference != Interference::None {
-            return gripper;
+            return Ok(());
         }
         if adapter.get_control_mode() != mode {
             self.ordered_mode = None;
             match adapter.set_control_mode(mode) {
                 // The arm may hold itself to be moving for a moment longer than we do: the tick waits for the mode,
                 // and this is asked again with the next command.
-                Err(AdapterError::Rejected(_)) if !self.waited_too_long_for_a_mode() => return gripper,
+                Err(AdapterError::Rejected(_)) if !self.waited_too_long_for_a_mode() => return Ok(()),
                 result => result?,
             }
         }
@@ -487,7 +517,7 @@ impl Worker {
         let age = self.config.clock.now().since(self.state.stamp);
         if !self.guard.admits(command, mode, &self.state, age, self.config.read_period()) {
             self.health.withheld.fetch_add(1, Relaxed);
-            return gripper;
+            return Ok(());
         }
         let values = command.values.get(..self.config.dof).unwrap_or_default();
         let written = match mode {
@@ -502,7 +532,7 @@ impl Worker {
         written?;
         self.in_flight = 0;
         self.health.writes.fetch_add(1, Relaxed);
-        gripper
+        Ok(())
     }
 
     /// Whether the arm has refused a change of mode for longer than it may take to stand still.
@@ -529,6 +559,7 @@ impl Worker {
                 }
                 // Last: whoever sees it sees the confirmation too.
                 self.health.stop_sent.store(self.last.stop_seq, Release);
+                self.health.answered();
             }
             Err(error) => self.not_taken(adapter, "the arm did not take the stop", &error),
         }
@@ -623,7 +654,7 @@ impl Worker {
         let all = self.whole_state_at_once;
         let turn = self.turn;
         self.turn = (turn + 1) % 5;
-        if all || turn == 0 {
+        if all || turn == ERROR_TURN {
             let (code, text) = adapter.read_error()?;
             if code != self.state.error {
                 self.health.set_error_text(text.clone());
@@ -633,7 +664,7 @@ impl Worker {
             }
             self.state.error = code;
         }
-        if all || turn == 1 {
+        if all || turn == ENABLED_TURN {
             self.state.enabled = adapter.read_enabled()?;
         }
         if all || turn == 2 {
