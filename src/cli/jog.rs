@@ -18,6 +18,8 @@ mod watch;
 
 use std::io::{self, IsTerminal};
 
+use anyhow::Context;
+
 use super::arguments::{Target, finite};
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
@@ -92,8 +94,7 @@ pub fn run(args: &Args) -> Result {
     let signals = Signals::watch_with_hangup();
     let watch = Watch::start(&status.run, &args.arm)?;
     let mut session = Session::new(client, watch, drives, setting(args, &status.run));
-    let terminal =
-        Terminal::open().map_err(|e| Failure::new(Exit::Failed, format!("the terminal cannot be used: {e}")))?;
+    let terminal = Terminal::open().context("the terminal cannot be used")?;
     session.run(terminal, &signals)
 }
 

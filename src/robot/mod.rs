@@ -8,6 +8,7 @@
 //! Every element keeps the place it was written at, through includes and macros, so that every mistake is shown there.
 
 pub mod builtin;
+pub mod interchange;
 mod joint_limits;
 pub mod kinematics;
 mod load;

@@ -28,6 +28,7 @@ mod yaml11;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use crate::message::Message;
 use crate::robot::packages::Packages;
 use crate::robot::xml::{Calls, Document, Place};
 use crate::yaml::{Diag, SourceId, Tree};
@@ -92,11 +93,7 @@ type Result<T = ()> = std::result::Result<T, Box<Trouble>>;
 
 impl Trouble {
     fn new(message: impl Into<String>) -> Box<Self> {
-        let message = message.into();
-        let (message, hint) = match message.split_once("\nhint: ") {
-            Some((message, hint)) => (message.to_owned(), Some(hint.to_owned())),
-            None => (message, None),
-        };
+        let Message { what: message, hint } = Message::from(message.into());
         Box::new(Self { message, at: None, hint, also: Vec::new() })
     }
 

@@ -11,6 +11,7 @@ use crate::arm::Link;
 use crate::control::request::Request;
 use crate::hardware::device::{Answer, Device};
 use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::message::Message;
 use crate::rpc::api::{self, Done, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::describe::cause_text;
@@ -199,9 +200,9 @@ impl Service {
         match self.until(Instant::now() + ORDER_LIMIT, look).await {
             Some(Ok(())) => Ok(Reply::Gripper(Done {})),
             Some(Err(error)) => {
-                let what = format!("{} refused the gripper order: {error}", call.arm);
-                let error = RpcError::new(Code::DeviceRefused, what);
-                Err(error.hint("`dimos state` shows the gripper's opening now, in metres"))
+                let message = Message::of(format!("{} refused the gripper order: {error}", call.arm));
+                let (what, hint) = message.or_hint("`dimos state` shows the gripper's opening now, in metres");
+                Err(RpcError::new(Code::DeviceRefused, what).hint(hint))
             }
             None => {
                 let what = format!("{} did not answer the gripper order within {} s", call.arm, ORDER_LIMIT.as_secs());
@@ -268,9 +269,7 @@ async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
 }
 
 fn refused(arm: &str, what: &str, error: &AdapterError) -> RpcError {
-    let text = format!("{arm} {what}: {error}");
-    // An adapter that knows what to do says so in a line of its own.
     let general = "see the arm's own panel or manual; `dimos status` shows its link and error";
-    let (text, hint) = text.split_once("\nhint: ").unwrap_or((&text, general));
-    RpcError::new(Code::DeviceRefused, text).hint(hint)
+    let (what, hint) = Message::of(format!("{arm} {what}: {error}")).or_hint(general);
+    RpcError::new(Code::DeviceRefused, what).hint(hint)
 }

@@ -12,6 +12,7 @@ use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
 use crate::hardware::spec::AdapterError;
 use crate::joint::JointLimits;
+use crate::message::Message;
 use crate::rt::beat::Beat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
 
@@ -135,14 +136,6 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     Ok(config)
 }
 
-/// What is wrong, and what to do: an adapter that knows says so in a line of its own.
-fn with_hint(text: &str, otherwise: String) -> (String, String) {
-    match text.split_once("\nhint: ") {
-        Some((what, hint)) => (what.to_owned(), hint.to_owned()),
-        None => (text.to_owned(), otherwise),
-    }
-}
-
 /// What the blueprint says of an arm does not go together: nobody was asked yet, so nobody needs power.
 fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
     if !matches!(error, AdapterError::Rejected(_)) {
@@ -150,7 +143,7 @@ fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
     }
     let id = &arm.hardware_id;
     let general = format!("see `hardware.{id}.joints` and `hardware.{id}.options` in the blueprint");
-    let (what, hint) = with_hint(&error.to_string(), general);
+    let (what, hint) = Message::of(error).or_hint(general);
     StartError::Hardware { arm: id.clone(), what, hint }
 }
 
@@ -160,7 +153,7 @@ fn hardware(arm: &Arm, error: &AdapterError) -> StartError {
         Some(_) => format!("is it powered, and is `hardware.{id}.address` right ({form})? To try without it: --sim"),
         None => format!("see `hardware.{id}` in the blueprint"),
     };
-    let (what, hint) = with_hint(&error.to_string(), general);
+    let (what, hint) = Message::of(error).or_hint(general);
     StartError::Hardware { arm: id.clone(), what, hint }
 }
 
@@ -218,7 +211,7 @@ impl Arms {
                 let general = format!(
                     "clear the arm's own error, or start without motors: --set hardware.{id}.auto_enable=false"
                 );
-                let (what, hint) = with_hint(&format!("cannot be enabled: {e}"), general);
+                let (what, hint) = Message::of(format!("cannot be enabled: {e}")).or_hint(general);
                 return Err(StartError::Hardware { arm: id.clone(), what, hint });
             }
         }

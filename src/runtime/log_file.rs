@@ -8,6 +8,7 @@ use crate::blueprint::Blueprint;
 use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::control::config::CoordinatorConfig;
 use crate::hardware::device;
+use crate::message::Message;
 use crate::recording::files;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::Notes;
@@ -34,7 +35,7 @@ pub(super) fn log_path(
         }
     };
     if let Some(log) = &log {
-        space::check(log, blueprint.recording.min_free.0).map_err(|e| no_log(&e.to_string()))?;
+        space::check(log, blueprint.recording.min_free.0).map_err(no_log)?;
     }
     Ok(log)
 }
@@ -101,7 +102,7 @@ pub(super) fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: d
 }
 
 /// Why there is no log.
-pub(super) fn no_log(text: &str) -> StartError {
-    let (what, hint) = text.split_once("\nhint: ").unwrap_or((text, "run with --no-record"));
+pub(super) fn no_log(error: impl std::fmt::Display) -> StartError {
+    let (what, hint) = Message::of(error).or_hint("run with --no-record");
     StartError::other(what, hint)
 }

@@ -204,7 +204,7 @@ fn start_recorder(
     };
     let told = service.clone();
     let notice = move |notice: Notice<'_>| told.notice(notice, wall);
-    let recorder = Recorder::start(record, samples, noted, notice).map_err(|e| no_log(&e.to_string()))?;
+    let recorder = Recorder::start(record, samples, noted, notice).map_err(no_log)?;
     service.set_recorder(recorder.stats());
     retain(blueprint, &prepared.log);
     Ok(recorder)

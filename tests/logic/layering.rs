@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 
 /// Every module of `src/`, with the modules that it may use besides itself. `ALL`: everything above it.
 const ALL: &[&str] = &["*"];
-const VOCABULARY: &[&str] = &["joint", "arm", "trajectory", "clock", "telemetry", "yaml"];
+const VOCABULARY: &[&str] = &["message", "joint", "arm", "trajectory", "clock", "telemetry", "yaml"];
 const LAYERS: &[(&str, &[&str])] = &[
+    ("message", &[]),
     ("joint", &[]),
     ("arm", &[]),
     ("trajectory", &[]),

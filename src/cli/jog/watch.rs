@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use serde_json::Value;
 
 use crate::cli::exit::{Exit, Failure, Result};
@@ -59,7 +60,7 @@ impl Watch {
             }
         };
         let thread = std::thread::Builder::new().name("jog-watch".into()).spawn(reading);
-        let thread = thread.map_err(|e| Failure::new(Exit::Failed, format!("no thread to read the run: {e}")))?;
+        let thread = thread.context("no thread to read the run")?;
         Ok(Self { seen, ending, thread: Some(thread) })
     }
 
