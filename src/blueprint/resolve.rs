@@ -7,7 +7,7 @@ use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
-use crate::blueprint::planner::ViewConfig;
+use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
@@ -244,7 +244,12 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     });
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
+    let given_twice = file.view.is_some() && file.planner.as_ref().is_some_and(|p| p.visualization.is_some());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
+    if let Some(view) = view.as_ref().filter(|view| !given_twice && view.backend != ViewBackend::None) {
+        let diag = Diag::warning("the live view is not in this version: no page will be served");
+        checker.error(view.at, diag.hint("leave the section out, or say `backend: none`"));
+    }
     Blueprint {
         name: name.value,
         description: file.description,
