@@ -14,6 +14,12 @@ pub const DEFAULT_ACCELERATION: f64 = 2.0;
 /// Jerk limit where neither the arm nor the blueprint gives one [rad/s³].
 pub const DEFAULT_JERK: f64 = 20.0;
 
+/// Standstill velocity: a slower joint is at rest, given the noise of measured velocities [rad/s].
+pub const STANDSTILL: f64 = 0.02;
+/// The same where one reading decides, which may be a difference of two positions: noisier, so the threshold of the
+/// tick is higher [rad/s].
+pub const TICK_STANDSTILL: f64 = 0.05;
+
 /// A slice as a fixed array; what does not fit is left out.
 pub fn joints_of(values: &[f64]) -> Joints {
     let mut out = [0.0; MAX_DOF];

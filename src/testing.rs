@@ -2,11 +2,12 @@
 //! what it was asked.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::arm::Pose;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use crate::joint::{ControlMode, JointLimits};
+use crate::sync::lock;
 
 /// A call that an adapter got, with its arguments in SI units.
 #[derive(Debug, Clone, PartialEq)]
@@ -216,7 +217,7 @@ impl MockAdapter {
     }
 
     fn lock(&self) -> MutexGuard<'_, Shared> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     /// Records a call and fails if it was told to.

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -17,6 +17,7 @@ use super::setup::Setup;
 use super::solve::{Failure, Found, Request, solve};
 use crate::collision::Stop;
 use crate::collision::world::World;
+use crate::sync::lock;
 
 /// Plans that are kept.
 const KEPT: usize = 16;
@@ -109,10 +110,6 @@ pub enum NotBegun {
     /// Too many before it never ended.
     #[error("the planner hangs in {MAX_HANGING} requests that never ended: a defect of the program")]
     Hangs,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Desk {

@@ -8,7 +8,6 @@ use glamx::DVec3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use super::idle::{Measured, idle};
-use super::timing::DEFAULT_ACCELERATION;
 use crate::collision::always::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;

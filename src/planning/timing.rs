@@ -29,9 +29,6 @@ impl Default for TimingSettings {
     }
 }
 
-/// Acceleration of joints that state none [rad/s² or m/s²].
-pub const DEFAULT_ACCELERATION: f64 = 2.0;
-
 /// A trajectory, and what it came to.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Timed {

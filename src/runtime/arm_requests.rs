@@ -6,11 +6,12 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use super::dispatch::log_of;
-use super::service::{STANDSTILL, Service, internal};
+use super::service::{Service, internal};
 use crate::arm::Link;
 use crate::control::request::Request;
 use crate::hardware::device::{Answer, Device};
 use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::joint::STANDSTILL;
 use crate::message::Message;
 use crate::rpc::api::{self, Done, Reply};
 use crate::rpc::{Code, RpcError};

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::service::Service;
 use crate::clock::WallOffset;
 use crate::rpc::api::Confirmation;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde_json::json;
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::motions::{Carried, Planned};
 use super::service::{Service, internal};
 use crate::control::config::TaskKind;

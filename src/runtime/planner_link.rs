@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::planner_port::PlannerPort;
 use super::service::{Service, internal};
 use crate::control::config::{CoordinatorConfig, TaskKind};

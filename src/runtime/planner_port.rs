@@ -6,7 +6,7 @@ use std::sync::Mutex;
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::plan_requests::job;
 use super::recheck::Released;
 use super::service::internal;

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::motions::UnderWay;
 use super::plan_requests::all_positions;
 use super::planner_link::Planner;

@@ -3,7 +3,7 @@
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::motions::{End, Next};
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};

@@ -9,7 +9,8 @@ use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use super::Ending;
-use super::dispatch::{Dispatcher, NotTold, lock, log_of};
+use super::dispatch::{Dispatcher, NotTold, log_of};
+use crate::sync::lock;
 use super::late_stops::LateStops;
 use super::motions::Motions;
 use super::planner_link::Attached;
@@ -23,6 +24,7 @@ use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Device};
+use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
 use crate::rpc::place::Claim;
@@ -35,8 +37,6 @@ use crate::rt::slot::SlotReader;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 
-/// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
-pub(super) const STANDSTILL: f64 = 0.02;
 
 /// What a service is made from.
 pub struct ServiceParts {

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use nalgebra::Isometry3;
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index, spec};
 use super::service::internal;
 use crate::collision::Solid;

@@ -2,7 +2,7 @@
 //! delays a command.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -15,6 +15,7 @@ use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::RunFolder;
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
 use crate::rpc::streams::{Stream, Subscribe};
+use crate::sync::lock;
 
 /// How often the joints are read.
 const STATE: Duration = Duration::from_millis(50);
@@ -82,10 +83,6 @@ impl Drop for Watch {
             let _ = thread.join();
         }
     }
-}
-
-fn lock(seen: &Mutex<Seen>) -> std::sync::MutexGuard<'_, Seen> {
-    seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn read(client: &mut Client, arm: &str, to: &Mutex<Seen>, ending: &AtomicBool) -> std::result::Result<(), ClientError> {

@@ -2,11 +2,12 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, OnceLock};
 
 use crate::clock::Mono;
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::rt::wake::Wake;
+use crate::sync::lock;
 
 /// Episodes that are remembered.
 const EPISODES: usize = 16;
@@ -97,7 +98,7 @@ impl Health {
 
     /// What the arm answered to the gripper order with this `ArmCommand::gripper_seq`; `None`: nothing yet.
     pub fn gripper_answer(&self, order: u32) -> Option<AdapterResult<()>> {
-        let last = self.gripper.lock().unwrap_or_else(PoisonError::into_inner);
+        let last = lock(&self.gripper);
         match last.as_ref()? {
             (answered, result) if *answered == order => Some(result.clone()),
             // Sequence numbers wrap around: the nearer half of them is newer.
@@ -109,7 +110,7 @@ impl Health {
     }
 
     pub(super) fn answer_gripper(&self, order: u32, result: AdapterResult<()>) {
-        *self.gripper.lock().unwrap_or_else(PoisonError::into_inner) = Some((order, result));
+        *lock(&self.gripper) = Some((order, result));
         self.answered();
     }
 
@@ -122,22 +123,22 @@ impl Health {
 
     /// Text of the device's present error; empty when there is none.
     pub fn error_text(&self) -> String {
-        self.lock().error.clone()
+        lock(&self.text).error.clone()
     }
 
     pub(super) fn set_error_text(&self, text: String) {
-        self.lock().error = text;
+        lock(&self.text).error = text;
     }
 
     /// Recent episodes, the newest last.
     pub fn episodes(&self) -> Vec<Episode> {
-        self.lock().episodes.iter().cloned().collect()
+        lock(&self.text).episodes.iter().cloned().collect()
     }
 
     /// Trouble was seen. `true`: it is new, and worth a line. What comes again before all is well is not new, also
     /// when other trouble came between: an arm that is gone fails at reads and writes in turn.
     pub(super) fn trouble(&self, now: Mono, text: &str) -> bool {
-        let mut all = self.lock();
+        let mut all = lock(&self.text);
         let open = all.episodes.back_mut().filter(|e| e.until.is_none());
         if let Some(open) = open {
             open.count += 1;
@@ -158,16 +159,12 @@ impl Health {
 
     /// All is well again. Answers what is over.
     pub(super) fn over(&self, now: Mono) -> Option<String> {
-        let mut all = self.lock();
+        let mut all = lock(&self.text);
         let last = all.episodes.back_mut().filter(|e| e.until.is_none())?;
         last.until = Some(now);
         let text = last.text.clone();
         all.told.clear();
         Some(text)
-    }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, Text> {
-        self.text.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

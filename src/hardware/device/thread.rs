@@ -13,7 +13,7 @@ use super::{Connected, DeviceConfig, Health, Note, Order};
 use crate::arm::{ArmCommand, ArmState, Interference, Link, VelocitySource};
 use crate::clock::Mono;
 use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, Stop};
-use crate::joint::{ControlMode, JointLimits};
+use crate::joint::{ControlMode, JointLimits, STANDSTILL};
 use crate::rt::due::Due;
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, SlotWriter};
@@ -37,9 +37,8 @@ const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::fr
 const MODE_LIMIT: Duration = Duration::from_secs(1);
 /// How long `activate` waits for plausible states, and for the motors.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
-/// How long a stopped arm gets to stand still before its motors are disabled, and what counts as standing [rad/s, s].
+/// How long a stopped arm gets to stand still before its motors are disabled, and for how long it must stand [s].
 const REST_LIMIT: Duration = Duration::from_secs(1);
-const STANDSTILL: f64 = 0.02;
 const STILL_FOR: f64 = 0.03;
 
 /// What the thread shares with its handle.
