@@ -36,6 +36,7 @@ pub mod arm;
 pub mod clock;
 pub mod joint;
 pub mod message;
+mod named;
 pub mod sync;
 pub mod telemetry;
 pub mod trajectory;

@@ -68,17 +68,6 @@ const METHODS: &[&str] = &[
     "read_force_torque",
 ];
 
-/// All control modes: a mock adapter accepts each.
-const MODES: &[ControlMode] = &[
-    ControlMode::Position,
-    ControlMode::ServoPosition,
-    ControlMode::Velocity,
-    ControlMode::Torque,
-    ControlMode::Cartesian,
-    ControlMode::CartesianVelocity,
-    ControlMode::Impedance,
-];
-
 struct Shared {
     dof: usize,
     connected: bool,
@@ -273,7 +262,7 @@ impl ManipulatorAdapter for MockAdapter {
             firmware_version: None,
             serial_number: None,
             native_rate: 1000.0,
-            modes: MODES,
+            modes: ControlMode::ALL,
             holds_when_disabled: true,
             whole_state_at_once: true,
         }

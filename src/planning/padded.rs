@@ -8,6 +8,7 @@ use std::sync::Arc;
 use super::path::between;
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
+use crate::named::named;
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
@@ -21,27 +22,19 @@ const POSES: usize = 32;
 const KEPT: f64 = 0.5;
 const KEPT_AGAIN: f64 = 0.4;
 
-/// Where the padding is given up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Place {
-    /// Near the start.
-    Start,
-    /// Near the goal.
-    Goal,
-    /// In every pose: the two are closer whatever the arm does.
-    Everywhere,
-}
-
-impl Place {
-    /// Its name in rpc.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Start => "start",
-            Self::Goal => "goal",
-            Self::Everywhere => "everywhere",
-        }
+named! {
+    /// Where the padding is given up.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum Place {
+        /// Near the start.
+        Start = "start",
+        /// Near the goal.
+        Goal = "goal",
+        /// In every pose: the two are closer whatever the arm does.
+        Everywhere = "everywhere",
     }
 }
+
 
 /// A pair that does not keep the padding, and where.
 #[derive(Debug, Clone, PartialEq)]

@@ -278,30 +278,17 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
 }
 
 fn interference(name: &str) -> Result<Interference, String> {
-    let all = [Interference::None, Interference::Mode, Interference::Power, Interference::Stop];
-    all.into_iter().find(|i| i.name() == name).ok_or_else(|| format!("{name:?} is no interference"))
+    Interference::of_name(name).ok_or_else(|| format!("{name:?} is no interference"))
 }
 
 fn source(name: &str) -> Result<VelocitySource, String> {
-    let all = [VelocitySource::Absent, VelocitySource::Measured, VelocitySource::Estimated];
-    all.into_iter().find(|s| s.name() == name).ok_or_else(|| format!("{name:?} is no source of velocities"))
+    VelocitySource::of_name(name).ok_or_else(|| format!("{name:?} is no source of velocities"))
 }
 
 fn link(name: &str) -> Result<Link, String> {
-    let all = [Link::Down, Link::Up, Link::Stale, Link::Faulted];
-    all.into_iter().find(|l| l.name() == name).ok_or_else(|| format!("{name:?} is no state of a connection"))
+    Link::of_name(name).ok_or_else(|| format!("{name:?} is no state of a connection"))
 }
 
-/// A control mode by its name.
 fn mode(name: &str) -> Result<ControlMode, String> {
-    let all = [
-        ControlMode::Position,
-        ControlMode::ServoPosition,
-        ControlMode::Velocity,
-        ControlMode::Torque,
-        ControlMode::Cartesian,
-        ControlMode::CartesianVelocity,
-        ControlMode::Impedance,
-    ];
-    all.into_iter().find(|m| m.name() == name).ok_or_else(|| format!("{name:?} is no control mode"))
+    ControlMode::of_name(name).ok_or_else(|| format!("{name:?} is no control mode"))
 }

@@ -13,6 +13,8 @@ use std::path::PathBuf;
 use nalgebra::{Isometry3, Matrix3, Unit, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::named::named;
+
 /// A robot: a tree of links. Links are `0..n`, joints are `0..n-1`, both in an order where parents come first;
 /// joint `i` moves link `i + 1`.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -111,31 +113,23 @@ pub struct Inertial {
     pub inertia: Matrix3<f64>,
 }
 
-/// What a joint lets its link do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum JointKind {
-    /// Nothing.
-    Fixed,
-    /// Turn about the axis, between limits [rad].
-    Revolute,
-    /// Turn about the axis without end [rad].
-    Continuous,
-    /// Slide along the axis, between limits [m].
-    Prismatic,
+named! {
+    /// What a joint lets its link do.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum JointKind {
+        /// Nothing.
+        Fixed = "fixed",
+        /// Turn about the axis, between limits [rad].
+        Revolute = "revolute",
+        /// Turn about the axis without end [rad].
+        Continuous = "continuous",
+        /// Slide along the axis, between limits [m].
+        Prismatic = "prismatic",
+    }
 }
 
 impl JointKind {
-    /// URDF's word for it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Fixed => "fixed",
-            Self::Revolute => "revolute",
-            Self::Continuous => "continuous",
-            Self::Prismatic => "prismatic",
-        }
-    }
-
     /// The unit of its position.
     pub fn unit(self) -> &'static str {
         if self == Self::Prismatic { "m" } else { "rad" }

@@ -5,6 +5,7 @@
 use serde::Serialize;
 
 use super::{Age, Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
+use crate::named::named;
 
 /// The names behind the tick's indices, in the blueprint's order.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -42,28 +43,20 @@ impl Names {
     }
 }
 
-/// How much an event matters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Severity {
-    /// As it should be.
-    Info,
-    /// Not as somebody wanted it.
-    Warn,
-    /// An arm is held, or the tick fails to keep its time.
-    Error,
-}
-
-impl Severity {
-    /// The name used in rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Info => "info",
-            Self::Warn => "warn",
-            Self::Error => "error",
-        }
+named! {
+    /// How much an event matters.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum Severity {
+        /// As it should be.
+        Info = "info",
+        /// Not as somebody wanted it.
+        Warn = "warn",
+        /// An arm is held, or the tick fails to keep its time.
+        Error = "error",
     }
 }
+
 
 /// An event with names and a sentence. What does not apply to an event is `None` or empty.
 #[derive(Debug, Clone, PartialEq, Serialize)]

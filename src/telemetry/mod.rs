@@ -5,6 +5,7 @@ pub mod describe;
 
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
+use crate::named::named;
 
 /// One entry of the ring.
 // The ring holds values: a box would be an allocation in the tick.
@@ -55,37 +56,26 @@ pub struct TickSample {
     pub dropped: u32,
 }
 
-/// What an arm is ready for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Phase {
-    /// No state yet.
-    #[default]
-    Unknown,
-    /// Motors off: nothing is sent.
-    Disabled,
-    /// Just enabled: holds where it is, for the length of the ramp.
-    Activating,
-    /// Holds or follows its tasks.
-    Ready,
-    /// Latched hold after a stop or a fault: waits for `reset`.
-    Held,
-    /// Reset after a latched hold: waits for `enable`. Holds, if powered.
-    Standby,
-}
-
-impl Phase {
-    /// The name used in tables, rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Disabled => "disabled",
-            Self::Activating => "activating",
-            Self::Ready => "ready",
-            Self::Held => "held",
-            Self::Standby => "standby",
-        }
+named! {
+    /// What an arm is ready for.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum Phase {
+        /// No state yet.
+        #[default]
+        Unknown = "unknown",
+        /// Motors off: nothing is sent.
+        Disabled = "disabled",
+        /// Just enabled: holds where it is, for the length of the ramp.
+        Activating = "activating",
+        /// Holds or follows its tasks.
+        Ready = "ready",
+        /// Latched hold after a stop or a fault: waits for `reset`.
+        Held = "held",
+        /// Reset after a latched hold: waits for `enable`. Holds, if powered.
+        Standby = "standby",
     }
 }
+
 
 /// Age of a state, and what it is compared with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -169,37 +159,26 @@ impl Cause {
     }
 }
 
-/// State of a task, with the reference system's names.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum TaskState {
-    /// Nothing to do.
-    #[default]
-    Idle,
-    /// In motion, or following a stream.
-    Executing,
-    /// Slowing down after a cancel.
-    Cancelling,
-    /// Ended where it should.
-    Completed,
-    /// Ended elsewhere.
-    Aborted,
-    /// A command of it was refused as unfit for the arm.
-    Fault,
-}
-
-impl TaskState {
-    /// The name used in tables, rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Idle => "IDLE",
-            Self::Executing => "EXECUTING",
-            Self::Cancelling => "CANCELLING",
-            Self::Completed => "COMPLETED",
-            Self::Aborted => "ABORTED",
-            Self::Fault => "FAULT",
-        }
+named! {
+    /// State of a task, with the reference system's names.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum TaskState {
+        /// Nothing to do.
+        #[default]
+        Idle = "IDLE",
+        /// In motion, or following a stream.
+        Executing = "EXECUTING",
+        /// Slowing down after a cancel.
+        Cancelling = "CANCELLING",
+        /// Ended where it should.
+        Completed = "COMPLETED",
+        /// Ended elsewhere.
+        Aborted = "ABORTED",
+        /// A command of it was refused as unfit for the arm.
+        Fault = "FAULT",
     }
 }
+
 
 /// Why a task is in its state.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -245,27 +224,19 @@ pub enum Bound {
     Invalid,
 }
 
-/// What a limit did to a command.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LimitKind {
-    /// Position held inside its range.
-    Position,
-    /// Velocity reduced.
-    Velocity,
-    /// Acceleration reduced.
-    Acceleration,
-}
-
-impl LimitKind {
-    /// The name used in rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Position => "position",
-            Self::Velocity => "velocity",
-            Self::Acceleration => "acceleration",
-        }
+named! {
+    /// What a limit did to a command.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum LimitKind {
+        /// Position held inside its range.
+        Position = "position",
+        /// Velocity reduced.
+        Velocity = "velocity",
+        /// Acceleration reduced.
+        Acceleration = "acceleration",
     }
 }
+
 
 /// Something that happened in a tick. Indices are those of the blueprint: arms, tasks, joints (over all arms).
 #[derive(Debug, Clone, Copy, PartialEq)]
