@@ -89,6 +89,7 @@ impl Service {
             stop_pending: self.late_stops.is_waiting(index),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
+            device_state: health.codes().map(|codes| DeviceState { state: codes.state, mode: codes.mode }),
             error: (view.state.error != 0).then(|| DeviceError { code: view.state.error, text: health.error_text() }),
             state_age_ms: self.age_ms(&view.state),
             measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),

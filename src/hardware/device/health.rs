@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::spec::{AdapterError, AdapterResult, RobotState};
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 
@@ -58,6 +58,7 @@ pub struct Health {
     /// Mean time between states [ns]; a mean of rates would count short pauses for too much.
     interval_ns: AtomicU64,
     text: Mutex<Text>,
+    codes: Mutex<Option<RobotState>>,
     /// `ArmCommand::gripper_seq` of the last gripper order that was answered, and the answer.
     gripper: Mutex<Option<(u32, AdapterResult<()>)>>,
     /// Raised when an order that came with a command has its answer.
@@ -128,6 +129,15 @@ impl Health {
 
     pub(super) fn set_error_text(&self, text: String) {
         lock(&self.text).error = text;
+    }
+
+    /// The device's own state and mode codes; `None` before they were read, and where it has none.
+    pub fn codes(&self) -> Option<RobotState> {
+        *lock(&self.codes)
+    }
+
+    pub(super) fn set_codes(&self, codes: RobotState) {
+        *lock(&self.codes) = Some(codes);
     }
 
     /// Recent episodes, the newest last.

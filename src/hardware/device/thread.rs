@@ -12,7 +12,7 @@ use super::wire_guard::WireGuard;
 use super::{Connected, DeviceConfig, Health, Note, Order};
 use crate::arm::{ArmCommand, ArmState, Interference, Link, VelocitySource};
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, RobotState, Stop};
 use crate::joint::{ControlMode, JointLimits, STANDSTILL};
 use crate::rt::due::Due;
 use crate::rt::host;
@@ -28,7 +28,9 @@ const MAX_IN_FLIGHT: u32 = 2;
 const INTERFERENCE_READINGS: u32 = 2;
 /// The longest delay of this thread that does not count for the tick's silence.
 const LONGEST_DELAY: Duration = Duration::from_millis(100);
-/// In which cycle of five the error code is read, and in which the motors' state, where each costs a round trip.
+/// Cycles in which everything is read once, where each read costs a round trip; in which of them the error code is read,
+/// and the motors' state.
+const TURNS: u8 = 6;
 const ERROR_TURN: u8 = 0;
 const ENABLED_TURN: u8 = 1;
 /// Waits between two attempts to connect again.
@@ -57,6 +59,7 @@ pub(super) struct Worker {
     due: Arc<Due>,
     state: ArmState,
     reading: JointReading,
+    codes: Option<RobotState>,
     last: ArmCommand,
     /// A stop that the arm has not taken yet. Kept until it does, also over a new connection.
     stop_owed: bool,
@@ -120,6 +123,7 @@ impl Worker {
             health,
             state,
             reading: JointReading::default(),
+            codes: None,
             last: ArmCommand::default(),
             stop_owed: false,
             gripper_stop: GripperStop::default(),
@@ -339,7 +343,7 @@ impl Worker {
         self.gripper_stop.end();
         self.write_errors = 0;
         self.turn = 0;
-        for _ in 0..6 {
+        for _ in 0..TURNS {
             self.read(adapter);
         }
         Ok(())
@@ -652,7 +656,7 @@ impl Worker {
         adapter.read_joints(&mut self.reading)?;
         let all = self.whole_state_at_once;
         let turn = self.turn;
-        self.turn = (turn + 1) % 5;
+        self.turn = (turn + 1) % TURNS;
         if all || turn == ERROR_TURN {
             let (code, text) = adapter.read_error()?;
             if code != self.state.error {
@@ -676,9 +680,25 @@ impl Worker {
         if all || turn == 4 {
             self.state.pose = adapter.read_cartesian_position()?;
         }
+        if all || turn == 5 {
+            self.read_codes(adapter)?;
+        }
         self.state.mode = adapter.get_control_mode();
         self.compare_with_orders();
         self.heed(adapter.foreign_change());
+        Ok(())
+    }
+
+    /// Reads the device's own state codes, for `status`.
+    fn read_codes(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        let codes = match adapter.read_state() {
+            Err(AdapterError::Unsupported) => return Ok(()),
+            codes => codes?,
+        };
+        if self.codes != Some(codes) {
+            self.codes = Some(codes);
+            self.health.set_codes(codes);
+        }
         Ok(())
     }
 
