@@ -63,7 +63,6 @@ named! {
     }
 }
 
-
 named! {
     /// Where a velocity came from.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -77,7 +76,6 @@ named! {
         Estimated = "estimated",
     }
 }
-
 
 named! {
     /// How the device thread's connection to the arm is doing.
@@ -94,7 +92,6 @@ named! {
         Faulted = "faulted",
     }
 }
-
 
 /// An end-effector pose in the arm's base frame, as the arm's controller states it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

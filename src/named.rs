@@ -43,6 +43,9 @@ mod tests {
     #[test]
     fn names_lead_to_variants_and_back() {
         assert_eq!(Colour::ALL, [Colour::Red, Colour::Clear]);
-        assert_eq!((Colour::of_name("red"), Colour::of_name(""), Colour::of_name("Red")), (Some(Colour::Red), Some(Colour::Clear), None));
+        assert_eq!(
+            (Colour::of_name("red"), Colour::of_name(""), Colour::of_name("Red")),
+            (Some(Colour::Red), Some(Colour::Clear), None)
+        );
     }
 }

@@ -15,7 +15,7 @@ use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
-use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Tree, quote};
+use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Severity, Tree, quote};
 
 /// A blueprint without mistakes.
 #[derive(Debug, Clone)]
@@ -244,9 +244,10 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     });
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
-    let given_twice = file.view.is_some() && file.planner.as_ref().is_some_and(|p| p.visualization.is_some());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
-    if let Some(view) = view.as_ref().filter(|view| !given_twice && view.backend != ViewBackend::None) {
+    // What is wrong comes first: a mistake in the section may be the reason for its backend.
+    let sound = checker.tree.diags().iter().all(|diag| diag.severity != Severity::Error);
+    if let Some(view) = view.as_ref().filter(|view| sound && view.backend != ViewBackend::None) {
         let diag = Diag::warning("the live view is not in this version: no page will be served");
         checker.error(view.at, diag.hint("leave the section out, or say `backend: none`"));
     }

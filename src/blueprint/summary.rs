@@ -21,7 +21,6 @@ named! {
     }
 }
 
-
 /// A limit and where it comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Limit {

@@ -21,7 +21,7 @@ use std::io::{self, IsTerminal};
 use anyhow::Context;
 
 use super::arguments::{Target, finite};
-use super::exit::{Exit, Failure, Result};
+use super::exit::{Failure, Result};
 use super::follow::Signals;
 use crate::rpc::api::{Lease, Status};
 use crate::rpc::{Code, RpcError};

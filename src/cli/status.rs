@@ -233,7 +233,10 @@ fn print_arms(arms: &[ArmReport]) {
             output::line(format_args!("  {name}: a stop was not sent yet; it is delivered after the reconnect"));
         }
         if let Some(codes) = &arm.device_state {
-            output::line(format_args!("  {name}: the device is in state {}, mode {} of its own", codes.state, codes.mode));
+            output::line(format_args!(
+                "  {name}: the device is in state {}, mode {} of its own",
+                codes.state, codes.mode
+            ));
         }
         if let Some(error) = &arm.error {
             output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));

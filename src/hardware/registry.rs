@@ -24,7 +24,6 @@ named! {
     }
 }
 
-
 /// The form of an adapter's `address`.
 #[derive(Debug, Clone, Copy)]
 pub struct AddressForm {

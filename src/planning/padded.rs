@@ -35,7 +35,6 @@ named! {
     }
 }
 
-
 /// A pair that does not keep the padding, and where.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GivenUp {

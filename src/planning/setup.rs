@@ -13,6 +13,7 @@ use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
+use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::kinematics::{Kinematics, frame};
 use crate::robot::load;
 use crate::robot::mesh::Mesh;

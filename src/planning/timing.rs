@@ -5,6 +5,7 @@
 //! between two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a window of
 //! time, which keeps the curve and bounds the jerk, and the points are where the jerk changes.
 
+use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 

@@ -31,7 +31,7 @@ impl TryFrom<&urdf_rs::Robot> for RobotModel {
 
 impl From<&RobotModel> for urdf_rs::Robot {
     fn from(model: &RobotModel) -> Self {
-        let joint = |joint| joint_of(joint, model);
+        let joint = |joint: &Joint| joint_of(joint, model);
         Self {
             name: model.name.clone(),
             version: None,
@@ -126,14 +126,7 @@ fn inertial_of(inertial: &Inertial) -> urdf_rs::Inertial {
     urdf_rs::Inertial {
         origin: pose_of(&inertial.origin),
         mass: Mass { value: inertial.mass },
-        inertia: urdf_rs::Inertia {
-            ixx: m.m11,
-            ixy: m.m12,
-            ixz: m.m13,
-            iyy: m.m22,
-            iyz: m.m23,
-            izz: m.m33,
-        },
+        inertia: urdf_rs::Inertia { ixx: m.m11, ixy: m.m12, ixz: m.m13, iyy: m.m22, iyz: m.m23, izz: m.m33 },
     }
 }
 

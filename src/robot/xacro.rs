@@ -93,7 +93,8 @@ type Result<T = ()> = std::result::Result<T, Box<Trouble>>;
 
 impl Trouble {
     fn new(message: impl Into<String>) -> Box<Self> {
-        let Message { what: message, hint } = Message::from(message.into());
+        let text: String = message.into();
+        let Message { what: message, hint } = text.into();
         Box::new(Self { message, at: None, hint, also: Vec::new() })
     }
 

@@ -28,7 +28,6 @@ named! {
     }
 }
 
-
 /// Parameters of `subscribe`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

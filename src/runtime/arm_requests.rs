@@ -175,11 +175,18 @@ impl Service {
 
     /// Waits until an arm is at rest, or refuses when it still moves at the limit.
     async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
-        // Where nothing is commanded any more the device has been asked to stop, or was not moved by us.
-        let commanded = || self.arm_view(arm as usize).is_some_and(|view| view.command.mode.is_some());
+        let device = self.device(arm)?;
+        let late = || Instant::now() >= limit;
+        // Where nothing is commanded any more the arm is asked to stop, or was not moved by us. The motors wait for that
+        // stop.
+        let stopped = |seq| device.health().stop_sent.load(Ordering::Acquire) == seq;
+        let rests = || {
+            self.arm_view(arm as usize)
+                .is_none_or(|view| view.command.mode.is_none() && (stopped(view.command.stop_seq) || late()))
+        };
         let look = || match self.speed(arm) {
-            speed if speed > STANDSTILL => (Instant::now() >= limit).then_some(Err(speed)),
-            _ => (!commanded()).then_some(Ok(())),
+            speed if speed > STANDSTILL => late().then_some(Err(speed)),
+            _ => rests().then_some(Ok(())),
         };
         let rested = self.until(limit + SETTLING_LIMIT, look).await;
         rested.unwrap_or_else(|| Err(self.speed(arm))).map_err(|speed| still_moves(id, speed))

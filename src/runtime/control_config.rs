@@ -55,4 +55,3 @@ pub(super) fn coordinator_config(
             .collect(),
     }
 }
-

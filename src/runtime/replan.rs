@@ -4,12 +4,12 @@
 
 use std::time::{Duration, Instant};
 
-use crate::sync::lock;
 use super::motions::UnderWay;
 use super::service::{Service, internal};
 use crate::joint::STANDSTILL;
 use crate::rpc::api::{ExecutePlan, Plan, Planning, Reply, Request as Call};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 use crate::telemetry::{Phase, TaskState};
 
 /// How long the arm may take to come to rest.

@@ -3,7 +3,6 @@
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
-use crate::sync::lock;
 use super::motions::{End, Next};
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
@@ -14,6 +13,7 @@ use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
 use crate::rt::histogram::Figures;
+use crate::sync::lock;
 use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, outcome_text, reason_text};
 use crate::telemetry::{Cause, Outcome, Reason, TaskState};
 

@@ -10,7 +10,6 @@ use std::time::{Duration, Instant};
 
 use super::Ending;
 use super::dispatch::{Dispatcher, NotTold, log_of};
-use crate::sync::lock;
 use super::late_stops::LateStops;
 use super::motions::Motions;
 use super::planner_link::Attached;
@@ -34,9 +33,9 @@ use crate::rpc::streams::Streams;
 use crate::rpc::{Code, RpcError, Subject};
 use crate::rt::host::{self, Grant};
 use crate::rt::slot::SlotReader;
+use crate::sync::lock;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
-
 
 /// What a service is made from.
 pub struct ServiceParts {

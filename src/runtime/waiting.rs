@@ -49,10 +49,8 @@ impl Service {
             if let Some(found) = look() {
                 return Some(found);
             }
-            // It can only fail when the service is gone, which is borrowed here.
-            match tokio::time::timeout_at(limit.into(), progress.changed()).await {
-                Ok(_) => {}
-                Err(_) => return look(),
+            if tokio::time::timeout_at(limit.into(), progress.changed()).await.is_err() {
+                return look();
             }
         }
     }

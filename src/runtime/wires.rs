@@ -85,4 +85,3 @@ fn ring_size(config: &CoordinatorConfig) -> usize {
     let per_tick = config.arms.len() + 1;
     512 + (per_tick as f64 * config.rate * RING_SECONDS) as usize
 }
-

@@ -57,7 +57,6 @@ named! {
     }
 }
 
-
 /// An event with names and a sentence. What does not apply to an event is `None` or empty.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Described {

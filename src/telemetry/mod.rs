@@ -76,7 +76,6 @@ named! {
     }
 }
 
-
 /// Age of a state, and what it is compared with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Age {
@@ -179,7 +178,6 @@ named! {
     }
 }
 
-
 /// Why a task is in its state.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Reason {
@@ -236,7 +234,6 @@ named! {
         Acceleration = "acceleration",
     }
 }
-
 
 /// Something that happened in a tick. Indices are those of the blueprint: arms, tasks, joints (over all arms).
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -103,7 +103,7 @@ fn same_robot(what: &str, a: &RobotModel, b: &RobotModel) {
     let (in_a, in_b) = (poses(&mut a), poses(&mut b));
     assert_eq!(a, b, "{what}");
     for (one, other) in in_a.iter().zip(&in_b) {
-        assert!((one.to_homogeneous() - other.to_homogeneous()).amax() < 1e-12, "{what}: {one} {other}");
+        assert!((one.to_homogeneous() - other.to_homogeneous()).amax() < 1e-9, "{what}: {one} {other}");
     }
 }
 

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use dimos::hardware::arms::mock;
 use dimos::hardware::fit::Fit;
-use dimos::hardware::registry::{AddressForm, AdapterSpec};
+use dimos::hardware::registry::{AdapterSpec, AddressForm};
 use dimos::hardware::spec::{AdapterResult, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use dimos::joint::{ControlMode, JointLimits};
 use dimos::testing::MockAdapter;

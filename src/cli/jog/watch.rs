@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use serde_json::Value;
 
-use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::exit::{Failure, Result};
 use crate::rpc::api::{State, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::RunFolder;

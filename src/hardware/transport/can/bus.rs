@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 use super::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
 use crate::hardware::spec::{AdapterError, AdapterResult};
