@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
+use crate::named::named;
 
 /// Figures with which an arm's measurements and its motion are checked: the adapter's row, overridden by the blueprint.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -45,79 +46,50 @@ impl Default for Supervision {
     }
 }
 
-/// A change of the arm's condition that this run did not order: made at its panel, by hand guiding, or by another
-/// program.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Interference {
-    /// None was seen.
-    #[default]
-    None,
-    /// The arm is in another mode than the one that was ordered.
-    Mode,
-    /// The motors were enabled.
-    Power,
-    /// The arm was stopped, paused or reset.
-    Stop,
-}
-
-impl Interference {
-    /// The name used in logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::None => "",
-            Self::Mode => "mode",
-            Self::Power => "power",
-            Self::Stop => "stop",
-        }
+named! {
+    /// A change of the arm's condition that this run did not order: made at its panel, by hand guiding, or by another
+    /// program.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum Interference {
+        /// None was seen.
+        #[default]
+        None = "",
+        /// The arm is in another mode than the one that was ordered.
+        Mode = "mode",
+        /// The motors were enabled.
+        Power = "power",
+        /// The arm was stopped, paused or reset.
+        Stop = "stop",
     }
 }
 
-/// Where a velocity came from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum VelocitySource {
-    /// Not known at all (yet).
-    #[default]
-    Absent,
-    /// The arm measured it.
-    Measured,
-    /// Filtered finite differences of its positions.
-    Estimated,
-}
-
-impl VelocitySource {
-    /// The name used in tables, rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Absent => "absent",
-            Self::Measured => "measured",
-            Self::Estimated => "estimated",
-        }
+named! {
+    /// Where a velocity came from.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum VelocitySource {
+        /// Not known at all (yet).
+        #[default]
+        Absent = "absent",
+        /// The arm measured it.
+        Measured = "measured",
+        /// Filtered finite differences of its positions.
+        Estimated = "estimated",
     }
 }
 
-/// How the device thread's connection to the arm is doing.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Link {
-    /// Not connected, or not any more.
-    #[default]
-    Down,
-    /// Connected; states arrive.
-    Up,
-    /// Connected, but three reads in a row failed or the last one is too old.
-    Stale,
-    /// The arm reports an error, or its connection broke.
-    Faulted,
-}
-
-impl Link {
-    /// The name used in tables, rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Down => "down",
-            Self::Up => "up",
-            Self::Stale => "stale",
-            Self::Faulted => "faulted",
-        }
+named! {
+    /// How the device thread's connection to the arm is doing.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum Link {
+        /// Not connected, or not any more.
+        #[default]
+        Down = "down",
+        /// Connected; states arrive.
+        Up = "up",
+        /// Connected, but three reads in a row failed or the last one is too old.
+        Stale = "stale",
+        /// The arm reports an error, or its connection broke.
+        Faulted = "faulted",
     }
 }
 

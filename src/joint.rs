@@ -3,6 +3,8 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::named::named;
+
 /// The most joints one arm may have. Arrays of this size cross between threads without allocation.
 pub const MAX_DOF: usize = 16;
 
@@ -13,6 +15,12 @@ pub type Joints = [f64; MAX_DOF];
 pub const DEFAULT_ACCELERATION: f64 = 2.0;
 /// Jerk limit where neither the arm nor the blueprint gives one [rad/s³].
 pub const DEFAULT_JERK: f64 = 20.0;
+
+/// Standstill velocity: a slower joint is at rest, given the noise of measured velocities [rad/s].
+pub const STANDSTILL: f64 = 0.02;
+/// The same where one reading decides, which may be a difference of two positions: noisier, so the threshold of the
+/// tick is higher [rad/s].
+pub const TICK_STANDSTILL: f64 = 0.05;
 
 /// A slice as a fixed array; what does not fit is left out.
 pub fn joints_of(values: &[f64]) -> Joints {
@@ -38,41 +46,30 @@ pub fn make_joints(prefix: &str, count: usize) -> Vec<String> {
     (1..=count).map(|i| format!("{prefix}_joint{i}")).collect()
 }
 
-/// How an arm interprets what is written to it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum ControlMode {
-    /// Joint positions; the arm plans its own way there.
-    #[default]
-    Position,
-    /// Joint positions streamed at the control rate; the arm follows each at once.
-    ServoPosition,
-    /// Joint velocities.
-    Velocity,
-    /// Joint torques.
-    Torque,
-    /// End-effector poses; the arm plans its own way there.
-    Cartesian,
-    /// End-effector twists.
-    CartesianVelocity,
-    /// Joint positions with a stiffness.
-    Impedance,
+named! {
+    /// How an arm interprets what is written to it.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize, JsonSchema)]
+    #[serde(rename_all = "snake_case")]
+    pub enum ControlMode {
+        /// Joint positions; the arm plans its own way there.
+        #[default]
+        Position = "position",
+        /// Joint positions streamed at the control rate; the arm follows each at once.
+        ServoPosition = "servo_position",
+        /// Joint velocities.
+        Velocity = "velocity",
+        /// Joint torques.
+        Torque = "torque",
+        /// End-effector poses; the arm plans its own way there.
+        Cartesian = "cartesian",
+        /// End-effector twists.
+        CartesianVelocity = "cartesian_velocity",
+        /// Joint positions with a stiffness.
+        Impedance = "impedance",
+    }
 }
 
 impl ControlMode {
-    /// The name used in blueprints, tables and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Position => "position",
-            Self::ServoPosition => "servo_position",
-            Self::Velocity => "velocity",
-            Self::Torque => "torque",
-            Self::Cartesian => "cartesian",
-            Self::CartesianVelocity => "cartesian_velocity",
-            Self::Impedance => "impedance",
-        }
-    }
-
     /// Whether commands in this mode are joint positions.
     pub fn is_position(self) -> bool {
         matches!(self, Self::Position | Self::ServoPosition | Self::Impedance)

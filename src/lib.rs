@@ -35,6 +35,9 @@ pub const VERSION: &str = env!("DIMOS_VERSION");
 pub mod arm;
 pub mod clock;
 pub mod joint;
+pub mod message;
+mod named;
+pub mod sync;
 pub mod telemetry;
 pub mod trajectory;
 pub mod yaml;
@@ -42,6 +45,8 @@ pub mod yaml;
 pub mod rt;
 
 pub mod robot;
+/// The type of robots from and for other programs: `RobotModel::try_from(&urdf_rs::Robot)`, and back.
+pub use urdf_rs;
 
 pub mod assets;
 

@@ -2,11 +2,12 @@
 //! what it was asked.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::arm::Pose;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use crate::joint::{ControlMode, JointLimits};
+use crate::sync::lock;
 
 /// A call that an adapter got, with its arguments in SI units.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,17 +66,6 @@ const METHODS: &[&str] = &[
     "read_gripper_position",
     "write_gripper_position",
     "read_force_torque",
-];
-
-/// All control modes: a mock adapter accepts each.
-const MODES: &[ControlMode] = &[
-    ControlMode::Position,
-    ControlMode::ServoPosition,
-    ControlMode::Velocity,
-    ControlMode::Torque,
-    ControlMode::Cartesian,
-    ControlMode::CartesianVelocity,
-    ControlMode::Impedance,
 ];
 
 struct Shared {
@@ -216,7 +206,7 @@ impl MockAdapter {
     }
 
     fn lock(&self) -> MutexGuard<'_, Shared> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     /// Records a call and fails if it was told to.
@@ -272,7 +262,7 @@ impl ManipulatorAdapter for MockAdapter {
             firmware_version: None,
             serial_number: None,
             native_rate: 1000.0,
-            modes: MODES,
+            modes: ControlMode::ALL,
             holds_when_disabled: true,
             whole_state_at_once: true,
         }

@@ -250,7 +250,7 @@ pub struct PoseEntry {
     pub quat: Option<[f64; 4]>,
 }
 
-/// The live view in the browser.
+/// The live view in the browser. Not in this version: `check` and `run` warn of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ViewConfig {

@@ -7,7 +7,7 @@ use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
 use crate::blueprint::limits::JointOverride;
 use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
-use crate::blueprint::planner::ViewConfig;
+use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
@@ -15,7 +15,7 @@ use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
-use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Tree, quote};
+use crate::yaml::{Diag, Located, Lost, NOWHERE, NodeId, Severity, Tree, quote};
 
 /// A blueprint without mistakes.
 #[derive(Debug, Clone)]
@@ -245,6 +245,12 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
+    // What is wrong comes first: a mistake in the section may be the reason for its backend.
+    let sound = checker.tree.diags().iter().all(|diag| diag.severity != Severity::Error);
+    if let Some(view) = view.as_ref().filter(|view| sound && view.backend != ViewBackend::None) {
+        let diag = Diag::warning("the live view is not in this version: no page will be served");
+        checker.error(view.at, diag.hint("leave the section out, or say `backend: none`"));
+    }
     Blueprint {
         name: name.value,
         description: file.description,

@@ -33,7 +33,7 @@ pub struct BlueprintFile {
     pub tasks: Vec<Located<TaskEntry>>,
     /// Motion planning.
     pub planner: Option<Located<PlannerConfig>>,
-    /// The live view in the browser.
+    /// The live view in the browser; not in this version.
     pub view: Option<Located<ViewConfig>>,
     /// The log of the run.
     pub recording: RecordingConfig,

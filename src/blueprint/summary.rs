@@ -5,27 +5,19 @@ use serde::Serialize;
 use crate::blueprint::resolve::{Arm, Blueprint, TaskKind};
 use crate::blueprint::schema::{CoordinatorConfig, OnExit};
 use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
+use crate::named::named;
 
-/// Where a value comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Origin {
-    /// The adapter states it.
-    Adapter,
-    /// The blueprint says so.
-    Blueprint,
-    /// Nobody says anything.
-    Default,
-}
-
-impl Origin {
-    /// The word used in tables.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Adapter => "adapter",
-            Self::Blueprint => "blueprint",
-            Self::Default => "default",
-        }
+named! {
+    /// Where a value comes from.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum Origin {
+        /// The adapter states it.
+        Adapter = "adapter",
+        /// The blueprint says so.
+        Blueprint = "blueprint",
+        /// Nobody says anything.
+        Default = "default",
     }
 }
 

@@ -16,6 +16,7 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
+use anyhow::Context;
 use serde::{Deserialize, Serialize};
 
 use super::exit::{Exit, Failure, Result};
@@ -69,8 +70,7 @@ pub fn start(args: &Args, registry: &Registry) -> Result {
     let run = args.name.as_ref().unwrap_or(&blueprint.name);
     place::check_name(run).map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
     let text_log = new_text_log(run)?;
-    let failed = |e: io::Error| Failure::new(Exit::Failed, format!("cannot start the run's process: {e}"));
-    let (mut child, ours) = spawn(&text_log).map_err(failed)?;
+    let (mut child, ours) = spawn(&text_log).context("cannot start the run's process")?;
     let mut line = String::new();
     let message = match BufReader::new(ours).read_line(&mut line) {
         Ok(_) => serde_json::from_str(&line).ok(),
@@ -174,8 +174,7 @@ impl StartingProcess {
             let _ = rustix::process::setsid();
             io::Result::Ok(stream)
         };
-        let stream =
-            leave().map_err(|e| Failure::new(Exit::Failed, format!("cannot detach from the terminal: {e}")))?;
+        let stream = leave().context("cannot detach from the terminal")?;
         Ok(Self { stream, text_log: text_log.to_owned() })
     }
 

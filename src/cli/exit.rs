@@ -1,9 +1,12 @@
 //! How a verb ends: an exit code for scripts; what went wrong and what to do about it for people.
 
+use std::fmt::Display;
+
+use crate::message::Message;
 use crate::rpc::client::ClientError;
 use crate::rpc::{Code, RpcError};
 
-/// The exit codes: a contract, see `docs/`.
+/// The exit codes: a contract. `dimos --help` lists them from here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Exit {
@@ -26,10 +29,24 @@ pub enum Exit {
 }
 
 impl Exit {
+    /// What readers of logs end with when a log is cut, or data is missing in it.
+    pub const DATA_LOST: Self = Self::Hardware;
+
+    /// All of them, with what they mean.
+    pub const ALL: &[(Self, &str)] = &[
+        (Self::Ok, "done"),
+        (Self::Failed, "failed, refused, or not confirmed"),
+        (Self::Usage, "the command line, a blueprint, a model or a file is wrong"),
+        (Self::Hardware, "hardware unreachable; replay: the log is cut or has lost data"),
+        (Self::Fault, "a run ended by a fault"),
+        (Self::Log, "a run ended because its log could not go on"),
+        (Self::Interrupted, "ended by SIGINT, after the controlled stop"),
+        (Self::Terminated, "ended by SIGTERM, after the controlled stop"),
+    ];
+
     /// The exit code of a number; one that is not in the contract (a crash) counts as failed.
     pub fn of(code: u8) -> Self {
-        let all = [Self::Ok, Self::Usage, Self::Hardware, Self::Fault, Self::Log, Self::Interrupted, Self::Terminated];
-        all.into_iter().find(|exit| *exit as u8 == code).unwrap_or(Self::Failed)
+        Self::ALL.iter().map(|(exit, _)| *exit).find(|exit| *exit as u8 == code).unwrap_or(Self::Failed)
     }
 
     /// The code of a run or a wait that a signal ended.
@@ -39,7 +56,8 @@ impl Exit {
 }
 
 /// Why a verb failed.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{what}")]
 pub struct Failure {
     /// The exit code.
     pub exit: Exit,
@@ -58,6 +76,12 @@ impl Failure {
         Self { exit, what: what.into(), hint: None }
     }
 
+    /// An error's text as a failure: it may end with a hint.
+    pub fn of(exit: Exit, error: impl Display) -> Self {
+        let Message { what, hint } = Message::of(error);
+        Self { exit, what, hint }
+    }
+
     /// Something is wrong with what was typed.
     pub fn usage(what: impl Into<String>) -> Self {
         Self::new(Exit::Usage, what)
@@ -67,6 +91,13 @@ impl Failure {
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
+    }
+}
+
+/// At the program's edge an error of the system is told with its context: `FILE: permission denied`.
+impl From<anyhow::Error> for Failure {
+    fn from(error: anyhow::Error) -> Self {
+        error.downcast().unwrap_or_else(|error| Self::of(Exit::Failed, format_args!("{error:#}")))
     }
 }
 
@@ -90,5 +121,28 @@ fn exit_of(code: Code) -> Exit {
     match code {
         Code::UnknownArm | Code::UnknownTask | Code::InvalidParams | Code::InvalidTrajectory => Exit::Usage,
         _ => Exit::Failed,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context;
+
+    use super::*;
+
+    #[test]
+    fn every_exit_code_is_in_the_list_once() {
+        let codes: Vec<u8> = Exit::ALL.iter().map(|(exit, _)| *exit as u8).collect();
+        assert_eq!(codes, [0, 1, 2, 3, 4, 5, 130, 143]);
+        assert_eq!((Exit::of(5), Exit::of(101)), (Exit::Log, Exit::Failed));
+    }
+
+    #[test]
+    fn an_error_of_the_system_has_its_context_and_a_failure_stays_what_it_is() {
+        let denied = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
+        let told: Failure = Err::<(), _>(denied()).context("plan.json").unwrap_err().into();
+        assert_eq!(told, Failure::new(Exit::Failed, "plan.json: permission denied"));
+        let usage = Failure::usage("no such arm").hint("there is `left`");
+        assert_eq!(Failure::from(anyhow::Error::from(usage.clone())), usage);
     }
 }

@@ -18,8 +18,10 @@ mod watch;
 
 use std::io::{self, IsTerminal};
 
+use anyhow::Context;
+
 use super::arguments::{Target, finite};
-use super::exit::{Exit, Failure, Result};
+use super::exit::{Failure, Result};
 use super::follow::Signals;
 use crate::rpc::api::{Lease, Status};
 use crate::rpc::{Code, RpcError};
@@ -92,7 +94,7 @@ pub fn run(args: &Args) -> Result {
     let signals = Signals::watch_with_hangup();
     let watch = Watch::start(&status.run, &args.arm)?;
     let mut session = Session::new(client, watch, drives, setting(args, &status.run));
-    let terminal = Terminal::open().map_err(|e| Failure::new(Exit::Failed, format!("cannot use the terminal: {e}")))?;
+    let terminal = Terminal::open().context("cannot use the terminal")?;
     session.run(terminal, &signals)
 }
 

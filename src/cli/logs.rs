@@ -5,6 +5,8 @@ use std::io::{self, Read, Write};
 use std::path::Path;
 use std::time::Duration;
 
+use anyhow::Context;
+
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{RunRecord, RunState};
@@ -41,8 +43,7 @@ pub fn run(args: &Args) -> Result {
         let what = format!("{} has no text log: its text goes to its terminal", record.run);
         return Err(Failure::new(Exit::Failed, what).hint("runs started with `dimos run --daemon` have one"));
     };
-    let failed = |e: io::Error| Failure::new(Exit::Failed, format!("{}: {e}", path.display()));
-    show(path, || args.follow && record.lives()).map_err(failed)?;
+    show(path, || args.follow && record.lives()).with_context(|| path.display().to_string())?;
     Ok(Exit::Ok)
 }
 

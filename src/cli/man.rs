@@ -3,9 +3,10 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use anyhow::Context;
 use clap::CommandFactory;
 
-use super::exit::{Exit, Failure, Result};
+use super::exit::{Exit, Result};
 use super::output;
 
 /// Arguments of `man`.
@@ -25,14 +26,13 @@ pub fn run(args: &Args) -> Result {
     let Some(dir) = &args.dir else {
         let mut page = Vec::new();
         let rendered = clap_mangen::Man::new(command).render(&mut page);
-        rendered.map_err(|e| Failure::new(Exit::Failed, e.to_string()))?;
+        rendered.context("cannot render the manual page")?;
         // A closed pipe is not an error.
         let _ = io::stdout().lock().write_all(&page);
         return Ok(Exit::Ok);
     };
-    let failed = |e: io::Error| Failure::new(Exit::Failed, format!("{}: {e}", dir.display()));
-    std::fs::create_dir_all(dir).map_err(failed)?;
-    clap_mangen::generate_to(command, dir).map_err(failed)?;
+    let pages = std::fs::create_dir_all(dir).and_then(|()| clap_mangen::generate_to(command, dir));
+    pages.with_context(|| dir.display().to_string())?;
     output::note(format_args!("pages are in {}", dir.display()));
     Ok(Exit::Ok)
 }

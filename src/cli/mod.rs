@@ -49,17 +49,20 @@ use crate::blueprint;
 use crate::hardware::registry::{Absent, AdapterSpec, Registry};
 use crate::robot::builtin;
 
-const AFTER_HELP: &str = "\
+const START_WITH: &str = "\
 Start with:  dimos run coordinator-yourarm
-Then, in a second terminal:  dimos status, dimos state, dimos move arm 0.3 -0.2 0.5 0 0.4 0
+Then, in a second terminal:  dimos status, dimos state, dimos move arm 0.3 -0.2 0.5 0 0.4 0";
 
-Exit codes: 0 done, 1 failed or refused, 2 usage or blueprint wrong, 3 hardware unreachable, 4 a run ended by a fault,
-130 and 143 ended by SIGINT and SIGTERM after the controlled stop.
-
+const NO_SAFETY_FUNCTION: &str = "\
 `stop` is an operational stop and no safety function: use the arm's own rated stop where people can come to harm.";
 
+fn after_help() -> String {
+    let codes = exit::Exit::ALL.iter().map(|(exit, meaning)| format!("\n  {:<3}  {meaning}", *exit as u8));
+    format!("{START_WITH}\n\nExit codes:{}\n\n{NO_SAFETY_FUNCTION}", codes.collect::<String>())
+}
+
 #[derive(Debug, Parser)]
-#[command(name = "dimos", version = crate::VERSION, about = "Runs robot arms from a blueprint", after_help = AFTER_HELP)]
+#[command(name = "dimos", version = crate::VERSION, about = "Runs robot arms from a blueprint", after_help = after_help())]
 #[command(arg_required_else_help = true)]
 struct Cli {
     #[command(subcommand)]
@@ -211,15 +214,7 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Man(args) => man::run(args),
         Command::Model(args) => model::run(args, registry),
         Command::Schema(args) => schema::run(args, registry),
-        Command::Replay(args) => {
-            return match replay::run(args, registry) {
-                Ok(code) => ExitCode::from(code),
-                Err(e) => {
-                    output::failure(&exit::Failure::new(exit::Exit::Failed, e.to_string()));
-                    ExitCode::from(exit::Exit::Failed as u8)
-                }
-            };
-        }
+        Command::Replay(args) => replay::run(args, registry),
     };
     let exit = result.unwrap_or_else(|failure| {
         output::failure(&failure);

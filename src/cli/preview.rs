@@ -2,8 +2,10 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context;
+
 use super::arguments::Target;
-use super::exit::{Exit, Failure, Result};
+use super::exit::{Exit, Result};
 use super::goal::{Planned, show};
 use super::output::{self, Table, fixed};
 use crate::rpc::api::{Preview, PreviewReply};
@@ -29,8 +31,7 @@ pub fn run(args: &Args) -> Result {
     let reply = args.target_run.connect()?.call(Preview { plan: args.plan })?;
     if let Some(file) = &args.out {
         let text = serde_json::to_string(&reply.trajectory).unwrap_or_default();
-        std::fs::write(file, text + "\n")
-            .map_err(|e| Failure::new(Exit::Failed, format!("{}: {e}", file.display())))?;
+        std::fs::write(file, text + "\n").with_context(|| file.display().to_string())?;
         output::note(format_args!("written to {}", file.display()));
     }
     if args.target_run.json {

@@ -14,20 +14,13 @@ use clap::Args;
 use thiserror::Error;
 
 use super::arguments::setting;
-use super::output;
+use super::exit::{Exit, Failure, Result};
 use crate::hardware::registry::Registry;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
 use player::{Part, RealTime, play};
 use view::{JsonLines, Live, Plain, View};
-
-/// Exit code: the replayed outputs differ from the log.
-const DIFFERENT: u8 = 1;
-/// Exit code: the log does not exist, is not a log, or lacks the requested part.
-const USAGE: u8 = 2;
-/// Exit code: samples were lost while recording, or the log is truncated.
-const DATA_LOST: u8 = 3;
 
 /// Play a log on the terminal, verify it, or drive arms with it
 ///
@@ -102,13 +95,13 @@ pub struct OntoArgs {
     pub no_record: bool,
 }
 
-fn rate(text: &str) -> Result<f64, String> {
+fn rate(text: &str) -> std::result::Result<f64, String> {
     let rate: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
     if (1e-3..=1e6).contains(&rate) { Ok(rate) } else { Err("must be between 0.001 and 1000000".into()) }
 }
 
 /// Parses a time in seconds, or with a unit.
-fn duration(text: &str) -> Result<Duration, String> {
+fn duration(text: &str) -> std::result::Result<Duration, String> {
     let wrong = || "not a duration: write 1.5, 500ms, 10s or 2m".to_owned();
     match text.parse::<f64>() {
         Ok(seconds) => Duration::try_from_secs_f64(seconds).map_err(|_| wrong()),
@@ -133,20 +126,19 @@ fn folder_text(folder: &Option<PathBuf>) -> String {
     folder.as_ref().map_or_else(String::new, |f| format!(" in {}", f.display()))
 }
 
-/// Plays a log as requested. Returns the exit code.
-pub fn run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
+/// Plays a log as requested.
+pub fn run(args: &ReplayArgs, registry: &Registry) -> Result {
     match try_run(args, registry) {
-        Ok(code) => Ok(code),
-        Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(0),
+        // A closed pipe (`| head`) is not an error.
+        Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(Exit::Ok),
         Err(e) if e.is::<SelectionError>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
-            eprintln!("error: {e}");
-            Ok(USAGE)
+            Err(Failure::of(Exit::Usage, e))
         }
-        Err(e) => Err(e),
+        other => Ok(other?),
     }
 }
 
-fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
+fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<Exit> {
     let path = log_path(args)?;
     if args.verify {
         return Ok(verify::run(&path, args.json)?);
@@ -154,11 +146,7 @@ fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
     let mut log = LogReader::open(&path)?;
     let part = choose(args, log.info(), &path)?;
     if let Some(blueprint) = &args.onto.blueprint {
-        let exit = onto::run(args, blueprint, &path, &part, registry).unwrap_or_else(|failure| {
-            output::failure(&failure);
-            failure.exit
-        });
-        return Ok(exit as u8);
+        return Ok(onto::run(args, blueprint, &path, &part, registry)?);
     }
     let out = io::stdout();
     let tty = out.is_terminal();
@@ -179,7 +167,7 @@ fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
     if end.damaged > 0 {
         eprintln!("warning: {} messages do not match their schema", end.damaged);
     }
-    Ok(if end.cut.is_some() || end.lost > 0 || end.damaged > 0 { DATA_LOST } else { 0 })
+    Ok(if end.cut.is_some() || end.lost > 0 || end.damaged > 0 { Exit::DATA_LOST } else { Exit::Ok })
 }
 
 fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
@@ -191,7 +179,7 @@ fn log_path(args: &ReplayArgs) -> anyhow::Result<PathBuf> {
     Ok(newest.ok_or(SelectionError::NoLogs(folder))?)
 }
 
-fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> Result<Part, SelectionError> {
+fn choose(args: &ReplayArgs, info: &LogInfo, path: &Path) -> std::result::Result<Part, SelectionError> {
     let path = path.to_owned();
     if let Some(topic) = args.topics.iter().find(|t| !info.topics.contains_key(*t)) {
         let topics = info.topics.keys().cloned().collect::<Vec<_>>().join(", ");

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::Sender;
 use std::time::Duration;
 
+use anyhow::Context;
 use serde::Serialize;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::iterator::Signals;
@@ -169,12 +170,11 @@ pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result
 }
 
 fn signals() -> Result<Signals> {
-    Signals::new([SIGINT, SIGTERM, SIGHUP])
-        .map_err(|e| Failure::new(Exit::Failed, format!("cannot watch signals: {e}")))
+    Ok(Signals::new([SIGINT, SIGTERM, SIGHUP]).context("cannot watch signals")?)
 }
 
 fn terminal() -> Result<Terminal> {
-    Terminal::start().map_err(|e| Failure::new(Exit::Failed, format!("cannot start the thread of the terminal: {e}")))
+    Ok(Terminal::start().context("cannot start the thread of the terminal")?)
 }
 
 fn keep_up(
@@ -219,7 +219,8 @@ fn watch(mut signals: Signals, endings: Sender<Ending>) -> Result<()> {
             let _ = endings.send(Ending::Signal(signal));
         }
     });
-    watching.map(|_| ()).map_err(|e| Failure::new(Exit::Failed, format!("cannot start the thread of signals: {e}")))
+    watching.context("cannot start the thread of signals")?;
+    Ok(())
 }
 
 /// Returns why something ended, in a few words.

@@ -237,6 +237,12 @@ fn print_arms(arms: &[ArmReport]) {
         if arm.stop_pending {
             output::line(format_args!("  {name}: a stop is pending; it is sent after the reconnect"));
         }
+        if let Some(codes) = &arm.device_state {
+            output::line(format_args!(
+                "  {name}: the device is in state {}, mode {} of its own",
+                codes.state, codes.mode
+            ));
+        }
         if let Some(error) = &arm.error {
             output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));
         }

@@ -14,11 +14,9 @@ use super::task::Demand;
 use super::written::{Issued, Written};
 use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
 use crate::clock::Mono;
-use crate::joint::{ControlMode, Joints, MAX_DOF};
+use crate::joint::{ControlMode, Joints, MAX_DOF, TICK_STANDSTILL};
 use crate::telemetry::{Age, Cause, LimitKind, Phase};
 
-/// A joint that measures no more than this is at a standstill for a change of mode [rad/s].
-const STANDSTILL: f64 = 0.05;
 /// How long an arm that lags gets to come to where its last command is, before it is asked to stop [s].
 const SETTLING_LIMIT: f64 = 0.5;
 /// A joint that moves this far while its arm is being enabled does so for another reason [rad].
@@ -516,7 +514,7 @@ impl ArmControl {
         self.drawing = (self.drawing - dt).max(dt);
         for j in 0..self.config.dof {
             // One that still moves is on its way, and its set point is brought to rest like any other.
-            let stands = self.state.velocity.get(j).is_none_or(|v| v.abs() <= STANDSTILL);
+            let stands = self.state.velocity.get(j).is_none_or(|v| v.abs() <= TICK_STANDSTILL);
             let off = stands && self.tracking_error(j).abs() > tolerance;
             let q = self.state.position.get(j).copied().unwrap_or_default();
             if let Some(limiter) =
@@ -678,7 +676,7 @@ impl ArmControl {
     }
 
     fn at_standstill(&self) -> bool {
-        let still = self.state.velocity.iter().take(self.config.dof).all(|v| v.abs() <= STANDSTILL);
+        let still = self.state.velocity.iter().take(self.config.dof).all(|v| v.abs() <= TICK_STANDSTILL);
         still && self.limiters.iter().all(Limiter::at_rest)
     }
 

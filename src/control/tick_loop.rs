@@ -23,6 +23,8 @@ use crate::telemetry::{ArmSample, Event, Outcome, Sample, TaskView, TickSample};
 pub struct Pulse {
     /// The thread's heartbeat.
     pub beat: Arc<Heartbeat>,
+    /// Ticks begun.
+    pub begun: AtomicU64,
     /// Ticks made.
     pub ticks: AtomicU64,
     /// Ticks that began a period or more too late.
@@ -35,6 +37,8 @@ pub struct Pulse {
     pub at_rest: AtomicBool,
     /// Somebody listens to the joint state: wake whoever publishes it after every tick.
     pub streaming: AtomicBool,
+    /// How many wait for what a tick brings: wake them after every tick.
+    pub waiting: AtomicU32,
     /// Set to end the thread after its present tick.
     pub stop: AtomicBool,
     /// Samples that found the ring full.
@@ -119,6 +123,7 @@ pub fn run(
         deadline = deadline.after(period * missed);
         let skipped = skips_before + missed;
         let (next, skips_after) = next_deadline(deadline, woke, period);
+        pulse.begun.store(tick + 1, Ordering::SeqCst);
         for ((state, slot), due) in states.iter_mut().zip(&mut ports.states).zip(&ports.dues) {
             *state = slot.read();
             state.own_delay_ns = due.overdue(woke).as_nanos() as u64;
@@ -138,15 +143,6 @@ pub fn run(
         let compute_ns = done.0.saturating_sub(woke.0);
         pulse.beat.beat(done);
 
-        let mut replied = false;
-        for event in &output.events {
-            if let Event::Request(id, outcome) = event {
-                replied |= ports.replies.push((*id, *outcome)).is_ok();
-            }
-        }
-        if replied || pulse.streaming.load(Ordering::Relaxed) {
-            ports.reply_wake.raise();
-        }
         for motion in output.retired.drain(..) {
             // The ring is as long as all motions that can exist; one that finds no room is leaked rather than freed.
             if let Err(rtrb::PushError::Full(motion)) = ports.retired.push(motion) {
@@ -172,6 +168,13 @@ pub fn run(
         for (slot, view) in ports.task_views.iter_mut().zip(&output.tasks) {
             slot.write(view);
         }
+        // After the views: whoever gets an outcome finds its effect there.
+        let mut replied = false;
+        for event in &output.events {
+            if let Event::Request(id, outcome) = event {
+                replied |= ports.replies.push((*id, *outcome)).is_ok();
+            }
+        }
         pulse.at_rest.store(coordinator.at_rest(), Ordering::Release);
         pulse.lateness.record(late_ns);
         pulse.compute.record(compute_ns);
@@ -179,6 +182,10 @@ pub fn run(
         pulse.overruns.fetch_add(u64::from(skipped > 0), Ordering::Relaxed);
         pulse.skipped.fetch_add(skipped as u64, Ordering::Relaxed);
         pulse.ticks.store(tick + 1, Ordering::Release);
+        let watched = pulse.streaming.load(Ordering::Relaxed) || pulse.waiting.load(Ordering::Relaxed) > 0;
+        if replied || watched {
+            ports.reply_wake.raise();
+        }
         tick += 1;
         (skips_before, late_before) = (skips_after, late_ns);
         deadline = next;

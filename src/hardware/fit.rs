@@ -9,6 +9,7 @@ use serde::de::DeserializeOwned;
 use super::registry::AdapterConfig;
 use super::spec::{AdapterError, AdapterResult};
 use crate::joint::JointLimits;
+use crate::message::Message;
 
 /// What follows from a configuration that fits.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -55,8 +56,7 @@ impl fmt::Display for Misfit {
 
 impl From<Misfit> for AdapterError {
     fn from(misfit: Misfit) -> Self {
-        let hint = misfit.hint.map(|hint| format!("\nhint: {hint}")).unwrap_or_default();
-        Self::Rejected(misfit.what + &hint)
+        Self::Rejected(Message { what: misfit.what, hint: misfit.hint }.to_string())
     }
 }
 

@@ -10,24 +10,17 @@ use crate::hardware::fit::{Fit, Misfit};
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::joint::{ControlMode, Joints};
+use crate::named::named;
 use crate::yaml;
 
-/// How far an adapter has been proven without its hardware.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Level {
-    /// Passes the conformance suite against a double at its SDK or wire boundary.
-    Conformant,
-    /// Has an emulator of its real wire format, and passes the suite against it.
-    Emulated,
-}
-
-impl Level {
-    /// The name used in tables.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Conformant => "conformant",
-            Self::Emulated => "emulated",
-        }
+named! {
+    /// How far an adapter has been proven without its hardware.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum Level {
+        /// Passes the conformance suite against a double at its SDK or wire boundary.
+        Conformant = "conformant",
+        /// Has an emulator of its real wire format, and passes the suite against it.
+        Emulated = "emulated",
     }
 }
 

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use super::path::between;
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
+use crate::named::named;
 use crate::robot::model::Limits;
 use crate::robot::random::Random;
 
@@ -23,25 +24,16 @@ const POSES: usize = 32;
 const DISTANCE_RATIO: f64 = 0.5;
 const REVALIDATION_RATIO: f64 = 0.4;
 
-/// Where an exception from the padding applies.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Near {
-    /// Near the start.
-    Start,
-    /// Near the goal.
-    Goal,
-    /// In every configuration: the pair is always closer than the padding.
-    Everywhere,
-}
-
-impl Near {
-    /// Returns its name in rpc.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Start => "start",
-            Self::Goal => "goal",
-            Self::Everywhere => "everywhere",
-        }
+named! {
+    /// Where an exception from the padding applies.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum Near {
+        /// Near the start.
+        Start = "start",
+        /// Near the goal.
+        Goal = "goal",
+        /// In every configuration: the pair is always closer than the padding.
+        Everywhere = "everywhere",
     }
 }
 

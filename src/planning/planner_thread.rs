@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -16,6 +16,7 @@ use super::revalidate::revalidate;
 use super::unplanned_joints::Measured;
 use crate::collision::Stop;
 use crate::collision::world::World;
+use crate::sync::lock;
 
 /// Maximum number of plans kept.
 const MAX_JOBS: usize = 16;
@@ -109,10 +110,6 @@ pub enum BeginError {
     /// Too many requests hang.
     #[error("{MAX_HANGING} earlier requests hang in the planner: a bug in the planner")]
     Hangs,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl PlannerThread {

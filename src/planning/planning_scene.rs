@@ -7,13 +7,13 @@ use std::sync::Arc;
 use glamx::DVec3;
 
 use super::config::{CLOUD_RADIUS, JointBounds, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
-use super::timing::DEFAULT_ACCELERATION;
 use super::unplanned_joints::{Measured, idle};
 use crate::collision::allowed_pairs::always_touching;
 use crate::collision::body::{MeshMode, solids, solids_of, surface};
 use crate::collision::cloud::Cloud;
 use crate::collision::world::{Obstacle, Robot, World};
 use crate::collision::{Solid, ply};
+use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::kinematics::{Kinematics, frame};
 use crate::robot::load;
 use crate::robot::mesh::Mesh;

@@ -4,6 +4,7 @@
 //! two of them is the curve itself. With jerk limits the parameter's motion `s(t)` is averaged over a time window,
 //! which keeps the curve and limits the jerk; the points are where the jerk changes.
 
+use crate::joint::DEFAULT_ACCELERATION;
 use crate::robot::model::Limits;
 use crate::trajectory::{JointTrajectory, TrajectoryError, TrajectoryPoint};
 
@@ -27,9 +28,6 @@ impl Default for TimingSettings {
         Self { deviation: 0.05, speed: 1.0 }
     }
 }
-
-/// Acceleration limit of joints without one [rad/s² or m/s²].
-pub const DEFAULT_ACCELERATION: f64 = 2.0;
 
 /// A trajectory and its figures.
 #[derive(Debug, Clone, PartialEq)]

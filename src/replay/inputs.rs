@@ -277,30 +277,17 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
 }
 
 fn interference(name: &str) -> Result<Interference, String> {
-    let all = [Interference::None, Interference::Mode, Interference::Power, Interference::Stop];
-    all.into_iter().find(|i| i.name() == name).ok_or_else(|| format!("{name:?} is not an interference"))
+    Interference::of_name(name).ok_or_else(|| format!("{name:?} is not an interference"))
 }
 
 fn source(name: &str) -> Result<VelocitySource, String> {
-    let all = [VelocitySource::Absent, VelocitySource::Measured, VelocitySource::Estimated];
-    all.into_iter().find(|s| s.name() == name).ok_or_else(|| format!("{name:?} is not a source of velocities"))
+    VelocitySource::of_name(name).ok_or_else(|| format!("{name:?} is not a source of velocities"))
 }
 
 fn link(name: &str) -> Result<Link, String> {
-    let all = [Link::Down, Link::Up, Link::Stale, Link::Faulted];
-    all.into_iter().find(|l| l.name() == name).ok_or_else(|| format!("{name:?} is not a connection state"))
+    Link::of_name(name).ok_or_else(|| format!("{name:?} is not a connection state"))
 }
 
-/// Returns a control mode by name.
 fn mode(name: &str) -> Result<ControlMode, String> {
-    let all = [
-        ControlMode::Position,
-        ControlMode::ServoPosition,
-        ControlMode::Velocity,
-        ControlMode::Torque,
-        ControlMode::Cartesian,
-        ControlMode::CartesianVelocity,
-        ControlMode::Impedance,
-    ];
-    all.into_iter().find(|m| m.name() == name).ok_or_else(|| format!("{name:?} is not a control mode"))
+    ControlMode::of_name(name).ok_or_else(|| format!("{name:?} is not a control mode"))
 }

@@ -13,6 +13,8 @@ use std::path::PathBuf;
 use nalgebra::{Isometry3, Matrix3, Unit, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::named::named;
+
 /// A robot: a tree of links. Links are `0..n`, joints are `0..n-1`, both with parents first; joint `i` moves link `i +
 /// 1`.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -111,31 +113,23 @@ pub struct Inertial {
     pub inertia: Matrix3<f64>,
 }
 
-/// Kind of a joint.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum JointKind {
-    /// No motion.
-    Fixed,
-    /// Rotation about the axis, between limits [rad].
-    Revolute,
-    /// Rotation about the axis without limits [rad].
-    Continuous,
-    /// Translation along the axis, between limits [m].
-    Prismatic,
+named! {
+    /// Kind of a joint.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum JointKind {
+        /// No motion.
+        Fixed = "fixed",
+        /// Rotation about the axis, between limits [rad].
+        Revolute = "revolute",
+        /// Rotation about the axis without limits [rad].
+        Continuous = "continuous",
+        /// Translation along the axis, between limits [m].
+        Prismatic = "prismatic",
+    }
 }
 
 impl JointKind {
-    /// Returns URDF's name of it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Fixed => "fixed",
-            Self::Revolute => "revolute",
-            Self::Continuous => "continuous",
-            Self::Prismatic => "prismatic",
-        }
-    }
-
     /// Returns the unit of its position.
     pub fn unit(self) -> &'static str {
         if self == Self::Prismatic { "m" } else { "rad" }

@@ -28,6 +28,7 @@ mod yaml11;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use crate::message::Message;
 use crate::robot::packages::Packages;
 use crate::robot::xml::{Calls, Document, SourcePos};
 use crate::yaml::{Diag, SourceId, Tree};
@@ -92,11 +93,8 @@ type Result<T = ()> = std::result::Result<T, Box<ExpansionError>>;
 
 impl ExpansionError {
     fn new(message: impl Into<String>) -> Box<Self> {
-        let message = message.into();
-        let (message, hint) = match message.split_once("\nhint: ") {
-            Some((message, hint)) => (message.to_owned(), Some(hint.to_owned())),
-            None => (message, None),
-        };
+        let text: String = message.into();
+        let Message { what: message, hint } = text.into();
         Box::new(Self { message, at: None, hint, also: Vec::new() })
     }
 

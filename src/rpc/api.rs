@@ -69,6 +69,14 @@ pub trait Method: Serialize + DeserializeOwned {
     fn check(&self) -> Result<(), String> {
         Ok(())
     }
+    /// The request to the run; `None`: the connection itself answers it.
+    fn to_request(&self) -> Option<Request> {
+        None
+    }
+    /// Takes the reply to such a request; `None`: it is the reply to another one.
+    fn from_reply(_reply: Reply) -> Option<Self::Reply> {
+        None
+    }
 }
 
 /// One row per method: name, parameters, reply. Makes [`Request`], [`Reply`], [`METHODS`].
@@ -102,6 +110,15 @@ macro_rules! methods {
             const NAME: &'static str = $name;
             type Reply = $reply;
             $(fn check(&self) -> Result<(), String> { $check(self) })?
+            fn to_request(&self) -> Option<Request> {
+                Some(Request::$variant(Clone::clone(self)))
+            }
+            fn from_reply(reply: Reply) -> Option<$reply> {
+                match reply {
+                    Reply::$variant(reply) => Some(reply),
+                    _ => None,
+                }
+            }
         })*
 
         impl Request {

@@ -5,7 +5,7 @@
 //! commander goes stale like any other, and a trajectory that has begun goes on.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Instant;
 
 use serde_json::json;
@@ -13,6 +13,7 @@ use serde_json::json;
 use super::api::{Backend, ExecutePlan, Presence, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
+use crate::sync::lock;
 
 /// What a request is about, for [`Backend::arms_of`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -86,7 +87,7 @@ pub(super) struct Leases(Mutex<BTreeMap<String, Holder>>);
 
 impl Leases {
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Holder>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     /// Whether a connection holds the lease of any arm.

@@ -2,7 +2,7 @@
 //! number. Nothing here waits longer than it says, however the process behaves: it may hang, send nonsense, or be gone.
 
 use std::collections::HashMap;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 use std::time::Duration;
 
 use serde_json::{Value, json};
@@ -12,6 +12,7 @@ use tokio::time::timeout;
 use super::api::{Moment, PLANNER_REQUESTS, PlannerAnswer, PlannerRequest};
 use super::error::{Code, RpcError};
 use super::wire;
+use crate::sync::lock;
 
 /// Requests that may wait for the planner at once.
 const WAITING: usize = 32;
@@ -107,7 +108,7 @@ impl PlannerLine {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 

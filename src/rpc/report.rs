@@ -137,6 +137,9 @@ pub struct ArmReport {
     pub enabled: bool,
     /// The control mode it is in.
     pub mode: String,
+    /// The device's own state and mode codes, as its manual has them; absent where it has none.
+    #[serde(default)]
+    pub device_state: Option<DeviceState>,
     /// The device's error; absent when there is none.
     pub error: Option<DeviceError>,
     /// Age of its latest state [ms]; absent before the first.
@@ -182,6 +185,15 @@ pub struct CauseReport {
     pub name: String,
     /// For people.
     pub text: String,
+}
+
+/// A device's own codes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct DeviceState {
+    /// Its state.
+    pub state: i32,
+    /// Its mode.
+    pub mode: i32,
 }
 
 /// A device's own error.

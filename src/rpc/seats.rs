@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use tokio::sync::Notify;
@@ -13,6 +13,7 @@ use tokio::sync::Notify;
 use super::api::{MAX_CONNECTIONS, RESERVED_CONNECTIONS};
 use super::error::{Code, RpcError};
 use super::lease::Leases;
+use crate::sync::lock;
 
 /// The places of a run.
 #[derive(Debug)]
@@ -165,10 +166,6 @@ impl Drop for Seat {
     fn drop(&mut self) {
         lock(&self.seats.taken).seats.remove(&self.number);
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

@@ -9,29 +9,22 @@ use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
 use super::api::Method;
+use crate::named::named;
 
 /// Joint states kept for slow readers.
 const STATES_KEPT: usize = 256;
 /// Events kept for slow readers.
 const EVENTS_KEPT: usize = 1024;
 
-/// The streams of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Stream {
-    /// One [`JointState`] per tick.
-    CoordinatorJointState,
-    /// One [`EventReport`] per event.
-    Events,
-}
-
-impl Stream {
-    /// The name used in requests and messages.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::CoordinatorJointState => "coordinator_joint_state",
-            Self::Events => "events",
-        }
+named! {
+    /// The streams of a run.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Stream {
+        /// One [`JointState`] per tick.
+        CoordinatorJointState = "coordinator_joint_state",
+        /// One [`EventReport`] per event.
+        Events = "events",
     }
 }
 

@@ -1,19 +1,22 @@
-//! What is asked of an arm as a whole: stop, reset, enable, disable.
+//! What is asked of an arm as a whole: stop, reset, enable, disable; and of its gripper.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use super::service::{STANDSTILL, Service, internal};
+use super::dispatch::log_of;
+use super::service::{Service, internal};
 use crate::arm::Link;
 use crate::control::request::Request;
 use crate::hardware::device::{Answer, Device};
 use crate::hardware::spec::{AdapterError, AdapterResult};
-use crate::rpc::api::{self, Reply};
+use crate::joint::STANDSTILL;
+use crate::message::Message;
+use crate::rpc::api::{self, Done, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::telemetry::describe::cause_text;
-use crate::telemetry::{Outcome, Phase};
+use crate::telemetry::{ArmSample, Outcome, Phase};
 
 /// How long a stopped arm gets to come to rest and confirm.
 const STOP_LIMIT: Duration = Duration::from_secs(3);
@@ -25,6 +28,10 @@ const SETTLING_LIMIT: Duration = Duration::from_secs(1);
 const BRAKING_LIMIT: Duration = Duration::from_secs(7);
 /// How long an order to a device may take.
 const ORDER_LIMIT: Duration = Duration::from_secs(8);
+/// Reports within which an arm tells what an order changed.
+const REPORTS: u32 = 3;
+/// How often an enabled arm is asked for again that is not ready yet.
+const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// How long an enabled arm gets to be ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
 
@@ -38,13 +45,8 @@ impl Service {
             if arm.is_some_and(|a| a as usize != i) {
                 continue;
             }
-            let confirmation = loop {
-                match self.confirmation(i) {
-                    Some(c) => break c,
-                    None if Instant::now() >= limit => break api::Confirmation::SentNotConfirmed,
-                    None => tokio::time::sleep(Duration::from_millis(5)).await,
-                }
-            };
+            let confirmation = self.until(limit, || self.confirmation(i)).await;
+            let confirmation = confirmation.unwrap_or(api::Confirmation::SentNotConfirmed);
             if confirmation == api::Confirmation::NotSent {
                 self.stop_not_sent(i);
             }
@@ -86,11 +88,13 @@ impl Service {
                 Ok(()) | Err(AdapterError::NotConnected) => {}
                 Err(e) => return Err(refused(&id, "did not clear its error", &e)),
             }
-            // The next tick must see the state after the clearing.
-            tokio::time::sleep(self.period() * 2).await;
+            // The tick must see the state after the clearing, and an arm that sends its state by itself tells it in its
+            // next report.
+            self.next_tick().await;
+            self.until(self.next_report(arm), || self.seen(arm, |view| view.state.error == 0)).await;
         }
         self.ask(Request::Reset { arm }).await?;
-        let mut reply = self.phase_of(id, arm).await;
+        let mut reply = self.phase_of(id, arm);
         // What was wrong is read once more before the arm is enabled.
         reply.note = cause.map(|cause| format!("was held: {cause}"));
         Ok(Reply::ArmReset(reply))
@@ -110,20 +114,40 @@ impl Service {
                 self.ask(Request::Ready { arm }).await?;
             }
         }
+        let settled = |phase| matches!(phase, Phase::Ready | Phase::Held);
+        self.until(Instant::now() + READY_LIMIT, || self.seen(arm, |view| settled(view.phase))).await;
+        let view = self.arm_view(arm as usize).ok_or_else(internal)?;
+        let outcome = match view.phase {
+            Phase::Ready => return Ok(Reply::ArmEnable(self.phase_of(id, arm))),
+            // A stop or a fault overtook it.
+            Phase::Held => Outcome::ArmLatched(arm, view.cause),
+            phase => Outcome::ArmNotReady(arm, phase, view.cause),
+        };
+        self.refusal(&outcome).map_or_else(|| Err(internal()), Err)
+    }
+
+    /// Makes the arms ready that a start has enabled, and waits until they are and the others are seen; not for ever: the
+    /// banner and `status` say how far each came.
+    pub async fn first_ready(&self) {
+        let arms = || self.parts.blueprint.arms.iter().map(|arm| arm.auto_enable).enumerate();
+        let settled = |(arm, enabled): (usize, bool)| match self.phase(arm) {
+            Phase::Ready => true,
+            phase => !enabled && phase != Phase::Unknown,
+        };
         let limit = Instant::now() + READY_LIMIT;
-        loop {
-            let view = self.arm_view(arm as usize).ok_or_else(internal)?;
-            let outcome = match view.phase {
-                Phase::Ready => return self.phase_reply(id, arm).await,
-                // A stop or a fault overtook it.
-                Phase::Held => Outcome::ArmLatched(arm, view.cause),
-                phase if Instant::now() >= limit => Outcome::ArmNotReady(arm, phase, view.cause),
-                _ => {
-                    tokio::time::sleep(Duration::from_millis(5)).await;
-                    continue;
+        while Instant::now() < limit {
+            for (arm, _) in arms().filter(|(_, enabled)| *enabled) {
+                if !matches!(self.phase(arm), Phase::Activating | Phase::Ready | Phase::Held) {
+                    // Whether it is taken shows in the arm's phase. On a busy host its state may not be fresh just now.
+                    let ready = Request::Ready { arm: arm as u16 };
+                    let log = log_of(&ready);
+                    let _ = self.parts.dispatcher.send(ready, log);
                 }
-            };
-            return self.refusal(&outcome).map_or_else(|| Err(internal()), Err);
+            }
+            let round = limit.min(Instant::now() + ASK_AGAIN);
+            if self.until(round, || arms().all(settled).then_some(())).await.is_some() {
+                return;
+            }
         }
     }
 
@@ -137,8 +161,10 @@ impl Service {
         }
         let speed = self.speed(arm);
         order(self.device(arm)?.disable()).await.map_err(|e| refused(&id, "was not disabled", &e))?;
-        tokio::time::sleep(self.period() * 2).await;
-        let mut reply = self.phase_of(id, arm).await;
+        self.next_tick().await;
+        let off = |view: &ArmSample| !view.state.enabled && view.phase != Phase::Standby;
+        self.until(self.next_report(arm), || self.seen(arm, off)).await;
+        let mut reply = self.phase_of(id, arm);
         if now {
             let was =
                 if speed > STANDSTILL { format!("while it moved at {speed:.2} rad/s") } else { "at rest".to_owned() };
@@ -149,23 +175,59 @@ impl Service {
 
     /// Waits until an arm is at rest, or refuses when it still moves at the limit.
     async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
-        let settled = limit + SETTLING_LIMIT;
-        // Where nothing is commanded any more the device has been asked to stop, or was not moved by us.
-        while self.arm_view(arm as usize).is_some_and(|v| v.command.mode.is_some()) {
-            let (now, speed) = (Instant::now(), self.speed(arm));
-            if now >= if speed > STANDSTILL { limit } else { settled } {
-                return Err(still_moves(id, speed));
-            }
-            tokio::time::sleep(Duration::from_millis(5)).await;
+        let device = self.device(arm)?;
+        let late = || Instant::now() >= limit;
+        // Where nothing is commanded any more the arm is asked to stop, or was not moved by us. The motors wait for that
+        // stop.
+        let stopped = |seq| device.health().stop_sent.load(Ordering::Acquire) == seq;
+        let rests = || {
+            self.arm_view(arm as usize)
+                .is_none_or(|view| view.command.mode.is_none() && (stopped(view.command.stop_seq) || late()))
+        };
+        let look = || match self.speed(arm) {
+            speed if speed > STANDSTILL => late().then_some(Err(speed)),
+            _ => rests().then_some(Ok(())),
+        };
+        let rested = self.until(limit + SETTLING_LIMIT, look).await;
+        rested.unwrap_or_else(|| Err(self.speed(arm))).map_err(|speed| still_moves(id, speed))
+    }
+
+    /// Commands a gripper, and waits for what the arm answers to this order.
+    pub(super) async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&call.arm)?;
+        if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
+            return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
         }
-        let speed = self.speed(arm);
-        while self.speed(arm) > STANDSTILL {
-            if Instant::now() >= limit {
-                return Err(still_moves(id, speed));
+        let device = self.device(arm)?;
+        let _turn = self.grippers.get(arm as usize).ok_or_else(internal)?.lock().await;
+        self.ask(Request::Gripper { arm, opening: call.position }).await?;
+        let order = self.arm_view(arm as usize).ok_or_else(internal)?.command.gripper_seq;
+        let gone = |view: &ArmSample| matches!(view.state.link, Link::Down | Link::Faulted);
+        let gone = || self.seen(arm, gone).map(|()| Err(AdapterError::NotConnected));
+        let look = || device.health().gripper_answer(order).or_else(gone);
+        match self.until(Instant::now() + ORDER_LIMIT, look).await {
+            Some(Ok(())) => Ok(Reply::Gripper(Done {})),
+            Some(Err(error)) => {
+                let message = Message::of(format!("{} refused the gripper order: {error}", call.arm));
+                let (what, hint) = message.or_hint("`dimos state` shows the gripper's opening now, in metres");
+                Err(RpcError::new(Code::DeviceRefused, what).hint(hint))
             }
-            tokio::time::sleep(Duration::from_millis(5)).await;
+            None => {
+                let what = format!("{} did not answer the gripper order within {} s", call.arm, ORDER_LIMIT.as_secs());
+                Err(RpcError::new(Code::NoAnswer, what).hint("`dimos status` shows the arm's connection"))
+            }
         }
-        Ok(())
+    }
+
+    /// `Some`, once an arm is seen in a condition.
+    fn seen(&self, arm: u16, is: impl Fn(&ArmSample) -> bool) -> Option<()> {
+        self.arm_view(arm as usize).is_some_and(|view| is(&view)).then_some(())
+    }
+
+    /// When an arm has reported again, if it reports as often as it should.
+    fn next_report(&self, arm: u16) -> Instant {
+        let own = self.parts.config.arms.get(arm as usize).map(|arm| arm.read_period);
+        Instant::now() + REPORTS * own.unwrap_or_default().max(self.period())
     }
 
     /// How long an arm gets to brake: twice as long as its fastest joint needs at its limit of acceleration.
@@ -189,13 +251,8 @@ impl Service {
         joints.map(|v| v.abs()).fold(0.0, f64::max)
     }
 
-    async fn phase_reply(&self, arm: String, index: u16) -> Result<Reply, RpcError> {
-        Ok(Reply::ArmReset(self.phase_of(arm, index).await))
-    }
-
-    /// An arm's phase after the next tick.
-    async fn phase_of(&self, arm: String, index: u16) -> api::ArmReply {
-        tokio::time::sleep(self.period()).await;
+    /// An arm's phase after the tick that was seen last.
+    fn phase_of(&self, arm: String, index: u16) -> api::ArmReply {
         api::ArmReply { arm, phase: self.phase(index as usize).name().to_owned(), note: None }
     }
 
@@ -220,9 +277,7 @@ async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
 }
 
 fn refused(arm: &str, what: &str, error: &AdapterError) -> RpcError {
-    let text = format!("{arm} {what}: {error}");
-    // An adapter that knows what to do says so in a line of its own.
     let general = "see the arm's own panel or manual; `dimos status` shows its link and error";
-    let (text, hint) = text.split_once("\nhint: ").unwrap_or((&text, general));
-    RpcError::new(Code::DeviceRefused, text).hint(hint)
+    let (what, hint) = Message::of(format!("{arm} {what}: {error}")).or_hint(general);
+    RpcError::new(Code::DeviceRefused, what).hint(hint)
 }

@@ -7,11 +7,12 @@ use super::StartError;
 use super::device_lock::{self, DeviceLock};
 use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
-use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::clock::MonotonicClock;
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
 use crate::hardware::spec::AdapterError;
 use crate::joint::JointLimits;
+use crate::message::Message;
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
 
@@ -22,7 +23,7 @@ const ENABLE_LIMIT: Duration = Duration::from_secs(10);
 /// How long all arms together get to be released.
 const RELEASE_LIMIT: Duration = Duration::from_secs(2);
 
-/// The arms of a run.
+/// The arms of a run. Dropped, they are released.
 pub struct Arms {
     /// Their device threads, in the blueprint's order.
     pub devices: Vec<Arc<Device>>,
@@ -100,10 +101,7 @@ pub fn bring_up(
                 }
                 connected.push(pair);
             }
-            Err(error) => {
-                arms.release();
-                return Err(error);
-            }
+            Err(error) => return Err(error),
         }
     }
     Ok(BroughtUp { arms, slots, connected })
@@ -138,14 +136,6 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     Ok(config)
 }
 
-/// What is wrong, and what to do: an adapter that knows says so in a line of its own.
-fn with_hint(text: &str, otherwise: String) -> (String, String) {
-    match text.split_once("\nhint: ") {
-        Some((what, hint)) => (what.to_owned(), hint.to_owned()),
-        None => (text.to_owned(), otherwise),
-    }
-}
-
 /// What the blueprint says of an arm does not go together: nobody was asked yet, so nobody needs power.
 fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
     if !matches!(error, AdapterError::Rejected(_)) {
@@ -153,7 +143,7 @@ fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
     }
     let id = &arm.hardware_id;
     let general = format!("see `hardware.{id}.joints` and `hardware.{id}.options` in the blueprint");
-    let (what, hint) = with_hint(&error.to_string(), general);
+    let (what, hint) = Message::of(error).or_hint(general);
     StartError::Hardware { arm: id.clone(), what, hint }
 }
 
@@ -163,7 +153,7 @@ fn hardware(arm: &Arm, error: &AdapterError) -> StartError {
         Some(_) => format!("is it powered, and is `hardware.{id}.address` right ({form})? To try without it: --sim"),
         None => format!("see `hardware.{id}` in the blueprint"),
     };
-    let (what, hint) = with_hint(&error.to_string(), general);
+    let (what, hint) = Message::of(error).or_hint(general);
     StartError::Hardware { arm: id.clone(), what, hint }
 }
 
@@ -212,11 +202,6 @@ fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartEr
 }
 
 impl Arms {
-    /// The time that the device threads use.
-    pub fn now(&self) -> Mono {
-        MonotonicClock.now()
-    }
-
     /// Enables the given arms, all at once; answers the first that could not be.
     pub fn enable(&self, blueprint: &Blueprint, which: impl Iterator<Item = usize>) -> Result<(), StartError> {
         let answers: Vec<_> = which.filter_map(|i| Some((i, self.devices.get(i)?.activate()))).collect();
@@ -226,7 +211,7 @@ impl Arms {
                 let general = format!(
                     "clear the arm's own error, or start without motors: --set hardware.{id}.auto_enable=false"
                 );
-                let (what, hint) = with_hint(&format!("cannot be enabled: {e}"), general);
+                let (what, hint) = Message::of(format!("cannot be enabled: {e}")).or_hint(general);
                 return Err(StartError::Hardware { arm: id.clone(), what, hint });
             }
         }
@@ -245,5 +230,13 @@ impl Arms {
         }
         self.devices.clear();
         troubles
+    }
+}
+
+impl Drop for Arms {
+    fn drop(&mut self) {
+        for trouble in self.release() {
+            tracing::warn!("{trouble}");
+        }
     }
 }

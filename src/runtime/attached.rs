@@ -10,9 +10,9 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 
 use super::StartError;
-use super::build::robots;
 use super::planner_link::answer_travelling;
 use super::planner_port::{PlannerPort, registered};
+use super::start::robots;
 use crate::planning::config::PlannerConfig;
 use crate::planning::planning_scene::PlanningScene;
 use crate::rpc::api::{RegisterPlanner, RegisteredRobot};

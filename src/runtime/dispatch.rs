@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ use crate::control::tasks::cartesian::Goal;
 use crate::recording::notes::{Note, Notes};
 use crate::rt::host;
 use crate::rt::wake::Wake;
+use crate::sync::lock;
 use crate::telemetry::Outcome;
 use crate::telemetry::describe::Severity;
 use crate::trajectory::JointTrajectory;
@@ -189,9 +190,4 @@ impl Drop for Courier {
             let _ = thread.join();
         }
     }
-}
-
-/// Locks; a panic of another holder leaves plain data behind, which is as good as before.
-pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

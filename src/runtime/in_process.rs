@@ -1,43 +1,55 @@
-//! What rpc offers, for the program that holds the run: the same requests and answers, without a socket.
+//! What rpc offers, for the program that holds the run: the same requests and answers, without a socket and without
+//! JSON.
 
-use std::sync::Arc;
+use std::future::poll_fn;
+use std::sync::{Arc, LazyLock};
+use std::task::Poll;
+
+use tokio::runtime::{Builder, Handle, Runtime};
 
 use super::service::Service;
-use crate::rpc::api::{Backend, Method, Reply, Request};
+use crate::rpc::api::{Backend, METHODS, Method, Reply, Request};
 use crate::rpc::server::CALL_LIMIT;
 use crate::rpc::{Code, RpcError};
+
+/// What all calls of this process wait with. It has no threads: each call runs on the thread that makes it.
+static RUNTIME: LazyLock<std::io::Result<Runtime>> =
+    LazyLock::new(|| Builder::new_current_thread().enable_time().build());
 
 /// Asks all of it at once and waits for all answers, which come in the order of the requests.
 pub fn call<M: Method>(service: &Arc<Service>, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
     let requests: Vec<_> = requests.iter().map(typed).collect();
-    let answers = if tokio::runtime::Handle::try_current().is_err() {
-        wait_for(service, requests)
-    } else {
-        // On a thread of an async program, which cannot wait for a second one.
-        std::thread::scope(|scope| scope.spawn(|| wait_for(service, requests)).join()).unwrap_or_default()
-    };
+    let failed: Vec<_> = requests.iter().map(|_| Err(defect("no answer"))).collect();
+    let answers = wait_for(ask(service, requests)).unwrap_or(failed);
     answers.into_iter().map(|answer| answer.and_then(reply::<M>)).collect()
 }
 
-fn wait_for(service: &Arc<Service>, requests: Vec<Result<Request, RpcError>>) -> Vec<Result<Reply, RpcError>> {
-    let runtime = match tokio::runtime::Builder::new_current_thread().enable_time().build() {
-        Ok(runtime) => runtime,
-        Err(e) => return requests.iter().map(|_| Err(defect(&e.to_string()))).collect(),
+/// Waits for something on this thread; `None` where the system refuses what that takes.
+pub fn wait_for<T: Send>(something: impl Future<Output = T> + Send) -> Option<T> {
+    let runtime = RUNTIME.as_ref().ok()?;
+    if Handle::try_current().is_err() {
+        return Some(runtime.block_on(something));
+    }
+    // On a thread of an async program, which cannot wait for a second one.
+    std::thread::scope(|scope| scope.spawn(|| runtime.block_on(something)).join().ok())
+}
+
+async fn ask(service: &Arc<Service>, requests: Vec<Result<Request, RpcError>>) -> Vec<Result<Reply, RpcError>> {
+    let begin = |request: Result<Request, RpcError>| async move {
+        tokio::time::timeout(CALL_LIMIT, service.call(request?)).await.unwrap_or_else(late)
     };
-    runtime.block_on(async {
-        let begin = |request: Result<Request, RpcError>| {
-            let service = service.clone();
-            tokio::spawn(
-                async move { tokio::time::timeout(CALL_LIMIT, service.call(request?)).await.unwrap_or_else(late) },
-            )
-        };
-        let begun: Vec<_> = requests.into_iter().map(begin).collect();
-        let mut answers = Vec::with_capacity(begun.len());
-        for answer in begun {
-            answers.push(answer.await.unwrap_or_else(|e| Err(defect(&e.to_string()))));
+    let mut begun: Vec<_> = requests.into_iter().map(|request| (Box::pin(begin(request)), None)).collect();
+    poll_fn(|context| {
+        for (asked, answer) in begun.iter_mut().filter(|(_, answer)| answer.is_none()) {
+            if let Poll::Ready(answered) = asked.as_mut().poll(context) {
+                *answer = Some(answered);
+            }
         }
-        answers
+        let done = begun.iter().all(|(_, answer)| answer.is_some());
+        if done { Poll::Ready(()) } else { Poll::Pending }
     })
+    .await;
+    begun.into_iter().map(|(_, answer)| answer.unwrap_or_else(|| Err(defect("no answer")))).collect()
 }
 
 fn late(_: tokio::time::error::Elapsed) -> Result<Reply, RpcError> {
@@ -48,11 +60,11 @@ fn late(_: tokio::time::error::Elapsed) -> Result<Reply, RpcError> {
 /// The request as the service takes it, checked like one that came over the socket.
 fn typed<M: Method>(request: &M) -> Result<Request, RpcError> {
     request.check().map_err(|what| RpcError::new(Code::InvalidParams, format!("params of {:?}: {what}", M::NAME)))?;
-    Request::read(M::NAME, serde_json::to_value(request).map_err(|e| defect(&e.to_string()))?)
+    request.to_request().ok_or_else(|| RpcError::unknown(Code::UnknownMethod, "method", M::NAME, METHODS))
 }
 
 fn reply<M: Method>(reply: Reply) -> Result<M::Reply, RpcError> {
-    serde_json::to_value(reply).and_then(serde_json::from_value).map_err(|e| defect(&e.to_string()))
+    M::from_reply(reply).ok_or_else(|| defect("the answer is that to another request"))
 }
 
 /// What cannot happen, happened.

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::dispatch::lock;
 use super::service::Service;
 use crate::clock::WallOffset;
 use crate::rpc::api::Confirmation;
+use crate::sync::lock;
 use crate::telemetry::Phase;
 use crate::telemetry::describe::{Described, Severity};
 

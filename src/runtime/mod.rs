@@ -9,13 +9,14 @@
 mod arm_requests;
 mod arms;
 mod attached;
-mod build;
 mod builder;
+mod control_config;
 pub(crate) mod device_lock;
 mod dispatch;
 mod handle;
 mod in_process;
 mod late_stops;
+mod log_file;
 mod motion_requests;
 mod motions;
 mod plan_requests;
@@ -27,16 +28,19 @@ mod replan;
 mod reports;
 mod service;
 mod service_manager;
+mod start;
 mod stream_requests;
 mod task_kinds;
+mod tick;
+mod waiting;
 mod watchdog;
+mod wires;
 mod world_requests;
 
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
-use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 pub use attached::{AttachedPlanner, Turn};
@@ -56,14 +60,13 @@ use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
 use arms::Arms;
 use dispatch::{Courier, Dispatcher};
+use tick::Tick;
 use watchdog::Watchdog;
 
 /// How long moving arms get to come to rest.
 const REST_LIMIT: Duration = Duration::from_secs(2);
 /// How long an arm stands still before it is taken to be at rest: an instant is also where it turns round.
 const STILL_FOR: Duration = Duration::from_millis(50);
-/// How long the tick gets to end.
-const TICK_END_LIMIT: Duration = Duration::from_millis(300);
 
 /// Where a run is logged.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -194,7 +197,7 @@ pub struct Ended {
 pub struct Run {
     arms: Arms,
     pulse: Arc<Pulse>,
-    tick: Option<JoinHandle<()>>,
+    tick: Tick,
     watchdog: Watchdog,
     dispatcher: Arc<Dispatcher>,
     courier: Option<Courier>,
@@ -269,7 +272,9 @@ impl Run {
         self.handle.service.close();
         self.come_to_rest(&mut ended);
         self.watchdog.stand_down();
-        self.end_tick(&mut ended);
+        if !self.tick.end() {
+            ended.troubles.push("the tick thread does not end; it is left behind".to_owned());
+        }
         ended.troubles.extend(self.arms.release());
         self.courier = None;
         if let Err(e) = recorder.finish() {
@@ -278,55 +283,23 @@ impl Run {
         ended
     }
 
-    fn tick_lives(&self) -> bool {
-        self.tick.as_ref().is_some_and(|t| !t.is_finished())
-            && self
-                .pulse
-                .beat
-                .silence(self.arms.now())
-                .is_none_or(|s| s < watchdog::silence_limit(self.handle.service.period()))
-    }
-
     fn come_to_rest(&self, ended: &mut Ended) {
-        let limit = Instant::now() + REST_LIMIT;
         let told = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
-        let Ok(answer) = told else { return ended.troubles.push("the coordinator takes no requests".to_owned()) };
-        let mut answer = Some(answer);
-        let mut still_since = Instant::now();
-        while self.tick_lives() && Instant::now() < limit {
-            std::thread::sleep(Duration::from_millis(2));
-            if let Some(waiting) = &mut answer {
-                if waiting.try_recv().is_err() {
-                    continue;
-                }
-                answer = None;
-            }
+        let Ok(mut answer) = told else { return ended.troubles.push("the coordinator takes no requests".to_owned()) };
+        let (service, tick, pulse) = (&self.handle.service, &self.tick, &self.pulse);
+        let (mut taken, mut still_since) = (false, Instant::now());
+        let look = || {
+            taken = taken || answer.try_recv().is_ok();
             // That nothing is commanded to move is half of it: an arm that lags, or that was let go of, still moves.
-            if !self.pulse.at_rest.load(Ordering::Acquire) || !self.handle.service.at_standstill() {
+            if !(taken && pulse.at_rest.load(Ordering::Acquire) && service.at_standstill()) {
                 still_since = Instant::now();
-            } else if still_since.elapsed() >= STILL_FOR.max(2 * self.handle.service.period()) {
-                return;
             }
-        }
-        if self.tick_lives() {
+            let rests = still_since.elapsed() >= STILL_FOR.max(2 * service.period());
+            (rests || !tick.is_alive()).then_some(())
+        };
+        let rested = in_process::wait_for(service.until(Instant::now() + REST_LIMIT, look)).flatten();
+        if rested.is_none() && tick.is_alive() {
             ended.troubles.push(format!("the arms were not at rest after {} s", REST_LIMIT.as_secs()));
-        }
-    }
-
-    fn end_tick(&mut self, ended: &mut Ended) {
-        self.pulse.stop.store(true, Ordering::Release);
-        let hangs = !self.tick_lives();
-        let Some(tick) = self.tick.take() else { return };
-        let patience = if hangs { Duration::ZERO } else { TICK_END_LIMIT.max(2 * self.handle.service.period()) };
-        let limit = Instant::now() + patience;
-        while !tick.is_finished() && Instant::now() < limit {
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        if tick.is_finished() {
-            // A panic was told when it happened.
-            let _ = tick.join();
-        } else {
-            ended.troubles.push("the tick thread does not end; it is left behind".to_owned());
         }
     }
 }

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use serde_json::json;
 
-use super::dispatch::lock;
 use super::motions::{Carried, Planned};
 use super::service::{Service, internal};
 use crate::control::config::TaskKind;
@@ -13,6 +12,7 @@ use crate::control::point_to_point::{NoMotion, point_to_point};
 use crate::control::request::Motion;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 use crate::telemetry::Outcome;
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 

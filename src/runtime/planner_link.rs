@@ -7,7 +7,6 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::dispatch::lock;
 use super::planner_port::PlannerPort;
 use super::service::{Service, internal};
 use crate::control::config::{CoordinatorConfig, TaskKind};
@@ -20,6 +19,7 @@ use crate::rpc::api::{
 use crate::rpc::planner_line::{PlannerLine, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 use crate::telemetry::describe::Names;
 
 /// A state older than this is no place to plan from.

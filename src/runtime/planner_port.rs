@@ -6,7 +6,6 @@ use std::sync::Mutex;
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use super::dispatch::lock;
 use super::plan_requests::job;
 use super::recheck::Released;
 use super::service::internal;
@@ -19,6 +18,7 @@ use crate::planning::unplanned_joints::Measured;
 use crate::rpc::api::{CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject};
 use crate::rpc::api::{Request as Call, WorldAdd, WorldReport};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 
 /// A planner.
 pub struct PlannerPort {

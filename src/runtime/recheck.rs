@@ -4,7 +4,6 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::dispatch::lock;
 use super::motions::UnderWay;
 use super::plan_requests::all_positions;
 use super::planner_link::Planner;
@@ -16,6 +15,7 @@ use crate::planning::ahead::rests_before;
 use crate::planning::pipeline::PlannedMotion;
 use crate::rpc::api::{BlockedReport, Moment, Recheck, RecheckReply};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 use crate::telemetry::TaskState;
 
 /// The longest time to find out whether the rest of a motion is free; then it is cancelled.

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use super::dispatch::lock;
+use crate::sync::lock;
 use crate::telemetry::describe::Described;
 
 /// How often lines of one kind are told.

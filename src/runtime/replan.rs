@@ -4,19 +4,18 @@
 
 use std::time::{Duration, Instant};
 
-use super::dispatch::lock;
 use super::motions::UnderWay;
 use super::service::{Service, internal};
+use crate::joint::STANDSTILL;
 use crate::rpc::api::{ExecutePlan, Plan, Planning, Reply, Request as Call};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 use crate::telemetry::{Phase, TaskState};
 
 /// How long the arm may take to come to rest.
 const REST: Duration = Duration::from_secs(10);
 /// How often is looked whether it rests, or whether there is a plan.
 const INTERVAL: Duration = Duration::from_millis(10);
-/// Joints slower than this are at rest [rad/s].
-const STILL: f64 = 0.02;
 /// Requests for plans that are remembered.
 const REMEMBERED: usize = 64;
 
@@ -86,7 +85,7 @@ impl Service {
             let ends = matches!(view.state, TaskState::Executing | TaskState::Cancelling);
             let still = |joint: &u16| {
                 let (arm, j) = self.locate(*joint)?;
-                self.arm_view(arm)?.state.velocity.get(j).map(|velocity| velocity.abs() <= STILL)
+                self.arm_view(arm)?.state.velocity.get(j).map(|velocity| velocity.abs() <= STANDSTILL)
             };
             if !ends && motion.joints.iter().all(|joint| still(joint).unwrap_or(false)) {
                 return Ok(());

@@ -3,7 +3,6 @@
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
 
-use super::dispatch::lock;
 use super::motions::{End, Next};
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
@@ -14,6 +13,7 @@ use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
 use crate::rt::histogram::Figures;
+use crate::sync::lock;
 use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, outcome_text, reason_text};
 use crate::telemetry::{Cause, Outcome, Reason, TaskState};
 
@@ -89,6 +89,7 @@ impl Service {
             stop_pending: self.late_stops.is_waiting(index),
             enabled: view.state.enabled,
             mode: view.state.mode.name().to_owned(),
+            device_state: health.codes().map(|codes| DeviceState { state: codes.state, mode: codes.mode }),
             error: (view.state.error != 0).then(|| DeviceError { code: view.state.error, text: health.error_text() }),
             state_age_ms: self.age_ms(&view.state),
             measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),

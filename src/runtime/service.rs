@@ -9,12 +9,13 @@ use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use super::Ending;
-use super::dispatch::{Dispatcher, NotTold, lock, log_of};
+use super::dispatch::{Dispatcher, NotTold, log_of};
 use super::late_stops::LateStops;
 use super::motions::Motions;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
 use super::repeats::Repeats;
+use super::waiting::Progress;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
 use crate::clock::{Mono, WallOffset};
@@ -22,6 +23,7 @@ use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device::{Connected, Device};
+use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
 use crate::rpc::place::Claim;
@@ -31,13 +33,9 @@ use crate::rpc::streams::Streams;
 use crate::rpc::{Code, RpcError, Subject};
 use crate::rt::host::{self, Grant};
 use crate::rt::slot::SlotReader;
+use crate::sync::lock;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
-
-/// How long a device takes to refuse an opening of its gripper.
-const GRIPPER_REPLY: Duration = Duration::from_millis(20);
-/// A joint slower than this stands still, for all that noise of its measurement tells [rad/s].
-pub(super) const STANDSTILL: f64 = 0.02;
 
 /// What a service is made from.
 pub struct ServiceParts {
@@ -67,6 +65,9 @@ pub struct Service {
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
     pub(super) repeats: Repeats,
     pub(super) late_stops: LateStops,
+    pub(super) progress: Progress,
+    /// One gripper order at a time and arm, so that each has its own answer.
+    pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
     /// Ticks done when the joint state was published last.
     pub(super) published: AtomicU64,
     /// The planner that is attached, or was.
@@ -83,6 +84,8 @@ pub struct Service {
 impl Service {
     pub fn new(parts: ServiceParts, me: Weak<Self>) -> Self {
         Self {
+            progress: Progress::default(),
+            grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             parts,
             started: Instant::now(),
             motions: Mutex::default(),
@@ -240,24 +243,6 @@ impl Service {
         // Behind what moves: a planner in another process may take its time.
         let planning = call.task.is_none() && self.cancel_planning().await;
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
-    }
-
-    async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
-        let arm = self.arm_index(&call.arm)?;
-        if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
-            return self.refusal(&Outcome::NoGripper(arm)).map_or_else(|| Err(internal()), Err);
-        }
-        let device = self.device(arm)?;
-        let refusals = device.health().write_errors.load(Ordering::Relaxed);
-        self.ask(Request::Gripper { arm, opening: call.position }).await?;
-        // The tick hands the opening over without knowing what the gripper can do; the arm says so at once.
-        tokio::time::sleep(self.period() + GRIPPER_REPLY).await;
-        if device.health().write_errors.load(Ordering::Relaxed) > refusals {
-            let why = device.health().episodes().pop().map_or_else(String::new, |e| e.text);
-            let error = RpcError::new(Code::DeviceRefused, format!("{}: {why}", call.arm));
-            return Err(error.hint("`dimos state` shows the gripper's opening now, in metres"));
-        }
-        Ok(Reply::Gripper(Done {}))
     }
 
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 
 use nalgebra::Isometry3;
 
-use super::dispatch::lock;
 use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index, spec};
 use super::service::internal;
 use crate::collision::Solid;
@@ -15,6 +14,7 @@ use crate::planning::planning_scene::{PlannedRobot, obstacle};
 use crate::robot::kinematics::{frame, pose};
 use crate::rpc::api::{self, Done, Moment, ShapeSpec, WorldObject};
 use crate::rpc::{Code, RpcError};
+use crate::sync::lock;
 
 impl PlannerPort {
     pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<Done, RpcError> {

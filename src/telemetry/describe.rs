@@ -5,6 +5,7 @@
 use serde::Serialize;
 
 use super::{Age, Bound, Cause, Event, LimitKind, Outcome, Phase, Reason, TaskState};
+use crate::named::named;
 
 /// The names behind the tick's indices, in the order of the blueprint.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -42,26 +43,17 @@ impl Names {
     }
 }
 
-/// Severity of an event.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Severity {
-    /// Normal operation.
-    Info,
-    /// A request or a command was not carried out as wanted.
-    Warn,
-    /// An arm is held, or the tick misses its deadlines.
-    Error,
-}
-
-impl Severity {
-    /// Returns its name in rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Info => "info",
-            Self::Warn => "warn",
-            Self::Error => "error",
-        }
+named! {
+    /// Severity of an event.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+    #[serde(rename_all = "lowercase")]
+    pub enum Severity {
+        /// Normal operation.
+        Info = "info",
+        /// A request or a command was not carried out as wanted.
+        Warn = "warn",
+        /// An arm is held, or the tick misses its deadlines.
+        Error = "error",
     }
 }
 

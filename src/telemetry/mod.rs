@@ -5,6 +5,7 @@ pub mod describe;
 
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
+use crate::named::named;
 
 /// One entry of the ring.
 // The ring holds values: a box would allocate in the tick.
@@ -55,35 +56,23 @@ pub struct TickSample {
     pub dropped: u32,
 }
 
-/// Phase of an arm.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Phase {
-    /// No state yet.
-    #[default]
-    Unknown,
-    /// Motors off: no commands are sent.
-    Disabled,
-    /// Just enabled: holds its position for the duration of the ramp.
-    Activating,
-    /// Holds or follows its tasks.
-    Ready,
-    /// Latched hold after a stop or a fault: waits for `reset`.
-    Held,
-    /// Reset after a latched hold: waits for `enable`. Holds, if powered.
-    Standby,
-}
-
-impl Phase {
-    /// Returns its name in tables, rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::Disabled => "disabled",
-            Self::Activating => "activating",
-            Self::Ready => "ready",
-            Self::Held => "held",
-            Self::Standby => "standby",
-        }
+named! {
+    /// Phase of an arm.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum Phase {
+        /// No state yet.
+        #[default]
+        Unknown = "unknown",
+        /// Motors off: no commands are sent.
+        Disabled = "disabled",
+        /// Just enabled: holds its position for the duration of the ramp.
+        Activating = "activating",
+        /// Holds or follows its tasks.
+        Ready = "ready",
+        /// Latched hold after a stop or a fault: waits for `reset`.
+        Held = "held",
+        /// Reset after a latched hold: waits for `enable`. Holds, if powered.
+        Standby = "standby",
     }
 }
 
@@ -170,35 +159,23 @@ impl Cause {
     }
 }
 
-/// State of a task, with the reference system's names.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum TaskState {
-    /// Idle.
-    #[default]
-    Idle,
-    /// In motion, or following a stream.
-    Executing,
-    /// Decelerating after a cancel.
-    Cancelling,
-    /// Reached its goal.
-    Completed,
-    /// Ended elsewhere.
-    Aborted,
-    /// A command was rejected as unsafe for the arm.
-    Fault,
-}
-
-impl TaskState {
-    /// Returns its name in tables, rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Idle => "IDLE",
-            Self::Executing => "EXECUTING",
-            Self::Cancelling => "CANCELLING",
-            Self::Completed => "COMPLETED",
-            Self::Aborted => "ABORTED",
-            Self::Fault => "FAULT",
-        }
+named! {
+    /// State of a task, with the reference system's names.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+    pub enum TaskState {
+        /// Idle.
+        #[default]
+        Idle = "IDLE",
+        /// In motion, or following a stream.
+        Executing = "EXECUTING",
+        /// Decelerating after a cancel.
+        Cancelling = "CANCELLING",
+        /// Reached its goal.
+        Completed = "COMPLETED",
+        /// Ended elsewhere.
+        Aborted = "ABORTED",
+        /// A command was rejected as unsafe for the arm.
+        Fault = "FAULT",
     }
 }
 
@@ -246,25 +223,16 @@ pub enum Bound {
     Invalid,
 }
 
-/// Effect of a limit on a command.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LimitKind {
-    /// Position held inside its range.
-    Position,
-    /// Velocity reduced.
-    Velocity,
-    /// Acceleration reduced.
-    Acceleration,
-}
-
-impl LimitKind {
-    /// Returns its name in rpc and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Position => "position",
-            Self::Velocity => "velocity",
-            Self::Acceleration => "acceleration",
-        }
+named! {
+    /// Effect of a limit on a command.
+    #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+    pub enum LimitKind {
+        /// Position held inside its range.
+        Position = "position",
+        /// Velocity reduced.
+        Velocity = "velocity",
+        /// Acceleration reduced.
+        Acceleration = "acceleration",
     }
 }
 

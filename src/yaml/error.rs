@@ -4,6 +4,7 @@ use std::fmt;
 
 use serde::de::{Expected, Unexpected};
 
+use crate::message::Message;
 use crate::yaml::tree::NodeId;
 
 /// Kind of error.
@@ -64,11 +65,8 @@ impl std::error::Error for ReadError {}
 impl serde::de::Error for ReadError {
     /// Splits a `hint: …` line off the message.
     fn custom<T: fmt::Display>(message: T) -> Self {
-        let message = message.to_string();
-        match message.split_once("\nhint: ") {
-            Some((message, hint)) => Self::value(message, Some(hint.to_owned())),
-            None => Self::value(message, None),
-        }
+        let Message { what, hint } = Message::of(message);
+        Self::value(what, hint)
     }
 
     fn invalid_type(found: Unexpected<'_>, expected: &dyn Expected) -> Self {

@@ -227,6 +227,17 @@ fn the_written_blueprint_reads_back_the_same() {
 }
 
 #[test]
+fn a_live_view_is_warned_of_and_runs_all_the_same() {
+    let in_planner = Overrides { set: vec!["planner.visualization.port=7000".to_owned()], sim: true };
+    let in_planner = load(&find("yourarm-planner").unwrap(), &in_planner, &fake_arms::registry());
+    for loaded in [set(&["view.port=7000"]), in_planner] {
+        assert_eq!((loaded.errors(), loaded.warnings()), (0, 1), "{}", loaded.render(false));
+        assert!(loaded.render(false).contains("the live view is not in this version"), "{}", loaded.render(false));
+    }
+    assert_eq!(set(&["view.backend=none"]).warnings(), 0);
+}
+
+#[test]
 fn json_has_places_and_hints() {
     let json = set(&["hardware.arm.adress=1.2.3.4"]).to_json();
     assert_eq!(json["ok"], false);

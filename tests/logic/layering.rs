@@ -6,8 +6,11 @@ use std::path::{Path, PathBuf};
 
 /// Every module of `src/`, with the modules that it may use besides itself. `ALL`: everything above it.
 const ALL: &[&str] = &["*"];
-const VOCABULARY: &[&str] = &["joint", "arm", "trajectory", "clock", "telemetry", "yaml"];
+const VOCABULARY: &[&str] = &["message", "named", "sync", "joint", "arm", "trajectory", "clock", "telemetry", "yaml"];
 const LAYERS: &[(&str, &[&str])] = &[
+    ("message", &[]),
+    ("named", &[]),
+    ("sync", &[]),
     ("joint", &[]),
     ("arm", &[]),
     ("trajectory", &[]),

@@ -88,6 +88,53 @@ fn another_reader_reads_the_same() {
     }
 }
 
+/// Makes two robots differ by nothing but rounding of their poses.
+fn same_robot(what: &str, a: &RobotModel, b: &RobotModel) {
+    fn poses(robot: &mut RobotModel) -> Vec<Isometry3<f64>> {
+        let mut all: Vec<_> = robot.joints.iter_mut().map(|joint| std::mem::take(&mut joint.origin)).collect();
+        for link in &mut robot.links {
+            let shapes = link.visuals.iter_mut().chain(&mut link.collisions);
+            all.extend(shapes.map(|shape| std::mem::take(&mut shape.origin)));
+            all.extend(link.inertial.iter_mut().map(|inertial| std::mem::take(&mut inertial.origin)));
+        }
+        all
+    }
+    let (mut a, mut b) = (a.clone(), b.clone());
+    let (in_a, in_b) = (poses(&mut a), poses(&mut b));
+    assert_eq!(a, b, "{what}");
+    for (one, other) in in_a.iter().zip(&in_b) {
+        assert!((one.to_homogeneous() - other.to_homogeneous()).amax() < 1e-9, "{what}: {one} {other}");
+    }
+}
+
+#[test]
+fn a_robot_goes_through_urdf_rs_and_back() {
+    for name in builtin::NAMES {
+        let text = builtin::text(name).unwrap();
+        let ours = dimos::robot::urdf::from_text(name, text).unwrap();
+        let theirs = urdf_rs::Robot::from(&ours);
+        same_robot(name, &ours, &RobotModel::try_from(&theirs).unwrap());
+        // As a file, and as their reader has it.
+        let written = urdf_rs::write_to_string(&theirs).unwrap();
+        let read = urdf_rs::read_from_string(&written).unwrap();
+        same_robot(name, &ours, &RobotModel::try_from(&read).unwrap());
+        same_robot(name, &ours, &RobotModel::try_from(&urdf_rs::read_from_string(text).unwrap()).unwrap());
+    }
+}
+
+#[test]
+fn what_urdf_rs_takes_for_a_robot_is_checked_all_the_same() {
+    let text = builtin::text("yourarm").unwrap();
+    let with = |change: &dyn Fn(&mut urdf_rs::Robot)| {
+        let mut robot = urdf_rs::read_from_string(text).unwrap();
+        change(&mut robot);
+        RobotModel::try_from(&robot).unwrap_err().to_string()
+    };
+    assert!(with(&|robot| robot.joints[1].child.link = "link1".into()).contains("two parents"));
+    assert!(with(&|robot| robot.joints[0].joint_type = urdf_rs::JointType::Floating).contains("cannot be driven"));
+    assert!(with(&|robot| drop(robot.joints.pop())).contains("hangs on nothing"));
+}
+
 /// Poses of links in the frame of `base`, for joints by name.
 fn poses(robot: &RobotModel, base: &str, joints: &HashMap<String, f64>) -> HashMap<String, Isometry3<f64>> {
     let all = robot.link_poses(&robot.positions(joints));

@@ -16,3 +16,4 @@ pub mod terminal;
 pub mod uml;
 pub mod virtual_run;
 pub mod wire;
+pub mod wrapped;

@@ -94,19 +94,10 @@ pub fn joints(row: &AdapterSpec) -> String {
     }
 }
 
-/// An adapter's error as a failure: its last line may be a hint.
-pub fn failure(exit: Exit, error: &AdapterError) -> Failure {
-    let text = error.to_string();
-    match text.split_once("\nhint: ") {
-        Some((what, hint)) => Failure::new(exit, what).hint(hint),
-        None => Failure::new(exit, text),
-    }
-}
-
 /// Why an emulator does not start: what was asked for cannot be, or the computer does not give what it needs.
 pub fn not_started(error: AdapterError) -> Failure {
     let exit = if matches!(error, AdapterError::Rejected(_)) { Exit::Usage } else { Exit::Hardware };
-    failure(exit, &error)
+    Failure::of(exit, error)
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use std::io::{self, BufRead, IsTerminal};
 use std::path::PathBuf;
 use std::time::Duration;
 
+use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
@@ -12,7 +13,7 @@ use rustix::io::Errno;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
-use super::choice::{Choice, failure, not_started};
+use super::choice::{Choice, not_started};
 use super::report::{Arm, Limits, Report, Row};
 use crate::hardware::conformance::lag::Lag;
 use crate::hardware::conformance::{Check, Made, Subject, checks, figures, gently, run_all};
@@ -83,9 +84,9 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     if args.lag && bench.subject.real && !args.allow_motion {
         return Err(Failure::usage("--lag moves the arm").hint("add --allow-motion"));
     }
-    let mut adapter = (row.create)(&bench.subject.config).map_err(|e| failure(Exit::Usage, &e))?;
+    let mut adapter = (row.create)(&bench.subject.config).map_err(|e| Failure::of(Exit::Usage, e))?;
     let unreachable = |e: AdapterError| {
-        let failure = failure(Exit::Hardware, &e);
+        let failure = Failure::of(Exit::Hardware, e);
         let hint = format!("is it powered, and is the address right ({})?", row.address.form);
         if failure.hint.is_none() && bench.subject.real { failure.hint(hint) } else { failure }
     };
@@ -267,19 +268,16 @@ impl Args {
             report.conclude();
         }
         let Some(path) = &self.report else { return Ok(()) };
-        std::fs::write(path, report.markdown())
-            .map_err(|e| Failure::new(Exit::Failed, format!("--report {}: {e}", path.display())))
+        Ok(std::fs::write(path, report.markdown()).with_context(|| format!("--report {}", path.display()))?)
     }
 }
 
 /// Connects to an arm that is to be moved, unless something speaks against moving it from where it stands.
 fn connect_to_move(adapter: &mut dyn ManipulatorAdapter) -> Result<()> {
-    adapter.connect().map_err(|e| failure(Exit::Hardware, &e))?;
+    adapter.connect().map_err(|e| Failure::of(Exit::Hardware, e))?;
     let Err(why) = gently::refusal(adapter) else { return Ok(()) };
     adapter.disconnect();
-    let (what, hint) = why.split_once("\nhint: ").unwrap_or((&why, ""));
-    let failure = Failure::new(Exit::Failed, format!("not moved: {what}"));
-    Err(if hint.is_empty() { failure } else { failure.hint(hint) })
+    Err(Failure::of(Exit::Failed, format!("not moved: {why}")))
 }
 
 /// Asks, where somebody can answer.

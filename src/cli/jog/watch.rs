@@ -1,18 +1,20 @@
 //! Reads the run while jog drives, on its own connection and thread, so that it never delays a command.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use serde_json::Value;
 
-use crate::cli::exit::{Exit, Failure, Result};
+use crate::cli::exit::{Failure, Result};
 use crate::rpc::api::{State, Status};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::place::RunFolder;
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
 use crate::rpc::streams::{Stream, Subscribe};
+use crate::sync::lock;
 
 /// Period of reading the joints.
 const STATE_PERIOD: Duration = Duration::from_millis(50);
@@ -58,7 +60,7 @@ impl Watch {
             }
         };
         let thread = std::thread::Builder::new().name("jog-watch".into()).spawn(reading);
-        let thread = thread.map_err(|e| Failure::new(Exit::Failed, format!("no thread to read the run: {e}")))?;
+        let thread = thread.context("no thread to read the run")?;
         Ok(Self { seen, ending, thread: Some(thread) })
     }
 
@@ -80,10 +82,6 @@ impl Drop for Watch {
             let _ = thread.join();
         }
     }
-}
-
-fn lock(seen: &Mutex<ArmSnapshot>) -> std::sync::MutexGuard<'_, ArmSnapshot> {
-    seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn read(

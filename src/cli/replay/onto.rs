@@ -5,6 +5,7 @@ use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
@@ -46,8 +47,7 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Re
     }
     let plan = plan(&blueprint, &fit(&motion).scaled(args.rate)).map_err(split)?;
     refuse_real_arms(&blueprint, args.onto.allow_motion)?;
-    let terminal = Terminal::start()
-        .map_err(|e| Failure::new(Exit::Failed, format!("cannot start the thread of the text log: {e}")))?;
+    let terminal = Terminal::start().context("cannot start the thread of the text log")?;
     let signals = Signals::watch_with_hangup();
     // The motors are enabled after the limits have been checked.
     let wanted: Vec<bool> = blueprint.arms.iter().map(|arm| arm.auto_enable).collect();
@@ -93,11 +93,7 @@ fn refuse_real_arms(blueprint: &Blueprint, allowed: bool) -> Result<()> {
 
 /// Splits a hint off an error's text: a usage error.
 fn split(error: impl std::fmt::Display) -> Failure {
-    let text = error.to_string();
-    match text.split_once("\nhint: ") {
-        Some((what, hint)) => Failure::usage(what).hint(hint),
-        None => Failure::usage(text),
-    }
+    Failure::of(Exit::Usage, error)
 }
 
 /// Why the motion ended early.

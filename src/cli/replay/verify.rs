@@ -2,14 +2,14 @@
 
 use std::path::Path;
 
-use super::{DATA_LOST, DIFFERENT};
+use crate::cli::exit::Exit;
 use crate::cli::output;
 use crate::replay::compare::Difference;
 use crate::replay::recorded::RecordedError;
 use crate::replay::verify::{Finding, Verification, verify};
 
-/// Verifies a log and prints the result. Returns the exit code.
-pub fn run(path: &Path, json: bool) -> Result<u8, RecordedError> {
+/// Verifies a log and prints the result.
+pub fn run(path: &Path, json: bool) -> Result<Exit, RecordedError> {
     let found = verify(path)?;
     if json {
         output::json(&found);
@@ -17,9 +17,9 @@ pub fn run(path: &Path, json: bool) -> Result<u8, RecordedError> {
         print(&found);
     }
     Ok(match found.finding {
-        Finding::Reproducible => 0,
-        Finding::Different(_) => DIFFERENT,
-        Finding::Incomplete { .. } => DATA_LOST,
+        Finding::Reproducible => Exit::Ok,
+        Finding::Different(_) => Exit::Failed,
+        Finding::Incomplete { .. } => Exit::DATA_LOST,
     })
 }
 

@@ -5,11 +5,10 @@ use crate::control::config::TrajectoryParams;
 use crate::control::path_clock::{PathClock, RateLimits};
 use crate::control::request::Motion;
 use crate::control::task::{Claim, Context};
+use crate::joint::TICK_STANDSTILL;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 use crate::trajectory::{Cursor, Sample};
 
-/// An arrived joint moves no faster than this [rad/s].
-const STANDSTILL: f64 = 0.05;
 /// The shortest time over which the difference between the first point and the last command is faded out [s].
 const SHORTEST_FADE: f64 = 0.2;
 
@@ -187,7 +186,7 @@ impl TrajectoryTask {
         motion.joints.iter().zip(&self.samples).find_map(|(&joint, sample)| {
             let view = cx.joint(joint);
             let error = view.position - sample.position;
-            let arrived = error.abs() <= self.params.goal_tolerance && view.velocity.abs() <= STANDSTILL;
+            let arrived = error.abs() <= self.params.goal_tolerance && view.velocity.abs() <= TICK_STANDSTILL;
             (!arrived).then_some((joint, error))
         })
     }

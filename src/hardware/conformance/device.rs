@@ -111,16 +111,7 @@ fn modes(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     context.activate()?;
     let start = context.positions()?;
-    let all = [
-        ControlMode::Position,
-        ControlMode::ServoPosition,
-        ControlMode::Velocity,
-        ControlMode::Torque,
-        ControlMode::Cartesian,
-        ControlMode::CartesianVelocity,
-        ControlMode::Impedance,
-    ];
-    for mode in all {
+    for &mode in ControlMode::ALL {
         let result = context.set_mode(mode);
         if context.row.modes.contains(&mode) {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;

@@ -2,9 +2,12 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock};
 
 use crate::clock::Mono;
+use crate::hardware::spec::{AdapterError, AdapterResult, RobotState};
+use crate::rt::wake::Wake;
+use crate::sync::lock;
 
 /// Episodes that are remembered.
 const EPISODES: usize = 16;
@@ -55,6 +58,11 @@ pub struct Health {
     /// Mean time between states [ns]; a mean of rates would count short pauses for too much.
     interval_ns: AtomicU64,
     text: Mutex<Text>,
+    codes: Mutex<Option<RobotState>>,
+    /// `ArmCommand::gripper_seq` of the last gripper order that was answered, and the answer.
+    gripper: Mutex<Option<(u32, AdapterResult<()>)>>,
+    /// Raised when an order that came with a command has its answer.
+    listener: OnceLock<Wake>,
 }
 
 #[derive(Debug, Default)]
@@ -84,24 +92,63 @@ impl Health {
         }
     }
 
+    /// Raises `wake` whenever an order that came with a command (a stop, a gripper opening) has its answer.
+    pub fn wake_on_answers(&self, wake: Wake) {
+        let _ = self.listener.set(wake);
+    }
+
+    /// What the arm answered to the gripper order with this `ArmCommand::gripper_seq`; `None`: nothing yet.
+    pub fn gripper_answer(&self, order: u32) -> Option<AdapterResult<()>> {
+        let last = lock(&self.gripper);
+        match last.as_ref()? {
+            (answered, result) if *answered == order => Some(result.clone()),
+            // Sequence numbers wrap around: the nearer half of them is newer.
+            (answered, _) if answered.wrapping_sub(order) < u32::MAX / 2 => {
+                Some(Err(AdapterError::Rejected("a newer gripper order replaced it".to_owned())))
+            }
+            _ => None,
+        }
+    }
+
+    pub(super) fn answer_gripper(&self, order: u32, result: AdapterResult<()>) {
+        *lock(&self.gripper) = Some((order, result));
+        self.answered();
+    }
+
+    /// An order that came with a command has its answer.
+    pub(super) fn answered(&self) {
+        if let Some(listener) = self.listener.get() {
+            listener.raise();
+        }
+    }
+
     /// Text of the device's present error; empty when there is none.
     pub fn error_text(&self) -> String {
-        self.lock().error.clone()
+        lock(&self.text).error.clone()
     }
 
     pub(super) fn set_error_text(&self, text: String) {
-        self.lock().error = text;
+        lock(&self.text).error = text;
+    }
+
+    /// The device's own state and mode codes; `None` before they were read, and where it has none.
+    pub fn codes(&self) -> Option<RobotState> {
+        *lock(&self.codes)
+    }
+
+    pub(super) fn set_codes(&self, codes: RobotState) {
+        *lock(&self.codes) = Some(codes);
     }
 
     /// Recent episodes, the newest last.
     pub fn episodes(&self) -> Vec<Episode> {
-        self.lock().episodes.iter().cloned().collect()
+        lock(&self.text).episodes.iter().cloned().collect()
     }
 
     /// Trouble was seen. `true`: it is new, and worth a line. What comes again before all is well is not new, also
     /// when other trouble came between: an arm that is gone fails at reads and writes in turn.
     pub(super) fn trouble(&self, now: Mono, text: &str) -> bool {
-        let mut all = self.lock();
+        let mut all = lock(&self.text);
         let open = all.episodes.back_mut().filter(|e| e.until.is_none());
         if let Some(open) = open {
             open.count += 1;
@@ -122,22 +169,33 @@ impl Health {
 
     /// All is well again. Answers what is over.
     pub(super) fn over(&self, now: Mono) -> Option<String> {
-        let mut all = self.lock();
+        let mut all = lock(&self.text);
         let last = all.episodes.back_mut().filter(|e| e.until.is_none())?;
         last.until = Some(now);
         let text = last.text.clone();
         all.told.clear();
         Some(text)
     }
-
-    fn lock(&self) -> std::sync::MutexGuard<'_, Text> {
-        self.text.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_gripper_order_has_its_own_answer() {
+        let (health, wake) = (Health::default(), Wake::new().unwrap());
+        health.wake_on_answers(wake.clone());
+        assert_eq!(health.gripper_answer(1), None);
+        health.answer_gripper(1, Err(AdapterError::Unsupported));
+        assert!(wake.wait(std::time::Duration::ZERO));
+        assert_eq!(health.gripper_answer(1), Some(Err(AdapterError::Unsupported)));
+        assert_eq!(health.gripper_answer(2), None, "the answer to the order before says nothing about this one");
+        health.answer_gripper(3, Ok(()));
+        assert!(matches!(health.gripper_answer(2), Some(Err(AdapterError::Rejected(_)))), "it never reached the arm");
+        health.answer_gripper(u32::MAX, Ok(()));
+        assert_eq!(health.gripper_answer(0), None, "numbers wrap around");
+    }
 
     #[test]
     fn trouble_is_told_once_until_it_is_over() {

@@ -12,8 +12,8 @@ use super::wire_guard::WireGuard;
 use super::{Connected, DeviceConfig, Health, Note, Order};
 use crate::arm::{ArmCommand, ArmState, Interference, Link, VelocitySource};
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, Stop};
-use crate::joint::{ControlMode, JointLimits};
+use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, RobotState, Stop};
+use crate::joint::{ControlMode, JointLimits, STANDSTILL};
 use crate::rt::due::Due;
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, SlotWriter};
@@ -28,15 +28,19 @@ const MAX_IN_FLIGHT: u32 = 2;
 const INTERFERENCE_READINGS: u32 = 2;
 /// The longest delay of this thread that does not count for the tick's silence.
 const LONGEST_DELAY: Duration = Duration::from_millis(100);
+/// Cycles in which everything is read once, where each read costs a round trip; in which of them the error code is read,
+/// and the motors' state.
+const TURNS: u8 = 6;
+const ERROR_TURN: u8 = 0;
+const ENABLED_TURN: u8 = 1;
 /// Waits between two attempts to connect again.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(5));
 /// How long an arm may refuse a change of mode because it still moves.
 const MODE_LIMIT: Duration = Duration::from_secs(1);
 /// How long `activate` waits for plausible states, and for the motors.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(1);
-/// How long a stopped arm gets to stand still before its motors are disabled, and what counts as standing [rad/s, s].
+/// How long a stopped arm gets to stand still before its motors are disabled, and for how long it must stand [s].
 const REST_LIMIT: Duration = Duration::from_secs(1);
-const STANDSTILL: f64 = 0.02;
 const STILL_FOR: f64 = 0.03;
 
 /// What the thread shares with its handle.
@@ -55,6 +59,7 @@ pub(super) struct Worker {
     due: Arc<Due>,
     state: ArmState,
     reading: JointReading,
+    codes: Option<RobotState>,
     last: ArmCommand,
     /// A stop that the arm has not taken yet. Kept until it does, also over a new connection.
     stop_owed: bool,
@@ -118,6 +123,7 @@ impl Worker {
             health,
             state,
             reading: JointReading::default(),
+            codes: None,
             last: ArmCommand::default(),
             stop_owed: false,
             gripper_stop: GripperStop::default(),
@@ -196,8 +202,11 @@ impl Worker {
                     self.pass_on_command(adapter);
                 }
             }
-        } else if self.wanted && self.config.clock.now() >= self.reconnect.0 {
-            self.connect_again(adapter);
+        } else {
+            self.skip_command();
+            if self.wanted && self.config.clock.now() >= self.reconnect.0 {
+                self.connect_again(adapter);
+            }
         }
         false
     }
@@ -213,6 +222,7 @@ impl Worker {
             Order::Disable(reply) => {
                 self.expect_nothing(Some(false));
                 let result = self.while_connected(adapter, |a| a.write_enable(false));
+                self.turn = ENABLED_TURN;
                 self.read(adapter);
                 let _ = reply.send(result);
             }
@@ -220,6 +230,7 @@ impl Worker {
                 self.write_errors = 0;
                 self.expect_nothing(Some(self.state.enabled));
                 let result = self.while_connected(adapter, |a| a.write_clear_errors());
+                self.turn = ERROR_TURN;
                 self.read(adapter);
                 let _ = reply.send(result);
             }
@@ -267,7 +278,7 @@ impl Worker {
         if self.speed == 0.0 {
             self.set_limits(&limits);
         }
-        self.take_command();
+        self.skip_command();
         self.read(adapter);
         let write_period = self.config.write_period(adapter.set_point_period());
         self.guard.set_period(write_period);
@@ -332,7 +343,7 @@ impl Worker {
         self.gripper_stop.end();
         self.write_errors = 0;
         self.turn = 0;
-        for _ in 0..6 {
+        for _ in 0..TURNS {
             self.read(adapter);
         }
         Ok(())
@@ -382,6 +393,14 @@ impl Worker {
         std::mem::replace(&mut self.last, command)
     }
 
+    /// Takes the newest command while there is no connection: a stop is kept for later, a gripper order is refused.
+    fn skip_command(&mut self) {
+        let before = self.take_command();
+        if self.last.gripper_seq != before.gripper_seq {
+            self.health.answer_gripper(self.last.gripper_seq, Err(AdapterError::NotConnected));
+        }
+    }
+
     /// Whether the arm is being moved by commands, as far as this thread lets them through.
     fn moving(&self) -> bool {
         self.connected && self.last.mode.is_some() && !self.state.self_held
@@ -398,10 +417,13 @@ impl Worker {
         if adapter.state_fd().is_none() {
             self.read_before(command.next_tick);
         }
-        if self.state.self_held {
+        if command.gripper_seq != before.gripper_seq {
+            self.move_gripper(adapter, &command);
+        }
+        if self.state.self_held || !self.connected {
             return;
         }
-        match self.write(adapter, &before, &command) {
+        match self.write(adapter, &command) {
             Ok(()) if self.stop_owed => {}
             Ok(()) => self.write_errors = 0,
             // Not sent, and no failure: the tick sees that it was not written.
@@ -415,6 +437,30 @@ impl Worker {
         }
         // At once: the next tick continues from what was written.
         self.states.write(&self.state);
+    }
+
+    /// Commands the gripper and answers that order. A refusal costs the joints nothing.
+    fn move_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter, command: &ArmCommand) {
+        let result = if self.state.self_held {
+            Err(AdapterError::Rejected("the arm is held; `arm enable` makes it ready again".to_owned()))
+        } else {
+            self.gripper_stop.end();
+            adapter.write_gripper_position(command.gripper)
+        };
+        match &result {
+            Ok(()) => {}
+            Err(error @ (AdapterError::Rejected(_) | AdapterError::Unsupported | AdapterError::Fault { .. })) => {
+                self.health.write_errors.fetch_add(1, Relaxed);
+                self.trouble(&format!("the gripper did not take its order: {error}"));
+            }
+            Err(error) => {
+                if matches!(error, AdapterError::Timeout(_)) {
+                    self.in_flight += 1;
+                }
+                self.not_taken(adapter, "the gripper did not take its order", error);
+            }
+        }
+        self.health.answer_gripper(command.gripper_seq, result);
     }
 
     /// Set points that the arm did not acknowledge must not reach it later: with two of them, or with one and no state,
@@ -453,32 +499,19 @@ impl Worker {
         self.next_read = self.next_read.min(next_tick.before(lead)).max(earliest);
     }
 
-    fn write(
-        &mut self,
-        adapter: &mut dyn ManipulatorAdapter,
-        before: &ArmCommand,
-        command: &ArmCommand,
-    ) -> AdapterResult<()> {
-        // A refused gripper costs the joints nothing.
-        let gripper = match command.gripper_seq == before.gripper_seq {
-            true => Ok(()),
-            false => {
-                self.gripper_stop.end();
-                adapter.write_gripper_position(command.gripper)
-            }
-        };
-        let Some(mode) = command.mode else { return gripper };
+    fn write(&mut self, adapter: &mut dyn ManipulatorAdapter, command: &ArmCommand) -> AdapterResult<()> {
+        let Some(mode) = command.mode else { return Ok(()) };
         // Another mode than the one that was ordered is somebody else's: it is left alone, and shows in the next state.
         let foreign = self.ordered_mode == Some(mode) && adapter.get_control_mode() != mode;
         if foreign || self.state.interference != Interference::None {
-            return gripper;
+            return Ok(());
         }
         if adapter.get_control_mode() != mode {
             self.ordered_mode = None;
             match adapter.set_control_mode(mode) {
                 // The arm may hold itself to be moving for a moment longer than we do: the tick waits for the mode,
                 // and this is asked again with the next command.
-                Err(AdapterError::Rejected(_)) if !self.waited_too_long_for_a_mode() => return gripper,
+                Err(AdapterError::Rejected(_)) if !self.waited_too_long_for_a_mode() => return Ok(()),
                 result => result?,
             }
         }
@@ -487,7 +520,7 @@ impl Worker {
         let age = self.config.clock.now().since(self.state.stamp);
         if !self.guard.admits(command, mode, &self.state, age, self.config.read_period()) {
             self.health.withheld.fetch_add(1, Relaxed);
-            return gripper;
+            return Ok(());
         }
         let values = command.values.get(..self.config.dof).unwrap_or_default();
         let written = match mode {
@@ -502,7 +535,7 @@ impl Worker {
         written?;
         self.in_flight = 0;
         self.health.writes.fetch_add(1, Relaxed);
-        gripper
+        Ok(())
     }
 
     /// Whether the arm has refused a change of mode for longer than it may take to stand still.
@@ -529,6 +562,7 @@ impl Worker {
                 }
                 // Last: whoever sees it sees the confirmation too.
                 self.health.stop_sent.store(self.last.stop_seq, Release);
+                self.health.answered();
             }
             Err(error) => self.not_taken(adapter, "the arm did not take the stop", &error),
         }
@@ -622,8 +656,8 @@ impl Worker {
         adapter.read_joints(&mut self.reading)?;
         let all = self.whole_state_at_once;
         let turn = self.turn;
-        self.turn = (turn + 1) % 5;
-        if all || turn == 0 {
+        self.turn = (turn + 1) % TURNS;
+        if all || turn == ERROR_TURN {
             let (code, text) = adapter.read_error()?;
             if code != self.state.error {
                 self.health.set_error_text(text.clone());
@@ -633,7 +667,7 @@ impl Worker {
             }
             self.state.error = code;
         }
-        if all || turn == 1 {
+        if all || turn == ENABLED_TURN {
             self.state.enabled = adapter.read_enabled()?;
         }
         if all || turn == 2 {
@@ -646,9 +680,25 @@ impl Worker {
         if all || turn == 4 {
             self.state.pose = adapter.read_cartesian_position()?;
         }
+        if all || turn == 5 {
+            self.read_codes(adapter)?;
+        }
         self.state.mode = adapter.get_control_mode();
         self.compare_with_orders();
         self.heed(adapter.foreign_change());
+        Ok(())
+    }
+
+    /// Reads the device's own state codes, for `status`.
+    fn read_codes(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        let codes = match adapter.read_state() {
+            Err(AdapterError::Unsupported) => return Ok(()),
+            codes => codes?,
+        };
+        if self.codes != Some(codes) {
+            self.codes = Some(codes);
+            self.health.set_codes(codes);
+        }
         Ok(())
     }
 

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 use std::time::Duration;
 
 use rustix::event::PollFlags;
@@ -12,6 +12,7 @@ use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
 use super::serial::{make_raw, wait};
 use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::sync::lock;
 
 /// So many lines that are gone keep their numbers. The system would give them to the next lines, and a client that
 /// comes back for its own would find another's.
@@ -79,7 +80,7 @@ impl Pty {
 
 impl Drop for Pty {
     fn drop(&mut self) {
-        let mut gone = GONE.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut gone = lock(&GONE);
         gone.extend(self.far.take());
         let excess = gone.len().saturating_sub(KEEP);
         gone.drain(..excess);

@@ -4,6 +4,7 @@
 use nalgebra::Matrix3;
 
 use super::{Meshes, Reader};
+use crate::message::Message;
 use crate::robot::model::{Geometry, Inertial, MeshFile, Shape};
 use crate::robot::xml::{Element, SourcePos};
 use crate::yaml::{Diag, quote};
@@ -84,10 +85,7 @@ impl Reader<'_> {
             match (self.resolve)(uri) {
                 Ok(found) => path = Some(found),
                 Err(why) => {
-                    let (what, hint) = match why.split_once("\nhint: ") {
-                        Some((what, hint)) => (what, Some(hint.to_owned())),
-                        None => (why.as_str(), None),
-                    };
+                    let Message { what, hint } = why.into();
                     let diag = match collides {
                         true => Diag::error(format!("collision mesh not found: {what}")),
                         false => Diag::warning(format!("visual mesh not found, it is not shown: {what}")),

@@ -7,6 +7,7 @@ use super::expand::{Env, Expander};
 use super::text::{Part, Substitution, converted, parts, substitution};
 use super::value::Value;
 use super::{ExpansionError, Result, functions};
+use crate::message::Message;
 use crate::robot::packages::absolute;
 use crate::robot::xml::{Element, SourcePos};
 use crate::yaml::{Diag, closest};
@@ -62,10 +63,7 @@ impl Expander<'_> {
             if let Some(trouble) = trouble {
                 return trouble.also(at, "used here");
             }
-            let (what, hint) = match what.split_once("\nhint: ") {
-                Some((what, hint)) => (what.to_owned(), Some(hint.to_owned())),
-                None => (what, None),
-            };
+            let Message { what, hint } = what.into();
             let hint = hint.or_else(|| self.near_name(&what, env));
             let shown: String = expression.chars().take(120).collect();
             ExpansionError::new(format!("{what}, when evaluating the expression '{}'", shown.trim())).at(at).hint(hint)

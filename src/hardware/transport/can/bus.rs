@@ -8,11 +8,12 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 use super::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::rt::wake::Wake;
+use crate::sync::lock;
 
 /// Events that wait for a port at most; then they are lost, and the port hears of it.
 pub const RECEIVE_QUEUE: usize = 4096;
@@ -272,9 +273,4 @@ impl Drop for BusPort {
     fn drop(&mut self) {
         lock(&self.hub).members.retain(|member| member.number != self.number);
     }
-}
-
-/// No code panics while it holds the lock, so a poisoned one is as good as any.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,0 +1,107 @@
+//! Where a run is logged, and what the log begins with.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use super::{Options, Record, StartError};
+use crate::blueprint::Blueprint;
+use crate::clock::{Clock, MonotonicClock, WallOffset};
+use crate::control::config::CoordinatorConfig;
+use crate::hardware::device;
+use crate::message::Message;
+use crate::recording::{disk_space, files};
+use crate::recording::log_writer::LogAttachment;
+use crate::recording::notes::Notes;
+use crate::recording::recorder::Note;
+use crate::telemetry::describe::{Names, Severity};
+
+/// The log of a run, where it has one; refused where there is no room for it.
+pub(super) fn log_path(
+    blueprint: &Blueprint,
+    options: &Options,
+    run: &str,
+    wall: WallOffset,
+) -> Result<Option<PathBuf>, StartError> {
+    let log = match &options.record {
+        Record::Off => None,
+        Record::To(path) => Some(path.clone()),
+        Record::AsBlueprint if !blueprint.recording.enabled => None,
+        Record::AsBlueprint => {
+            let folder = log_folder(blueprint).ok_or_else(|| {
+                StartError::other("no folder for the log: neither XDG_STATE_HOME nor HOME is set", "use --record FILE")
+            })?;
+            Some(files::new_log_path(&folder, run, wall.wall(MonotonicClock.now())))
+        }
+    };
+    if let Some(log) = &log {
+        disk_space::check(log, blueprint.recording.min_free.0).map_err(no_log)?;
+    }
+    Ok(log)
+}
+
+fn log_folder(blueprint: &Blueprint) -> Option<PathBuf> {
+    blueprint.recording.directory.as_ref().map(PathBuf::from).or_else(files::log_folder)
+}
+
+/// Removes the oldest logs beyond what the blueprint keeps.
+pub(super) fn retain(blueprint: &Blueprint, log: &Option<PathBuf>) {
+    let folder = log_folder(blueprint).filter(|f| log.as_deref().and_then(|l| l.parent()) == Some(f));
+    if let (Some(folder), 1..) = (folder, blueprint.recording.keep)
+        && let Err(e) = files::retain(&folder, blueprint.recording.keep as usize)
+    {
+        tracing::warn!("old logs were not removed: {e}");
+    }
+}
+
+/// The blueprint as read and as resolved, and what the coordinator was made from: with these and its messages a log
+/// can be run again.
+pub(super) fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> Vec<LogAttachment> {
+    let yaml = |name: String, text: &str| LogAttachment {
+        name,
+        media_type: "application/yaml".to_owned(),
+        data: text.as_bytes().to_vec(),
+    };
+    let mut all = vec![yaml("blueprint.yaml".to_owned(), &blueprint.source_yaml)];
+    all.extend(blueprint.sources.iter().map(|(name, text)| yaml(format!("source/{name}"), text)));
+    all.push(LogAttachment {
+        name: "coordinator.json".to_owned(),
+        media_type: "application/json".to_owned(),
+        // Plain structs with string keys always encode.
+        data: serde_json::to_vec_pretty(config).unwrap_or_default(),
+    });
+    all
+}
+
+/// More about the run, for the log's reader.
+pub(super) fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
+    BTreeMap::from([
+        ("blueprint".to_owned(), blueprint.name.clone()),
+        ("tick_rate".to_owned(), blueprint.coordinator.tick_rate.to_string()),
+        ("dimos_version".to_owned(), crate::VERSION.to_owned()),
+        ("simulated".to_owned(), blueprint.arms.iter().any(|a| a.simulated).to_string()),
+    ])
+}
+
+/// Tells an episode of a device to the text log and to the recorder.
+pub(super) fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: device::Note) {
+    let id = names.arm(arm as u16);
+    let (severity, text) = match note {
+        device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),
+        device::Note::Over(text) => (Severity::Info, format!("{id}: over: {text}")),
+    };
+    // One line per episode, without DIMOS_LOG=info.
+    match severity {
+        Severity::Info => tracing::info!("{text}"),
+        _ => tracing::warn!("{text}"),
+    }
+    let stamp = MonotonicClock.now();
+    // Only a run that is ending has no recorder any more.
+    let _ = notes.send(Note::ArmText { arm: arm as u16, text: text.clone() });
+    let _ = notes.send(Note::Log { severity, stamp, text });
+}
+
+/// Why there is no log.
+pub(super) fn no_log(error: impl std::fmt::Display) -> StartError {
+    let (what, hint) = Message::of(error).or_hint("run with --no-record");
+    StartError::other(what, hint)
+}

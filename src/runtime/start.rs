@@ -1,0 +1,267 @@
+//! How a run comes up, in stages. Each stage owns what it has started, and what it owns is released when it is dropped:
+//! a start that fails leaves nothing behind, wherever it fails.
+//!
+//! ```text
+//! Prepared ─────────▶ Connected ───────────▶ Run ──────────────────────────────▶ enabled ─▶ listening
+//! name, log, models   devices, arms' limits  recorder, courier, tick, watchdog   motors     socket
+//! ```
+
+use std::path::PathBuf;
+use std::sync::mpsc::{Sender, channel};
+use std::sync::{Arc, Mutex};
+
+use super::arms::{self, Arms, BroughtUp, Slots};
+use super::control_config::{coordinator_config, names_of};
+use super::dispatch::{Courier, Dispatcher};
+use super::log_file::{attachments, log_path, metadata, no_log, retain, tell_device_note};
+use super::planner_link::command_limits;
+use super::planner_port::PlannerPort;
+use super::service::{Service, ServiceParts};
+use super::service_manager::ServiceManager;
+use super::task_kinds::task_kinds;
+use super::tick::Tick;
+use super::watchdog::Watchdog;
+use super::wires::wires;
+use super::{Ending, Handle, Options, Run, StartError, in_process};
+use crate::blueprint::Blueprint;
+use crate::clock::{MonotonicClock, WallOffset};
+use crate::control::config::{CoordinatorConfig, TaskKind};
+use crate::control::tick_loop::Pulse;
+use crate::hardware::device;
+use crate::planning::config::PlannerConfig;
+use crate::planning::planning_scene::PlanningScene;
+use crate::recording::notes::{self, NoteReceiver, Notes};
+use crate::recording::recorder::{Notice, Recorder, RecorderConfig};
+use crate::rpc::place::Claim;
+use crate::rpc::report::StatusReport;
+use crate::rpc::server::Server;
+use crate::rpc::streams::Streams;
+use crate::rt::host::{self, Grant, LatencyHold};
+use crate::telemetry::Sample;
+use crate::telemetry::describe::Names;
+
+impl Run {
+    /// Starts a run. When this fails, everything that had been started is stopped again and nothing has moved.
+    pub fn start(blueprint: &Blueprint, options: Options) -> Result<Self, StartError> {
+        // Should what follows fail, the run ends before its name is free.
+        let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
+        run.enable(blueprint)?;
+        if blueprint.rpc.enabled {
+            let server = Server::start(claim, run.handle.service.clone()).map_err(|e| {
+                let hint = "see the folder's rights, or set rpc.enabled: false";
+                StartError::other(format!("the socket cannot be opened: {e}"), hint)
+            })?;
+            run.server = Some(server);
+        } else {
+            run.handle.service.keep(claim);
+        }
+        if let Some(manager) = &run.manager {
+            manager.ready(&in_short(&run.status()));
+        }
+        Ok(run)
+    }
+
+    fn enable(&self, blueprint: &Blueprint) -> Result<(), StartError> {
+        let which = blueprint.arms.iter().enumerate().filter(|(_, arm)| arm.auto_enable).map(|(i, _)| i);
+        self.arms.enable(blueprint, which)?;
+        in_process::wait_for(self.handle.service.first_ready());
+        Ok(())
+    }
+}
+
+/// A run whose name is taken and whose blueprint holds together. No arm was touched.
+struct Prepared<'a> {
+    blueprint: &'a Blueprint,
+    options: Options,
+    name: String,
+    names: Names,
+    log: Option<PathBuf>,
+    wall: WallOffset,
+    robots: Option<PlanningScene>,
+    kinds: Vec<TaskKind>,
+    grants: Vec<Grant>,
+    latency: Option<LatencyHold>,
+    claim: Claim,
+}
+
+impl<'a> Prepared<'a> {
+    fn new(blueprint: &'a Blueprint, options: Options) -> Result<Self, StartError> {
+        let name = options.name.clone().unwrap_or_else(|| blueprint.name.clone());
+        let claim = options.folder.claim(&name).map_err(|e| StartError::other(&e, e.hint()))?;
+        let (grants, latency) = host::prepare_process(options.hold_latency);
+        let wall = WallOffset::take(&MonotonicClock);
+        let log = log_path(blueprint, &options, &name, wall)?;
+        let robots = blueprint.planner.as_ref().map(robots).transpose()?;
+        let kinds = task_kinds(blueprint).map_err(wrong_model)?;
+        let names = names_of(blueprint);
+        Ok(Self { blueprint, options, name, names, log, wall, robots, kinds, grants, latency, claim })
+    }
+
+    fn connect(mut self) -> Result<Connected<'a>, StartError> {
+        let pulse = Arc::new(Pulse::default());
+        let (notes, noted) = notes::channel();
+        let device_notes = {
+            let (notes, names) = (notes.clone(), self.names.clone());
+            move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
+        };
+        let BroughtUp { arms, slots, connected } = arms::bring_up(self.blueprint, &pulse.beat, device_notes)?;
+        let config = coordinator_config(self.blueprint, &connected, std::mem::take(&mut self.kinds));
+        let planner = self.blueprint.planner.as_ref().zip(self.robots.take()).map(|(planner, setup)| {
+            let limits = command_limits(&self.names, &config);
+            PlannerPort::start(planner, setup, &limits, self.options.solver.take()).map_err(|what| {
+                let hint = "the model's limits, the arm's, and `limits` in the blueprint must have room in common";
+                StartError::other(what, hint)
+            })
+        });
+        let planner = planner.transpose()?;
+        let connected = connected.into_iter().map(|(connected, _)| connected).collect();
+        Ok(Connected { arms, slots, connected, config, planner, pulse, notes, noted, prepared: self })
+    }
+}
+
+/// A run whose arms are connected. Fields are dropped in this order: the arms go before the name.
+struct Connected<'a> {
+    arms: Arms,
+    slots: Slots,
+    connected: Vec<device::Connected>,
+    config: CoordinatorConfig,
+    planner: Option<PlannerPort>,
+    pulse: Arc<Pulse>,
+    notes: Notes,
+    noted: NoteReceiver,
+    prepared: Prepared<'a>,
+}
+
+impl Connected<'_> {
+    /// Starts the threads; each that was started ends when the next one cannot be.
+    fn start(self) -> Result<(Claim, Run), StartError> {
+        // Dropped in reverse: the arms before the name.
+        let Self { prepared, arms, slots, connected, config, planner, pulse, notes, noted } = self;
+        let (ports, ends) = wires(&config, slots, &arms, pulse.clone())?;
+        let dispatcher = Arc::new(Dispatcher::new(ends.requests, notes));
+        let (endings, ended) = channel();
+        let parts = ServiceParts {
+            run: prepared.name.clone(),
+            blueprint: prepared.blueprint.clone(),
+            config: config.clone(),
+            names: prepared.names.clone(),
+            connected,
+            devices: arms.devices.clone(),
+            dispatcher: dispatcher.clone(),
+            pulse: pulse.clone(),
+            streams: Streams::default(),
+            arm_views: Mutex::new(ends.arm_views),
+            task_views: Mutex::new(ends.task_views),
+            grants: prepared.grants.clone(),
+            wall: prepared.wall,
+            log: prepared.log.clone(),
+            endings: endings.clone(),
+            planner,
+        };
+        let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
+        let recorder = start_recorder(&prepared, &config, ends.samples, noted, &service)?;
+        let publish = publisher(service.clone(), prepared.wall);
+        let courier = Courier::start(dispatcher.clone(), ends.reply_wake, ends.replies, ends.retired, publish);
+        let courier = courier.map_err(no_thread("courier"))?;
+        let Options { probe, service_manager: manager, .. } = prepared.options;
+        let tick = Tick::start(&config, ports, probe, endings.clone()).map_err(no_thread("tick"))?;
+        let watchdog = start_watchdog(&pulse, &config, &endings, manager.as_ref())?;
+        let run = Run {
+            arms,
+            pulse,
+            tick,
+            watchdog,
+            dispatcher,
+            courier: Some(courier),
+            recorder: Some(recorder),
+            server: None,
+            handle: Handle { service },
+            endings: (endings, ended),
+            manager,
+            _latency: prepared.latency,
+        };
+        Ok((prepared.claim, run))
+    }
+}
+
+fn start_recorder(
+    prepared: &Prepared<'_>,
+    config: &CoordinatorConfig,
+    samples: rtrb::Consumer<Sample>,
+    noted: NoteReceiver,
+    service: &Arc<Service>,
+) -> Result<Recorder, StartError> {
+    let (blueprint, wall) = (prepared.blueprint, prepared.wall);
+    let record = RecorderConfig {
+        path: prepared.log.clone(),
+        run: prepared.name.clone(),
+        names: prepared.names.clone(),
+        frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
+        attachments: attachments(blueprint, config),
+        metadata: metadata(blueprint),
+        wall,
+        min_free: blueprint.recording.min_free.0,
+    };
+    let told = service.clone();
+    let notice = move |notice: Notice<'_>| told.notice(notice, wall);
+    let recorder = Recorder::start(record, samples, noted, notice).map_err(no_log)?;
+    service.set_recorder(recorder.stats());
+    retain(blueprint, &prepared.log);
+    Ok(recorder)
+}
+
+/// What the courier does whenever it is woken.
+fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send + 'static {
+    move |woken| {
+        service.progress.made();
+        service.publish(woken);
+        service.report_late_stops(wall);
+    }
+}
+
+fn start_watchdog(
+    pulse: &Pulse,
+    config: &CoordinatorConfig,
+    endings: &Sender<Ending>,
+    manager: Option<&ServiceManager>,
+) -> Result<Watchdog, StartError> {
+    let alive = signs_of_life(manager);
+    let watchdog = Watchdog::start(pulse.beat.clone(), config.period(), endings.clone(), alive);
+    watchdog.map_err(no_thread("watchdog"))
+}
+
+fn no_thread(name: &'static str) -> impl FnOnce(std::io::Error) -> StartError {
+    move |error| StartError::other(format!("no {name} thread: {error}"), "see ulimit -u")
+}
+
+fn wrong_model(what: String) -> StartError {
+    StartError::Blueprint { what, hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned() }
+}
+
+/// The planner's robots, with what must be said of them.
+pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError> {
+    let setup = PlanningScene::load(config).map_err(wrong_model)?;
+    for (robot, [a, b]) in &setup.always_touching {
+        tracing::warn!("robot {robot}: {a} and {b} touch in every pose: they are not checked against each other");
+    }
+    Ok(setup)
+}
+
+/// What the watchdog does at each look that finds the tick alive.
+fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
+    match manager.map(ServiceManager::signs_of_life) {
+        Some(Ok(alive)) => Box::new(alive),
+        Some(Err(e)) => {
+            tracing::warn!("the service manager's watchdog is not fed: {e}");
+            Box::new(|| {})
+        }
+        None => Box::new(|| {}),
+    }
+}
+
+/// A run in a line.
+fn in_short(report: &StatusReport) -> String {
+    let arms: Vec<String> = report.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
+    let simulated = if report.simulated { ", SIMULATED" } else { "" };
+    format!("{}: {}{simulated}", report.run, arms.join(", "))
+}

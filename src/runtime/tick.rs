@@ -1,0 +1,80 @@
+//! The tick's thread as a run has it: started, watched, ended.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::Sender;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use super::{Ending, watchdog};
+use crate::clock::{Clock, MonotonicClock};
+use crate::control::config::CoordinatorConfig;
+use crate::control::coordinator::Coordinator;
+use crate::control::tick_loop::{self, Probe, Pulse, TickPorts};
+use crate::rt::host;
+
+/// How long the thread gets to end.
+const END_LIMIT: Duration = Duration::from_millis(300);
+/// How often is looked whether it has.
+const LOOK_EVERY: Duration = Duration::from_millis(1);
+
+/// The running tick. Ends when it is dropped.
+pub(super) struct Tick {
+    pulse: Arc<Pulse>,
+    period: Duration,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Tick {
+    /// Starts the thread `tick`. A panic in it is a fault that ends the run.
+    pub fn start(
+        config: &CoordinatorConfig,
+        ports: TickPorts,
+        probe: Option<Probe>,
+        endings: Sender<Ending>,
+    ) -> std::io::Result<Self> {
+        let (coordinator, period, pulse) = (Coordinator::new(config), config.period(), ports.pulse.clone());
+        let thread = std::thread::Builder::new().name("tick".into()).stack_size(host::STACK).spawn(move || {
+            let ran = catch_unwind(AssertUnwindSafe(|| {
+                tick_loop::run(coordinator, ports, period, &MonotonicClock, probe);
+            }));
+            if let Err(panic) = ran {
+                let text = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
+                let text = text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
+                let _ = endings.send(Ending::Fault(format!("the tick thread panicked: {text}")));
+            }
+        })?;
+        Ok(Self { pulse, period, thread: Some(thread) })
+    }
+
+    /// Whether it runs and its heartbeat is not late.
+    pub fn is_alive(&self) -> bool {
+        let silence = self.pulse.beat.silence(MonotonicClock.now());
+        self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+            && silence.is_none_or(|silence| silence < watchdog::silence_limit(self.period))
+    }
+
+    /// Ends it after its present tick. `false`: it hangs, and is left behind.
+    pub fn end(&mut self) -> bool {
+        self.pulse.stop.store(true, Ordering::Release);
+        let limit = if self.is_alive() { END_LIMIT.max(2 * self.period) } else { Duration::ZERO };
+        let Some(thread) = self.thread.take() else { return true };
+        let began = Instant::now();
+        while !thread.is_finished() && began.elapsed() < limit {
+            std::thread::sleep(LOOK_EVERY);
+        }
+        let ended = thread.is_finished();
+        if ended {
+            // A panic was reported when it happened.
+            let _ = thread.join();
+        }
+        ended
+    }
+}
+
+impl Drop for Tick {
+    fn drop(&mut self) {
+        self.end();
+    }
+}

@@ -1,0 +1,65 @@
+//! Waiting for what a tick or a device thread brings: whoever waits looks again after every tick and after every
+//! answer of an arm. No pause is guessed.
+
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+
+use super::service::Service;
+use crate::control::tick_loop::Pulse;
+
+/// How long a tick may take to come, before nobody waits for it any more.
+const TICK_LIMIT: Duration = Duration::from_secs(1);
+
+/// Counts ticks and answers of arms, and wakes those who wait for them.
+#[derive(Debug, Default)]
+pub(super) struct Progress(watch::Sender<u64>);
+
+impl Progress {
+    /// A tick is done, or an arm has answered.
+    pub fn made(&self) {
+        self.0.send_modify(|count| *count = count.wrapping_add(1));
+    }
+}
+
+/// Somebody waits: the tick wakes the courier for as long as this lives.
+struct Waiting<'a>(&'a Pulse);
+
+impl<'a> Waiting<'a> {
+    fn begin(pulse: &'a Pulse) -> Self {
+        pulse.waiting.fetch_add(1, Ordering::SeqCst);
+        Self(pulse)
+    }
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        self.0.waiting.fetch_sub(1, Ordering::SeqCst);
+    }
+}
+
+impl Service {
+    /// Waits until `look` finds something: it is called now, and after every tick and every answer of an arm. Where no
+    /// tick comes, several times a second all the same. `None`: nothing was found until `limit`.
+    pub(super) async fn until<T>(&self, limit: Instant, mut look: impl FnMut() -> Option<T>) -> Option<T> {
+        let mut progress = self.progress.0.subscribe();
+        let _waiting = Waiting::begin(&self.parts.pulse);
+        loop {
+            if let Some(found) = look() {
+                return Some(found);
+            }
+            if tokio::time::timeout_at(limit.into(), progress.changed()).await.is_err() {
+                return look();
+            }
+        }
+    }
+
+    /// Waits for the end of a tick that begins from now on: it reads what the arms have reported up to now.
+    pub(super) async fn next_tick(&self) {
+        let pulse = &self.parts.pulse;
+        let begun = pulse.begun.load(Ordering::SeqCst);
+        let done = || (pulse.ticks.load(Ordering::Acquire) > begun).then_some(());
+        self.until(Instant::now() + TICK_LIMIT, done).await;
+    }
+}

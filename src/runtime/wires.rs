@@ -1,0 +1,87 @@
+//! The rings and slots between the tick and the rest of a run.
+
+use std::sync::Arc;
+
+use super::StartError;
+use super::arms::{Arms, Slots};
+use super::dispatch::REQUEST_RING;
+use crate::arm::{ArmCommand, ArmState};
+use crate::control::config::CoordinatorConfig;
+use crate::control::request::{Envelope, Motion};
+use crate::control::tick_loop::{Pulse, TickPorts};
+use crate::rt::host;
+use crate::rt::slot::{SlotReader, slot};
+use crate::rt::wake::Wake;
+use crate::telemetry::{ArmSample, Cause, Outcome, Phase, Sample, TaskView, TickSample};
+
+/// So many seconds of samples fit into the recorder's ring.
+const RING_SECONDS: f64 = 5.0;
+
+/// The ends that are not the tick's.
+pub(super) struct Ends {
+    pub requests: rtrb::Producer<Envelope>,
+    pub replies: rtrb::Consumer<(u64, Outcome)>,
+    pub reply_wake: Wake,
+    pub retired: rtrb::Consumer<Box<Motion>>,
+    pub samples: rtrb::Consumer<Sample>,
+    pub arm_views: Vec<SlotReader<ArmSample>>,
+    pub task_views: Vec<SlotReader<TaskView>>,
+}
+
+/// Makes them all. What a device thread answers to a command wakes the same thread as a reply of the tick.
+pub(super) fn wires(
+    config: &CoordinatorConfig,
+    slots: Slots,
+    arms: &Arms,
+    pulse: Arc<Pulse>,
+) -> Result<(TickPorts, Ends), StartError> {
+    let reply_wake = Wake::new().map_err(|e| StartError::other(format!("no eventfd: {e}"), "see ulimit -n"))?;
+    for device in &arms.devices {
+        device.health().wake_on_answers(reply_wake.clone());
+    }
+    let (mut sample_producer, mut samples) = rtrb::RingBuffer::new(ring_size(config));
+    touch(&mut sample_producer, &mut samples);
+    let (requests, request_consumer) = rtrb::RingBuffer::new(REQUEST_RING);
+    let (reply_producer, replies) = rtrb::RingBuffer::new(2 * REQUEST_RING);
+    let (retired_producer, retired) = rtrb::RingBuffer::new(REQUEST_RING + 2 * config.tasks.len());
+    let nothing = ArmSample {
+        arm: 0,
+        state: ArmState::default(),
+        command: ArmCommand::default(),
+        phase: Phase::Unknown,
+        cause: Cause::None,
+    };
+    let (arm_writers, arm_views) = config.arms.iter().map(|_| slot(nothing)).unzip();
+    let (task_writers, task_views) = config.tasks.iter().map(|_| slot(TaskView::default())).unzip();
+    let ports = TickPorts {
+        states: slots.states,
+        commands: slots.commands,
+        wakes: arms.devices.iter().map(|d| d.wake()).collect(),
+        dues: arms.devices.iter().map(|d| d.due()).collect(),
+        requests: request_consumer,
+        replies: reply_producer,
+        reply_wake: reply_wake.clone(),
+        retired: retired_producer,
+        samples: sample_producer,
+        arm_views: arm_writers,
+        task_views: task_writers,
+        pulse,
+    };
+    Ok((ports, Ends { requests, replies, reply_wake, retired, samples, arm_views, task_views }))
+}
+
+/// Touches every page of the ring, so that no page fault comes while it is filled for the first time.
+fn touch(producer: &mut rtrb::Producer<Sample>, consumer: &mut rtrb::Consumer<Sample>) {
+    while producer.push(Sample::Tick(TickSample::default())).is_ok() {}
+    if let Ok(chunk) = consumer.read_chunk(consumer.slots()) {
+        let (first, second) = chunk.as_slices();
+        host::lock_pages(first);
+        host::lock_pages(second);
+        chunk.commit_all();
+    }
+}
+
+fn ring_size(config: &CoordinatorConfig) -> usize {
+    let per_tick = config.arms.len() + 1;
+    512 + (per_tick as f64 * config.rate * RING_SECONDS) as usize
+}
