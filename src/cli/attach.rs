@@ -123,7 +123,7 @@ fn unfit(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Unfit {
 
 fn lacks_task(run: &StatusReport, robot: &RobotConfig) -> Option<String> {
     let name = robot.task.as_ref()?;
-    let Some(task) = run.tasks.iter().find(|task| task.name == *name && task.kind == "trajectory") else {
+    let Some(task) = run.tasks.iter().find(|task| task.name == *name && task.takes("execute")) else {
         return Some(format!("it has no trajectory task {name}"));
     };
     let missing = robot.coordinator_joints.iter().find(|joint| !task.joints.contains(joint))?;

@@ -14,7 +14,7 @@ use thiserror::Error;
 
 use super::arguments::setting;
 use super::output;
-use crate::hardware::registry::Registry;
+use crate::blueprint::Catalog;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
@@ -132,8 +132,8 @@ fn folder_text(folder: &Option<PathBuf>) -> String {
 }
 
 /// Plays a log as the arguments say. Gives the exit code.
-pub fn run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
-    match try_run(args, registry) {
+pub fn run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<u8> {
+    match try_run(args, catalog) {
         Ok(code) => Ok(code),
         Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(0),
         Err(e) if e.is::<NotThere>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
@@ -144,15 +144,15 @@ pub fn run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
     }
 }
 
-fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<u8> {
+fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<u8> {
     let path = log_path(args)?;
     if args.verify {
-        return Ok(verify::run(&path, args.json)?);
+        return Ok(verify::run(&path, catalog.tasks, args.json)?);
     }
     let mut log = LogReader::open(&path)?;
     let part = choose(args, log.info(), &path)?;
     if let Some(blueprint) = &args.onto.blueprint {
-        let exit = onto::run(args, blueprint, &path, &part, registry).unwrap_or_else(|failure| {
+        let exit = onto::run(args, blueprint, &path, &part, catalog).unwrap_or_else(|failure| {
             output::failure(&failure);
             failure.exit
         });

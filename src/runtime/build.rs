@@ -13,7 +13,6 @@ use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
-use super::task_kinds::task_kinds;
 use super::watchdog::Watchdog;
 use super::{Ending, Handle, Options, Record, Run, StartError};
 use crate::arm::ArmState;
@@ -22,6 +21,8 @@ use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Request;
+use crate::control::task::Task;
+use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::control::tick_loop::{self, Pulse, TickPorts};
 use crate::hardware::device;
 use crate::joint::MAX_DOF;
@@ -62,7 +63,7 @@ impl Run {
         let names = names_of(blueprint);
         // Before any arm is touched: a robot's description that is wrong costs nothing but its message.
         let robots = blueprint.planner.as_ref().map(robots).transpose()?;
-        let kinds = task_kinds(blueprint).map_err(|what| StartError::Blueprint {
+        let (task_configs, tasks) = tasks(blueprint).map_err(|what| StartError::Blueprint {
             what,
             hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned(),
         })?;
@@ -74,7 +75,7 @@ impl Run {
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
         let BroughtUp { mut arms, slots, connected } = arms::bring_up(blueprint, &pulse.beat, device_notes)?;
-        let config = coordinator_config(blueprint, &connected, kinds);
+        let config = coordinator_config(blueprint, &connected, task_configs);
         let limits = command_limits(&names, &config);
         let planner = blueprint.planner.as_ref().zip(robots);
         let planner = planner.map(|(config, setup)| PlannerPort::start(config, setup, &limits, options.solver.take()));
@@ -172,7 +173,7 @@ impl Run {
         let io = |what: &str, e: std::io::Error| StartError::other(format!("no {what} thread: {e}"), "see ulimit -u");
         let courier = Courier::start(dispatcher.clone(), reply_wake, reply_consumer, retired_consumer, publish)
             .map_err(|e| fail(&mut arms, io("courier", e)))?;
-        let tick = spawn_tick(&config, ports, options.probe.take(), endings.clone())
+        let tick = spawn_tick(&config, tasks, ports, options.probe.take(), endings.clone())
             .map_err(|e| fail(&mut arms, io("tick", e)))?;
         let manager = options.service_manager.take();
         let alive = signs_of_life(manager.as_ref());
@@ -282,11 +283,12 @@ fn wake() -> Result<Wake, StartError> {
 
 fn spawn_tick(
     config: &CoordinatorConfig,
+    tasks: Vec<Task>,
     ports: TickPorts,
     probe: Option<tick_loop::Probe>,
     endings: Sender<Ending>,
 ) -> std::io::Result<std::thread::JoinHandle<()>> {
-    let (coordinator, period) = (Coordinator::new(config), config.period());
+    let (coordinator, period) = (Coordinator::new(config, tasks), config.period());
     std::thread::Builder::new().name("tick".into()).stack_size(host::STACK).spawn(move || {
         let ran = catch_unwind(AssertUnwindSafe(|| {
             tick_loop::run(coordinator, ports, period, &MonotonicClock, probe);
@@ -326,10 +328,29 @@ fn names_of(blueprint: &Blueprint) -> Names {
     }
 }
 
+/// What the blueprint's tasks are to the coordinator. The robots of those that move an end effector are read here.
+fn tasks(blueprint: &Blueprint) -> Result<(Vec<TaskConfig>, Vec<Task>), String> {
+    let config = |task: &crate::blueprint::Task| -> Result<TaskConfig, String> {
+        let robot = task.robot.as_ref().map(|robot| robot.kinematics().map(Box::new)).transpose();
+        let robot = robot.map_err(|what| format!("task {}: {what}", task.name))?;
+        Ok(TaskConfig {
+            name: task.name.clone(),
+            kind: TaskKind { name: task.spec.name.to_owned(), params: task.params.clone(), robot },
+            joints: task.joints.iter().map(|&j| j as u16).collect(),
+            priority: task.priority,
+            auto_start: task.auto_start,
+        })
+    };
+    let configs = blueprint.tasks.iter().map(config).collect::<Result<Vec<_>, _>>()?;
+    let types: Vec<TaskSpec> = blueprint.tasks.iter().map(|task| task.spec).collect();
+    let tasks = TaskTable::with(&types).build(&configs)?;
+    Ok((configs, tasks))
+}
+
 fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, crate::joint::JointLimits)],
-    kinds: Vec<TaskKind>,
+    tasks: Vec<TaskConfig>,
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
@@ -348,18 +369,7 @@ fn coordinator_config(
                 supervision: arm.supervision,
             })
             .collect(),
-        tasks: blueprint
-            .tasks
-            .iter()
-            .zip(kinds)
-            .map(|(task, kind)| TaskConfig {
-                name: task.name.clone(),
-                kind,
-                joints: task.joints.iter().map(|&j| j as u16).collect(),
-                priority: task.priority,
-                auto_start: task.auto_start,
-            })
-            .collect(),
+        tasks,
     }
 }
 

@@ -28,7 +28,6 @@ mod reports;
 mod service;
 mod service_manager;
 mod stream_requests;
-mod task_kinds;
 mod watchdog;
 mod world_requests;
 
