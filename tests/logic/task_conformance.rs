@@ -127,7 +127,7 @@ fn caught(row: &TaskSpec, by: &str, saying: &str) {
 #[test]
 fn every_mistake_of_a_body_is_found_by_its_check() {
     caught(&Wrong::<ALLOCATES>::SPEC, "allocates_nothing", "allocations");
-    caught(&Wrong::<NOT_FINITE>::SPEC, "claims_its_joints_once", "NonFinite");
+    caught(&Wrong::<NOT_FINITE>::SPEC, "claims_its_joints_once", "claims NaN");
     caught(&Wrong::<FOREIGN_JOINT>::SPEC, "claims_its_joints_once", "not its own");
     caught(&Wrong::<CLAIMS_TWICE>::SPEC, "claims_its_joints_once", "twice");
     caught(&Wrong::<DEAF_TO_CANCEL>::SPEC, "comes_to_rest_on_cancel", "after a cancel");

@@ -12,12 +12,12 @@ pub const CHECKS: &[Check] = &[
 const MOTION: f64 = 1e-3;
 
 fn moves(bench: &mut Bench) -> Result<(), String> {
-    bench.stream(2.0)?;
+    bench.stream(1.5)?;
     if let Some(fault) = bench.fault() {
         return Err(fault);
     }
     if bench.moved() < MOTION {
-        return Err(format!("it moved no joint by more than {:.6} rad in 2 s", bench.moved()));
+        return Err(format!("it moved no joint by more than {:.6} rad in 1.5 s", bench.moved()));
     }
     Ok(())
 }
