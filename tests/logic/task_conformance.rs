@@ -94,7 +94,7 @@ impl<const MISTAKE: u8> TaskBody for Wrong<MISTAKE> {
             }
             TAKES_BACK => claims.extend(self.lost.map(|joint| Claim { joint, value: 0.0 })),
             NOT_REPEATABLE => {
-                let odd = COUNT.fetch_add(1, Ordering::Relaxed) % 7 == 0;
+                let odd = COUNT.fetch_add(1, Ordering::Relaxed).is_multiple_of(7);
                 claims.iter_mut().for_each(|claim| claim.value *= if odd { 0.5 } else { 1.0 });
             }
             MOVES_NOTHING => claims.iter_mut().for_each(|claim| claim.value = 0.0),
