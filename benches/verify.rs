@@ -12,6 +12,7 @@ use std::time::Instant;
 
 use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::Request;
+use dimos::control::task_spec::TaskTable;
 use dimos::joint::{JointLimits, make_joints};
 use dimos::replay::verify::{Finding, verify};
 use dimos::telemetry::TaskState;
@@ -35,7 +36,7 @@ fn main() {
 
 fn ticks_per_second(log: &std::path::Path) -> f64 {
     let began = Instant::now();
-    let found = verify(log).expect("the log can be read");
+    let found = verify(log, &TaskTable::builtin()).expect("the log can be read");
     assert_eq!(found.finding, Finding::Reproducible);
     found.ticks as f64 / began.elapsed().as_secs_f64()
 }

@@ -6,11 +6,12 @@ use std::time::Duration;
 use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::control::config::{
-    ArmConfig, CONTROL_VERSION, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind,
+    ArmConfig, CONTROL_VERSION, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TaskKinematics,
     TrajectoryParams, VelocityParams,
 };
-use dimos::control::request::{Envelope, Motion, Request};
-use dimos::control::tasks::cartesian::Goal;
+use dimos::control::request::{Envelope, Goal, Motion, Request};
+use dimos::control::task::Task;
+use dimos::control::task_spec::TaskTable;
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
@@ -63,10 +64,10 @@ impl Bed {
             supervision: Supervision { stale_after: Duration::from_millis(30), ..Supervision::default() },
         };
         let kinds = [
-            TaskKind::Trajectory(TrajectoryParams::default()),
-            TaskKind::Servo(ServoParams::default()),
-            TaskKind::Velocity(VelocityParams::default()),
-            TaskKind::EefTwist(Box::new(xarm7())),
+            TaskKind::new("trajectory", &TrajectoryParams { path_tolerance: 0.1, ..TrajectoryParams::default() }),
+            TaskKind::new("servo", &ServoParams::default()),
+            TaskKind::new("velocity", &VelocityParams::default()),
+            TaskKind::new("eef_twist", &CartesianParams::default()).of_robot(xarm7()),
         ];
         let task = |i: usize| TaskConfig {
             name: format!("task{i}"),
@@ -96,6 +97,11 @@ impl Bed {
         &self.config
     }
 
+    /// Returns the tasks of this coordinator.
+    pub fn tasks(&self) -> Vec<Task> {
+        TaskTable::builtin().build(&self.config.tasks).expect("built-in types with their defaults")
+    }
+
     /// Queues the requests of a tick, given the views after the previous one.
     pub fn requests(&mut self, tick: u64, tasks: &[TaskView], queue: &mut VecDeque<Envelope>) {
         if tick == 10 {
@@ -109,18 +115,16 @@ impl Bed {
         }
         for t in 0..self.config.tasks.len() {
             let task = t as u16;
-            let request = match self.config.tasks[t].kind {
-                TaskKind::Trajectory(_) if tasks.get(t).is_some_and(|v| v.state == TaskState::Executing) => continue,
-                TaskKind::Trajectory(_) => {
+            let request = match self.config.tasks[t].kind.name.as_str() {
+                "trajectory" if tasks.get(t).is_some_and(|v| v.state == TaskState::Executing) => continue,
+                "trajectory" => {
                     let joints = self.config.tasks[t].joints.clone();
                     let motion = Motion { id: self.sent + 1, joints, spline: self.motion.clone() };
                     Request::Execute { task, motion: Box::new(motion) }
                 }
-                TaskKind::Servo(_) => Request::Servo { task, target: swing(tick as f64 / 100.0).0 },
-                TaskKind::Velocity(_) => Request::Velocity { task, target: swing(tick as f64 / 100.0).1 },
-                TaskKind::CartesianIk(_) | TaskKind::EefTwist(_) => {
-                    Request::Steer { task, goal: circle(tick as f64 / 100.0) }
-                }
+                "servo" => Request::Servo { task, target: swing(tick as f64 / 100.0).0 },
+                "velocity" => Request::Velocity { task, target: swing(tick as f64 / 100.0).1 },
+                _ => Request::Steer { task, goal: circle(tick as f64 / 100.0) },
             };
             self.send(request, queue);
         }
@@ -138,10 +142,10 @@ impl Bed {
 }
 
 /// An arm of 7 joints and its flange.
-fn xarm7() -> CartesianParams {
+fn xarm7() -> TaskKinematics {
     let model = load(&Source::new("builtin:xarm7")).into_model().expect("a built-in description");
     let link = model.link_index("link7").expect("its last link");
-    CartesianParams::new(Kinematics::whole(&model).expect("a tree of joints"), link)
+    TaskKinematics::new(Kinematics::whole(&model).expect("a tree of joints"), link)
 }
 
 /// Returns a twist along a circle, one revolution in 4 s.

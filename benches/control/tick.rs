@@ -45,7 +45,7 @@ pub fn coordinator(arms: usize, load: Load, pace: Pace, ticks: usize) -> Ticks {
     on_a_thread(move || {
         host::enter_realtime(host::TICK_PRIORITY);
         let mut bed = Bed::new(arms, load);
-        let mut coordinator = Coordinator::new(bed.config());
+        let mut coordinator = Coordinator::new(bed.config(), bed.tasks());
         let mut states = vec![bed::fresh_arm(); arms];
         let mut queue = VecDeque::with_capacity(4 * arms);
         let mut views = vec![TaskView::default(); bed.config().tasks.len()];
@@ -85,7 +85,7 @@ pub fn whole(arms: usize, load: Load, pace: Pace, plant: Plant, ticks: usize) ->
     on_a_thread(move || {
         let clock = VirtualClock::starting_at(Mono(1_000_000_000));
         let (ports, mut world) = World::new(arms, load, plant, &clock);
-        let coordinator = Coordinator::new(world.bed.config());
+        let coordinator = Coordinator::new(world.bed.config(), world.bed.tasks());
         let (sender, result) = channel();
         let mut meter = Meter { pace, times: Vec::with_capacity(ticks), ticks, began: None, left: None, sender };
         let (free, moved) = (pace == Pace::Free, clock.clone());

@@ -245,13 +245,13 @@ fn adapter(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>) -> Option<
     if !checker.has(entry.at, "adapter_type") {
         return None;
     }
-    let row = checker.adapters.get(&entry.adapter_type).copied();
+    let row = checker.catalog.adapters.get(&entry.adapter_type).copied();
     if row.is_none() {
         let name = quote(&entry.adapter_type);
-        let diag = match checker.adapters.absent().find(|absent| absent.name == entry.adapter_type.value) {
+        let diag = match checker.catalog.adapters.absent().find(|absent| absent.name == entry.adapter_type.value) {
             Some(absent) => Diag::error(format!("adapter {name} is not in this build")).hint(absent.remedy),
             None => {
-                let hint = did_you_mean(&entry.adapter_type, checker.adapters.names(), "there are");
+                let hint = did_you_mean(&entry.adapter_type, checker.catalog.adapters.names(), "there are");
                 Diag::error(format!("there is no adapter {name}")).maybe_hint(hint)
             }
         };

@@ -4,33 +4,28 @@
 use std::collections::BTreeMap;
 use std::sync::OnceLock;
 
-use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
+use schemars::generate::SchemaSettings;
 use serde_json::{Value, json};
 
-use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
+use crate::blueprint::catalog::Catalog;
 use crate::blueprint::schema::BlueprintFile;
 use crate::hardware::registry::Registry;
 
-/// The JSON Schema (draft 2020-12) of a blueprint whose arms are those of `adapters`.
-pub fn json_schema(adapters: &Registry) -> Value {
-    let mut schema = full_schema(adapters);
+/// The JSON Schema (draft 2020-12) of a blueprint whose arms and task types are those of the catalog.
+pub fn json_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
+    let mut schema = full_schema(catalog.into());
     allow_partial_entries(&mut schema);
     schema
 }
 
 /// The schema of a blueprint that includes no other: every key that is needed is required.
-pub(super) fn full_schema(adapters: &Registry) -> Value {
+pub(super) fn full_schema(Catalog { adapters, tasks }: Catalog<'_>) -> Value {
     let mut generator = SchemaSettings::draft2020_12().into_generator();
     // One generator for all: it keeps types of equal name apart.
     let options: Vec<(&str, Value)> =
         adapters.rows().iter().map(|row| (row.name, (row.options.schema)(&mut generator).to_value())).collect();
-    let params = [
-        ("trajectory", subschema::<TrajectoryParams>(&mut generator)),
-        ("servo", subschema::<ServoParams>(&mut generator)),
-        ("velocity", subschema::<VelocityParams>(&mut generator)),
-        ("cartesian_ik", subschema::<CartesianParams>(&mut generator)),
-        ("eef_twist", subschema::<CartesianParams>(&mut generator)),
-    ];
+    let params: Vec<(&str, Value)> =
+        tasks.rows().map(|row| (row.name, (row.params.schema)(&mut generator).to_value())).collect();
     let mut schema = generator.into_root_schema_for::<BlueprintFile>().to_value();
     let names: Vec<&str> = adapters.names();
     if let Some(hardware) = schema.pointer_mut("/$defs/HardwareEntry") {
@@ -43,6 +38,11 @@ pub(super) fn full_schema(adapters: &Registry) -> Value {
     }
     if let Some(task) = schema.pointer_mut("/$defs/TaskEntry") {
         join(task, "type", "params", params);
+        if let Some(kind) = task.pointer_mut("/properties/type").and_then(Value::as_object_mut) {
+            let about: Vec<String> = tasks.rows().map(|row| format!("`{}` {}", row.name, row.about)).collect();
+            kind.insert("description".to_owned(), json!(format!("What the task does: {}.", about.join(", "))));
+            kind.insert("enum".to_owned(), json!(tasks.names()));
+        }
     }
     schema
 }
@@ -53,7 +53,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
     static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
     let homes = HOMES.get_or_init(|| {
         let mut homes: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();
-        let schema = full_schema(&Registry::default());
+        let schema = full_schema(Catalog::from(&Registry::default()));
         for (pointer, name) in GROUPS {
             let keys = schema.pointer(&format!("{pointer}/properties")).and_then(Value::as_object);
             for key in keys.into_iter().flat_map(|keys| keys.keys()) {
@@ -109,10 +109,6 @@ fn allow_partial_entries(schema: &mut Value) {
         root.insert("if".to_owned(), json!({ "not": { "required": ["include"] } }));
         root.insert("then".to_owned(), without_include);
     }
-}
-
-fn subschema<T: JsonSchema>(generator: &mut SchemaGenerator) -> Value {
-    generator.subschema_for::<T>().to_value()
 }
 
 /// Adds "if the key `by` is this word, then the key `what` is of that type" for each word. `required` keeps the

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::blueprint::assets::Assets;
+use crate::blueprint::catalog::Catalog;
 use crate::blueprint::include::{Includer, RULES};
 use crate::blueprint::json_schema::home_of;
 use crate::blueprint::registry::{Found, SearchPath};
@@ -102,14 +103,19 @@ impl Loaded {
 }
 
 /// Reads and checks a blueprint; includes are looked for in the folders of the environment.
-pub fn load(found: &Found, overrides: &Overrides, adapters: &Registry) -> Loaded {
-    load_from(&SearchPath::from_env(), found, overrides, adapters)
+pub fn load<'a>(found: &Found, overrides: &Overrides, catalog: impl Into<Catalog<'a>>) -> Loaded {
+    load_from(&SearchPath::from_env(), found, overrides, catalog)
 }
 
 /// Reads and checks a blueprint; includes are looked for in `search`.
-pub fn load_from(search: &SearchPath, found: &Found, overrides: &Overrides, adapters: &Registry) -> Loaded {
+pub fn load_from<'a>(
+    search: &SearchPath,
+    found: &Found,
+    overrides: &Overrides,
+    catalog: impl Into<Catalog<'a>>,
+) -> Loaded {
     let mut tree = Tree::new();
-    let blueprint = read_blueprint(&mut tree, search, found, overrides, adapters);
+    let blueprint = read_blueprint(&mut tree, search, found, overrides, catalog.into());
     let mut diags = tree.diags().to_vec();
     // The main file is the first source, the arguments are the last; what has no place comes first of all.
     diags.sort_by_key(|d| d.at.as_ref().map(|at| (at.source, at.range.start)));
@@ -121,7 +127,7 @@ fn read_blueprint(
     search: &SearchPath,
     found: &Found,
     overrides: &Overrides,
-    adapters: &Registry,
+    catalog: Catalog<'_>,
 ) -> Option<Blueprint> {
     tree.know_homes(home_of);
     let mut includer = Includer::new(tree, search);
@@ -134,12 +140,12 @@ fn read_blueprint(
         yaml::set(tree, root, argument, &RULES);
     }
     if overrides.sim {
-        simulate(tree, root, adapters);
+        simulate(tree, root, catalog.adapters);
     }
     let missing = if incomplete { Missing::Ignore } else { Missing::Report };
     let (file, lost) = read::<BlueprintFile>(tree, root, missing);
     let assets = Assets::of(Keyed::default());
-    let checker = Checker { tree, root, lost, adapters, assets, incomplete };
+    let checker = Checker { tree, root, lost, catalog, assets, incomplete };
     let mut blueprint = resolve(checker, file?, &found.name);
     blueprint.sources = sources;
     if tree.has_errors() {

@@ -7,16 +7,15 @@
 
 mod arms;
 mod assets;
+mod catalog;
 mod include;
 mod json_schema;
 mod limits;
 mod load;
-pub mod params;
 pub mod planner;
 mod planner_check;
 mod planner_files;
 mod planner_models;
-mod range;
 mod reference;
 mod registry;
 mod resolve;
@@ -26,12 +25,12 @@ mod summary;
 mod task_robots;
 mod tasks;
 
+pub use catalog::Catalog;
 pub use json_schema::json_schema;
 pub use limits::JointOverride;
 pub use load::{Loaded, Overrides, load, load_from};
-pub use params::CartesianParams;
 pub use reference::reference;
 pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, list};
-pub use resolve::{Arm, Blueprint, Task, TaskKind, TaskRobot, UsedAsset};
+pub use resolve::{Arm, Blueprint, Task, TaskRobot, UsedAsset};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};

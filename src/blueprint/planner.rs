@@ -8,8 +8,8 @@ use serde::de::value::MapAccessDeserializer;
 use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::range::{maybe_positive, non_negative, positive};
 use crate::collision::body::MeshMode;
+use crate::yaml::range::{maybe_positive, non_negative, positive};
 use crate::yaml::{Keyed, Located, Text};
 
 /// Distance that plans keep when the blueprint does not say [m].

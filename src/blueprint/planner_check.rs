@@ -5,6 +5,7 @@ use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConf
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
+use crate::control::task_body::TargetKind;
 use crate::yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(
@@ -71,6 +72,11 @@ fn pose(checker: &mut Checker<'_>, pose: &Located<PoseEntry>) {
     }
 }
 
+/// Whether a task is of a type that executes trajectories.
+fn executes(checker: &Checker<'_>, task: &TaskEntry) -> bool {
+    checker.catalog.tasks.get(&task.kind).is_some_and(|row| row.takes(TargetKind::Trajectory))
+}
+
 /// The task that executes the robot's motions, when it exists and can.
 fn task<'t>(
     checker: &mut Checker<'_>,
@@ -81,7 +87,7 @@ fn task<'t>(
     let task = tasks.iter().find(|t| t.name.value == name.value);
     let unnamed = tasks.iter().any(|t| !checker.has(t.at, "name"));
     match task {
-        Some(task) if checker.has(task.at, "type") && task.kind.value != "trajectory" => {
+        Some(task) if checker.has(task.at, "type") && !executes(checker, task) => {
             let also = checker.tree.label(task.kind.at).with_text("its type");
             let diag = Diag::error(format!("the task {} is not a trajectory task", quote(name))).also(also);
             checker.error(name.at, diag.hint("the planner's motions are executed by a task of type `trajectory`"));

@@ -2,17 +2,17 @@
 
 use std::fmt::Write;
 
-use serde::de::{Deserialize, Deserializer, Visitor};
 use serde_json::Value;
 
+use crate::blueprint::catalog::Catalog;
 use crate::blueprint::json_schema::full_schema;
 use crate::blueprint::limits::LimitsEntry;
-use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, CountedJoints, HardwareEntry, RecordingConfig, RpcConfig, TaskEntry,
 };
-use crate::hardware::registry::Registry;
+use crate::control::task_spec::{TaskSpec, TaskTable};
+use crate::yaml::keys;
 
 const INTRODUCTION: &str = "\
 # Blueprint reference
@@ -50,17 +50,16 @@ const fn section(title: &'static str, first: &'static str, pointer: &'static str
 const ARMS: &str = "A list of arms, merged by `hardware_id` when blueprints are included.";
 const TASKS: &str = "A list of tasks, merged by `name` when blueprints are included.";
 
-const SECTIONS: [Section; 19] = [
+const SECTIONS: [Section; 6] = [
     section("Top level", "", "", keys::<BlueprintFile>),
     section("`coordinator`", "", "/$defs/CoordinatorConfig", keys::<CoordinatorConfig>),
     section("`hardware[]`", ARMS, "/$defs/HardwareEntry", keys::<HardwareEntry>),
     section("`hardware[].joints`, short form", "", "/$defs/CountedJoints", keys::<CountedJoints>),
     section("`hardware[].limits`", "", "/$defs/LimitsEntry", keys::<LimitsEntry>),
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
-    section("`params` of `trajectory`", "", "/$defs/TrajectoryParams", keys::<TrajectoryParams>),
-    section("`params` of `servo`", "", "/$defs/ServoParams", keys::<ServoParams>),
-    section("`params` of `velocity`", "", "/$defs/VelocityParams", keys::<VelocityParams>),
-    section("`params` of `cartesian_ik` and `eef_twist`", "", "/$defs/CartesianParams", keys::<CartesianParams>),
+];
+/// Those behind the parameters of the task types.
+const SECTIONS_AFTER_TASKS: [Section; 9] = [
     section("`planner`", "", "/$defs/PlannerConfig", keys::<PlannerConfig>),
     section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotConfig", keys::<RobotConfig>),
     section("`planner.robots[].gripper_joint`", "", "/$defs/GripperJointEntry", keys::<GripperJointEntry>),
@@ -74,67 +73,15 @@ const SECTIONS: [Section; 19] = [
 
 type Keys = &'static [&'static str];
 
-/// The keys of a type in the order of its fields, which the schema does not keep.
-fn keys<T: Deserialize<'static>>() -> Keys {
-    match T::deserialize(AskKeys) {
-        Err(Asked(keys)) => keys,
-        Ok(_) => &[],
-    }
-}
-
-/// Is told the keys of the type that is read from it, and gives them as its error.
-struct AskKeys;
-
-#[derive(Debug)]
-struct Asked(Keys);
-
-impl std::fmt::Display for Asked {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{:?}", self.0)
-    }
-}
-
-impl std::error::Error for Asked {}
-
-impl serde::de::Error for Asked {
-    fn custom<T: std::fmt::Display>(_: T) -> Self {
-        Self(&[])
-    }
-}
-
-impl Deserializer<'static> for AskKeys {
-    type Error = Asked;
-
-    fn deserialize_any<V: Visitor<'static>>(self, _visitor: V) -> Result<V::Value, Asked> {
-        Err(Asked(&[]))
-    }
-
-    fn deserialize_struct<V: Visitor<'static>>(
-        self,
-        _name: &'static str,
-        fields: Keys,
-        _visitor: V,
-    ) -> Result<V::Value, Asked> {
-        Err(Asked(fields))
-    }
-
-    serde::forward_to_deserialize_any! {
-        <V: Visitor<'static>>
-        bool i8 i16 i32 i64 i128 u8 u16 u32 u64 u128 f32 f64 char str string bytes byte_buf option unit unit_struct
-        newtype_struct seq tuple tuple_struct map enum identifier ignored_any
-    }
-}
-
-/// The page `docs/blueprint-reference.md`, with the adapters' own options.
-pub fn reference(adapters: &Registry) -> String {
-    let schema = full_schema(adapters);
+/// The page `docs/blueprint-reference.md`, with the adapters' own options and the task types' parameters.
+pub fn reference<'a>(catalog: impl Into<Catalog<'a>>) -> String {
+    let catalog = catalog.into();
+    let schema = full_schema(catalog);
     let mut page = INTRODUCTION.to_owned();
-    for Section { title, first, pointer, keys } in SECTIONS {
-        let Some(group) = schema.pointer(pointer) else { continue };
-        let first = if first.is_empty() { text(group, "description") } else { first.to_owned() };
-        write_section(&mut page, title, &first, keys(), group, &schema);
-    }
-    for row in adapters.rows() {
+    write_sections(&mut page, &SECTIONS, &schema);
+    write_params(&mut page, catalog.tasks, &schema);
+    write_sections(&mut page, &SECTIONS_AFTER_TASKS, &schema);
+    for row in catalog.adapters.rows() {
         let title = format!("`options` of `{}`", row.name);
         let rules = schema.pointer("/$defs/HardwareEntry/allOf").and_then(Value::as_array);
         let rule = rules
@@ -150,6 +97,35 @@ pub fn reference(adapters: &Registry) -> String {
     page.truncate(page.trim_end().len());
     page.push('\n');
     page
+}
+
+fn write_sections(page: &mut String, sections: &[Section], schema: &Value) {
+    for Section { title, first, pointer, keys } in sections {
+        let Some(group) = schema.pointer(pointer) else { continue };
+        let first = if first.is_empty() { text(group, "description") } else { (*first).to_owned() };
+        write_section(page, title, &first, keys(), group, schema);
+    }
+}
+
+/// A section for each kind of parameters; types may share theirs.
+fn write_params(page: &mut String, tasks: &TaskTable, schema: &Value) {
+    let group = |row: &TaskSpec| {
+        let mut rules = schema.pointer("/$defs/TaskEntry/allOf")?.as_array()?.iter();
+        let of = |rule: &&Value| rule.pointer("/if/properties/type/const").and_then(Value::as_str) == Some(row.name);
+        let params = rules.find(of)?.pointer("/then/properties/params/anyOf/0")?;
+        Some(follow(params, schema))
+    };
+    let rows: Vec<&TaskSpec> = tasks.rows().collect();
+    for (number, row) in rows.iter().enumerate() {
+        let Some(params) = group(row) else { continue };
+        let same = |other: &&&TaskSpec| group(other).is_some_and(|theirs| std::ptr::eq(theirs, params));
+        if rows.iter().take(number).any(|other| same(&other)) {
+            continue;
+        }
+        let names: Vec<String> = rows.iter().filter(same).map(|row| format!("`{}`", row.name)).collect();
+        let title = format!("`params` of {}", names.join(" and "));
+        write_section(page, &title, &text(params, "description"), (row.params.keys)(), params, schema);
+    }
 }
 
 fn write_section(page: &mut String, title: &str, first: &str, order: Keys, group: &Value, schema: &Value) {
@@ -257,6 +233,7 @@ fn plural(kind: &str) -> String {
 mod tests {
     use super::*;
     use crate::blueprint::json_schema::json_schema;
+    use crate::hardware::registry::Registry;
 
     /// Compares a generated file with the committed one.
     fn check(path: &str, generated: &str) {

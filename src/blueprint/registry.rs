@@ -8,8 +8,8 @@ use std::{env, fs, io};
 
 use serde::Serialize;
 
+use crate::blueprint::catalog::Catalog;
 use crate::blueprint::load::{Overrides, load_from};
-use crate::hardware::registry::Registry;
 use crate::yaml::{MAX_BYTES, did_you_mean, quote};
 
 /// Names and texts of the blueprints in the binary, made by `build.rs` from `blueprints/`.
@@ -211,14 +211,15 @@ impl SearchPath {
     }
 
     /// All blueprints that can be run by name.
-    pub fn list(&self, adapters: &Registry) -> Vec<Listing> {
+    pub fn list<'a>(&self, catalog: impl Into<Catalog<'a>>) -> Vec<Listing> {
+        let catalog = catalog.into();
         let found = self.names().into_iter().map(|(name, source)| {
             let found = match &source {
                 Source::Path(path) => Found::file_at(path).map_err(|error| self.cannot_open(path, &error).message),
                 Source::Embedded => Found::embedded(&name).ok_or_else(|| "it is gone".to_owned()),
             };
             let mut listing = Listing { name, source, arms: Vec::new(), description: String::new(), problem: None };
-            match found.map(|found| load_from(self, &found, &Overrides::default(), adapters)) {
+            match found.map(|found| load_from(self, &found, &Overrides::default(), catalog)) {
                 Ok(loaded) => {
                     listing.problem = loaded.first_problem();
                     if let Some(blueprint) = loaded.blueprint {
@@ -265,6 +266,6 @@ pub fn find(name_or_path: &str) -> Result<Found, FindError> {
 }
 
 /// All blueprints that can be run by name, from the folders of the environment.
-pub fn list(adapters: &Registry) -> Vec<Listing> {
-    SearchPath::from_env().list(adapters)
+pub fn list<'a>(catalog: impl Into<Catalog<'a>>) -> Vec<Listing> {
+    SearchPath::from_env().list(catalog)
 }

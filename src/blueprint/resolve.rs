@@ -1,17 +1,18 @@
 //! A blueprint as it is meant: checked, indices instead of names, SI units.
 
-use serde::Serialize;
+use serde_json::Value;
 
 use crate::arm::Supervision;
 use crate::assets::{Asset, Cache};
 use crate::blueprint::assets::Assets;
+use crate::blueprint::catalog::Catalog;
 use crate::blueprint::limits::JointOverride;
-use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
 use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
-use crate::hardware::registry::{AdapterSpec, Registry};
+use crate::control::task_spec::TaskSpec;
+use crate::hardware::registry::AdapterSpec;
 use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
 use crate::robot::Source;
@@ -94,57 +95,22 @@ pub struct Arm {
     /// Figures with which its measurements and its motion are checked.
     pub supervision: Supervision,
     /// The adapter's own options: an object.
-    pub options: serde_json::Value,
+    pub options: Value,
     /// The arm's own nominal limits, by its number of joints and its options.
     pub own_limits: JointLimits,
     /// Limits narrower than the arm's own, one entry for each joint.
     pub limits: Vec<JointOverride>,
 }
 
-/// What a task does, with its parameters.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(tag = "type", content = "params", rename_all = "snake_case")]
-pub enum TaskKind {
-    /// Executes trajectories.
-    Trajectory(TrajectoryParams),
-    /// Follows streamed positions.
-    Servo(ServoParams),
-    /// Follows streamed velocities.
-    Velocity(VelocityParams),
-    /// Takes an end effector to streamed poses.
-    CartesianIk(CartesianParams),
-    /// Moves an end effector with streamed twists.
-    EefTwist(CartesianParams),
-}
-
-impl TaskKind {
-    /// The word used in blueprints.
-    pub fn name(&self) -> &'static str {
-        match self {
-            Self::Trajectory(_) => "trajectory",
-            Self::Servo(_) => "servo",
-            Self::Velocity(_) => "velocity",
-            Self::CartesianIk(_) => "cartesian_ik",
-            Self::EefTwist(_) => "eef_twist",
-        }
-    }
-
-    /// The parameters of a task that moves an end effector.
-    pub fn cartesian(&self) -> Option<&CartesianParams> {
-        match self {
-            Self::CartesianIk(params) | Self::EefTwist(params) => Some(params),
-            _ => None,
-        }
-    }
-}
-
 /// A task.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Task {
     /// Its name.
     pub name: String,
-    /// What it does.
-    pub kind: TaskKind,
+    /// The row of its type.
+    pub spec: TaskSpec,
+    /// Its parameters, defaults filled in.
+    pub params: Value,
     /// The joints it commands, counted over all arms' joints in the blueprint's order.
     pub joints: Vec<usize>,
     /// The arms those joints belong to.
@@ -176,7 +142,7 @@ pub(super) struct Checker<'t> {
     /// The blueprint's own group.
     pub(super) root: NodeId,
     pub(super) lost: Lost,
-    pub(super) adapters: &'t Registry,
+    pub(super) catalog: Catalog<'t>,
     /// Files that paths may lead into.
     pub(super) assets: Assets,
     /// A file could not be read: names may be missing for that reason.

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::planner::{PlannerConfig, ViewConfig};
-use crate::blueprint::range::{self, tick_rate};
 use crate::blueprint::size::Size;
+use crate::yaml::range::{self, tick_rate};
 use crate::yaml::{Keyed, Located, Raw};
 
 /// A blueprint: which arms there are, and what is done with them.
@@ -223,11 +223,8 @@ impl JsonSchema for Joints {
 pub struct TaskEntry {
     /// Unique name of the task: letters, digits, `_` and `-`.
     pub name: Located<String>,
-    /// What the task does: `trajectory` executes trajectories, `servo` follows streamed positions, `velocity` follows
-    /// streamed velocities; `cartesian_ik` takes the end effector to streamed poses, `eef_twist` moves it with streamed
-    /// velocities.
+    /// What the task does: a row of the table of task types, from which the schema has their names.
     #[serde(rename = "type")]
-    #[schemars(extend("enum" = ["trajectory", "servo", "velocity", "cartesian_ik", "eef_twist"]))]
     pub kind: Located<String>,
     /// The joints it commands: a list of names, or `{hardware: arm}` for all joints of an arm.
     pub joint_names: Located<JointNames>,

@@ -1,8 +1,9 @@
 //! What `dimos check` shows of a blueprint: arms, their joints' limits and where each comes from, tasks.
 
 use serde::Serialize;
+use serde_json::Value;
 
-use crate::blueprint::resolve::{Arm, Blueprint, TaskKind};
+use crate::blueprint::resolve::{Arm, Blueprint};
 use crate::blueprint::schema::{CoordinatorConfig, OnExit};
 use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
 use crate::named::named;
@@ -77,9 +78,11 @@ pub struct ArmSummary {
 pub struct TaskSummary {
     /// Its name.
     pub name: String,
-    /// What it does, with its parameters.
-    #[serde(flatten)]
-    pub kind: TaskKind,
+    /// Its type.
+    #[serde(rename = "type")]
+    pub kind: String,
+    /// Its parameters, defaults filled in.
+    pub params: Value,
     /// The joints it commands.
     pub joints: Vec<String>,
     /// The arms those belong to.
@@ -115,7 +118,8 @@ impl Summary {
         let joints = blueprint.joint_names();
         let tasks = blueprint.tasks.iter().map(|task| TaskSummary {
             name: task.name.clone(),
-            kind: task.kind.clone(),
+            kind: task.spec.name.to_owned(),
+            params: task.params.clone(),
             joints: task.joints.iter().filter_map(|i| joints.get(*i)).map(|j| (*j).to_owned()).collect(),
             arms: task.arms.iter().filter_map(|i| blueprint.arms.get(*i)).map(|a| a.hardware_id.clone()).collect(),
             priority: task.priority,

@@ -1,21 +1,25 @@
 //! Finds the robot of each Cartesian task, in its own parameters or among the planner's robots, and checks it against
 //! its description.
 
+use std::collections::HashMap;
 use std::path::PathBuf;
 
+use glamx::DQuat;
 use nalgebra::Isometry3;
+use serde::Deserialize;
 
 use crate::blueprint::arms::Found;
-use crate::blueprint::params::CartesianParams;
 use crate::blueprint::planner_files::file;
-use crate::blueprint::resolve::{Checker, Task, TaskKind, TaskRobot};
+use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
+use crate::control::task_robot::{Place as Frame, RobotParams, TaskKinematics};
 use crate::planning::config::{PlannerConfig, RobotConfig};
+use crate::robot::kinematics::{Kinematics, frame};
 use crate::robot::model::{JointKind, RobotModel};
 use crate::robot::{Source, load};
 use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
 
-/// Gives the Cartesian ones among `tasks` their robots.
+/// Gives those of `tasks` their robots whose types move an end effector.
 pub(super) fn resolve(
     checker: &mut Checker<'_>,
     entries: &[Located<TaskEntry>],
@@ -24,15 +28,15 @@ pub(super) fn resolve(
     found: &Found,
 ) {
     let names: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
-    for task in tasks {
-        let Some(params) = task.kind.cartesian().cloned() else { continue };
+    for task in tasks.iter_mut().filter(|task| task.spec.robot) {
+        let Ok(params) = RobotParams::deserialize(&task.params) else { continue };
         let Some(entry) = entries.iter().find(|e| e.name.value == task.name) else { continue };
         let known = found.joints_known && !task.joints.is_empty() && checker.has(entry.at, "joint_names");
         let whole = checker.has(entry.at, "params") && !checker.lost.contains(entry.joint_names.at);
         let joints: Vec<String> = task.joints.iter().filter_map(|j| names.get(*j)).map(|j| (*j).to_owned()).collect();
         if known && whole {
             let place = Place { entry, params: entry.params.as_ref().map(|p| p.at) };
-            task.robot = robot(checker, &place, &params, &joints, planner, &task.kind);
+            task.robot = robot(checker, &place, &params, &joints, planner, task.spec.name);
         }
     }
 }
@@ -53,10 +57,10 @@ impl Place<'_> {
 fn robot(
     checker: &mut Checker<'_>,
     place: &Place<'_>,
-    params: &CartesianParams,
+    params: &RobotParams,
     joints: &[String],
     planner: Option<&PlannerConfig>,
-    kind: &TaskKind,
+    kind: &str,
 ) -> Option<TaskRobot> {
     let covers = |robot: &&RobotConfig| joints.iter().all(|j| robot.coordinator_joints.contains(j));
     let planned = planner.and_then(|planner| planner.robots.iter().find(covers));
@@ -75,8 +79,7 @@ fn robot(
         },
         (None, Some(planned)) => of_planner(planned, joints, mapped),
         (None, None) => {
-            let diag =
-                Diag::error(format!("the description of the robot is missing, which a `{}` task needs", kind.name()));
+            let diag = Diag::error(format!("the description of the robot is missing, which a `{kind}` task needs"));
             let hint = "name it: `params: {model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: arm_}`, \
                         or add a robot with these joints to `planner`";
             checker.error(place.entry.kind.at, diag.hint(hint));
@@ -119,7 +122,7 @@ fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<Strin
 fn packages(
     checker: &Checker<'_>,
     place: &Place<'_>,
-    params: &CartesianParams,
+    params: &RobotParams,
 ) -> std::collections::BTreeMap<String, PathBuf> {
     let at = place.of(checker, "package_paths");
     params.package_paths.iter().map(|(name, path)| (name.clone(), file(checker, at, path))).collect()
@@ -129,7 +132,7 @@ fn packages(
 fn mapping(
     checker: &mut Checker<'_>,
     place: &Place<'_>,
-    params: &CartesianParams,
+    params: &RobotParams,
     joints: &[String],
 ) -> Option<Option<Vec<String>>> {
     let (prefix, mapping) = (&params.joint_prefix, &params.joint_name_mapping);
@@ -226,3 +229,24 @@ fn check_chain(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, 
 
 /// Where a planner's robot stands: its base link, and that link's pose in the frame `map`.
 pub type Base = (String, Isometry3<f64>);
+
+impl TaskRobot {
+    /// Reads the robot's description and compiles it for the tick.
+    pub fn kinematics(&self) -> Result<TaskKinematics, String> {
+        let model = load(&self.source).into_model()?;
+        let link = |name: &str| model.link_index(name).ok_or_else(|| format!("the model has no link {name:?}"));
+        let joint = |name: &String| model.joint_index(name).ok_or_else(|| format!("the model has no joint {name:?}"));
+        let joints = self.joints.iter().map(joint).collect::<Result<Vec<_>, _>>()?;
+        let kinematics = Kinematics::new(&model, &joints, &[]).map_err(|e| e.to_string())?;
+        let mut robot = TaskKinematics::new(kinematics, link(&self.link)?);
+        if let Some((base_link, base_pose)) = &self.base {
+            let rest = model.positions(&HashMap::new());
+            let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
+            let root = frame(&(base_pose * base.inverse()));
+            let turn = DQuat::from_mat3(&root.matrix3).to_array();
+            robot.root = Frame { position: root.translation.to_array(), orientation: turn };
+            robot.base = DQuat::from_mat3(&frame(&base).matrix3).to_array();
+        }
+        Ok(robot)
+    }
+}

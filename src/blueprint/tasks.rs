@@ -1,16 +1,14 @@
 //! Checks `tasks`: names, types, joints, modes, parameters, and who shares a joint with whom.
 
-use serde::de::DeserializeOwned;
+use serde_json::Value;
 
 use crate::blueprint::arms::Found;
-use crate::blueprint::params::{CartesianParams, ServoParams, TrajectoryParams, VelocityParams};
-use crate::blueprint::resolve::{Checker, Task, TaskKind};
+use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::{JointNames, TaskEntry};
+use crate::control::task_body::TargetKind;
+use crate::control::task_spec::{TaskSetup, TaskSpec};
 use crate::joint::{ControlMode, MAX_DOF};
-use crate::yaml::{Diag, Located, Missing, NodeId, did_you_mean, quote, read};
-
-/// The task types of this version.
-pub(super) const KINDS: [&str; 5] = ["trajectory", "servo", "velocity", "cartesian_ik", "eef_twist"];
+use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
 
 /// A task as far as it is understood, with its places.
 struct Checked<'e> {
@@ -39,11 +37,13 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>],
             }
         }
         let (joints, arms) = joints(checker, entry, found);
-        if let Some(kind) = kind(checker, entry, &joints, found) {
-            modes(checker, entry, &kind, &arms, found);
+        if let Some(spec) = spec(checker, entry) {
+            let params = params(checker, entry, &spec, &joints, found);
+            modes(checker, entry, &spec, &arms, found);
             tasks.push(Task {
                 name: entry.name.value.clone(),
-                kind,
+                spec,
+                params,
                 joints: joints.clone(),
                 arms,
                 priority: entry.priority,
@@ -114,88 +114,81 @@ fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) 
     (joints, arms)
 }
 
-/// The task's type, with its parameters.
-fn kind(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, joints: &[usize], found: &Found) -> Option<TaskKind> {
+/// The row of the task's type.
+fn spec(checker: &mut Checker<'_>, entry: &Located<TaskEntry>) -> Option<TaskSpec> {
     if !checker.has(entry.at, "type") {
         return None;
     }
-    let params = entry.params.as_ref().filter(|p| !p.value.is_null()).map(|p| p.at);
-    let params = params.filter(|_| checker.has(entry.at, "params"));
-    check_width(checker, entry, joints);
-    match entry.kind.as_str() {
-        "trajectory" => Some(TaskKind::Trajectory(read_params::<TrajectoryParams>(checker, params))),
-        "servo" => {
-            let servo = read_params::<ServoParams>(checker, params);
-            check_default_positions(checker, entry, params, &servo, joints, found);
-            Some(TaskKind::Servo(servo))
-        }
-        "velocity" => Some(TaskKind::Velocity(read_params::<VelocityParams>(checker, params))),
-        "cartesian_ik" => Some(TaskKind::CartesianIk(read_params::<CartesianParams>(checker, params))),
-        "eef_twist" => Some(TaskKind::EefTwist(read_params::<CartesianParams>(checker, params))),
-        other => {
-            let diag = Diag::error(format!("there is no task type {}", quote(other)));
-            checker.error(entry.kind.at, diag.maybe_hint(did_you_mean(other, KINDS, "there are")));
-            None
-        }
+    let types = checker.catalog.tasks;
+    let found = types.get(&entry.kind).copied();
+    if found.is_none() {
+        let diag = Diag::error(format!("there is no task type {}", quote(&entry.kind)));
+        checker.error(entry.kind.at, diag.maybe_hint(did_you_mean(&entry.kind, types.names(), "there are")));
+    }
+    found
+}
+
+/// The task's parameters, with what the type itself has to say to them.
+fn params(
+    checker: &mut Checker<'_>,
+    entry: &Located<TaskEntry>,
+    spec: &TaskSpec,
+    joints: &[usize],
+    found: &Found,
+) -> Value {
+    check_width(checker, entry, spec, joints);
+    let node = entry.params.as_ref().filter(|p| !p.value.is_null()).map(|p| p.at);
+    let node = node.filter(|_| checker.has(entry.at, "params"));
+    let Some(node) = node else { return (spec.params.default)() };
+    let (params, lost) = (spec.params.read)(checker.tree, node);
+    checker.lost.extend(lost);
+    let params = params.unwrap_or_else(spec.params.default);
+    let named = checker.has(entry.at, "joint_names") && !checker.lost.contains(entry.joint_names.at);
+    if named && found.joints_known && !joints.is_empty() && !spec.robot {
+        try_build(checker, node, spec, joints, &params);
+    }
+    params
+}
+
+/// Builds the task's body as a run does, only to learn whether that works. Where the type moves an end effector, its
+/// robot is checked elsewhere.
+fn try_build(checker: &mut Checker<'_>, node: NodeId, spec: &TaskSpec, joints: &[usize], params: &Value) {
+    let joints: Vec<u16> = joints.iter().map(|&j| j as u16).collect();
+    let Err(error) = (spec.build)(&TaskSetup { joints: &joints, params, robot: None }) else { return };
+    let at = checker.tree.get(node, error.key).unwrap_or(node);
+    if !checker.lost.contains(at) {
+        checker.error(at, Diag::error(error.what).maybe_hint(error.hint));
     }
 }
 
 /// A stream's target crosses to the tick as one fixed array.
-fn check_width(checker: &mut Checker<'_>, entry: &TaskEntry, joints: &[usize]) {
-    if KINDS.contains(&entry.kind.as_str()) && entry.kind.value != "trajectory" && joints.len() > MAX_DOF {
-        let kind = entry.kind.as_str();
+fn check_width(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, joints: &[usize]) {
+    if spec.takes.iter().any(|kind| *kind != TargetKind::Trajectory) && joints.len() > MAX_DOF {
+        let kind = spec.name;
         let diag =
             Diag::error(format!("a {kind} task moves at most {MAX_DOF} joints, this one names {}", joints.len()));
         checker.error(entry.joint_names.at, diag.hint("make one task per arm"));
     }
 }
 
-fn read_params<T: DeserializeOwned + Default>(checker: &mut Checker<'_>, params: Option<NodeId>) -> T {
-    let Some(node) = params else { return T::default() };
-    let (value, lost) = read::<T>(checker.tree, node, Missing::Report);
-    checker.lost.extend(lost);
-    value.unwrap_or_default()
-}
-
-fn check_default_positions(
-    checker: &mut Checker<'_>,
-    entry: &Located<TaskEntry>,
-    params: Option<NodeId>,
-    servo: &ServoParams,
-    joints: &[usize],
-    found: &Found,
-) {
-    let place = params.and_then(|params| checker.tree.get(params, "default_positions"));
-    let (Some(positions), Some(place)) = (&servo.default_positions, place) else { return };
-    let named = checker.has(entry.at, "joint_names") && !checker.lost.contains(entry.joint_names.at);
-    let known = named && found.joints_known && !joints.is_empty();
-    if known && positions.len() != joints.len() && !checker.lost.contains(place) {
-        let diag = Diag::error(format!("{} positions for {} joints", positions.len(), joints.len()));
-        checker.error(place, diag.hint("give one for each joint of the task, in the same order"));
-    }
-}
-
 /// Whether every arm of the task can be commanded the way the task does.
-fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, kind: &TaskKind, arms: &[usize], found: &Found) {
-    let wanted: &[ControlMode] = match kind {
-        TaskKind::Velocity(_) => &[ControlMode::Velocity],
-        _ => &[ControlMode::ServoPosition, ControlMode::Position],
-    };
+fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, arms: &[usize], found: &Found) {
+    let wanted = spec.modes();
     for (id, row) in arms.iter().filter_map(|i| found.entries.get(*i)).filter_map(|e| Some((&e.id, e.adapter?))) {
-        if row.modes.iter().any(|mode| wanted.contains(mode)) {
+        if wanted.is_empty() || row.modes.iter().any(|mode| wanted.contains(mode)) {
             continue;
         }
         let needs = wanted.iter().map(|m| m.name()).collect::<Vec<_>>().join(" or ");
         let has = row.modes.iter().map(|m| m.name()).collect::<Vec<_>>().join(", ");
-        let diag = Diag::error(format!("`{}` tasks need the mode {needs}, which arm {} lacks", kind.name(), quote(id)));
+        let diag = Diag::error(format!("`{}` tasks need the mode {needs}, which arm {} lacks", spec.name, quote(id)));
         let diag = diag.note(format!("its adapter `{}` has: {has}", row.name));
         let can = |m: ControlMode| row.modes.contains(&m);
-        let hint = match kind {
-            _ if can(ControlMode::Velocity) => "a `velocity` task would work with this arm",
-            _ if can(ControlMode::ServoPosition) || can(ControlMode::Position) => {
+        let hint = match () {
+            () if can(ControlMode::Velocity) => "a `velocity` task would work with this arm",
+            () if can(ControlMode::ServoPosition) || can(ControlMode::Position) => {
                 "a `servo` or `trajectory` task would work with this arm"
             }
-            _ => "no task type works with this arm; leave the task out",
+            () => "no task type works with this arm; leave the task out",
         };
         checker.error(entry.kind.at, diag.hint(hint));
     }

@@ -123,7 +123,7 @@ fn mismatch(run: &StatusReport, args: &Args, blueprint: &Blueprint) -> Mismatch 
 
 fn missing_task(run: &StatusReport, robot: &RobotConfig) -> Option<String> {
     let name = robot.task.as_ref()?;
-    let Some(task) = run.tasks.iter().find(|task| task.name == *name && task.kind == "trajectory") else {
+    let Some(task) = run.tasks.iter().find(|task| task.name == *name && task.takes("execute")) else {
         return Some(format!("no trajectory task {name}"));
     };
     let missing = robot.coordinator_joints.iter().find(|joint| !task.joints.contains(joint))?;

@@ -8,8 +8,7 @@ use super::arguments::setting;
 use super::exit::{Exit, Failure, Result};
 use super::fetch;
 use super::output::{self, Table};
-use crate::blueprint::{self, Limit, Loaded, OnExit, Overrides, Summary};
-use crate::hardware::registry::Registry;
+use crate::blueprint::{self, Catalog, Limit, Loaded, OnExit, Overrides, Summary};
 
 /// Arguments of `check`.
 #[derive(Debug, clap::Args)]
@@ -29,22 +28,22 @@ pub struct Args {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args, registry: &Registry) -> Result {
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     let set = args.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    report(&args.blueprint, &Overrides { set, sim: args.sim }, registry, args.json)
+    report(&args.blueprint, &Overrides { set, sim: args.sim }, catalog, args.json)
 }
 
 /// Finds and reads a blueprint; its mistakes are in the result.
-pub fn load(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
+pub fn load(name: &str, overrides: &Overrides, catalog: Catalog<'_>) -> Result<Loaded> {
     let found = blueprint::find(name).map_err(|e| Failure::usage(e.message).hint(e.hint))?;
-    Ok(blueprint::load(&found, overrides, registry))
+    Ok(blueprint::load(&found, overrides, catalog))
 }
 
 /// Same for a run: also downloads missing assets, and then checks what depends on them.
-pub fn load_to_run(name: &str, overrides: &Overrides, registry: &Registry) -> Result<Loaded> {
-    let loaded = load(name, overrides, registry)?;
+pub fn load_to_run(name: &str, overrides: &Overrides, catalog: Catalog<'_>) -> Result<Loaded> {
+    let loaded = load(name, overrides, catalog)?;
     match &loaded.blueprint {
-        Some(blueprint) if fetch::missing(blueprint)? => load(name, overrides, registry),
+        Some(blueprint) if fetch::missing(blueprint)? => load(name, overrides, catalog),
         _ => Ok(loaded),
     }
 }
@@ -63,8 +62,8 @@ pub fn print_warnings(loaded: &Loaded) {
 }
 
 /// Checks a blueprint and prints the result.
-pub fn report(name: &str, overrides: &Overrides, registry: &Registry, as_json: bool) -> Result {
-    let loaded = load(name, overrides, registry)?;
+pub fn report(name: &str, overrides: &Overrides, catalog: Catalog<'_>, as_json: bool) -> Result {
+    let loaded = load(name, overrides, catalog)?;
     let summary = loaded.blueprint.as_ref().map(Summary::of);
     let robots = loaded.blueprint.as_ref().map(robots::of).unwrap_or_else(|| Ok(Vec::new()));
     if as_json {
@@ -127,7 +126,7 @@ fn print(summary: &Summary) {
     output::line("");
     let mut table = Table::new(&["TASK", "TYPE", ">PRIORITY", "JOINTS"]);
     for task in &summary.tasks {
-        let kind = task.kind.name().to_owned();
+        let kind = task.kind.clone();
         table.row([task.name.clone(), kind, task.priority.to_string(), task.joints.join(" ")]);
     }
     table.print();

@@ -23,7 +23,7 @@ use super::exit::{Exit, Failure, Result};
 use super::run::Args;
 use super::run_record::last_lines;
 use super::{check, output};
-use crate::hardware::registry::Registry;
+use crate::blueprint::Catalog;
 use crate::recording::files::{self, KEPT_LOGS};
 use crate::rpc::place;
 use crate::rpc::report::StatusReport;
@@ -62,9 +62,9 @@ enum StartMessage {
 }
 
 /// Starts the run in its own process and waits until it is up.
-pub fn start(args: &Args, registry: &Registry) -> Result {
+pub fn start(args: &Args, catalog: Catalog<'_>) -> Result {
     // Print mistakes here, on the user's terminal, in colour.
-    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
+    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), catalog)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let run = args.name.as_ref().unwrap_or(&blueprint.name);

@@ -4,8 +4,7 @@ use serde_json::json;
 
 use super::exit::{Exit, Result};
 use super::output::{self, Table};
-use crate::blueprint;
-use crate::hardware::registry::Registry;
+use crate::blueprint::{self, Catalog};
 
 /// Arguments of `list-blueprints`.
 #[derive(Debug, clap::Args)]
@@ -16,8 +15,8 @@ pub struct Args {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args, registry: &Registry) -> Result {
-    let all = blueprint::list(registry);
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
+    let all = blueprint::list(catalog);
     if args.json {
         let rows = all.iter().map(|b| {
             json!({"name": b.name, "source": b.source.to_string(), "arms": b.arms,

@@ -45,7 +45,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use crate::blueprint;
+use crate::blueprint::{self, Catalog};
+use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::registry::{Absent, AdapterSpec, Registry};
 use crate::robot::builtin;
 
@@ -138,6 +139,7 @@ enum Command {
 #[derive(Debug, Clone, Default)]
 pub struct Program {
     adapters: Vec<AdapterSpec>,
+    tasks: Vec<TaskSpec>,
     absent: Vec<Absent>,
     blueprints: Vec<(&'static str, &'static str)>,
     robots: Vec<(&'static str, &'static str)>,
@@ -152,6 +154,12 @@ impl Program {
     /// Adds an adapter; it wins over one of the same name in the box.
     pub fn adapter(mut self, row: AdapterSpec) -> Self {
         self.adapters.push(row);
+        self
+    }
+
+    /// Adds a task type; it wins over a built-in one of the same name. `docs/adding-a-task.md` has a complete one.
+    pub fn task(mut self, row: TaskSpec) -> Self {
+        self.tasks.push(row);
         self
     }
 
@@ -177,20 +185,22 @@ impl Program {
     pub fn main(self) -> ExitCode {
         blueprint::embed(self.blueprints);
         builtin::embed(self.robots);
-        command_line(&Registry::with(&self.adapters).lacking(&self.absent))
+        let adapters = Registry::with(&self.adapters).lacking(&self.absent);
+        command_line(Catalog { adapters: &adapters, tasks: &TaskTable::with(&self.tasks) })
     }
 }
 
 /// Runs the command line with more adapters than those in the box. [`Program`] can add more than that.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
-    command_line(&Registry::with(adapters))
+    command_line(Catalog::from(&Registry::with(adapters)))
 }
 
-fn command_line(registry: &Registry) -> ExitCode {
+fn command_line(catalog: Catalog<'_>) -> ExitCode {
+    let registry = catalog.adapters;
     // Usage errors, `--help` and `--version` end here, with 2 or 0.
     let cli = Cli::parse_from(std::env::args_os().map(spelled_out));
     let result = match &cli.command {
-        Command::Run(args) => run::run(args, registry),
+        Command::Run(args) => run::run(args, catalog),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
         Command::Move(args) => motion::run(args),
@@ -207,14 +217,14 @@ fn command_line(registry: &Registry) -> ExitCode {
         Command::Logs(args) => logs::run(args),
         Command::Adapter(args) => adapter::run(args, registry),
         Command::ListAdapters(args) => list_adapters::run(args, registry),
-        Command::ListBlueprints(args) => list_blueprints::run(args, registry),
-        Command::Check(args) => check::run(args, registry),
+        Command::ListBlueprints(args) => list_blueprints::run(args, catalog),
+        Command::Check(args) => check::run(args, catalog),
         Command::Doctor(args) => doctor::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
-        Command::Model(args) => model::run(args, registry),
-        Command::Schema(args) => schema::run(args, registry),
-        Command::Replay(args) => replay::run(args, registry),
+        Command::Model(args) => model::run(args, catalog),
+        Command::Schema(args) => schema::run(args, catalog),
+        Command::Replay(args) => replay::run(args, catalog),
     };
     let exit = result.unwrap_or_else(|failure| {
         output::failure(&failure);

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use crate::hardware::registry::Registry;
+use crate::blueprint::Catalog;
 use crate::robot::urdf::Meshes;
 use crate::robot::{Loaded, RobotModel, Source, load};
 
@@ -103,7 +103,7 @@ impl File {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args, registry: &Registry) -> Result {
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     match &args.verb {
         Verb::Info(file) => info::info(file),
         Verb::Tree(file) => info::tree(file),
@@ -111,7 +111,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         Verb::Expand(file) => expand(file),
         Verb::Fk(args) => fk::run(args),
         Verb::Ik(args) => ik::run(args),
-        Verb::Assets(args) => assets::run(args, registry),
+        Verb::Assets(args) => assets::run(args, catalog),
     }
 }
 

@@ -15,7 +15,7 @@ use thiserror::Error;
 
 use super::arguments::setting;
 use super::exit::{Exit, Failure, Result};
-use crate::hardware::registry::Registry;
+use crate::blueprint::Catalog;
 use crate::recording::files;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError};
 use crate::replay::recorded::RecordedError;
@@ -127,8 +127,8 @@ fn folder_text(folder: &Option<PathBuf>) -> String {
 }
 
 /// Plays a log as requested.
-pub fn run(args: &ReplayArgs, registry: &Registry) -> Result {
-    match try_run(args, registry) {
+pub fn run(args: &ReplayArgs, catalog: Catalog<'_>) -> Result {
+    match try_run(args, catalog) {
         // A closed pipe (`| head`) is not an error.
         Err(e) if e.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe) => Ok(Exit::Ok),
         Err(e) if e.is::<SelectionError>() || e.is::<ReplayError>() || e.is::<RecordedError>() => {
@@ -138,15 +138,15 @@ pub fn run(args: &ReplayArgs, registry: &Registry) -> Result {
     }
 }
 
-fn try_run(args: &ReplayArgs, registry: &Registry) -> anyhow::Result<Exit> {
+fn try_run(args: &ReplayArgs, catalog: Catalog<'_>) -> anyhow::Result<Exit> {
     let path = log_path(args)?;
     if args.verify {
-        return Ok(verify::run(&path, args.json)?);
+        return Ok(verify::run(&path, catalog.tasks, args.json)?);
     }
     let mut log = LogReader::open(&path)?;
     let part = choose(args, log.info(), &path)?;
     if let Some(blueprint) = &args.onto.blueprint {
-        return Ok(onto::run(args, blueprint, &path, &part, registry)?);
+        return Ok(onto::run(args, blueprint, &path, &part, catalog)?);
     }
     let out = io::stdout();
     let tty = out.is_terminal();

@@ -18,8 +18,7 @@ use super::exit::{Exit, Failure, Result};
 use super::run_record::RunRecord;
 use super::text_log::Terminal;
 use super::{banner, check, daemon};
-use crate::blueprint::Overrides;
-use crate::hardware::registry::Registry;
+use crate::blueprint::{Catalog, Overrides};
 use crate::rpc::report::StatusReport;
 use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager, StartError};
 
@@ -84,13 +83,13 @@ impl Args {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args, registry: &Registry) -> Result {
+pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     if args.check {
-        return check::report(&args.blueprint, &args.overrides(), registry, args.json);
+        return check::report(&args.blueprint, &args.overrides(), catalog, args.json);
     }
     match &args.text_log {
-        None if args.daemon => daemon::start(args, registry),
-        None => match bring_up(args, registry)? {
+        None if args.daemon => daemon::start(args, catalog),
+        None => match bring_up(args, catalog)? {
             (Up::Run(run), signals, terminal) => {
                 let record = RunRecord::begin(&run.status(), None);
                 keep_up(*run, signals, &terminal, args.duration, args.json, Some(record))
@@ -100,14 +99,14 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
                 planner.keep_up(&terminal, args, None)
             }
         },
-        Some(text_log) => in_background(args, registry, text_log),
+        Some(text_log) => in_background(args, catalog, text_log),
     }
 }
 
 /// Runs in the background: reports to the starting process that the run is up, or why not.
-fn in_background(args: &Args, registry: &Registry, text_log: &Path) -> Result {
+fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
     let starter = StartingProcess::detach(text_log)?;
-    let (up, signals, terminal) = match bring_up(args, registry) {
+    let (up, signals, terminal) = match bring_up(args, catalog) {
         Ok(up) => up,
         Err(failure) => {
             starter.failed(&failure);
@@ -141,8 +140,8 @@ enum Up {
     Planner(Box<Attached>),
 }
 
-fn bring_up(args: &Args, registry: &Registry) -> Result<(Up, Signals, Terminal)> {
-    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), registry)?;
+fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)> {
+    let loaded = check::load_to_run(&args.blueprint, &args.overrides(), catalog)?;
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     // Watched before anything is connected: a signal during startup ends the run, controlled, as soon as it is up.

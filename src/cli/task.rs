@@ -88,16 +88,17 @@ pub fn run(args: &Args) -> Result {
         Action::Stream { task, file, rate, target_run } => {
             let mut client = target_run.connect()?;
             let report = find(&mut client, task)?;
-            let width = match report.kind.as_str() {
-                "eef_twist" => Width::Twist,
-                "cartesian_ik" => Width::Pose,
-                _ => Width::Joints(report.joints.len()),
+            let targets = Targets::of(&report)?;
+            let width = match targets {
+                Targets::Twist => Width::Twist,
+                Targets::Pose => Width::Pose,
+                Targets::Positions | Targets::Velocities => Width::Joints(report.joints.len()),
             };
             let (source, rate) = match file.as_deref().filter(|path| path.as_os_str() != "-") {
                 Some(path) => (Source::file(path, width)?, rate.or(Some(FILE_RATE))),
                 None => (Source::stdin(width), *rate),
             };
-            stream(&mut client, &report, source, rate, target_run.json)
+            stream(&mut client, &report, targets, source, rate, target_run.json)
         }
     }
 }
@@ -136,12 +137,40 @@ fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Sends targets until they end or a signal arrives.
-fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Option<f64>, json: bool) -> Result {
-    if task.kind == "trajectory" {
-        let text = format!("{} is a trajectory task and does not follow streams", task.name);
-        return Err(refusal(RpcError::new(Code::WrongTask, text).hint("`dimos task list` shows the types")));
+/// Kind of the targets that a task follows as a stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Targets {
+    Positions,
+    Velocities,
+    Twist,
+    Pose,
+}
+
+impl Targets {
+    fn of(task: &TaskReport) -> Result<Self> {
+        let target = |method: &String| match method.as_str() {
+            "servo" => Some(Self::Positions),
+            "velocity" => Some(Self::Velocities),
+            "twist" => Some(Self::Twist),
+            "pose" => Some(Self::Pose),
+            _ => None,
+        };
+        task.takes.iter().find_map(target).ok_or_else(|| {
+            let text = format!("{} is a {} task and does not follow streams", task.name, task.kind);
+            refusal(RpcError::new(Code::WrongTask, text).hint("`dimos task list` shows the types"))
+        })
     }
+}
+
+/// Sends targets until they end or a signal arrives.
+fn stream(
+    client: &mut Client,
+    task: &TaskReport,
+    targets: Targets,
+    mut source: Source,
+    rate: Option<f64>,
+    json: bool,
+) -> Result {
     let signals = Signals::watch();
     let period = rate.map(|rate| Duration::from_secs_f64(1.0 / rate));
     let (began, mut sent, mut beat) = (Instant::now(), 0_u64, Instant::now());
@@ -163,7 +192,7 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
                 return Err(mistake);
             }
         };
-        send(client, task, target)?;
+        send(client, task, targets, target)?;
         sent += 1;
         if let Some(period) = period {
             beat = (beat + period).max(Instant::now() - period);
@@ -175,7 +204,7 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
         let failure = Failure::new(Exit::Failed, format!("{}: {} after {sent} targets: {why}", now.name, now.state));
         return Err(failure.hint("`dimos status` shows what the arm waits for"));
     }
-    if ended.is_some() || task.kind != "servo" {
+    if ended.is_some() || targets != Targets::Positions {
         end(client, task)?;
     }
     let seconds = began.elapsed().as_secs_f64();
@@ -187,17 +216,17 @@ fn stream(client: &mut Client, task: &TaskReport, mut source: Source, rate: Opti
     Ok(ended.map_or(Exit::Ok, Exit::by_signal))
 }
 
-/// Sends a target in the form of the task's type.
-fn send(client: &mut Client, task: &TaskReport, target: Vec<f64>) -> Result<()> {
+/// Sends a target in the form of the stream.
+fn send(client: &mut Client, task: &TaskReport, targets: Targets, target: Vec<f64>) -> Result<()> {
     let name = task.name.clone();
     let three = |from: usize| std::array::from_fn(|i| target.get(from + i).copied().unwrap_or_default());
-    match task.kind.as_str() {
-        "servo" => client.call(Servo { task: name, positions: target })?,
-        "velocity" => client.call(Velocity { task: name, velocities: target })?,
-        "eef_twist" => {
+    match targets {
+        Targets::Positions => client.call(Servo { task: name, positions: target })?,
+        Targets::Velocities => client.call(Velocity { task: name, velocities: target })?,
+        Targets::Twist => {
             client.call(Twist { task: name, linear: three(0), angular: three(3), frame: TwistFrame::Base })?
         }
-        _ => {
+        Targets::Pose => {
             let quat = target.get(3..7).map(|q| std::array::from_fn(|i| q.get(i).copied().unwrap_or_default()));
             let rpy = quat.is_none().then(|| three(3));
             client.call(Pose { task: name, xyz: three(0), rpy, quat })?

@@ -2,7 +2,8 @@
 //! loser is told once per winner, and again only after that winner has let go.
 
 use super::request::Motion;
-use super::task::{Claim, Demand, Task};
+use super::task::Task;
+use super::task_body::{Claim, Demand};
 use crate::telemetry::Event;
 
 /// What came of arbitration.

@@ -10,7 +10,7 @@ use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Bounds, Limiter, Refusal};
 use super::set_points::{Range, SetPoints};
 use super::stalls::Stalls;
-use super::task::Demand;
+use super::task_body::Demand;
 use super::written::{Issued, Written};
 use crate::arm::{ArmCommand, ArmState, Link, VelocitySource};
 use crate::clock::Mono;

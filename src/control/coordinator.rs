@@ -10,11 +10,10 @@ use super::config::CoordinatorConfig;
 use super::limit::Refusal;
 use super::request::{Envelope, Motion, Request};
 use super::stalls::Stalls;
-use super::task::{Body, Context, JointView, Task};
-use super::tasks::cartesian::Goal;
+use super::task::Task;
+use super::task_body::{JointView, Target};
 use crate::arm::{ArmCommand, ArmState};
 use crate::clock::Mono;
-use crate::joint::Joints;
 use crate::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, TaskState, TaskView};
 
 /// At most this many requests are handled in one tick: as many as can wait, so that a stop is never kept waiting
@@ -84,13 +83,13 @@ pub struct Coordinator {
     stalls: Stalls,
     shutting_down: bool,
     started: bool,
-    auto_start: Vec<bool>,
     output: TickOutput,
 }
 
 impl Coordinator {
-    /// A coordinator of which no tick was run yet. All memory it will need is taken here.
-    pub fn new(config: &CoordinatorConfig) -> Self {
+    /// A coordinator of which no tick was run yet, with the configuration's tasks as
+    /// [`TaskTable::build`](super::task_spec::TaskTable::build) made them. All memory it will need is taken here.
+    pub fn new(config: &CoordinatorConfig, tasks: Vec<Task>) -> Self {
         let mut arm_of = Vec::new();
         let arms: Vec<ArmControl> = (config.arms.iter().enumerate())
             .map(|(i, arm)| {
@@ -99,7 +98,6 @@ impl Coordinator {
                 ArmControl::new(arm.clone(), first, config.period())
             })
             .collect();
-        let tasks: Vec<Task> = config.tasks.iter().map(Task::new).collect();
         let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
         // Each request has its outcome and may change a task; the rest tells of itself a few times at most.
         let events = 2 * REQUESTS_PER_TICK + 4 * (arms.len() + tasks.len()) + arm_of.len();
@@ -116,7 +114,6 @@ impl Coordinator {
                 retired: Vec::with_capacity(2 * tasks.len() + REQUESTS_PER_TICK),
                 events_lost: 0,
             },
-            auto_start: config.tasks.iter().map(|t| t.auto_start).collect(),
             arms,
             tasks,
             arm_of,
@@ -125,6 +122,11 @@ impl Coordinator {
             shutting_down: false,
             started: false,
         }
+    }
+
+    /// The tasks, as the last tick left them.
+    pub fn tasks(&self) -> &[Task] {
+        &self.tasks
     }
 
     /// Whether no arm is being moved by commands.
@@ -254,9 +256,9 @@ impl Coordinator {
             }
             _ if self.shutting_down => Outcome::ShuttingDown,
             Request::Execute { task, motion } => self.execute(now, task, motion),
-            Request::Servo { task, target } => self.stream(now, task, &target, true),
-            Request::Velocity { task, target } => self.stream(now, task, &target, false),
-            Request::Steer { task, goal } => self.steer(now, task, &goal),
+            Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
+            Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
+            Request::Steer { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
             Request::Reset { arm } => self.with_arm(arm, |a| a.failsafe.reset(arm, &a.state, a.freshness(), now)),
             Request::Ready { arm } => self.ready(arm, now),
             Request::Park { arm } => {
@@ -312,9 +314,10 @@ impl Coordinator {
             if which.is_some_and(|w| w as usize != t) {
                 continue;
             }
-            if let Some(task) = self.tasks.get_mut(t).filter(|t| t.is_active())
-                && task.cancel()
+            if let Some(task) = self.tasks.get_mut(t)
+                && let Some(motion) = task.cancel()
             {
+                self.output.retired.extend(motion);
                 outcome = Outcome::Cancelled;
                 let event = Event::Task(t as u16, task.state, task.reason);
                 self.output.tell(event);
@@ -324,106 +327,32 @@ impl Coordinator {
     }
 
     fn execute(&mut self, now: Mono, task: u16, motion: Box<Motion>) -> Outcome {
-        let cx = Context { now, dt: self.period, joints: &self.joints };
-        let check = || -> Result<(), Outcome> {
-            let t = self.tasks.get(task as usize).ok_or(Outcome::WrongTask(task))?;
-            let Body::Trajectory(body) = &t.body else { return Err(Outcome::WrongTask(task)) };
-            if motion.joints.iter().any(|j| !t.joints.contains(j)) || motion.joints.len() != motion.spline.joints() {
-                return Err(Outcome::WrongTask(task));
-            }
-            if t.is_active() {
-                return Err(Outcome::AlreadyExecuting(task));
-            }
-            self.admit(&motion.joints)?;
-            body.check_start(&cx, &motion)
+        let outcome = self.offer(now, task, &Target::Trajectory(&motion));
+        let done = match self.tasks.get_mut(task as usize) {
+            Some(t) if outcome == Outcome::Accepted => t.keep(motion),
+            _ => Some(motion),
         };
-        if let Err(outcome) = check() {
-            self.output.retired.push(motion);
-            return outcome;
-        }
-        let Some(t) = self.tasks.get_mut(task as usize) else { return Outcome::WrongTask(task) };
-        if let Body::Trajectory(body) = &mut t.body {
-            self.output.retired.extend(body.start(&cx, motion));
-        }
-        self.begin(task);
-        Outcome::Accepted
+        self.output.retired.extend(done);
+        outcome
     }
 
-    /// A target of a servo (`positions`) or velocity stream.
-    fn stream(&mut self, now: Mono, task: u16, target: &Joints, positions: bool) -> Outcome {
-        let cx = Context { now, dt: self.period, joints: &self.joints };
-        let Some(t) = self.tasks.get(task as usize) else { return Outcome::WrongTask(task) };
-        if let Some((&joint, _)) = t.joints.iter().zip(target).find(|(_, v)| !v.is_finite()) {
-            return Outcome::NonFinite(joint);
-        }
-        if let Err(outcome) = self.admit(&t.joints) {
-            return outcome;
-        }
-        if positions != matches!(t.body, Body::Servo(_)) {
-            return Outcome::WrongTask(task);
-        }
-        let idle = !t.is_active();
-        if positions && idle {
-            // A stream begins where the arm is; once it runs, a jump in it is a fault.
-            for (&joint, value) in t.joints.iter().zip(target) {
-                let step = value - cx.joint(joint).commanded;
-                if step.abs() > super::config::JUMP {
-                    return Outcome::StartStateMismatch(joint, step.abs());
-                }
-            }
-        }
-        let Some(t) = self.tasks.get_mut(task as usize) else { return Outcome::WrongTask(task) };
-        match (&mut t.body, positions) {
-            (Body::Servo(body), true) => body.set_target(&cx, &t.joints, target),
-            (Body::Velocity(body), false) => body.set_target(&cx, target),
-            _ => return Outcome::WrongTask(task),
-        }
-        t.reason = Reason::None;
-        if idle {
-            self.begin(task);
-        }
-        Outcome::Accepted
+    /// Offers a target to a task.
+    fn offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Outcome {
+        self.try_offer(now, task, target).err().unwrap_or(Outcome::Accepted)
     }
 
-    /// A goal of a Cartesian task.
-    fn steer(&mut self, now: Mono, task: u16, goal: &Goal) -> Outcome {
-        let cx = Context { now, dt: self.period, joints: &self.joints };
-        let Some(t) = self.tasks.get(task as usize) else { return Outcome::WrongTask(task) };
-        if let Err(outcome) = self.admit(&t.joints) {
-            return outcome;
-        }
-        let Some(t) = self.tasks.get_mut(task as usize) else { return Outcome::WrongTask(task) };
-        let idle = !t.is_active();
-        let Body::Cartesian(body) = &mut t.body else { return Outcome::WrongTask(task) };
-        if !body.follows(goal) {
-            return Outcome::WrongTask(task);
-        }
-        if let Some((joint, error)) = body.strayed(&cx, &t.joints).filter(|_| idle) {
-            return Outcome::StartStateMismatch(joint, error.abs());
-        }
-        if !body.set_goal(&cx, goal) {
-            return Outcome::InvalidTarget(task);
-        }
-        if idle || t.state == TaskState::Cancelling {
-            let granted = t.granted;
-            self.begin(task);
-            // Called back while it slows down, it goes on from there.
-            if let Some(t) = self.tasks.get_mut(task as usize) {
-                t.granted = granted;
-            }
-        } else {
-            t.reason = Reason::None;
-        }
-        Outcome::Accepted
-    }
-
-    fn begin(&mut self, task: u16) {
-        if let Some(t) = self.tasks.get_mut(task as usize) {
-            t.state = TaskState::Executing;
-            t.reason = Reason::None;
-            t.granted = false;
+    fn try_offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Result<(), Outcome> {
+        let t = self.tasks.get(task as usize).ok_or(Outcome::WrongTask(task))?;
+        t.check(target)?;
+        self.admit(match target {
+            Target::Trajectory(motion) => &motion.joints,
+            _ => &t.joints,
+        })?;
+        let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
+        if t.accept(now, self.period, &self.joints, target)? {
             self.output.tell(Event::Task(task, TaskState::Executing, Reason::None));
         }
+        Ok(())
     }
 
     fn admit(&self, joints: &[u16]) -> Result<(), Outcome> {
@@ -455,28 +384,23 @@ impl Coordinator {
         }
     }
 
-    /// Servo tasks with `auto_start` and default positions begin as soon as their arms are ready.
+    /// Tasks with `auto_start` and a first target begin as soon as all arms are ready.
     fn start_by_themselves(&mut self, now: Mono) {
         if self.started || self.shutting_down || !self.arms.iter().all(|a| a.failsafe.phase() == Phase::Ready) {
             return;
         }
         self.started = true;
         for t in 0..self.tasks.len() {
-            if !self.auto_start.get(t).copied().unwrap_or(false) {
-                continue;
-            }
-            let Some(Body::Servo(body)) = self.tasks.get(t).map(|t| &t.body) else { continue };
-            let Some(positions) = body.default_positions().map(crate::joint::joints_of) else { continue };
-            let outcome = self.stream(now, t as u16, &positions, true);
+            let Some(target) = self.tasks.get(t).and_then(Task::first_target) else { continue };
+            let outcome = self.offer(now, t as u16, &target);
             self.output.tell(Event::Request(0, outcome));
         }
     }
 
     fn compute(&mut self, now: Mono) {
-        let cx = Context { now, dt: self.period, joints: &self.joints };
         for (t, task) in self.tasks.iter_mut().enumerate() {
             let before = (task.state, task.reason);
-            let motion = task.compute(&cx);
+            let motion = task.compute(now, self.period, &self.joints);
             self.output.retired.extend(motion);
             if before != (task.state, task.reason) {
                 self.output.tell(Event::Task(t as u16, task.state, task.reason));

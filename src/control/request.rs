@@ -1,7 +1,6 @@
 //! What the coordinator can be told. Requests arrive through a ring; nothing in them is freed by the tick: a
 //! trajectory that is done goes back through [`TickOutput::retired`](super::coordinator::TickOutput).
 
-use super::tasks::cartesian::Goal;
 use crate::joint::Joints;
 use crate::trajectory::Spline;
 
@@ -90,4 +89,25 @@ pub struct Motion {
     pub joints: Vec<u16>,
     /// The curve, one joint each.
     pub spline: Spline,
+}
+
+/// Where an end effector shall be, or how it shall move, as it is asked for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Goal {
+    /// A pose, in the frame that poses of the task are given in.
+    Pose {
+        /// x, y, z [m].
+        position: [f64; 3],
+        /// Quaternion x, y, z, w.
+        orientation: [f64; 4],
+    },
+    /// A velocity.
+    Twist {
+        /// Of the origin [m/s].
+        linear: [f64; 3],
+        /// Angular [rad/s].
+        angular: [f64; 3],
+        /// Along the axes of the end effector itself, not of the base.
+        tool: bool,
+    },
 }

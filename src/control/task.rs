@@ -1,90 +1,11 @@
-//! A task: something that wants joints to move. Each tick it may claim joints with a position or a velocity each.
+//! A task of a coordinator: something that wants joints to move. What differs from type to type is its body.
 
-use super::config::{TaskConfig, TaskKind};
+use super::config::TaskConfig;
 use super::request::Motion;
-use super::tasks::cartesian::CartesianTask;
-use super::tasks::servo::ServoTask;
-use super::tasks::trajectory::TrajectoryTask;
-use super::tasks::velocity::VelocityTask;
+use super::task_body::{Claim, Context, Demand, JointView, OnCancel, OnLoss, Step, Target, TargetKind, TaskBody};
+use super::task_spec::TaskSpec;
 use crate::clock::Mono;
-use crate::telemetry::{Reason, TaskState, TaskView};
-
-/// What a task sees of a joint.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct JointView {
-    /// Measured position [rad].
-    pub position: f64,
-    /// Measured or estimated velocity [rad/s].
-    pub velocity: f64,
-    /// Last commanded position [rad].
-    pub commanded: f64,
-    /// Last commanded velocity [rad/s].
-    pub commanded_velocity: f64,
-    /// Lowest position that is commanded [rad].
-    pub lower: f64,
-    /// Highest position that is commanded [rad].
-    pub upper: f64,
-    /// Acceleration limit [rad/s²].
-    pub acceleration: f64,
-    /// Velocity limit [rad/s].
-    pub velocity_limit: f64,
-    /// Jerk limit [rad/s³].
-    pub jerk: f64,
-    /// How far the joint is outside the range of its set points of the last `lag` seconds [rad].
-    pub tracking_error: f64,
-}
-
-/// What a task sees when it computes.
-#[derive(Debug, Clone, Copy)]
-pub struct Context<'a> {
-    /// The tick's time.
-    pub now: Mono,
-    /// Length of the control step [s].
-    pub dt: f64,
-    /// All joints of all arms.
-    pub joints: &'a [JointView],
-}
-
-impl Context<'_> {
-    /// A joint's view; zeros for an index that does not exist.
-    pub fn joint(&self, joint: u16) -> JointView {
-        self.joints.get(joint as usize).copied().unwrap_or_default()
-    }
-}
-
-/// How a task's values are meant.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Demand {
-    /// It claims nothing.
-    #[default]
-    Nothing,
-    /// Joint positions [rad].
-    Positions,
-    /// Joint velocities [rad/s].
-    Velocities,
-}
-
-/// One joint that a task wants, and what it should do.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Claim {
-    /// Index over all arms' joints.
-    pub joint: u16,
-    /// [rad] or [rad/s], by the task's demand.
-    pub value: f64,
-}
-
-/// What is different between the types of tasks.
-#[derive(Debug)]
-pub enum Body {
-    /// See [`TrajectoryTask`].
-    Trajectory(Box<TrajectoryTask>),
-    /// See [`ServoTask`].
-    Servo(ServoTask),
-    /// See [`VelocityTask`].
-    Velocity(VelocityTask),
-    /// See [`CartesianTask`].
-    Cartesian(Box<CartesianTask>),
-}
+use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 
 /// A task of a coordinator.
 #[derive(Debug)]
@@ -103,29 +24,31 @@ pub struct Task {
     pub claims: Vec<Claim>,
     /// Whether all it wanted in the last tick went out to the arms.
     pub granted: bool,
-    /// What is special about it.
-    pub body: Body,
+    index: u16,
+    auto_start: bool,
+    takes: &'static [TargetKind],
+    /// The demand while it is active.
+    demands: Demand,
+    motion: Option<Box<Motion>>,
+    body: Box<dyn TaskBody>,
 }
 
 impl Task {
-    /// A task at rest.
-    pub fn new(config: &TaskConfig) -> Self {
-        let width = config.joints.len();
-        let body = match &config.kind {
-            TaskKind::Trajectory(p) => Body::Trajectory(Box::new(TrajectoryTask::new(p.clone(), width))),
-            TaskKind::Servo(p) => Body::Servo(ServoTask::new(p.clone())),
-            TaskKind::Velocity(p) => Body::Velocity(VelocityTask::new(p.clone())),
-            TaskKind::CartesianIk(p) => Body::Cartesian(Box::new(CartesianTask::new(*p.clone(), true))),
-            TaskKind::EefTwist(p) => Body::Cartesian(Box::new(CartesianTask::new(*p.clone(), false))),
-        };
+    /// The task with this index among those of its coordinator, idle.
+    pub fn new(index: u16, config: &TaskConfig, spec: &TaskSpec, body: Box<dyn TaskBody>) -> Self {
         Self {
             joints: config.joints.clone(),
             priority: config.priority,
             state: TaskState::Idle,
             reason: Reason::None,
             demand: Demand::Nothing,
-            claims: Vec::with_capacity(width),
+            claims: Vec::with_capacity(config.joints.len()),
             granted: false,
+            index,
+            auto_start: config.auto_start,
+            takes: spec.takes,
+            demands: spec.demand,
+            motion: None,
             body,
         }
     }
@@ -135,133 +58,138 @@ impl Task {
         matches!(self.state, TaskState::Executing | TaskState::Cancelling)
     }
 
-    /// Fills in the claims of this tick. Answers a finished motion, to be freed elsewhere.
-    pub fn compute(&mut self, cx: &Context<'_>) -> Option<Box<Motion>> {
+    /// The target with which it begins when the run starts it.
+    pub fn first_target(&self) -> Option<Target<'static>> {
+        if self.auto_start { self.body.first_target() } else { None }
+    }
+
+    /// Refuses a target that no task could take in this form.
+    pub fn check(&self, target: &Target<'_>) -> Result<(), Outcome> {
+        match target {
+            Target::Trajectory(motion) => {
+                let own = motion.joints.iter().all(|j| self.joints.contains(j));
+                let whole = motion.joints.len() == motion.spline.joints();
+                if !(own && whole && self.takes.contains(&TargetKind::Trajectory)) {
+                    return Err(Outcome::WrongTask(self.index));
+                }
+                if self.is_active() { Err(Outcome::AlreadyExecuting(self.index)) } else { Ok(()) }
+            }
+            Target::Positions(values) | Target::Velocities(values) => {
+                let odd = self.joints.iter().zip(values).find(|(_, v)| !v.is_finite());
+                odd.map_or(Ok(()), |(&joint, _)| Err(Outcome::NonFinite(joint)))
+            }
+            Target::EndEffector(_) => Ok(()),
+        }
+    }
+
+    /// Hands a target to the body. Returns whether the task begins with it.
+    pub fn accept(&mut self, now: Mono, dt: f64, views: &[JointView], target: &Target<'_>) -> Result<bool, Outcome> {
+        if !self.takes.contains(&target.kind()) {
+            return Err(Outcome::WrongTask(self.index));
+        }
+        let (cx, body, _) = self.parts(now, dt, views);
+        body.accept(&cx, target)?;
+        // A target while it decelerates after a cancel: it goes on from there.
+        let begins = self.state != TaskState::Executing;
+        self.state = TaskState::Executing;
+        self.reason = Reason::None;
+        Ok(begins)
+    }
+
+    /// Keeps the motion of an accepted trajectory. Returns the one before, to be freed elsewhere.
+    pub fn keep(&mut self, motion: Box<Motion>) -> Option<Box<Motion>> {
+        self.motion.replace(motion)
+    }
+
+    fn parts<'a>(
+        &'a mut self,
+        now: Mono,
+        dt: f64,
+        views: &'a [JointView],
+    ) -> (Context<'a>, &'a mut dyn TaskBody, &'a mut Vec<Claim>) {
+        let cx = Context {
+            now,
+            dt,
+            task: self.index,
+            joints: &self.joints,
+            active: matches!(self.state, TaskState::Executing | TaskState::Cancelling),
+            granted: self.granted,
+            motion: self.motion.as_deref(),
+            views,
+        };
+        (cx, self.body.as_mut(), &mut self.claims)
+    }
+
+    /// Fills in the claims of this tick. Returns a finished motion, to be freed elsewhere.
+    pub fn compute(&mut self, now: Mono, dt: f64, views: &[JointView]) -> Option<Box<Motion>> {
         self.claims.clear();
         self.demand = Demand::Nothing;
         if !self.is_active() {
             return None;
         }
-        match &mut self.body {
-            Body::Trajectory(t) => {
-                self.demand = Demand::Positions;
-                match t.compute(cx, self.granted, &mut self.claims) {
-                    None => None,
-                    Some((state, reason)) => self.end(state, reason),
+        self.demand = self.demands;
+        let (cx, body, claims) = self.parts(now, dt, views);
+        match body.compute(&cx, claims) {
+            Step::Continue => None,
+            Step::ContinueFor(reason) => {
+                if self.state == TaskState::Executing {
+                    self.reason = reason;
                 }
+                None
             }
-            Body::Servo(t) => {
-                self.demand = Demand::Positions;
-                match t.compute(cx, &self.joints, &mut self.claims) {
-                    true => None,
-                    false => self.end(TaskState::Idle, Reason::Timeout),
-                }
-            }
-            Body::Velocity(t) => {
-                self.demand = Demand::Velocities;
-                match t.compute(cx, &self.joints, &mut self.claims) {
-                    true => {
-                        if t.timed_out() {
-                            self.reason = Reason::Timeout;
-                        }
-                        None
-                    }
-                    false => self.end(TaskState::Idle, Reason::Timeout),
-                }
-            }
-            Body::Cartesian(t) => {
-                self.demand = Demand::Positions;
-                match t.compute(cx, &self.joints, self.granted, &mut self.claims) {
-                    None => {
-                        if t.timed_out() && self.state == TaskState::Executing {
-                            self.reason = Reason::Timeout;
-                        }
-                        None
-                    }
-                    Some((state, reason)) => self.end(state, reason),
-                }
-            }
+            Step::End(state, reason) => self.end(state, reason),
         }
     }
 
     /// Nothing reached an arm since the tick of `at`: it goes on from what was commanded then, from rest.
     pub fn rewind(&mut self, at: Mono, now: Mono) {
         self.granted = false;
-        if let Body::Trajectory(t) = &mut self.body {
-            t.rewind(at, now);
-        }
+        self.body.rewind(at, now);
     }
 
-    /// Ends what it does: its joints come to rest by themselves. Answers its motion, to be freed elsewhere.
+    /// Ends what it does: the limiter brings its joints to rest. Returns its motion, to be freed elsewhere.
     pub fn end(&mut self, state: TaskState, reason: Reason) -> Option<Box<Motion>> {
         self.state = state;
         self.reason = reason;
         self.demand = Demand::Nothing;
         self.claims.clear();
         self.granted = false;
-        match &mut self.body {
-            Body::Trajectory(t) => t.take(),
-            Body::Servo(t) => {
-                t.drop_target();
-                None
-            }
-            Body::Velocity(t) => {
-                t.drop_target();
-                None
-            }
-            Body::Cartesian(t) => {
-                t.drop_target();
-                None
-            }
-        }
+        self.body.end();
+        self.motion.take()
     }
 
-    /// Another task took a joint. A trajectory is all or nothing, as is an end effector's motion; a stream of joint values
-    /// loses the joint until its next target.
+    /// Another task took a joint.
     pub fn lose(&mut self, winner: u16, joint: u16) -> Option<Box<Motion>> {
-        match &mut self.body {
-            Body::Trajectory(_) | Body::Cartesian(_) => {
-                return self.end(TaskState::Aborted, Reason::Preempted(winner, joint));
+        match self.body.lose(&self.joints, joint) {
+            OnLoss::End => self.end(TaskState::Aborted, Reason::Preempted(winner, joint)),
+            OnLoss::Continue => {
+                self.claims.retain(|c| c.joint != joint);
+                None
             }
-            Body::Servo(t) => t.mute(&self.joints, joint),
-            Body::Velocity(t) => t.mute(&self.joints, joint),
         }
-        self.claims.retain(|c| c.joint != joint);
-        None
     }
 
-    /// A cancel: a trajectory slows down along its path, an end effector in its direction; of a stream of joint values it
-    /// is the ordinary end. `false`: there was nothing to cancel.
-    pub fn cancel(&mut self) -> bool {
-        match (&self.body, self.state) {
-            (_, TaskState::Cancelling) => true,
-            (Body::Trajectory(_) | Body::Cartesian(_), TaskState::Executing) => {
-                match &mut self.body {
-                    Body::Trajectory(t) => t.slow_down(),
-                    Body::Cartesian(t) => t.slow_down(),
-                    _ => {}
+    /// A cancel. Returns the motion that ended with it, to be freed elsewhere, or `None` when there was nothing to
+    /// cancel.
+    pub fn cancel(&mut self) -> Option<Option<Box<Motion>>> {
+        match self.state {
+            TaskState::Cancelling => Some(None),
+            TaskState::Executing => Some(match self.body.cancel() {
+                OnCancel::Decelerate => {
+                    self.state = TaskState::Cancelling;
+                    self.reason = Reason::Cancelled;
+                    None
                 }
-                self.state = TaskState::Cancelling;
-                self.reason = Reason::Cancelled;
-                true
-            }
-            (_, TaskState::Executing) => {
-                // Streams hold no motion, so there is nothing to free.
-                let _ = self.end(TaskState::Idle, Reason::StreamEnded);
-                true
-            }
-            _ => false,
+                OnCancel::End => self.end(TaskState::Idle, Reason::StreamEnded),
+            }),
+            _ => None,
         }
     }
 
-    /// What is told of it.
+    /// What the status shows.
     pub fn view(&self) -> TaskView {
         let mut view = TaskView { state: self.state, reason: self.reason, ..TaskView::default() };
-        match &self.body {
-            Body::Trajectory(t) => t.describe(&mut view),
-            Body::Cartesian(t) if self.is_active() => view.bound = t.bound(),
-            _ => {}
-        }
+        self.body.describe(&mut view);
         view
     }
 }

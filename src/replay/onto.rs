@@ -4,9 +4,10 @@
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::blueprint::{Arm, Blueprint, TaskKind};
+use crate::blueprint::{Arm, Blueprint};
 use crate::control::config::CoordinatorConfig;
 use crate::control::limit::Bounds;
+use crate::control::task_body::TargetKind;
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryError, TrajectoryPoint};
 
 /// Maximum values in one trajectory: it is checked, logged and held in memory as a whole.
@@ -158,7 +159,7 @@ pub fn plan(blueprint: &Blueprint, motion: &JointTrajectory) -> Result<Plan, Ont
 fn task_for(blueprint: &Blueprint, joints: &[String], all: &[&String]) -> Option<String> {
     let covers = |task: &&crate::blueprint::Task| {
         let has = |name: &String| task.joints.iter().any(|&j| all.get(j).is_some_and(|joint| *joint == name));
-        matches!(task.kind, TaskKind::Trajectory(_)) && joints.iter().all(has)
+        task.spec.takes(TargetKind::Trajectory) && joints.iter().all(has)
     };
     blueprint.tasks.iter().find(covers).map(|task| task.name.clone())
 }

@@ -2,8 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::control::request::{Motion, Request};
-use crate::control::tasks::cartesian::Goal;
+use crate::control::request::{Goal, Motion, Request};
 use crate::joint::{Joints, joints_of};
 use crate::trajectory::{JointTrajectory, Spline};
 

@@ -14,6 +14,8 @@ use crate::arm::ArmState;
 use crate::control::config::CONTROL_VERSION;
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Envelope;
+use crate::control::task::Task;
+use crate::control::task_spec::TaskTable;
 use crate::recording::records::{RawRecord, RecordReader, unpack_chunk};
 use crate::recording::replay::ReplayError;
 
@@ -50,8 +52,8 @@ pub struct Verification {
     pub length: f64,
 }
 
-/// Replays a log and compares.
-pub fn verify(path: &Path) -> Result<Verification, RecordedError> {
+/// Replays a log and compares. Its tasks are of the types of `table`; a log with any other type is rejected.
+pub fn verify(path: &Path, table: &TaskTable) -> Result<Verification, RecordedError> {
     let recorded = Recorded::open(path)?;
     if recorded.config.version != CONTROL_VERSION {
         let what = format!(
@@ -61,8 +63,10 @@ pub fn verify(path: &Path) -> Result<Verification, RecordedError> {
         );
         return Err(RecordedError::Unfit { path: path.to_owned(), what });
     }
+    let tasks = table.build(&recorded.config.tasks);
+    let tasks = tasks.map_err(|what| RecordedError::Unfit { path: path.to_owned(), what })?;
     let mut records = RecordReader::open(path)?;
-    let mut run = Rerun::new(&recorded);
+    let mut run = Rerun::new(&recorded, tasks);
     let end = loop {
         match records.next_record() {
             Ok(Some(record)) => {
@@ -97,12 +101,12 @@ struct Rerun<'a> {
 }
 
 impl<'a> Rerun<'a> {
-    fn new(recorded: &'a Recorded) -> Self {
+    fn new(recorded: &'a Recorded, tasks: Vec<Task>) -> Self {
         Self {
             recorded,
             channels: Vec::new(),
             ticks: Assembler::new(recorded),
-            coordinator: Coordinator::new(&recorded.config),
+            coordinator: Coordinator::new(&recorded.config, tasks),
             comparison: Comparison::new(recorded),
             states: vec![ArmState::default(); recorded.config.arms.len()],
             requests: Vec::new(),

@@ -223,9 +223,12 @@ pub struct FaultReport {
 pub struct TaskReport {
     /// Its name.
     pub name: String,
-    /// Its type: `trajectory`, `servo`, `velocity`, `cartesian_ik`, `eef_twist`.
+    /// Its type, as in the blueprint.
     #[serde(rename = "type")]
     pub kind: String,
+    /// The methods that send it targets: `execute`, `servo`, `velocity`, `pose`, `twist`.
+    #[serde(default)]
+    pub takes: Vec<String>,
     /// The joints that it may claim.
     pub joints: Vec<String>,
     /// Its priority; the higher wins.
@@ -241,6 +244,13 @@ pub struct TaskReport {
     /// What holds its end effector back just now.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<String>,
+}
+
+impl TaskReport {
+    /// Whether this method sends it targets.
+    pub fn takes(&self, method: &str) -> bool {
+        self.takes.iter().any(|taken| taken == method)
+    }
 }
 
 /// Reply to `state`.

@@ -2,7 +2,8 @@
 
 use super::{Options, Record, Run, StartError};
 use crate::assets::{Cache, NoProgress};
-use crate::blueprint::{self, FindError, Found, Loaded, Overrides, Source};
+use crate::blueprint::{self, Catalog, FindError, Found, Loaded, Overrides, Source};
+use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::planning::planner_thread::Solver;
 use crate::rpc::place::RunFolder;
@@ -26,6 +27,7 @@ pub struct Builder {
     found: Found,
     overrides: Overrides,
     adapters: Registry,
+    tasks: TaskTable,
     options: Options,
 }
 
@@ -57,7 +59,13 @@ impl Run {
 
 impl Builder {
     fn of(found: Found) -> Self {
-        Self { found, overrides: Overrides::default(), adapters: Registry::builtin(), options: Options::default() }
+        Self {
+            found,
+            overrides: Overrides::default(),
+            adapters: Registry::builtin(),
+            tasks: TaskTable::builtin(),
+            options: Options::default(),
+        }
     }
 
     /// Changes a field of the blueprint, like `--set`: `.set("hardware.arm.address", "192.168.1.100")`.
@@ -90,6 +98,12 @@ impl Builder {
         self
     }
 
+    /// Task types besides the built-in ones, which win over those of the same name.
+    pub fn tasks(mut self, more: &[TaskSpec]) -> Self {
+        self.tasks = TaskTable::with(more);
+        self
+    }
+
     /// What answers the planner's requests in the place of this program's own planner; it is called on the planner's
     /// thread.
     pub fn solver(mut self, solver: Solver) -> Self {
@@ -105,7 +119,8 @@ impl Builder {
 
     /// Reads and checks the blueprint; connects to nothing.
     pub fn check(&self) -> Loaded {
-        blueprint::load(&self.found, &self.overrides, &self.adapters)
+        let catalog = Catalog { adapters: &self.adapters, tasks: &self.tasks };
+        blueprint::load(&self.found, &self.overrides, catalog)
     }
 
     /// Fetches the assets that the blueprint uses and that are not in the user's cache yet.

@@ -2,6 +2,8 @@
 
 use crate::blueprint::Blueprint;
 use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::task::Task;
+use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::device;
 use crate::joint::{JointLimits, MAX_DOF};
 use crate::telemetry::describe::{ArmNames, Names};
@@ -18,11 +20,30 @@ pub(super) fn names_of(blueprint: &Blueprint) -> Names {
     }
 }
 
+/// Returns the blueprint's tasks for the coordinator. Reads the robots of tasks that move an end effector.
+pub(super) fn tasks(blueprint: &Blueprint) -> Result<(Vec<TaskConfig>, Vec<Task>), String> {
+    let config = |task: &crate::blueprint::Task| -> Result<TaskConfig, String> {
+        let robot = task.robot.as_ref().map(|robot| robot.kinematics().map(Box::new)).transpose();
+        let robot = robot.map_err(|what| format!("task {}: {what}", task.name))?;
+        Ok(TaskConfig {
+            name: task.name.clone(),
+            kind: TaskKind { name: task.spec.name.to_owned(), params: task.params.clone(), robot },
+            joints: task.joints.iter().map(|&j| j as u16).collect(),
+            priority: task.priority,
+            auto_start: task.auto_start,
+        })
+    };
+    let configs = blueprint.tasks.iter().map(config).collect::<Result<Vec<_>, _>>()?;
+    let types: Vec<TaskSpec> = blueprint.tasks.iter().map(|task| task.spec).collect();
+    let tasks = TaskTable::with(&types).build(&configs)?;
+    Ok((configs, tasks))
+}
+
 /// Arms with their effective limits, and tasks.
 pub(super) fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, JointLimits)],
-    kinds: Vec<TaskKind>,
+    tasks: Vec<TaskConfig>,
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
@@ -41,17 +62,6 @@ pub(super) fn coordinator_config(
                 supervision: arm.supervision,
             })
             .collect(),
-        tasks: blueprint
-            .tasks
-            .iter()
-            .zip(kinds)
-            .map(|(task, kind)| TaskConfig {
-                name: task.name.clone(),
-                kind,
-                joints: task.joints.iter().map(|&j| j as u16).collect(),
-                priority: task.priority,
-                auto_start: task.auto_start,
-            })
-            .collect(),
+        tasks,
     }
 }

@@ -11,8 +11,7 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::control::request::{Envelope, Motion, Request};
-use crate::control::tasks::cartesian::Goal;
+use crate::control::request::{Envelope, Goal, Motion, Request};
 use crate::recording::notes::{Note, Notes};
 use crate::rt::host;
 use crate::rt::wake::Wake;

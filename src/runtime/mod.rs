@@ -30,7 +30,6 @@ mod service;
 mod service_manager;
 mod start;
 mod stream_requests;
-mod task_kinds;
 mod tick;
 mod waiting;
 mod watchdog;

@@ -6,10 +6,10 @@ use serde_json::json;
 
 use super::motions::{Carried, Planned};
 use super::service::{Service, internal};
-use crate::control::config::TaskKind;
 use crate::control::limit::Bounds;
 use crate::control::point_to_point::{NoMotion, point_to_point};
 use crate::control::request::Motion;
+use crate::control::task_body::TargetKind;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
@@ -27,9 +27,9 @@ pub(super) type Carries = (u64, Option<Option<api::Presence>>);
 impl Service {
     /// A trajectory task that covers these joints.
     pub(super) fn trajectory_task(&self, joints: &[u16]) -> Result<u16, RpcError> {
-        let tasks = self.parts.config.tasks.iter().enumerate();
-        let fitting = |(_, t): &(usize, &crate::control::config::TaskConfig)| {
-            matches!(t.kind, TaskKind::Trajectory(_)) && joints.iter().all(|j| t.joints.contains(j))
+        let tasks = self.parts.blueprint.tasks.iter().enumerate();
+        let fitting = |(_, t): &(usize, &crate::blueprint::Task)| {
+            t.spec.takes(TargetKind::Trajectory) && joints.iter().all(|&j| t.joints.contains(&j.into()))
         };
         match { tasks }.find(fitting) {
             Some((i, _)) => Ok(i as u16),

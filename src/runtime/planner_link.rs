@@ -9,8 +9,9 @@ use serde_json::Value;
 
 use super::planner_port::PlannerPort;
 use super::service::{Service, internal};
-use crate::control::config::{CoordinatorConfig, TaskKind};
+use crate::control::config::CoordinatorConfig;
 use crate::control::limit::Bounds;
+use crate::control::task_body::TargetKind;
 use crate::joint::DEFAULT_JERK;
 use crate::rpc::api::{
     self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered,
@@ -256,11 +257,11 @@ impl Service {
         };
         let joints = robot.joints.iter().map(index).collect::<Result<Vec<_>, _>>()?;
         let Some(name) = &robot.task else { return Ok(()) };
-        let task = &self.parts.config.tasks[self.task_index(name)? as usize];
-        let has = |joint: &usize| task.joints.iter().any(|j| *j as usize == *joint);
-        match (&task.kind, joints.iter().all(has)) {
-            (TaskKind::Trajectory(_), true) => Ok(()),
-            (TaskKind::Trajectory(_), false) => {
+        let task = &self.parts.blueprint.tasks[self.task_index(name)? as usize];
+        let has = |joint: &usize| task.joints.contains(joint);
+        match (task.spec.takes(TargetKind::Trajectory), joints.iter().all(has)) {
+            (true, true) => Ok(()),
+            (true, false) => {
                 let what = format!("task {name} does not have all joints of robot {}", robot.name);
                 Err(RpcError::new(Code::NoTrajectoryTask, what))
             }

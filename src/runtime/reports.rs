@@ -116,9 +116,11 @@ impl Service {
 
     fn task_report(&self, index: usize) -> Option<TaskReport> {
         let (config, view) = (self.parts.config.tasks.get(index)?, self.task_view(index));
+        let row = &self.parts.blueprint.tasks.get(index)?.spec;
         Some(TaskReport {
             name: config.name.clone(),
-            kind: config.kind.name().to_owned(),
+            kind: config.kind.name.clone(),
+            takes: row.takes.iter().map(|kind| kind.method().to_owned()).collect(),
             joints: config.joints.iter().map(|&j| self.parts.names.joint(j)).collect(),
             priority: config.priority,
             state: view.state.name().to_owned(),

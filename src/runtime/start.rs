@@ -11,21 +11,21 @@ use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
 
 use super::arms::{self, Arms, BroughtUp, Slots};
-use super::control_config::{coordinator_config, names_of};
+use super::control_config::{coordinator_config, names_of, tasks};
 use super::dispatch::{Courier, Dispatcher};
 use super::log_file::{attachments, log_path, metadata, no_log, retain, tell_device_note};
 use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
-use super::task_kinds::task_kinds;
 use super::tick::Tick;
 use super::watchdog::Watchdog;
 use super::wires::wires;
 use super::{Ending, Handle, Options, Run, StartError, in_process};
 use crate::blueprint::Blueprint;
 use crate::clock::{MonotonicClock, WallOffset};
-use crate::control::config::{CoordinatorConfig, TaskKind};
+use crate::control::config::{CoordinatorConfig, TaskConfig};
+use crate::control::task::Task;
 use crate::control::tick_loop::Pulse;
 use crate::hardware::device;
 use crate::planning::config::PlannerConfig;
@@ -78,7 +78,8 @@ struct Prepared<'a> {
     log: Option<PathBuf>,
     wall: WallOffset,
     robots: Option<PlanningScene>,
-    kinds: Vec<TaskKind>,
+    task_configs: Vec<TaskConfig>,
+    tasks: Vec<Task>,
     grants: Vec<Grant>,
     latency: Option<LatencyHold>,
     claim: Claim,
@@ -92,9 +93,9 @@ impl<'a> Prepared<'a> {
         let wall = WallOffset::take(&MonotonicClock);
         let log = log_path(blueprint, &options, &name, wall)?;
         let robots = blueprint.planner.as_ref().map(robots).transpose()?;
-        let kinds = task_kinds(blueprint).map_err(wrong_model)?;
+        let (task_configs, tasks) = tasks(blueprint).map_err(wrong_model)?;
         let names = names_of(blueprint);
-        Ok(Self { blueprint, options, name, names, log, wall, robots, kinds, grants, latency, claim })
+        Ok(Self { blueprint, options, name, names, log, wall, robots, task_configs, tasks, grants, latency, claim })
     }
 
     fn connect(mut self) -> Result<Connected<'a>, StartError> {
@@ -105,7 +106,7 @@ impl<'a> Prepared<'a> {
             move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
         };
         let BroughtUp { arms, slots, connected } = arms::bring_up(self.blueprint, &pulse.beat, device_notes)?;
-        let config = coordinator_config(self.blueprint, &connected, std::mem::take(&mut self.kinds));
+        let config = coordinator_config(self.blueprint, &connected, std::mem::take(&mut self.task_configs));
         let planner = self.blueprint.planner.as_ref().zip(self.robots.take()).map(|(planner, setup)| {
             let limits = command_limits(&self.names, &config);
             PlannerPort::start(planner, setup, &limits, self.options.solver.take()).map_err(|what| {
@@ -164,7 +165,7 @@ impl Connected<'_> {
         let courier = Courier::start(dispatcher.clone(), ends.reply_wake, ends.replies, ends.retired, publish);
         let courier = courier.map_err(no_thread("courier"))?;
         let Options { probe, service_manager: manager, .. } = prepared.options;
-        let tick = Tick::start(&config, ports, probe, endings.clone()).map_err(no_thread("tick"))?;
+        let tick = Tick::start(&config, prepared.tasks, ports, probe, endings.clone()).map_err(no_thread("tick"))?;
         let watchdog = start_watchdog(&pulse, &config, &endings, manager.as_ref())?;
         let run = Run {
             arms,

@@ -2,8 +2,7 @@
 
 use super::planner_port::isometry;
 use super::service::Service;
-use crate::control::request::Request;
-use crate::control::tasks::cartesian::Goal;
+use crate::control::request::{Goal, Request};
 use crate::joint::joints_of;
 use crate::rpc::api::{self, Done};
 use crate::rpc::{Code, RpcError};

@@ -11,6 +11,7 @@ use super::{Ending, watchdog};
 use crate::clock::{Clock, MonotonicClock};
 use crate::control::config::CoordinatorConfig;
 use crate::control::coordinator::Coordinator;
+use crate::control::task::Task;
 use crate::control::tick_loop::{self, Probe, Pulse, TickPorts};
 use crate::rt::host;
 
@@ -30,11 +31,12 @@ impl Tick {
     /// Starts the thread `tick`. A panic in it is a fault that ends the run.
     pub fn start(
         config: &CoordinatorConfig,
+        tasks: Vec<Task>,
         ports: TickPorts,
         probe: Option<Probe>,
         endings: Sender<Ending>,
     ) -> std::io::Result<Self> {
-        let (coordinator, period, pulse) = (Coordinator::new(config), config.period(), ports.pulse.clone());
+        let (coordinator, period, pulse) = (Coordinator::new(config, tasks), config.period(), ports.pulse.clone());
         let thread = std::thread::Builder::new().name("tick".into()).stack_size(host::STACK).spawn(move || {
             let ran = catch_unwind(AssertUnwindSafe(|| {
                 tick_loop::run(coordinator, ports, period, &MonotonicClock, probe);

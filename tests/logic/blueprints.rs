@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
-use dimos::blueprint::{self, Loaded, OnExit, Overrides, SearchPath, Source, Summary, TaskKind, find, load, load_from};
+use dimos::blueprint::{self, Loaded, OnExit, Overrides, SearchPath, Source, Summary, find, load, load_from};
 use dimos::hardware::registry::Registry;
 
 use crate::support::fake_arms;
@@ -146,8 +146,8 @@ fn the_shipped_arm_is_resolved() {
     let task = &blueprint.tasks[0];
     assert_eq!((task.name.as_str(), task.priority, task.auto_start), ("traj_arm", 10, false));
     assert_eq!((&task.joints[..], &task.arms[..]), (&[0, 1, 2, 3, 4, 5][..], &[0][..]));
-    let TaskKind::Trajectory(params) = &task.kind else { panic!("{:?}", task.kind) };
-    assert_eq!(params.start_position_tolerance, 0.05);
+    assert_eq!(task.spec.name, "trajectory");
+    assert_eq!(task.params["start_position_tolerance"], 0.05);
 }
 
 #[test]

@@ -10,6 +10,7 @@ use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
 use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
+use dimos::control::task_spec::TaskTable;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::planning::ahead::{look_ahead, rests_before};
 use dimos::planning::config::{JointBounds, ObjectConfig, ObjectShape};
@@ -44,7 +45,7 @@ fn config() -> CoordinatorConfig {
     };
     let task = TaskConfig {
         name: "traj_arm".into(),
-        kind: TaskKind::Trajectory(TrajectoryParams::default()),
+        kind: TaskKind::new("trajectory", &TrajectoryParams { path_tolerance: 0.1, ..TrajectoryParams::default() }),
         joints: (0..DOF as u16).collect(),
         priority: 10,
         auto_start: false,
@@ -75,7 +76,7 @@ impl Virtual {
             link: Link::Up,
             ..ArmState::default()
         };
-        let coordinator = Coordinator::new(&config());
+        let coordinator = Coordinator::new(&config(), TaskTable::builtin().build(&config().tasks).unwrap());
         let task = (TaskState::Idle, 0.0);
         let mut run = Self { coordinator, arm, now: Mono(1_000_000_000), inbox: VecDeque::new(), task };
         run.step();

@@ -5,8 +5,7 @@ use std::f64::consts::PI;
 use std::sync::LazyLock;
 
 use dimos::control::config::*;
-use dimos::control::request::Request;
-use dimos::control::tasks::cartesian::Goal;
+use dimos::control::request::{Goal, Request};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
 use dimos::telemetry::{Bound, Event, Outcome, Phase, Reason, TaskState};
@@ -19,20 +18,20 @@ const HOME: [f64; 6] = [0.2, -0.3, 0.9, 0.3, 0.8, 0.1];
 const POSES: u16 = 0;
 const TWISTS: u16 = 1;
 
-fn params() -> CartesianParams {
-    static PARAMS: LazyLock<CartesianParams> = LazyLock::new(|| {
+fn robot() -> TaskKinematics {
+    static ROBOT: LazyLock<TaskKinematics> = LazyLock::new(|| {
         let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
         let link = model.link_index("flange").unwrap();
-        CartesianParams::new(Kinematics::whole(&model).unwrap(), link)
+        TaskKinematics::new(Kinematics::whole(&model).unwrap(), link)
     });
-    PARAMS.clone()
+    ROBOT.clone()
 }
 
 /// An arm with both tasks, and a trajectory task above and one below them; ready at a pose.
-fn rig_at(q: &[f64; 6], poses: CartesianParams, twists: CartesianParams) -> Rig {
+fn rig_at(q: &[f64; 6], poses: TaskKinematics, twists: &CartesianParams) -> Rig {
     let tasks = vec![
-        task("poses", TaskKind::CartesianIk(Box::new(poses)), 0..6, 20),
-        task("twists", TaskKind::EefTwist(Box::new(twists)), 0..6, 20),
+        task("poses", TaskKind::new("cartesian_ik", &CartesianParams::default()).of_robot(poses), 0..6, 20),
+        task("twists", TaskKind::new("eef_twist", twists).of_robot(robot()), 0..6, 20),
         task("above", trajectory(), 0..6, 30),
         task("below", trajectory(), 0..6, 10),
         task("speeds", velocity(), 0..6, 10),
@@ -44,11 +43,11 @@ fn rig_at(q: &[f64; 6], poses: CartesianParams, twists: CartesianParams) -> Rig 
 }
 
 fn rig() -> Rig {
-    rig_at(&HOME, params(), params())
+    rig_at(&HOME, robot(), &CartesianParams::default())
 }
 
 fn flange(q: &[f64]) -> DAffine3 {
-    let p = params();
+    let p = robot();
     let mut frames = p.kinematics.frames();
     p.kinematics.forward(q, &mut frames);
     p.kinematics.link_frame(p.link, &frames)
@@ -129,7 +128,7 @@ fn poses_are_in_the_frame_that_the_root_is_placed_in() {
     let turn = DQuat::from_rotation_z(PI / 2.0);
     let root = DAffine3::from_rotation_translation(turn, DVec3::new(1.0, 2.0, 0.5));
     let place = Place { position: root.translation.to_array(), orientation: turn.to_array() };
-    let mut rig = rig_at(&HOME, CartesianParams { root: place, ..params() }, params());
+    let mut rig = rig_at(&HOME, TaskKinematics { root: place, ..robot() }, &CartesianParams::default());
     let mut goal = HOME;
     goal[0] += 0.2;
     stream(&mut rig, POSES, pose_of(&(root * flange(&goal))), 4.0, |_| {});
@@ -167,8 +166,9 @@ fn what_is_too_fast_for_the_task_is_slowed_down_as_a_whole() {
 /// The joints' limits slow all joints down by the same factor: the way stays straight.
 #[test]
 fn joint_limits_keep_the_direction() {
-    let wide = CartesianParams { max_linear_velocity: 3.0, max_linear_acceleration: 20.0, ..params() };
-    let mut rig = rig_at(&HOME, params(), wide);
+    let wide =
+        CartesianParams { max_linear_velocity: 3.0, max_linear_acceleration: 20.0, ..CartesianParams::default() };
+    let mut rig = rig_at(&HOME, robot(), &wide);
     let start = commanded(&rig);
     let (mut bound, mut astray) = (false, 0.0f64);
     stream(&mut rig, TWISTS, twist([0.0, 3.0, 0.0], [0.0; 3]), 0.7, |rig| {

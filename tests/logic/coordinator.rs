@@ -13,9 +13,9 @@ fn one(kind: TaskKind) -> Vec<TaskConfig> {
 }
 
 fn params(change: impl FnOnce(&mut TrajectoryParams)) -> TaskKind {
-    let mut p = TrajectoryParams::default();
+    let mut p = TrajectoryParams { path_tolerance: 0.1, ..TrajectoryParams::default() };
     change(&mut p);
-    TaskKind::Trajectory(p)
+    TaskKind::new("trajectory", &p)
 }
 
 #[test]
@@ -476,7 +476,7 @@ fn shutdown_brings_everything_to_rest_and_takes_nothing_more() {
 
 #[test]
 fn a_servo_task_with_a_default_begins_by_itself() {
-    let at = |q: f64| TaskKind::Servo(ServoParams { timeout: 0.0, default_positions: Some(vec![q; 6]) });
+    let at = |q: f64| TaskKind::new("servo", &ServoParams { timeout: 0.0, default_positions: Some(vec![q; 6]) });
     let mut config = task("home", at(0.15), 0..6, 10);
     config.auto_start = true;
     let mut rig = Rig::one_arm(vec![config]);

@@ -322,8 +322,8 @@ fn f09_a_joint_outside_its_limits_may_always_come_in() {
         rig.make_ready();
         assert!((rig.arms[0].q[0] - 2.15).abs() < 1e-9, "held where it is");
         let out = |rig: &mut Rig, k: usize, sign: f64| {
-            match kind {
-                TaskKind::Servo(_) => rig.servo(0, &[2.15 + sign * 0.004 * k as f64]),
+            match kind.name.as_str() {
+                "servo" => rig.servo(0, &[2.15 + sign * 0.004 * k as f64]),
                 _ => rig.velocity(0, &[sign * 0.4]),
             };
             rig.tick();
@@ -339,7 +339,7 @@ fn f09_a_joint_outside_its_limits_may_always_come_in() {
 #[test]
 fn f10_a_servo_stream_that_stops_is_brought_to_rest_and_let_go() {
     for (speed, timeout) in [(0.4, 0.5), (1.2, 0.1)] {
-        let kind = TaskKind::Servo(ServoParams { timeout, default_positions: None });
+        let kind = TaskKind::new("servo", &ServoParams { timeout, default_positions: None });
         // A prediction beyond the last target is not made: the joints rest at the target long before the timeout.
         let mut rig = Rig::one_arm(vec![task("s", kind, 0..6, 10)]);
         for k in 1..60 {
@@ -362,7 +362,7 @@ fn f10_a_servo_stream_that_stops_is_brought_to_rest_and_let_go() {
 #[test]
 fn f10_a_stream_that_was_behind_its_target_stops_too() {
     // The target ran away faster than the joint may: at the timeout the joint is still on its way, at full speed.
-    let kind = TaskKind::Servo(ServoParams { timeout: 0.1, default_positions: None });
+    let kind = TaskKind::new("servo", &ServoParams { timeout: 0.1, default_positions: None });
     let mut rig = Rig::one_arm(vec![task("s", kind, 0..1, 10)]);
     for k in 1..60 {
         rig.servo(0, &[0.03 * k as f64]);
@@ -376,7 +376,7 @@ fn f10_a_stream_that_was_behind_its_target_stops_too() {
 #[test]
 fn f10_a_velocity_stream_that_stops_is_kept_at_zero() {
     for (timeout, zero_on_timeout) in [(0.2, true), (0.2, false), (0.05, true)] {
-        let kind = TaskKind::Velocity(VelocityParams { timeout, zero_on_timeout });
+        let kind = TaskKind::new("velocity", &VelocityParams { timeout, zero_on_timeout });
         let mut rig = Rig::one_arm(vec![task("v", kind, 0..6, 10)]);
         for _ in 0..60 {
             rig.velocity(0, &[1.2; 6]);
@@ -739,5 +739,5 @@ fn a_coordinator_without_arms_or_tasks_ticks() {
     let rig = Rig::new(100.0, vec![], vec![]);
     let time =
         dimos::control::coordinator::TickTime { now: rig.now, next: rig.now, skipped: 0, late_ns: 0, woke_late_ns: 0 };
-    assert!(Coordinator::new(&config).tick(time, &[], || None).commands.is_empty());
+    assert!(Coordinator::new(&config, Vec::new()).tick(time, &[], || None).commands.is_empty());
 }

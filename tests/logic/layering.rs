@@ -35,8 +35,14 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("cli", ALL),
 ];
 /// Modules of which others may use one part only: `(user, used, part)`.
-const PARTS: &[(&str, &str, &str)] =
-    &[("blueprint", "control", "config"), ("blueprint", "planning", "config"), ("blueprint", "recording", "config")];
+const PARTS: &[(&str, &str, &str)] = &[
+    ("blueprint", "control", "config"),
+    ("blueprint", "control", "task_body"),
+    ("blueprint", "control", "task_robot"),
+    ("blueprint", "control", "task_spec"),
+    ("blueprint", "planning", "config"),
+    ("blueprint", "recording", "config"),
+];
 
 /// The mock arm panics when a test's script of faults says so.
 const SCRIPTED_PANIC: &str = "src/hardware/arms/mock/device.rs";
@@ -217,6 +223,27 @@ fn one_arm_does_not_use_another() {
         }
     }
     fail_on(&found, "each arm stands alone");
+}
+
+#[test]
+fn one_task_type_does_not_use_another_and_the_coordinator_uses_none() {
+    let mut found = Vec::new();
+    for source in sources("src").iter().filter(|source| source.path.starts_with("src/control/")) {
+        let own = source.path.strip_prefix("src/control/tasks/").and_then(|p| p.split_once('/')).map(|(own, _)| own);
+        // The table, what a configuration is written with, and the suite's stronger tasks name types.
+        let names_types = ["src/control/tasks/mod.rs", "src/control/config.rs", "src/control/conformance/bench.rs"];
+        if names_types.contains(&source.path.as_str()) {
+            continue;
+        }
+        for (at, start) in source.code.match_indices("tasks::") {
+            let rest = &source.code[at + start.len()..];
+            let table = source.path == "src/control/task_spec.rs" && rest.starts_with("TABLE");
+            if !table && own.is_none_or(|own| !rest.starts_with(own)) {
+                found.push(format!("{}: {}", source.path, source.code[at..].lines().next().unwrap_or_default()));
+            }
+        }
+    }
+    fail_on(&found, "each task type stands alone, and only the table knows all");
 }
 
 /// Words of a line of code.

@@ -10,6 +10,7 @@ const REALTIME: bool = false;
 #[global_allocator]
 static ALLOCATOR: support::counting::Counting = support::counting::Counting;
 
+mod adding_a_task;
 mod blueprint_fuzz;
 mod blueprint_one_mistake;
 mod blueprint_registry;
@@ -34,6 +35,7 @@ mod planning;
 mod planning_timing;
 mod robot_models;
 mod rpc;
+mod task_conformance;
 mod templates;
 mod verify;
 mod xacro;

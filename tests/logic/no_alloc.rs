@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link};
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::control::config::{CartesianParams, CoordinatorConfig, TaskKind};
+use dimos::control::config::{CartesianParams, CoordinatorConfig, TaskKind, TaskKinematics};
 use dimos::control::coordinator::Coordinator;
-use dimos::control::request::{Envelope, Request};
-use dimos::control::tasks::cartesian::Goal;
+use dimos::control::request::{Envelope, Goal, Request};
+use dimos::control::task_spec::TaskTable;
 use dimos::control::tick_loop::{self, Pulse, TickPorts};
 use dimos::hardware::arms::mock::SPEC;
 use dimos::hardware::device::{Device, DeviceConfig};
@@ -42,7 +42,8 @@ fn the_count_sees_what_is_taken_grown_and_given_back() {
 fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() {
     let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
     let (kinematics, link) = (Kinematics::whole(&model).unwrap(), model.link_index("flange").unwrap());
-    let steered = Box::new(CartesianParams::new(kinematics, link));
+    let robot = TaskKinematics::new(kinematics, link);
+    let steered = |name: &str| TaskKind::new(name, &CartesianParams::default()).of_robot(robot.clone());
     let tasks = vec![
         task("traj_left", trajectory(), 0..7, 10),
         task("traj_right", trajectory(), 7..13, 10),
@@ -50,8 +51,8 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
         task("servo", servo(), 0..7, 20),
         task("velocity", velocity(), 7..13, 20),
         task("servo_too", servo(), 5..7, 20),
-        task("poses", TaskKind::CartesianIk(steered.clone()), 13..19, 20),
-        task("twists", TaskKind::EefTwist(steered), 13..19, 25),
+        task("poses", steered("cartesian_ik"), 13..19, 20),
+        task("twists", steered("eef_twist"), 13..19, 25),
     ];
     let mut rig = Rig::new(100.0, vec![arm("left", 7), arm("right", 6), arm("third", 6)], tasks);
     rig.make_ready();
@@ -173,7 +174,8 @@ fn the_tick_loop_takes_and_gives_back_no_memory() {
             _ => {}
         }
     };
-    let (coordinator, period) = (Coordinator::new(&config), config.period());
+    let (coordinator, period) =
+        (Coordinator::new(&config, TaskTable::builtin().build(&config.tasks).unwrap()), config.period());
     let ticking =
         std::thread::spawn(move || tick_loop::run(coordinator, ports, period, &MonotonicClock, Some(Box::new(probe))));
     let began = Instant::now();

@@ -4,15 +4,17 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use dimos::blueprint::{Blueprint, Overrides};
-use dimos::control::config::{CartesianParams, ServoParams, TaskConfig, TaskKind, TrajectoryParams, VelocityParams};
+use dimos::control::config::{
+    CartesianParams, ServoParams, TaskConfig, TaskKind, TaskKinematics, TrajectoryParams, VelocityParams,
+};
 use dimos::control::point_to_point::point_to_point;
-use dimos::control::request::Request;
-use dimos::control::tasks::cartesian::Goal;
+use dimos::control::request::{Goal, Request};
+use dimos::control::task_spec::TaskTable;
 use dimos::hardware::registry::Registry;
 use dimos::joint::{JointLimits, joints_of, make_joints};
 use dimos::recording::messages::{JointState, Text, Tick};
 use dimos::replay::recorded::RecordedError;
-use dimos::replay::verify::{Finding, Verification, verify};
+use dimos::replay::verify::{Finding, Verification};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
 use dimos::rpc::api;
@@ -22,6 +24,10 @@ use dimos::runtime::{Options, Record, Run};
 
 use crate::support::tampered::{rewrite, tamper, without_attachments};
 use crate::support::virtual_run::{VirtualRun, one_arm};
+
+fn verify(log: &Path) -> Result<Verification, RecordedError> {
+    dimos::replay::verify::verify(log, &TaskTable::builtin())
+}
 
 fn reproducible(log: &Path) -> Verification {
     let found = verify(log).unwrap();
@@ -40,9 +46,9 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
         auto_start,
     };
     let by_itself = ServoParams { timeout: 0.3, default_positions: Some(vec![0.05; 6]) };
-    config.tasks.push(task("servo", TaskKind::Servo(by_itself), 20, true));
-    config.tasks.push(task("velocity", TaskKind::Velocity(VelocityParams::default()), 30, false));
-    config.tasks.push(task("other", TaskKind::Trajectory(TrajectoryParams::default()), 20, false));
+    config.tasks.push(task("servo", TaskKind::new("servo", &by_itself), 20, true));
+    config.tasks.push(task("velocity", TaskKind::new("velocity", &VelocityParams::default()), 30, false));
+    config.tasks.push(task("other", TaskKind::new("trajectory", &TrajectoryParams::default()), 20, false));
     let log = folder.join("eventful.mcap");
     let mut run = VirtualRun::start(&config, &log);
     let limits = JointLimits::uniform(6, 3.0, 2.0).with_defaults();
@@ -130,13 +136,11 @@ fn motions_of_an_end_effector_come_out_the_same_again() {
     let mut config = one_arm(6);
     let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
     let (kinematics, link) = (Kinematics::whole(&model).unwrap(), model.link_index("flange").unwrap());
-    let steered = Box::new(CartesianParams::new(kinematics, link));
-    for (name, kind, priority) in
-        [("poses", TaskKind::CartesianIk(steered.clone()), 20), ("twists", TaskKind::EefTwist(steered.clone()), 30)]
-    {
+    let robot = TaskKinematics::new(kinematics, link);
+    for (name, kind, priority) in [("poses", "cartesian_ik", 20), ("twists", "eef_twist", 30)] {
         config.tasks.push(TaskConfig {
             name: name.into(),
-            kind,
+            kind: TaskKind::new(kind, &CartesianParams::default()).of_robot(robot.clone()),
             joints: (0..6).collect(),
             priority,
             auto_start: false,

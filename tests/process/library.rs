@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use dimos::control::task_spec::TaskTable;
 use dimos::rpc::Code;
 use dimos::rpc::api::Move;
 use dimos::rpc::place::RunFolder;
@@ -84,4 +85,39 @@ fn another_thread_can_end_a_run() {
     std::thread::spawn(move || endings.send(Ending::Asked));
     assert_eq!(run.wait_for_end(None), Ending::Asked);
     assert!(run.stop().troubles.is_empty());
+}
+
+#[path = "../../docs/examples/joystick.rs"]
+mod joystick;
+
+#[test]
+fn a_task_type_of_another_crate_moves_an_arm_and_its_log_is_verified_with_its_row_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("stick.mcap");
+    let blueprint = "
+hardware:
+  - {hardware_id: arm, adapter_type: mock, joints: {prefix: arm, count: 2}}
+tasks:
+  - {name: stick, type: joystick, joint_names: {hardware: arm}, params: {timeout: 0.5}}
+";
+    let of = |name: &str| Run::from_yaml(name, blueprint).folder(RunFolder::at(folder.path()));
+    match of("without").record(Record::Off).start() {
+        Err(StartError::Blueprint { what, .. }) => assert!(what.contains("no task type `joystick`"), "{what}"),
+        other => panic!("{:?}", other.map(|_| ()).err()),
+    }
+    let run = of("with").tasks(&[joystick::SPEC]).record(Record::To(log.clone())).start().unwrap();
+    let task = &run.status().tasks[0];
+    assert_eq!((task.kind.as_str(), &task.takes[..]), ("joystick", &["velocity".to_owned()][..]));
+    assert_eq!(run.servo("stick", &[0.0; 2]).unwrap_err().code, Code::WrongTask);
+    for _ in 0..50 {
+        run.velocity("stick", &[0.4, 0.0]).unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(10));
+    }
+    let moved = run.state().arms[0].joints[0].position.unwrap();
+    assert!(moved > 0.02, "{moved}");
+    run.stop();
+    let found = dimos::replay::verify::verify(&log, &TaskTable::with(&[joystick::SPEC])).unwrap();
+    assert_eq!(found.finding, dimos::replay::verify::Finding::Reproducible);
+    let refused = dimos::replay::verify::verify(&log, &TaskTable::builtin()).unwrap_err().to_string();
+    assert!(refused.contains("no task type `joystick`"), "{refused}");
 }

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use dimos::blueprint::{Overrides, find, load};
 use dimos::control::point_to_point::point_to_point;
 use dimos::control::request::Request;
+use dimos::control::task_spec::TaskTable;
 use dimos::hardware::registry::Registry;
 use dimos::joint::make_joints;
 use dimos::replay::motion::RecordedMotion;
@@ -175,7 +176,7 @@ fn a_motion_recorded_within_limits_is_followed_by_another_run_and_by_another_arm
     let (out, err) = home.run_in_time(&format!("replay {} --onto coordinator-yourarm", log.display()));
     assert!(out.contains("motion: COMPLETED") && err.contains("approach: arm"), "{out}{err}");
     assert_followed(&log, &home.path("again.mcap"));
-    assert_eq!(verify(&home.path("again.mcap")).unwrap().finding, Finding::Reproducible);
+    assert_eq!(verify(&home.path("again.mcap"), &TaskTable::builtin()).unwrap().finding, Finding::Reproducible);
 
     let (out, _) = home.run_in_time(&format!("replay {} --onto mock6.yaml --rate 0.9 --json", log.display()));
     assert_followed(&log, &home.path("again.mcap"));
@@ -251,5 +252,5 @@ fn an_interrupt_in_mid_motion_ends_it_controlled() {
     let err = String::from_utf8_lossy(&ended.stderr);
     assert_eq!(ended.status.code(), Some(130), "{err}");
     assert!(err.contains("cancelling: the arms decelerate"), "{err}");
-    assert_eq!(verify(&home.path("cut.mcap")).unwrap().finding, Finding::Reproducible);
+    assert_eq!(verify(&home.path("cut.mcap"), &TaskTable::builtin()).unwrap().finding, Finding::Reproducible);
 }

@@ -184,6 +184,7 @@ pub fn status() -> StatusReport {
         tasks: vec![TaskReport {
             name: "traj_arm".into(),
             kind: "trajectory".into(),
+            takes: vec!["execute".into()],
             joints: (1..=6).map(|i| format!("arm_joint{i}")).collect(),
             priority: 10,
             state: "EXECUTING".into(),

@@ -12,6 +12,7 @@ use dimos::clock::Mono;
 use dimos::control::config::*;
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
+use dimos::control::task_spec::TaskTable;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 use dimos::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
@@ -216,15 +217,15 @@ pub fn task(name: &str, kind: TaskKind, joints: impl IntoIterator<Item = u16>, p
 }
 
 pub fn trajectory() -> TaskKind {
-    TaskKind::Trajectory(TrajectoryParams::default())
+    TaskKind::new("trajectory", &TrajectoryParams { path_tolerance: 0.1, ..TrajectoryParams::default() })
 }
 
 pub fn servo() -> TaskKind {
-    TaskKind::Servo(ServoParams::default())
+    TaskKind::new("servo", &ServoParams::default())
 }
 
 pub fn velocity() -> TaskKind {
-    TaskKind::Velocity(VelocityParams::default())
+    TaskKind::new("velocity", &VelocityParams::default())
 }
 
 /// A motion through the given points `(time, positions)`, at rest at both ends.
@@ -249,6 +250,11 @@ pub fn sweep(id: u64, joints: std::ops::Range<u16>, from: f64, to: f64, seconds:
 
 impl Rig {
     pub fn new(rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
+        Self::with_types(&TaskTable::builtin(), rate, arms, tasks)
+    }
+
+    /// With tasks of a table's types.
+    pub fn with_types(table: &TaskTable, rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
         let config = CoordinatorConfig { version: CONTROL_VERSION, rate, arms, tasks };
         let wire = |a: &ArmConfig| Wire {
             mode: None,
@@ -258,7 +264,7 @@ impl Rig {
             highest: vec![SOFT; a.dof],
         };
         Self {
-            coordinator: Coordinator::new(&config),
+            coordinator: Coordinator::new(&config, table.build(&config.tasks).unwrap()),
             arms: config.arms.iter().map(|a| SimArm::new(a.dof)).collect(),
             now: Mono(1_000_000_000),
             ticks: 0,

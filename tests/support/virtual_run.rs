@@ -10,6 +10,7 @@ use dimos::clock::{Mono, WallOffset};
 use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
+use dimos::control::task_spec::TaskTable;
 use dimos::joint::{ControlMode, JointLimits, make_joints};
 use dimos::recording::log_writer::LogAttachment;
 use dimos::recording::notes::{Notes, channel};
@@ -40,7 +41,7 @@ pub fn one_arm(dof: usize) -> CoordinatorConfig {
     };
     let task = TaskConfig {
         name: "traj_arm".into(),
-        kind: TaskKind::Trajectory(TrajectoryParams::default()),
+        kind: TaskKind::new("trajectory", &TrajectoryParams::default()),
         joints: (0..dof as u16).collect(),
         priority: 10,
         auto_start: false,
@@ -72,6 +73,11 @@ pub struct VirtualRun {
 impl VirtualRun {
     /// Begins a run and its log.
     pub fn start(config: &CoordinatorConfig, log: &Path) -> Self {
+        Self::start_with(&TaskTable::builtin(), config, log)
+    }
+
+    /// The same with the task types of a table.
+    pub fn start_with(table: &TaskTable, config: &CoordinatorConfig, log: &Path) -> Self {
         let arm = |a: &ArmConfig| ArmNames { hardware_id: a.name.clone(), joints: make_joints(&a.name, a.dof) };
         let names = Names {
             arms: config.arms.iter().map(arm).collect(),
@@ -104,7 +110,7 @@ impl VirtualRun {
             ..ArmState::default()
         };
         Self {
-            coordinator: Coordinator::new(config),
+            coordinator: Coordinator::new(config, table.build(&config.tasks).unwrap()),
             states: config.arms.iter().map(state).collect(),
             tasks: vec![TaskView::default(); config.tasks.len()],
             tick: 0,

@@ -47,15 +47,15 @@ impl Drives {
     /// Returns the tasks of a run that move joints of only this arm, the one with the highest priority of each type.
     /// Prefers a velocity task to a servo task, whose targets jog has to integrate.
     pub fn of(tasks: &[TaskReport], joints: &[String]) -> Self {
-        let find = |name: &str, kind: Kind| {
+        let find = |method: &str, kind: Kind| {
             let ours = |task: &&TaskReport| {
-                task.kind == name && !task.joints.is_empty() && task.joints.iter().all(|joint| joints.contains(joint))
+                task.takes(method) && !task.joints.is_empty() && task.joints.iter().all(|joint| joints.contains(joint))
             };
             let task = tasks.iter().filter(ours).max_by_key(|task| task.priority)?;
             Some(Drive { kind, task: task.name.clone(), joints: task.joints.clone() })
         };
         let single = find("velocity", Kind::Velocity).or_else(|| find("servo", Kind::Servo));
-        Self { tool: find("eef_twist", Kind::Twist), joints: single }
+        Self { tool: find("twist", Kind::Twist), joints: single }
     }
 
     /// Returns the task for a mode.
@@ -210,9 +210,9 @@ mod tests {
     use super::*;
     use crate::rpc::report::JointReport;
 
-    fn task(name: &str, kind: &str, joints: &[&str], priority: i32) -> TaskReport {
+    fn task(name: &str, takes: &str, joints: &[&str], priority: i32) -> TaskReport {
         let joints = joints.iter().map(|j| (*j).to_owned()).collect();
-        TaskReport { name: name.into(), kind: kind.into(), joints, priority, ..Default::default() }
+        TaskReport { name: name.into(), takes: vec![takes.into()], joints, priority, ..Default::default() }
     }
 
     #[test]
@@ -221,12 +221,12 @@ mod tests {
         let both = task("both", "velocity", &["a", "b", "other"], 90);
         let servo = task("servo", "servo", &["a", "b"], 50);
         let (low, high) = (task("low", "velocity", &["a"], 10), task("high", "velocity", &["a", "b"], 20));
-        let drives = Drives::of(&[both.clone(), servo.clone(), low, high, task("t", "eef_twist", &["a"], 1)], &arm);
+        let drives = Drives::of(&[both.clone(), servo.clone(), low, high, task("t", "twist", &["a"], 1)], &arm);
         assert_eq!(drives.joints.unwrap().task, "high");
         assert_eq!(drives.tool.unwrap().task, "t");
         let drives = Drives::of(&[both, servo], &arm);
         assert_eq!((drives.joints.unwrap().kind, drives.tool), (Kind::Servo, None));
-        assert_eq!(Drives::of(&[task("traj", "trajectory", &["a", "b"], 10)], &arm), Drives::default());
+        assert_eq!(Drives::of(&[task("traj", "execute", &["a", "b"], 10)], &arm), Drives::default());
     }
 
     fn state(positions: [f64; 2]) -> ArmStateReport {

@@ -6,12 +6,11 @@ use clap::Subcommand;
 use serde_json::json;
 
 use crate::assets::{Asset, Cache};
-use crate::blueprint::{Blueprint, Overrides};
+use crate::blueprint::{Blueprint, Catalog, Overrides};
 use crate::cli::arguments::setting;
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output::{self, Table, Tone, toned};
 use crate::cli::{check, fetch};
-use crate::hardware::registry::Registry;
 
 /// Arguments of `model assets`.
 #[derive(Debug, clap::Args)]
@@ -45,9 +44,9 @@ struct BlueprintArgs {
 }
 
 impl BlueprintArgs {
-    fn load(&self, registry: &Registry) -> Result<Blueprint> {
+    fn load(&self, catalog: Catalog<'_>) -> Result<Blueprint> {
         let set = self.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-        let loaded = check::load(&self.blueprint, &Overrides { set, sim: false }, registry)?;
+        let loaded = check::load(&self.blueprint, &Overrides { set, sim: false }, catalog)?;
         match loaded.blueprint {
             Some(blueprint) => Ok(blueprint),
             None => Err(check::refuse(&loaded)),
@@ -56,30 +55,30 @@ impl BlueprintArgs {
 }
 
 /// Runs the verb.
-pub(super) fn run(args: &Args, registry: &Registry) -> Result {
+pub(super) fn run(args: &Args, catalog: Catalog<'_>) -> Result {
     match &args.verb {
         Verb::List(of) => {
-            let blueprint = of.load(registry)?;
+            let blueprint = of.load(catalog)?;
             show(&blueprint, of.json);
         }
         Verb::Fetch(of) => {
-            let blueprint = of.load(registry)?;
+            let blueprint = of.load(catalog)?;
             let cache = Cache::standard();
             for asset in blueprint.assets.iter().map(|used| &used.asset).filter(|asset| !cache.has(&asset.sha256)) {
                 fetch::one(asset)?;
             }
             // New files are checked now: paths into them, descriptions in them.
-            show(&of.load(registry)?, of.json);
+            show(&of.load(catalog)?, of.json);
         }
-        Verb::Clean(of) => clean(of, registry)?,
+        Verb::Clean(of) => clean(of, catalog)?,
     }
     Ok(Exit::Ok)
 }
 
 /// Removes the assets. A file shared by two names is removed once; mistakes in a description inside an asset are
 /// ignored.
-fn clean(of: &BlueprintArgs, registry: &Registry) -> Result<()> {
-    let (blueprint, cache) = (of.load(registry)?, Cache::standard());
+fn clean(of: &BlueprintArgs, catalog: Catalog<'_>) -> Result<()> {
+    let (blueprint, cache) = (of.load(catalog)?, Cache::standard());
     let mut seen = BTreeSet::new();
     let mut removed = Vec::new();
     for asset in blueprint.assets.iter().map(|used| &used.asset) {

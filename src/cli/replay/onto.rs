@@ -11,12 +11,11 @@ use serde::Serialize;
 
 use super::ReplayArgs;
 use super::player::Part as Span;
-use crate::blueprint::{Blueprint, Overrides};
+use crate::blueprint::{Blueprint, Catalog, Overrides};
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::follow::{Signals, show_deviation};
 use crate::cli::text_log::Terminal;
 use crate::cli::{banner, check, output};
-use crate::hardware::registry::Registry;
 use crate::replay::fit::fit;
 use crate::replay::motion::RecordedMotion;
 use crate::replay::onto::{Approach, Plan, check as check_limits, is_real, plan};
@@ -36,9 +35,9 @@ const FIRST_STATE_TIMEOUT: Duration = Duration::from_secs(2);
 const REST_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Drives the arms of a blueprint along a part of a log.
-pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, registry: &Registry) -> Result {
+pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Catalog<'_>) -> Result {
     let set = args.onto.set.iter().map(|(path, value)| format!("{path}={value}")).collect();
-    let loaded = check::load_to_run(onto, &Overrides { set, sim: args.onto.sim }, registry)?;
+    let loaded = check::load_to_run(onto, &Overrides { set, sim: args.onto.sim }, catalog)?;
     let Some(mut blueprint) = loaded.blueprint.clone() else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let motion = RecordedMotion::read(log, span.from, span.to).map_err(split)?;

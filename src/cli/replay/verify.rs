@@ -4,13 +4,14 @@ use std::path::Path;
 
 use crate::cli::exit::Exit;
 use crate::cli::output;
+use crate::control::task_spec::TaskTable;
 use crate::replay::compare::Difference;
 use crate::replay::recorded::RecordedError;
 use crate::replay::verify::{Finding, Verification, verify};
 
 /// Verifies a log and prints the result.
-pub fn run(path: &Path, json: bool) -> Result<Exit, RecordedError> {
-    let found = verify(path)?;
+pub fn run(path: &Path, table: &TaskTable, json: bool) -> Result<Exit, RecordedError> {
+    let found = verify(path, table)?;
     if json {
         output::json(&found);
     } else {

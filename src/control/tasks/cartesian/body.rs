@@ -4,12 +4,14 @@
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 
 use super::end_effector::{EndEffector, Velocity, seconds};
+use super::params::CartesianParams;
 use crate::clock::Mono;
-use crate::control::config::CartesianParams;
-use crate::control::task::{Claim, Context};
+use crate::control::request::Goal;
+use crate::control::task_body::{Claim, Context, OnCancel, Step, Target, TaskBody};
+use crate::control::task_robot::TaskKinematics;
 use crate::joint::braking_speed;
 use crate::robot::kinematics::step::rotation_between;
-use crate::telemetry::{Bound, Reason, TaskState};
+use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 
 /// Part of the acceleration that a goal is approached with; the rest is for what a joint needs besides.
 const APPROACH: f64 = 0.8;
@@ -18,30 +20,9 @@ const QUATERNION_SLACK: f64 = 0.01;
 /// Nearer than this is there [m, rad].
 const THERE: f64 = 1e-9;
 
-/// Where an end effector shall be, or how it shall move, as it is asked for.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Goal {
-    /// A pose, in the frame that poses of the task are given in.
-    Pose {
-        /// x, y, z [m].
-        position: [f64; 3],
-        /// Quaternion x, y, z, w.
-        orientation: [f64; 4],
-    },
-    /// A velocity.
-    Twist {
-        /// Of the origin [m/s].
-        linear: [f64; 3],
-        /// Angular [rad/s].
-        angular: [f64; 3],
-        /// Along the axes of the end effector itself, not of the base.
-        tool: bool,
-    },
-}
-
-/// The same, ready to be followed; in the frame of the model's root.
+/// A goal in the frame of the model's root.
 #[derive(Debug, Clone, Copy)]
-enum Target {
+enum Tracked {
     Pose(DAffine3),
     Twist(Velocity),
     ToolTwist(Velocity),
@@ -51,94 +32,63 @@ enum Target {
 #[derive(Debug)]
 pub struct CartesianTask {
     effector: EndEffector,
-    poses: bool,
-    target: Option<(Target, Mono)>,
+    target: Option<(Tracked, Mono)>,
     slowing: bool,
     timed_out: bool,
 }
 
 impl CartesianTask {
-    /// A task without a target that follows poses or, if not `poses`, velocities.
-    pub fn new(params: CartesianParams, poses: bool) -> Self {
-        Self { effector: EndEffector::new(params), poses, target: None, slowing: false, timed_out: false }
+    /// A task without a target, for the end effector of a robot.
+    pub fn new(params: CartesianParams, robot: TaskKinematics) -> Self {
+        Self { effector: EndEffector::new(params, robot), target: None, slowing: false, timed_out: false }
     }
+}
 
-    /// Whether it follows such goals at all.
-    pub fn follows(&self, goal: &Goal) -> bool {
-        self.poses == matches!(goal, Goal::Pose { .. })
-    }
-
-    /// The first joint that is too far from where it is commanded to be for a start, and how far [rad].
-    pub fn strayed(&self, cx: &Context<'_>, joints: &[u16]) -> Option<(u16, f64)> {
-        self.effector.strayed(cx, joints)
-    }
-
-    /// A new goal. `false`: it is none, and the one before it stands no more.
-    pub fn set_goal(&mut self, cx: &Context<'_>, goal: &Goal) -> bool {
-        let target = target(self.effector.params(), goal);
-        self.target = target.map(|target| (target, cx.now));
-        if target.is_some() {
-            (self.slowing, self.timed_out) = (false, false);
+impl TaskBody for CartesianTask {
+    fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome> {
+        let Target::EndEffector(goal) = target else { return Err(Outcome::WrongTask(cx.task)) };
+        if let Some((joint, error)) = self.effector.strayed(cx).filter(|_| !cx.active) {
+            return Err(Outcome::StartStateMismatch(joint, error.abs()));
         }
-        target.is_some()
+        // A goal that cannot be followed ends the one before it.
+        let tracked = tracked(&self.effector, goal);
+        self.target = tracked.map(|target| (target, cx.now));
+        if tracked.is_none() {
+            return Err(Outcome::InvalidTarget(cx.task));
+        }
+        (self.slowing, self.timed_out) = (false, false);
+        Ok(())
     }
 
-    /// Forgets the target.
-    pub fn drop_target(&mut self) {
-        (self.target, self.slowing, self.timed_out) = (None, false, false);
-    }
-
-    /// From now on come to rest.
-    pub fn slow_down(&mut self) {
-        self.slowing = true;
-    }
-
-    /// Whether the stream has stopped and the end effector comes to rest.
-    pub fn timed_out(&self) -> bool {
-        self.timed_out
-    }
-
-    /// What holds the end effector back just now.
-    pub fn bound(&self) -> Bound {
-        self.effector.bound()
-    }
-
-    /// Fills in the claims of this tick, or says how it ended. `granted`: the claims of the last tick went out.
-    pub fn compute(
-        &mut self,
-        cx: &Context<'_>,
-        joints: &[u16],
-        granted: bool,
-        claims: &mut Vec<Claim>,
-    ) -> Option<(TaskState, Reason)> {
+    fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step {
         let timeout = self.effector.params().timeout;
         let fresh = |at: &Mono| timeout <= 0.0 || cx.now.seconds_since(*at) <= timeout;
         let target = self.target.filter(|(_, at)| fresh(at)).map(|(target, _)| target);
         self.timed_out = target.is_none();
         let ended = || match self.slowing {
-            true => Some((TaskState::Aborted, Reason::Cancelled)),
-            false => Some((TaskState::Idle, Reason::Timeout)),
+            true => Step::End(TaskState::Aborted, Reason::Cancelled),
+            false => Step::End(TaskState::Idle, Reason::Timeout),
         };
         let ending = self.slowing || self.timed_out;
-        if !granted {
+        if !cx.granted {
             // Nothing of it goes out: there is nothing to slow down.
             if ending {
                 return ended();
             }
-            self.effector.rebase(cx, joints);
-        } else if let Some((joint, error)) = self.effector.strayed(cx, joints) {
-            return Some((TaskState::Aborted, Reason::TrackingError(joint, error)));
+            self.effector.rebase(cx);
+        } else if let Some((joint, error)) = self.effector.strayed(cx) {
+            return Step::End(TaskState::Aborted, Reason::TrackingError(joint, error));
         } else if ending && self.effector.at_rest() {
             return ended();
         }
         let (wanted, way) = match target.filter(|_| !self.slowing) {
             None => (Velocity::default(), None),
-            Some(Target::Twist(twist)) => (twist, None),
-            Some(Target::ToolTwist(Velocity { linear, angular })) => {
+            Some(Tracked::Twist(twist)) => (twist, None),
+            Some(Tracked::ToolTwist(Velocity { linear, angular })) => {
                 let turn = self.effector.pose().matrix3;
                 (Velocity { linear: turn * linear, angular: turn * angular }, None)
             }
-            Some(Target::Pose(pose)) => {
+            Some(Tracked::Pose(pose)) => {
                 let from = self.effector.pose();
                 let way = Velocity {
                     linear: pose.translation - from.translation,
@@ -147,8 +97,23 @@ impl CartesianTask {
                 (towards(self.effector.params(), &way, cx.dt), Some(way))
             }
         };
-        self.effector.advance(cx, joints, &wanted, way.as_ref(), claims);
-        None
+        self.effector.advance(cx, &wanted, way.as_ref(), claims);
+        if self.timed_out { Step::ContinueFor(Reason::Timeout) } else { Step::Continue }
+    }
+
+    fn end(&mut self) {
+        (self.target, self.slowing, self.timed_out) = (None, false, false);
+    }
+
+    fn cancel(&mut self) -> OnCancel {
+        self.slowing = true;
+        OnCancel::Decelerate
+    }
+
+    fn describe(&self, view: &mut TaskView) {
+        if matches!(view.state, TaskState::Executing | TaskState::Cancelling) {
+            view.bound = self.effector.bound();
+        }
     }
 }
 
@@ -171,18 +136,19 @@ fn towards(p: &CartesianParams, way: &Velocity, dt: f64) -> Velocity {
     Velocity { linear: way.linear * rate, angular: way.angular * rate }
 }
 
-/// A goal as a target; `None` where it is not finite, or no orientation.
-fn target(p: &CartesianParams, goal: &Goal) -> Option<Target> {
+/// A goal in the frame of the model's root; `None` where it is not finite, or no orientation.
+fn tracked(effector: &EndEffector, goal: &Goal) -> Option<Tracked> {
+    let (p, robot) = (effector.params(), effector.robot());
     match *goal {
         Goal::Pose { position, orientation } => {
             let turn = DQuat::from_array(orientation);
             let good = (turn.length() - 1.0).abs() <= QUATERNION_SLACK && DVec3::from_array(position).is_finite();
             let root = DAffine3::from_rotation_translation(
-                DQuat::from_array(p.root.orientation).normalize(),
-                DVec3::from_array(p.root.position),
+                DQuat::from_array(robot.root.orientation).normalize(),
+                DVec3::from_array(robot.root.position),
             );
             let pose = DAffine3::from_rotation_translation(turn.normalize(), DVec3::from_array(position));
-            good.then(|| Target::Pose(root.inverse() * pose))
+            good.then(|| Tracked::Pose(root.inverse() * pose))
         }
         Goal::Twist { linear, angular, tool } => {
             let (linear, angular) = (DVec3::from_array(linear), DVec3::from_array(angular));
@@ -192,9 +158,9 @@ fn target(p: &CartesianParams, goal: &Goal) -> Option<Target> {
             // What is too fast is slowed down as a whole: it keeps its direction.
             let asked = Velocity { linear, angular };
             let over = seconds(&asked, p.max_linear_velocity, p.max_angular_velocity).max(1.0);
-            let base = if tool { DMat3::IDENTITY } else { DMat3::from_quat(DQuat::from_array(p.base).normalize()) };
+            let base = if tool { DMat3::IDENTITY } else { DMat3::from_quat(DQuat::from_array(robot.base).normalize()) };
             let twist = Velocity { linear: base * linear / over, angular: base * angular / over };
-            Some(if tool { Target::ToolTwist(twist) } else { Target::Twist(twist) })
+            Some(if tool { Tracked::ToolTwist(twist) } else { Tracked::Twist(twist) })
         }
     }
 }

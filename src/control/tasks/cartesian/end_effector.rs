@@ -3,8 +3,9 @@
 
 use glamx::{DAffine3, DVec3};
 
-use crate::control::config::CartesianParams;
-use crate::control::task::{Claim, Context};
+use super::params::CartesianParams;
+use crate::control::task_body::{Claim, Context};
+use crate::control::task_robot::TaskKinematics;
 use crate::joint::MAX_DOF;
 use crate::robot::kinematics::step::{Bound as Bounded, JointBounds, JointMotion, StepSettings, Stepper, TargetTwist};
 use crate::telemetry::Bound;
@@ -27,6 +28,7 @@ pub fn seconds(change: &Velocity, linear: f64, angular: f64) -> f64 {
 #[derive(Debug)]
 pub struct EndEffector {
     params: CartesianParams,
+    robot: TaskKinematics,
     stepper: Stepper,
     joints: JointMotion,
     bounds: [JointBounds; MAX_DOF],
@@ -37,10 +39,11 @@ pub struct EndEffector {
 
 impl EndEffector {
     /// An end effector that was not moved yet.
-    pub fn new(params: CartesianParams) -> Self {
+    pub fn new(params: CartesianParams, robot: TaskKinematics) -> Self {
         Self {
-            stepper: Stepper::new(params.kinematics.clone(), params.link, StepSettings::default()),
+            stepper: Stepper::new(robot.kinematics.clone(), robot.link, StepSettings::default()),
             params,
+            robot,
             joints: JointMotion::default(),
             bounds: [JointBounds::default(); MAX_DOF],
             velocity: Velocity::default(),
@@ -53,24 +56,29 @@ impl EndEffector {
         &self.params
     }
 
+    /// Its robot.
+    pub fn robot(&self) -> &TaskKinematics {
+        &self.robot
+    }
+
     /// What holds it back just now.
     pub fn bound(&self) -> Bound {
         self.bound
     }
 
     /// Begins where the joints are commanded to be, as fast as they are commanded to move.
-    pub fn rebase(&mut self, cx: &Context<'_>, joints: &[u16]) {
+    pub fn rebase(&mut self, cx: &Context<'_>) {
         self.velocity = Velocity::default();
         let motion = self.joints.position.iter_mut().zip(&mut self.joints.velocity);
-        for ((q, v), &joint) in motion.zip(joints) {
+        for ((q, v), &joint) in motion.zip(cx.joints) {
             let view = cx.joint(joint);
             (*q, *v) = (view.commanded, view.commanded_velocity);
         }
     }
 
     /// The first joint that is measured too far from where it is commanded to be, and how far [rad].
-    pub fn strayed(&self, cx: &Context<'_>, joints: &[u16]) -> Option<(u16, f64)> {
-        joints.iter().find_map(|&joint| {
+    pub fn strayed(&self, cx: &Context<'_>) -> Option<(u16, f64)> {
+        cx.joints.iter().find_map(|&joint| {
             let view = cx.joint(joint);
             let error = view.tracking_error;
             (error.is_nan() || error.abs() > self.params.max_tracking_error).then_some((joint, error))
@@ -89,14 +97,7 @@ impl EndEffector {
 
     /// Moves on by one tick towards a velocity and claims the joints. `way`: what is left to a goal, where it shall
     /// stand still.
-    pub fn advance(
-        &mut self,
-        cx: &Context<'_>,
-        joints: &[u16],
-        wanted: &Velocity,
-        way: Option<&Velocity>,
-        claims: &mut Vec<Claim>,
-    ) {
+    pub fn advance(&mut self, cx: &Context<'_>, wanted: &Velocity, way: Option<&Velocity>, claims: &mut Vec<Claim>) {
         let before = self.velocity;
         self.approach(wanted, cx.dt);
         let Velocity { linear, angular } = self.velocity;
@@ -106,7 +107,7 @@ impl EndEffector {
             let speed = size(&self.velocity);
             if speed > 0.0 { size(way) / speed } else { f64::INFINITY }
         });
-        let model = self.params.kinematics.limits();
+        let (joints, model) = (cx.joints, self.robot.kinematics.limits());
         for ((bounds, own), &joint) in self.bounds.iter_mut().zip(model).zip(joints) {
             let view = cx.joint(joint);
             *bounds = JointBounds {

@@ -1,10 +1,10 @@
 //! Executes a trajectory: positions along its curve, from where the arm is, until the arm has arrived.
 
+use super::params::TrajectoryParams;
 use crate::clock::Mono;
-use crate::control::config::TrajectoryParams;
 use crate::control::path_clock::{PathClock, RateLimits};
 use crate::control::request::Motion;
-use crate::control::task::{Claim, Context};
+use crate::control::task_body::{Claim, Context, OnCancel, Step, Target, TaskBody};
 use crate::joint::TICK_STANDSTILL;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 use crate::trajectory::{Cursor, Sample};
@@ -16,7 +16,6 @@ const SHORTEST_FADE: f64 = 0.2;
 #[derive(Debug)]
 pub struct TrajectoryTask {
     params: TrajectoryParams,
-    motion: Option<Box<Motion>>,
     cursor: Cursor,
     /// Time along the trajectory.
     clock: PathClock,
@@ -39,7 +38,6 @@ impl TrajectoryTask {
     pub fn new(params: TrajectoryParams, width: usize) -> Self {
         Self {
             params,
-            motion: None,
             cursor: Cursor::default(),
             clock: PathClock::default(),
             slowing: false,
@@ -53,14 +51,6 @@ impl TrajectoryTask {
         }
     }
 
-    /// Whether a motion may start from the present state.
-    pub fn check_start(&self, cx: &Context<'_>, motion: &Motion) -> Result<(), Outcome> {
-        match self.away_from_start(cx, motion) {
-            Some((joint, error)) => Err(Outcome::StartStateMismatch(joint, error.abs())),
-            None => Ok(()),
-        }
-    }
-
     /// The first joint that is too far from the start, and how far it is ahead of it [rad].
     fn away_from_start(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
         motion.joints.iter().enumerate().find_map(|(k, &joint)| {
@@ -70,22 +60,19 @@ impl TrajectoryTask {
         })
     }
 
-    /// Takes on a motion. Answers the one before, if any.
-    pub fn start(&mut self, cx: &Context<'_>, motion: Box<Motion>) -> Option<Box<Motion>> {
+    /// Begins a motion.
+    fn start(&mut self, cx: &Context<'_>, motion: &Motion) {
         self.cursor = Cursor::default();
         self.clock.start();
         (self.slowing, self.begun, self.at_end, self.settling) = (false, false, false, 0.0);
         self.samples.clear();
         self.samples.resize(motion.joints.len(), Sample::default());
         self.last = TaskView { motion: motion.id, remaining: motion.spline.duration(), ..TaskView::default() };
-        let before = self.motion.replace(motion);
-        self.set_out(cx);
-        before
+        self.set_out(cx, motion);
     }
 
     /// Notes what the last commands are ahead of the first point, and over which time that is faded out.
-    fn set_out(&mut self, cx: &Context<'_>) {
-        let Some(motion) = self.motion.as_deref() else { return };
+    fn set_out(&mut self, cx: &Context<'_>, motion: &Motion) {
         self.fade = SHORTEST_FADE;
         self.offsets.clear();
         for (k, &joint) in motion.joints.iter().enumerate() {
@@ -98,78 +85,6 @@ impl TrajectoryTask {
             let by_acceleration = (5.774 * offset.abs() / (0.25 * view.acceleration)).sqrt();
             self.fade = self.fade.max(by_speed).max(by_acceleration);
         }
-    }
-
-    /// Nothing reached an arm since the tick of `at`: goes back to what was commanded then, at rest.
-    pub fn rewind(&mut self, at: Mono, now: Mono) {
-        if self.begun {
-            self.clock.rewind(at, now);
-            self.at_end = false;
-        }
-    }
-
-    /// From now on slow down along the path.
-    pub fn slow_down(&mut self) {
-        self.slowing = true;
-    }
-
-    /// Gives the motion back.
-    pub fn take(&mut self) -> Option<Box<Motion>> {
-        self.motion.take()
-    }
-
-    /// Fills in the claims of this tick, or says how it ended. `granted`: the claims of the last tick went out.
-    pub fn compute(&mut self, cx: &Context<'_>, granted: bool, claims: &mut Vec<Claim>) -> Option<(TaskState, Reason)> {
-        if !granted {
-            if self.slowing {
-                return Some((TaskState::Aborted, Reason::Cancelled));
-            }
-            if !self.begun {
-                // While the arm slows down and changes its mode for it, the way to the start changes.
-                self.set_out(cx);
-                let away = self.motion.as_deref().and_then(|motion| self.away_from_start(cx, motion));
-                if let Some((joint, error)) = away {
-                    return Some((TaskState::Aborted, Reason::PathTolerance(joint, error)));
-                }
-            }
-        }
-        self.begun |= granted;
-        let motion = self.motion.as_deref()?;
-        if granted {
-            if let Some(reason) = self.off_path(cx, motion) {
-                return Some((TaskState::Aborted, reason));
-            }
-            self.clock.advance(cx.dt);
-        }
-        let duration = motion.spline.duration();
-        motion.spline.sample(self.clock.elapsed(), &mut self.cursor, &mut self.samples);
-        note_progress(&mut self.last, self.clock.elapsed(), duration);
-        if self.slowing {
-            self.clock.slow_down(cx.dt * steepest_slowdown(cx, motion, &self.samples, self.clock.rate()));
-            if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration {
-                return Some((TaskState::Aborted, Reason::Cancelled));
-            }
-        } else if granted && !self.clock.full() {
-            self.clock.speed_up(rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);
-        }
-        if granted && self.at_end {
-            self.settling += cx.dt;
-            match self.away_from_goal(cx, motion) {
-                None => return Some((TaskState::Completed, Reason::None)),
-                Some((joint, error)) if self.settling > self.params.goal_time => {
-                    return Some((TaskState::Aborted, Reason::GoalTolerance(joint, error)));
-                }
-                Some(_) => {}
-            }
-        }
-        self.at_end = self.clock.elapsed() >= duration.max(self.fade);
-        self.clock.mark(cx.now);
-        let left = 1.0 - smooth_step(self.clock.elapsed() / self.fade);
-        for (k, &joint) in motion.joints.iter().enumerate() {
-            let (Some(s), Some(offset)) = (self.samples.get(k), self.offsets.get(k)) else { continue };
-            claims.push(Claim { joint, value: s.position + offset * left });
-        }
-        None
     }
 
     fn off_path(&self, cx: &Context<'_>, motion: &Motion) -> Option<Reason> {
@@ -190,9 +105,87 @@ impl TrajectoryTask {
             (!arrived).then_some((joint, error))
         })
     }
+}
 
-    /// Adds the motion's progress to what is told of the task.
-    pub fn describe(&self, view: &mut TaskView) {
+impl TaskBody for TrajectoryTask {
+    fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome> {
+        let Target::Trajectory(motion) = target else { return Err(Outcome::WrongTask(cx.task)) };
+        if let Some((joint, error)) = self.away_from_start(cx, motion) {
+            return Err(Outcome::StartStateMismatch(joint, error.abs()));
+        }
+        self.start(cx, motion);
+        Ok(())
+    }
+
+    fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step {
+        let Some(motion) = cx.motion else { return Step::Continue };
+        let granted = cx.granted;
+        if !granted {
+            if self.slowing {
+                return Step::End(TaskState::Aborted, Reason::Cancelled);
+            }
+            if !self.begun {
+                // While the arm slows down and changes its mode for it, the way to the start changes.
+                self.set_out(cx, motion);
+                if let Some((joint, error)) = self.away_from_start(cx, motion) {
+                    return Step::End(TaskState::Aborted, Reason::PathTolerance(joint, error));
+                }
+            }
+        }
+        self.begun |= granted;
+        if granted {
+            if let Some(reason) = self.off_path(cx, motion) {
+                return Step::End(TaskState::Aborted, reason);
+            }
+            self.clock.advance(cx.dt);
+        }
+        let duration = motion.spline.duration();
+        motion.spline.sample(self.clock.elapsed(), &mut self.cursor, &mut self.samples);
+        note_progress(&mut self.last, self.clock.elapsed(), duration);
+        if self.slowing {
+            self.clock.slow_down(cx.dt * steepest_slowdown(cx, motion, &self.samples, self.clock.rate()));
+            if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration {
+                return Step::End(TaskState::Aborted, Reason::Cancelled);
+            }
+        } else if granted && !self.clock.full() {
+            self.clock.speed_up(rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);
+        }
+        if granted && self.at_end {
+            self.settling += cx.dt;
+            match self.away_from_goal(cx, motion) {
+                None => return Step::End(TaskState::Completed, Reason::None),
+                Some((joint, error)) if self.settling > self.params.goal_time => {
+                    return Step::End(TaskState::Aborted, Reason::GoalTolerance(joint, error));
+                }
+                Some(_) => {}
+            }
+        }
+        self.at_end = self.clock.elapsed() >= duration.max(self.fade);
+        self.clock.mark(cx.now);
+        let left = 1.0 - smooth_step(self.clock.elapsed() / self.fade);
+        for (k, &joint) in motion.joints.iter().enumerate() {
+            let (Some(s), Some(offset)) = (self.samples.get(k), self.offsets.get(k)) else { continue };
+            claims.push(Claim { joint, value: s.position + offset * left });
+        }
+        Step::Continue
+    }
+
+    /// The motion is the coordinator's; the figures of the last one stay.
+    fn end(&mut self) {}
+
+    fn cancel(&mut self) -> OnCancel {
+        self.slowing = true;
+        OnCancel::Decelerate
+    }
+
+    fn rewind(&mut self, at: Mono, now: Mono) {
+        if self.begun {
+            self.clock.rewind(at, now);
+            self.at_end = false;
+        }
+    }
+
+    fn describe(&self, view: &mut TaskView) {
         (view.motion, view.progress) = (self.last.motion, self.last.progress);
         (view.elapsed, view.remaining) = (self.last.elapsed, self.last.remaining);
     }

@@ -1,76 +1,12 @@
-//! What the task types can be told: `params` of a task.
+//! Parameters of the tasks that move an end effector.
 
 use std::collections::BTreeMap;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::blueprint::range::{non_negative, positive};
 use crate::yaml::Text;
-
-/// Parameters of a `trajectory` task.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct TrajectoryParams {
-    /// How far each joint may be from the first point of a trajectory when it starts [rad].
-    #[serde(deserialize_with = "non_negative")]
-    #[schemars(range(min = 0.0))]
-    pub start_position_tolerance: f64,
-    /// How far a joint may stray from the trajectory on the way before it is aborted [rad]; 0 = not checked.
-    #[serde(deserialize_with = "non_negative")]
-    #[schemars(range(min = 0.0))]
-    pub path_tolerance: f64,
-    /// How near each joint must come to the last point to have arrived [rad].
-    #[serde(deserialize_with = "positive")]
-    #[schemars(extend("exclusiveMinimum" = 0.0))]
-    pub goal_tolerance: f64,
-    /// How long after the last point the joints may take to arrive [s].
-    #[serde(deserialize_with = "non_negative")]
-    #[schemars(range(min = 0.0))]
-    pub goal_time: f64,
-}
-
-impl Default for TrajectoryParams {
-    fn default() -> Self {
-        Self { start_position_tolerance: 0.05, path_tolerance: 0.2, goal_tolerance: 0.01, goal_time: 2.0 }
-    }
-}
-
-/// Parameters of a `servo` task.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct ServoParams {
-    /// Without a new target for this long the task lets go of its joints [s]; 0 = never.
-    #[serde(deserialize_with = "non_negative")]
-    #[schemars(range(min = 0.0))]
-    pub timeout: f64,
-    /// Targets at the start, one for each joint of the task [rad].
-    pub default_positions: Option<Vec<f64>>,
-}
-
-impl Default for ServoParams {
-    fn default() -> Self {
-        Self { timeout: 0.5, default_positions: None }
-    }
-}
-
-/// Parameters of a `velocity` task.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct VelocityParams {
-    /// Without a new target for this long the joints are brought to rest [s]; 0 = never.
-    #[serde(deserialize_with = "non_negative")]
-    #[schemars(range(min = 0.0))]
-    pub timeout: f64,
-    /// After the timeout, keep commanding zero velocity (true) or let go of the joints (false).
-    pub zero_on_timeout: bool,
-}
-
-impl Default for VelocityParams {
-    fn default() -> Self {
-        Self { timeout: 0.2, zero_on_timeout: true }
-    }
-}
+use crate::yaml::range::{non_negative, positive};
 
 /// Parameters of a `cartesian_ik` or `eef_twist` task. Where the planner has a robot with the task's joints, its
 /// description, joint names and end effector are the default, and poses are in the frame `map`.
@@ -133,5 +69,33 @@ impl Default for CartesianParams {
             max_angular_acceleration: 4.0,
             max_tracking_error: 0.1745,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::control::task_robot::RobotParams;
+
+    #[test]
+    fn the_robot_is_read_from_these_parameters() {
+        let typed = json!({
+            "model_path": "a.urdf", "package_paths": {"p": "q"}, "xacro_args": {"x": "0.50"},
+            "end_effector_link": "flange", "joint_prefix": "arm_", "joint_name_mapping": {"a": "b"}
+        });
+        let params = serde_json::to_value(CartesianParams::deserialize(&typed).unwrap()).unwrap();
+        let robot = RobotParams::deserialize(&params).unwrap();
+        let one = |key: &str, value: &str| BTreeMap::from([(key.to_owned(), value.to_owned())]);
+        let expected = RobotParams {
+            model_path: Some("a.urdf".into()),
+            package_paths: one("p", "q"),
+            xacro_args: BTreeMap::from([("x".into(), Text("0.50".into()))]),
+            end_effector_link: Some("flange".into()),
+            joint_prefix: Some("arm_".into()),
+            joint_name_mapping: one("a", "b"),
+        };
+        assert_eq!(robot, expected);
     }
 }

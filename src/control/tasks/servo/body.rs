@@ -2,10 +2,12 @@
 //! over the stream's own period, so that a slow stream makes a smooth motion. When the stream stops, so do the
 //! joints.
 
+use super::params::ServoParams;
 use crate::clock::Mono;
-use crate::control::config::{JUMP, ServoParams};
-use crate::control::task::{Claim, Context};
-use crate::joint::{Joints, MAX_DOF};
+use crate::control::config::JUMP;
+use crate::control::task_body::{Claim, Context, OnLoss, Step, Target, TaskBody};
+use crate::joint::{Joints, MAX_DOF, joints_of};
+use crate::telemetry::{Outcome, Reason, TaskState};
 
 /// A pause longer than this is no stream's period [s].
 const LONGEST_PERIOD: f64 = 0.1;
@@ -14,12 +16,13 @@ const LONGEST_PERIOD: f64 = 0.1;
 #[derive(Debug)]
 pub struct ServoTask {
     params: ServoParams,
-    target: Option<Target>,
+    target: Option<Setpoint>,
+    /// Joints lost to a stronger task, until the next target.
     muted: [bool; MAX_DOF],
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Target {
+struct Setpoint {
     from: Joints,
     to: Joints,
     at: Mono,
@@ -27,7 +30,7 @@ struct Target {
     period: f64,
 }
 
-impl Target {
+impl Setpoint {
     fn reached(&self, cx: &Context<'_>) -> Joints {
         // A target counts from its tick on, so the first step is made at once. The line is a tick longer than the
         // stream's period: the next target may come so much later without a halt in between.
@@ -52,13 +55,8 @@ impl ServoTask {
         Self { params, target: None, muted: [false; MAX_DOF] }
     }
 
-    /// Where it goes when it starts by itself.
-    pub fn default_positions(&self) -> Option<&[f64]> {
-        self.params.default_positions.as_deref()
-    }
-
     /// A new target [rad], in the order of the task's joints.
-    pub fn set_target(&mut self, cx: &Context<'_>, joints: &[u16], to: &Joints) {
+    fn set_target(&mut self, cx: &Context<'_>, to: &Joints) {
         self.muted = [false; MAX_DOF];
         let (from, period) = match &self.target {
             None => (*to, 0.0),
@@ -76,38 +74,57 @@ impl ServoTask {
                     let step = to.get(k).zip(last.to.get(k)).map_or(0.0, |(to, last)| (to - last).abs());
                     step <= JUMP.max(cx.joint(*joint).velocity_limit * pause * 1.5)
                 };
-                let possible = joints.iter().enumerate().all(reachable);
+                let possible = cx.joints.iter().enumerate().all(reachable);
                 (from, if possible { period } else { 0.0 })
             }
         };
-        self.target = Some(Target { from, to: *to, at: cx.now, period });
+        self.target = Some(Setpoint { from, to: *to, at: cx.now, period });
     }
+}
 
-    /// Forgets the target.
-    pub fn drop_target(&mut self) {
-        self.target = None;
-    }
-
-    /// A joint is lost until the next target.
-    pub fn mute(&mut self, joints: &[u16], joint: u16) {
-        if let Some(m) = joints.iter().position(|&j| j == joint).and_then(|k| self.muted.get_mut(k)) {
-            *m = true;
+impl TaskBody for ServoTask {
+    fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome> {
+        let Target::Positions(positions) = target else { return Err(Outcome::WrongTask(cx.task)) };
+        if !cx.active {
+            // A stream begins where the arm is; once it runs, a jump in it is a fault.
+            for (&joint, value) in cx.joints.iter().zip(positions) {
+                let step = value - cx.joint(joint).commanded;
+                if step.abs() > JUMP {
+                    return Err(Outcome::StartStateMismatch(joint, step.abs()));
+                }
+            }
         }
+        self.set_target(cx, positions);
+        Ok(())
     }
 
-    /// Fills in the claims of this tick; `false` when the stream has stopped.
-    pub fn compute(&mut self, cx: &Context<'_>, joints: &[u16], claims: &mut Vec<Claim>) -> bool {
-        let Some(target) = &self.target else { return false };
-        let age = cx.now.seconds_since(target.at);
-        if self.params.timeout > 0.0 && age > self.params.timeout {
-            return false;
-        }
+    fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step {
+        let age = |target: &Setpoint| cx.now.seconds_since(target.at);
+        let fresh = |target: &&Setpoint| self.params.timeout <= 0.0 || age(target) <= self.params.timeout;
+        let Some(target) = self.target.as_ref().filter(fresh) else {
+            return Step::End(TaskState::Idle, Reason::Timeout);
+        };
         let values = target.reached(cx);
-        for ((&joint, &value), muted) in joints.iter().zip(&values).zip(&self.muted) {
+        for ((&joint, &value), muted) in cx.joints.iter().zip(&values).zip(&self.muted) {
             if !muted {
                 claims.push(Claim { joint, value });
             }
         }
-        true
+        Step::Continue
+    }
+
+    fn end(&mut self) {
+        self.target = None;
+    }
+
+    fn lose(&mut self, joints: &[u16], joint: u16) -> OnLoss {
+        if let Some(m) = joints.iter().position(|&j| j == joint).and_then(|k| self.muted.get_mut(k)) {
+            *m = true;
+        }
+        OnLoss::Continue
+    }
+
+    fn first_target(&self) -> Option<Target<'static>> {
+        self.params.default_positions.as_deref().map(|positions| Target::Positions(joints_of(positions)))
     }
 }

@@ -1,0 +1,22 @@
+//! What a blueprint can name: adapters and task types.
+
+use crate::control::task_spec::TaskTable;
+use crate::hardware::registry::Registry;
+
+/// The tables that a blueprint is checked against.
+#[derive(Debug, Clone, Copy)]
+pub struct Catalog<'a> {
+    /// Adapters.
+    pub adapters: &'a Registry,
+    /// Task types.
+    pub tasks: &'a TaskTable,
+}
+
+static BUILT_IN: TaskTable = TaskTable::builtin();
+
+/// These adapters and the built-in task types.
+impl<'a> From<&'a Registry> for Catalog<'a> {
+    fn from(adapters: &'a Registry) -> Self {
+        Self { adapters, tasks: &BUILT_IN }
+    }
+}

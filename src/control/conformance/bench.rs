@@ -1,0 +1,336 @@
+//! What a check works with: a coordinator on a virtual clock, one arm that does what it is commanded, the task under
+//! test, and a stronger task on one of its joints.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use crate::arm::{ArmState, Link, Supervision, VelocitySource};
+use crate::clock::Mono;
+use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::coordinator::{Coordinator, TickTime};
+use crate::control::request::{Envelope, Goal, Motion, Request};
+use crate::control::task::Task;
+use crate::control::task_body::{Demand, TargetKind};
+use crate::control::task_robot::TaskKinematics;
+use crate::control::task_spec::{TaskSpec, TaskTable};
+use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF, joints_of};
+use crate::robot::kinematics::Kinematics;
+use crate::robot::{Source, load};
+use crate::telemetry::{Event, Outcome, Phase, TaskState};
+use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
+
+const DOF: usize = 6;
+/// Where the arm begins, away from every singular pose of the built-in robot [rad].
+const HOME: [f64; DOF] = [0.2, -0.3, 0.9, 0.3, 0.8, 0.1];
+/// Tick rate [Hz].
+const RATE: f64 = 100.0;
+/// The task under test, and the stronger one.
+const TESTED: u16 = 0;
+const STRONGER: u16 = 1;
+/// The joint that the stronger task takes.
+pub const CONTESTED: u16 = 0;
+
+/// A coordinator, its arm and its clock.
+#[derive(Debug)]
+pub struct Bench {
+    spec: TaskSpec,
+    coordinator: Coordinator,
+    robot: TaskKinematics,
+    arm: ArmState,
+    now: Mono,
+    inbox: VecDeque<Envelope>,
+    next_id: u64,
+    events: Vec<Event>,
+    phase: Phase,
+    /// Time since the stream of targets began [s].
+    streamed: f64,
+    trace: Vec<u64>,
+    allocations: Option<fn() -> u64>,
+    allocated: u64,
+}
+
+impl Bench {
+    /// An arm that is ready, and a task of this type without a target.
+    pub fn new(spec: &TaskSpec, allocations: Option<fn() -> u64>) -> Result<Self, String> {
+        let model = load(&Source::new("builtin:yourarm")).into_model()?;
+        let flange = model.link_index("flange").ok_or("the built-in robot has no flange")?;
+        let robot = TaskKinematics::new(Kinematics::whole(&model).map_err(|e| e.to_string())?, flange);
+        let config = config(spec, &robot);
+        let tasks = TaskTable::with(&[*spec]).build(&config.tasks)?;
+        let mut bench = Self {
+            spec: *spec,
+            coordinator: Coordinator::new(&config, tasks),
+            robot,
+            arm: ArmState {
+                dof: DOF,
+                position: joints_of(&HOME),
+                velocity: joints_of(&[0.0; DOF]),
+                velocity_source: VelocitySource::Measured,
+                mode: ControlMode::ServoPosition,
+                enabled: true,
+                link: Link::Up,
+                ..ArmState::default()
+            },
+            now: Mono(1_000_000_000),
+            inbox: VecDeque::new(),
+            next_id: 1,
+            events: Vec::new(),
+            phase: Phase::Unknown,
+            streamed: 0.0,
+            trace: Vec::new(),
+            allocations,
+            allocated: 0,
+        };
+        bench.tick(0);
+        bench.enable()?;
+        Ok(bench)
+    }
+
+    /// The same from the start.
+    pub fn again(&self) -> Result<Self, String> {
+        Self::new(&self.spec, self.allocations)
+    }
+
+    /// The row under test.
+    pub fn spec(&self) -> &TaskSpec {
+        &self.spec
+    }
+
+    /// The built-in robot, compiled for the arm.
+    pub fn robot(&self) -> &TaskKinematics {
+        &self.robot
+    }
+
+    /// The task under test.
+    pub fn task(&self) -> Result<&Task, String> {
+        self.coordinator.tasks().first().ok_or_else(|| "the coordinator lost the task".to_owned())
+    }
+
+    /// Whether the task under test does something.
+    pub fn is_active(&self) -> bool {
+        self.task().is_ok_and(Task::is_active)
+    }
+
+    /// Resets the arm's latch, enables it and waits until it is ready.
+    pub fn enable(&mut self) -> Result<(), String> {
+        self.ask(Request::Reset { arm: 0 });
+        self.ask(Request::Ready { arm: 0 });
+        self.run(0.5);
+        if self.phase == Phase::Ready { Ok(()) } else { Err(format!("the simulated arm is {:?}", self.phase)) }
+    }
+
+    /// One tick, after this number of skipped periods.
+    pub fn tick(&mut self, skipped: u32) {
+        let period = Duration::from_secs_f64(1.0 / RATE);
+        self.now = self.now.after(period * (skipped + 1));
+        self.arm.seq += 1;
+        self.arm.stamp = self.now.before(Duration::from_micros(1500));
+        let late_ns = u64::from(skipped) * period.as_nanos() as u64;
+        let time = TickTime { now: self.now, next: self.now.after(period), skipped, late_ns, woke_late_ns: late_ns };
+        let counted = || self.allocations.map_or(0, |count| count());
+        let before = counted();
+        let output = self.coordinator.tick(time, &[self.arm], || self.inbox.pop_front());
+        self.allocated += counted() - before;
+        self.events.extend(&output.events);
+        output.retired.clear();
+        self.phase = output.arms.first().map_or(Phase::Unknown, |arm| arm.phase);
+        let Some(command) = output.commands.first() else { return };
+        self.trace.extend(command.values.iter().map(|value| value.to_bits()));
+        let Some(mode) = command.mode else { return };
+        (self.arm.mode, self.arm.written) = (mode, command.seq);
+        for ((q, v), value) in self.arm.position.iter_mut().zip(&mut self.arm.velocity).zip(command.values).take(DOF) {
+            let before = *q;
+            *q = if mode == ControlMode::Velocity { before + value / RATE } else { value };
+            *v = (*q - before) * RATE;
+        }
+    }
+
+    /// Ticks for this time [s].
+    pub fn run(&mut self, seconds: f64) {
+        (0..(seconds * RATE).round() as u64).for_each(|_| self.tick(0));
+    }
+
+    /// Sends a request and returns what came of it in the next tick.
+    pub fn ask(&mut self, request: Request) -> Option<Outcome> {
+        let id = self.send(request);
+        self.tick(0);
+        let of = |event: &Event| match event {
+            Event::Request(answered, outcome) if *answered == id => Some(*outcome),
+            _ => None,
+        };
+        self.events.iter().rev().find_map(of)
+    }
+
+    fn send(&mut self, request: Request) -> u64 {
+        let id = self.next_id;
+        self.next_id += 1;
+        self.inbox.push_back(Envelope { id, request });
+        id
+    }
+
+    /// Cancels the task under test.
+    pub fn cancel(&mut self) -> Option<Outcome> {
+        self.ask(Request::Cancel { task: Some(TESTED) })
+    }
+
+    /// The kind of target with which the task is moved.
+    pub fn usual(&self) -> Result<TargetKind, String> {
+        self.spec.takes.first().copied().ok_or_else(|| "it takes no target".to_owned())
+    }
+
+    /// Sends the next usual target every other tick for this time [s]. A trajectory is sent once.
+    pub fn stream(&mut self, seconds: f64) -> Result<(), String> {
+        let kind = self.usual()?;
+        for k in 0..(seconds * RATE).round() as u64 {
+            if k % 2 == 0 && !(kind == TargetKind::Trajectory && self.is_active()) {
+                let target = self.target(kind)?;
+                self.send(target);
+            }
+            self.tick(0);
+            self.streamed += 1.0 / RATE;
+        }
+        Ok(())
+    }
+
+    /// The request with the next target of a slow motion.
+    pub fn target(&self, kind: TargetKind) -> Result<Request, String> {
+        let swing = 0.1 * (1.0 - (std::f64::consts::PI * self.streamed).cos());
+        let each = |f: &dyn Fn(f64) -> f64| -> Joints { joints_of(&HOME.map(f)) };
+        Ok(match kind {
+            TargetKind::Trajectory => Request::Execute { task: TESTED, motion: self.motion()? },
+            TargetKind::Positions => Request::Servo { task: TESTED, target: each(&|home| home + swing) },
+            TargetKind::Velocities => Request::Velocity { task: TESTED, target: each(&|_| 0.2) },
+            TargetKind::Pose => {
+                let mut frames = self.robot.kinematics.frames();
+                self.robot.kinematics.forward(&HOME, &mut frames);
+                let flange = self.robot.kinematics.link_frame(self.robot.link, &frames);
+                let mut position = flange.translation.to_array();
+                position[2] += 0.05;
+                let orientation = glamx::DQuat::from_mat3(&flange.matrix3).to_array();
+                Request::Steer { task: TESTED, goal: Goal::Pose { position, orientation } }
+            }
+            TargetKind::Twist => {
+                let goal = Goal::Twist { linear: [0.0, 0.0, 0.05], angular: [0.0; 3], tool: false };
+                Request::Steer { task: TESTED, goal }
+            }
+        })
+    }
+
+    /// The same with numbers that are not finite; `None`: this kind cannot be sent with such.
+    pub fn not_finite(kind: TargetKind) -> Option<Request> {
+        let (task, odd) = (TESTED, f64::NAN);
+        Some(match kind {
+            TargetKind::Trajectory => return None,
+            TargetKind::Positions => Request::Servo { task, target: [odd; MAX_DOF] },
+            TargetKind::Velocities => Request::Velocity { task, target: [odd; MAX_DOF] },
+            TargetKind::Pose => Request::Steer {
+                task,
+                goal: Goal::Pose { position: [0.3, odd, 0.4], orientation: [0.0, 0.0, 0.0, 1.0] },
+            },
+            TargetKind::Twist => {
+                let goal = Goal::Twist { linear: [0.0, f64::INFINITY, 0.0], angular: [odd; 3], tool: true };
+                Request::Steer { task, goal }
+            }
+        })
+    }
+
+    /// A motion of 2 s from where the arm is.
+    fn motion(&self) -> Result<Box<Motion>, String> {
+        let point = |time: f64, by: f64| TrajectoryPoint {
+            time_from_start: time,
+            positions: self.positions().map(|q| q + by).to_vec(),
+            velocities: vec![0.0; DOF],
+            accelerations: Vec::new(),
+        };
+        let joint_names = (0..DOF).map(|j| j.to_string()).collect();
+        let given = JointTrajectory { joint_names, points: vec![point(0.0, 0.0), point(2.0, 0.3)] };
+        let spline = Spline::new(&given).map_err(|e| e.to_string())?;
+        Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline }))
+    }
+
+    /// Lets the stronger task take its joint for this time [s], and end.
+    pub fn interfere(&mut self, seconds: f64) {
+        for _ in 0..(seconds * RATE).round() as u64 {
+            let here = self.arm.position[usize::from(CONTESTED)];
+            let request = match self.spec.demand {
+                Demand::Velocities => Request::Velocity { task: STRONGER, target: joints_of(&[0.0]) },
+                _ => Request::Servo { task: STRONGER, target: joints_of(&[here]) },
+            };
+            self.send(request);
+            self.tick(0);
+        }
+        self.ask(Request::Cancel { task: Some(STRONGER) });
+    }
+
+    /// Where the joints are [rad].
+    pub fn positions(&self) -> [f64; DOF] {
+        std::array::from_fn(|j| self.arm.position.get(j).copied().unwrap_or_default())
+    }
+
+    /// How far the joint is that moved furthest from where the arm began [rad].
+    pub fn moved(&self) -> f64 {
+        self.positions().iter().zip(HOME).fold(0.0, |most, (q, home)| most.max((q - home).abs()))
+    }
+
+    /// Whether the arm rests for this time [s], whatever the task does.
+    pub fn rests(&mut self, seconds: f64) -> bool {
+        let before = self.positions();
+        self.run(seconds);
+        self.positions() == before
+    }
+
+    /// A refused command since the start, or another end that is the task's fault.
+    pub fn fault(&self) -> Option<String> {
+        self.events.iter().find_map(|event| match event {
+            Event::Task(TESTED, TaskState::Fault, reason) => Some(format!("its command was refused: {reason:?}")),
+            _ => None,
+        })
+    }
+
+    /// Every command of every tick so far, bit by bit.
+    pub fn trace(&self) -> &[u64] {
+        &self.trace
+    }
+
+    /// Allocations inside of ticks, where they are counted.
+    pub fn allocated(&self) -> u64 {
+        self.allocated
+    }
+}
+
+fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
+    let arm = ArmConfig {
+        name: "arm".to_owned(),
+        dof: DOF,
+        limits: JointLimits::uniform(DOF, 2.9, 2.0).with_defaults(),
+        modes: vec![ControlMode::ServoPosition, ControlMode::Velocity],
+        gripper: false,
+        own_velocity: Vec::new(),
+        read_period: Duration::from_millis(10),
+        write_period: Duration::from_millis(10),
+        supervision: Supervision::default(),
+    };
+    let kind = |name: &str, params, robot| TaskKind { name: name.to_owned(), params, robot };
+    let task = |name: &str, kind: TaskKind, joints: std::ops::Range<u16>, priority: i32| TaskConfig {
+        name: name.to_owned(),
+        kind,
+        joints: joints.collect(),
+        priority,
+        auto_start: false,
+    };
+    let tested = kind(spec.name, (spec.params.default)(), spec.robot.then(|| Box::new(robot.clone())));
+    let stronger = match spec.demand {
+        Demand::Velocities => crate::control::tasks::velocity::SPEC,
+        _ => crate::control::tasks::servo::SPEC,
+    };
+    let stronger = kind(stronger.name, (stronger.params.default)(), None);
+    CoordinatorConfig {
+        version: CONTROL_VERSION,
+        rate: RATE,
+        arms: vec![arm],
+        tasks: vec![
+            task("tested", tested, 0..DOF as u16, 10),
+            task("stronger", stronger, CONTESTED..CONTESTED + 1, 20),
+        ],
+    }
+}

@@ -1,0 +1,208 @@
+//! What a type of task brings to the coordinator: a body that takes targets and claims joints, tick by tick.
+//!
+//! A body runs on the real-time thread: it never allocates, locks, logs, does I/O or panics. It holds plain data only;
+//! the coordinator keeps the motion of a trajectory and frees it elsewhere.
+
+use super::request::{Goal, Motion};
+use crate::clock::Mono;
+use crate::joint::Joints;
+use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
+
+/// What a task sees of a joint.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct JointView {
+    /// Measured position [rad].
+    pub position: f64,
+    /// Measured or estimated velocity [rad/s].
+    pub velocity: f64,
+    /// Last commanded position [rad].
+    pub commanded: f64,
+    /// Last commanded velocity [rad/s].
+    pub commanded_velocity: f64,
+    /// Lowest position that is commanded [rad].
+    pub lower: f64,
+    /// Highest position that is commanded [rad].
+    pub upper: f64,
+    /// Acceleration limit [rad/s²].
+    pub acceleration: f64,
+    /// Velocity limit [rad/s].
+    pub velocity_limit: f64,
+    /// Jerk limit [rad/s³].
+    pub jerk: f64,
+    /// How far the joint is outside the range of its set points of the last `lag` seconds [rad].
+    pub tracking_error: f64,
+}
+
+/// What a body sees when the coordinator calls it.
+#[derive(Debug, Clone, Copy)]
+pub struct Context<'a> {
+    /// The tick's time.
+    pub now: Mono,
+    /// Length of the control step [s].
+    pub dt: f64,
+    /// Index of the task, for outcomes that name it.
+    pub task: u16,
+    /// The task's joints: indices over all arms' joints, in the blueprint's order.
+    pub joints: &'a [u16],
+    /// Whether the task is active: executing or decelerating.
+    pub active: bool,
+    /// Whether all that the task claimed in the last tick went out to the arms.
+    pub granted: bool,
+    /// The motion of the last [`Target::Trajectory`], until the task ends.
+    pub motion: Option<&'a Motion>,
+    /// All joints of all arms.
+    pub views: &'a [JointView],
+}
+
+impl Context<'_> {
+    /// A joint's view; zeros for an index that does not exist.
+    pub fn joint(&self, joint: u16) -> JointView {
+        self.views.get(joint as usize).copied().unwrap_or_default()
+    }
+}
+
+/// How a task's claims are meant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Demand {
+    /// The task claims nothing.
+    #[default]
+    Nothing,
+    /// Joint positions [rad].
+    Positions,
+    /// Joint velocities [rad/s].
+    Velocities,
+}
+
+/// One joint that a task wants, and what it should do.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Claim {
+    /// Index over all arms' joints.
+    pub joint: u16,
+    /// [rad] or [rad/s], by the task's demand.
+    pub value: f64,
+}
+
+/// What a client sends to a task.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Target<'a> {
+    /// A motion to execute.
+    Trajectory(&'a Motion),
+    /// Positions of the task's joints, in their order [rad]; all finite.
+    Positions(Joints),
+    /// Velocities of the task's joints, in their order [rad/s]; all finite.
+    Velocities(Joints),
+    /// A pose or a twist of the end effector; any values.
+    EndEffector(Goal),
+}
+
+impl Target<'_> {
+    /// Its kind.
+    pub fn kind(&self) -> TargetKind {
+        match self {
+            Self::Trajectory(_) => TargetKind::Trajectory,
+            Self::Positions(_) => TargetKind::Positions,
+            Self::Velocities(_) => TargetKind::Velocities,
+            Self::EndEffector(Goal::Pose { .. }) => TargetKind::Pose,
+            Self::EndEffector(Goal::Twist { .. }) => TargetKind::Twist,
+        }
+    }
+}
+
+/// The kinds of targets. Each has its rpc method.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TargetKind {
+    /// A trajectory.
+    Trajectory,
+    /// Joint positions.
+    Positions,
+    /// Joint velocities.
+    Velocities,
+    /// A pose of the end effector.
+    Pose,
+    /// A twist of the end effector.
+    Twist,
+}
+
+impl TargetKind {
+    /// All kinds.
+    pub const ALL: [Self; 5] = [Self::Trajectory, Self::Positions, Self::Velocities, Self::Pose, Self::Twist];
+
+    /// The rpc method that sends one.
+    pub fn method(self) -> &'static str {
+        match self {
+            Self::Trajectory => "execute",
+            Self::Positions => "servo",
+            Self::Velocities => "velocity",
+            Self::Pose => "pose",
+            Self::Twist => "twist",
+        }
+    }
+}
+
+/// How a task goes on after a tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Step {
+    /// It goes on.
+    Continue,
+    /// It goes on, and shows this reason from now on.
+    ContinueFor(Reason),
+    /// It has ended. The coordinator brings its joints to rest.
+    End(TaskState, Reason),
+}
+
+/// What a task does on a cancel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnCancel {
+    /// It ends; the coordinator brings its joints to rest.
+    End,
+    /// It decelerates on its own, along its path, and ends then.
+    Decelerate,
+}
+
+/// What a task does when a stronger task takes one of its joints.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnLoss {
+    /// It ends.
+    End,
+    /// It goes on with the other joints, and claims this one again with its next target at the earliest.
+    Continue,
+}
+
+/// The part of a task that differs from type to type. `dimos::control::conformance` checks the rules.
+pub trait TaskBody: std::fmt::Debug + Send {
+    /// Takes a target, or refuses it with the outcome that the client gets. Only kinds that the type takes arrive.
+    fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome>;
+
+    /// Claims the joints for this tick: each at most once, of the task's joints only. Called while the task is active.
+    fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step;
+
+    /// The task has ended, for whatever reason: forgets its target.
+    fn end(&mut self);
+
+    /// A client cancels the task while it executes.
+    fn cancel(&mut self) -> OnCancel {
+        OnCancel::End
+    }
+
+    /// A stronger task took `joint` of the task's `joints`.
+    fn lose(&mut self, joints: &[u16], joint: u16) -> OnLoss {
+        let _ = (joints, joint);
+        OnLoss::End
+    }
+
+    /// Nothing reached an arm since the tick of `at`: goes on from what was commanded then, from rest. The next tick is
+    /// not granted, so that a body which integrates from [`JointView::commanded`] then needs no more than that.
+    fn rewind(&mut self, at: Mono, now: Mono) {
+        let _ = (at, now);
+    }
+
+    /// The target with which the task begins when the blueprint says `auto_start`; without one it waits for a client.
+    fn first_target(&self) -> Option<Target<'static>> {
+        None
+    }
+
+    /// Adds what the status shows besides state and reason: motion, progress, what limits the end effector.
+    fn describe(&self, view: &mut TaskView) {
+        let _ = view;
+    }
+}

@@ -1,0 +1,75 @@
+//! The robot whose end effector a task moves: as the task's parameters name it, and compiled for the tick.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::robot::kinematics::Kinematics;
+use crate::yaml::Text;
+
+/// The parameters that name a task's robot, read from among all its parameters. A type with `robot: true` has keys of
+/// these names and forms.
+#[derive(Debug, Clone, PartialEq, Default, Deserialize)]
+#[serde(default)]
+pub struct RobotParams {
+    /// The robot's `.urdf` or `.xacro` file, or `builtin:NAME`.
+    pub model_path: Option<String>,
+    /// Folders that `package://NAME` stands for, by name.
+    pub package_paths: BTreeMap<String, String>,
+    /// Arguments of the xacro file.
+    pub xacro_args: BTreeMap<String, Text>,
+    /// The link that is moved.
+    pub end_effector_link: Option<String>,
+    /// The coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
+    pub joint_prefix: Option<String>,
+    /// The coordinator's joint names and the model's.
+    pub joint_name_mapping: BTreeMap<String, String>,
+}
+
+/// The kinematics of the robot whose end effector a task moves.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TaskKinematics {
+    /// The robot's kinematics, for the joints of the task in the task's order.
+    pub kinematics: Kinematics,
+    /// The end effector: index of its link.
+    pub link: usize,
+    /// Where the model's root is in the frame that poses are given in.
+    pub root: Place,
+    /// The base whose axes twists are along, in the frame of the model's root: quaternion x, y, z, w.
+    pub base: [f64; 4],
+}
+
+/// A frame in another.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Place {
+    /// x, y, z [m].
+    pub position: [f64; 3],
+    /// Quaternion x, y, z, w.
+    pub orientation: [f64; 4],
+}
+
+/// The quaternion of no rotation.
+pub const NO_ROTATION: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
+
+impl Place {
+    /// The same frame.
+    pub const SAME: Self = Self { position: [0.0; 3], orientation: NO_ROTATION };
+}
+
+impl TaskKinematics {
+    /// A robot with nothing around it: poses and twists are in the frame of its root.
+    pub fn new(kinematics: Kinematics, link: usize) -> Self {
+        Self { kinematics, link, root: Place::SAME, base: NO_ROTATION }
+    }
+
+    /// Says what of it cannot be worked with, for a task with this number of joints.
+    pub fn check(&self, joints: usize) -> Result<(), String> {
+        let turned = |q: &[f64; 4]| (0.9..1.1).contains(&q.iter().map(|v| v * v).sum::<f64>());
+        match () {
+            () if self.kinematics.dof() != joints => Err("its kinematics have other joints".to_owned()),
+            () if self.link >= self.kinematics.links() => Err("its end effector does not exist".to_owned()),
+            () if !turned(&self.base) || !turned(&self.root.orientation) => Err("a frame is not one".to_owned()),
+            () => Ok(()),
+        }
+    }
+}
