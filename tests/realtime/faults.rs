@@ -27,8 +27,8 @@ const TOP_SPEED: [f64; 6] = [180.0, 180.0, 180.0, 360.0, 360.0, 360.0];
 const ACCELERATION: f64 = 10.0;
 /// What an angle is rounded to on the wire [deg]: half a step of an f32 near 270.
 const ROUNDING: f64 = 1.6e-5;
-/// Figures that depend on how busy the machine is may be missed so often.
-const TRIES: usize = 3;
+/// How often a reaction time is measured. Its median is judged: one try alone says more about the machine than about the run.
+const TRIES: usize = 5;
 
 fn now() -> Mono {
     MonotonicClock.now()
@@ -43,18 +43,17 @@ fn at(arm: &YourArmEmulator) -> String {
     format!("{RUN} --set hardware.arm.address={}", arm.address())
 }
 
-/// Runs `measure` until its figure is small enough, a few times at most. Prints all figures [ms].
+/// Measures a reaction time several times, prints all figures [ms] and judges their median.
 #[track_caller]
 fn within(what: &str, limit_ms: f64, mut measure: impl FnMut() -> f64) {
-    let mut figures = Vec::new();
-    while figures.len() < TRIES {
-        figures.push(measure());
-        if figures.iter().any(|f| *f <= limit_ms) {
-            println!("{what}: {figures:.1?} ms (limit {limit_ms} ms)");
-            return;
-        }
-    }
-    panic!("{what}: {figures:.1?} ms, limit {limit_ms} ms");
+    judge(what, limit_ms, (0..TRIES).map(|_| measure()).collect());
+}
+
+#[track_caller]
+fn judge(what: &str, limit_ms: f64, mut figures: Vec<f64>) {
+    figures.sort_by(f64::total_cmp);
+    println!("{what}: {figures:.1?} ms (limit of the median {limit_ms} ms)");
+    assert!(figures[figures.len() / 2] <= limit_ms, "{what}: {figures:.1?} ms, limit of the median {limit_ms} ms");
 }
 
 fn ms(from: Mono, to: Mono) -> f64 {
@@ -379,9 +378,7 @@ fn f21_a_tick_that_panics_leaves_the_arm_held_and_ends_the_run() {
         exits.push(exit);
         hold
     });
-    let best = exits.iter().copied().fold(f64::MAX, f64::min);
-    println!("F21 exit: {exits:.0?} ms (limit 1000 ms)");
-    assert!(best <= 1000.0, "{exits:?}");
+    judge("F21 exit", 1000.0, exits);
 }
 
 #[test]
@@ -392,13 +389,7 @@ fn f22_a_tick_that_hangs_leaves_the_arm_held_and_ends_the_run() {
         exits.push(exit);
         hold
     });
-    println!("F22 exit: {exits:.0?} ms (limit 1000 ms)");
-    let mut more = 0;
-    while exits.iter().all(|e| *e > 1000.0) && more < TRIES {
-        exits.push(break_the_tick("hang", "silent").1);
-        more += 1;
-    }
-    assert!(exits.iter().any(|e| *e <= 1000.0), "{exits:?}");
+    judge("F22 exit", 1000.0, exits);
 }
 
 #[test]
