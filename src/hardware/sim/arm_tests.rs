@@ -70,7 +70,7 @@ fn a_servo_takes_goals_at_any_time_and_follows_those_that_stream() {
         arm.take_goal(&[0.9 - 0.002 * f64::from(i), -0.5, 1.0], 1.0, false);
     }
     let speed = arm.joints().1[0];
-    assert!((speed + 0.2).abs() < 0.05, "{speed}");
+    assert!((-0.35..-0.1).contains(&speed), "0.2 rad/s streamed, not the top speed of 1 rad/s: {speed}");
     assert_eq!(arm.velocity(&[0.1, 0.0, 0.0]), Ok(()), "no mode forbids it");
     assert_eq!(self::arm().velocity(&[0.1; 3]), Err(Refusal::Disabled));
 }

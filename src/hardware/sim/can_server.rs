@@ -225,17 +225,20 @@ impl<C: CanController> Arm<C> {
                 self.deaf = now.after(time.max(controller.start_time()));
                 self.seat.lose_power(self.deaf);
             }
-            Delivery::Disconnect(time) => {
-                if !self.seat.go_down(now, time) {
-                    self.deaf = now.after(time.max(CUT));
-                }
-            }
+            Delivery::Disconnect(time) => self.disconnect(now, time),
             Delivery::BusOff => self.seat.bus_off(),
             _ => {}
         }
         drop(controller);
         if now >= self.stalled && now >= self.deaf {
             self.send();
+        }
+    }
+
+    /// The interface goes down; where it cannot, the arm neither hears nor sends.
+    fn disconnect(&mut self, now: Mono, time: Duration) {
+        if !self.seat.go_down(now, time) {
+            self.deaf = now.after(time.max(CUT));
         }
     }
 

@@ -58,7 +58,7 @@ mod tests {
 
     #[test]
     fn poses_that_can_be_seen_on_paper() {
-        let near = |joints, expected: [f64; 3]| {
+        let near = |joints: [f64; DOF], expected: [f64; 3]| {
             let found = Links.forward(&joints).translation.vector;
             assert!((found - Vector3::from(expected)).norm() < 1e-12, "{joints:?}: {found}");
         };
