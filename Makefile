@@ -1,11 +1,11 @@
-# run install check test · test-tools test-rerun · bench bench-quick jitter soak
+# run install check test test-fast · test-tools test-rerun · bench bench-quick jitter soak
 
 PYTHON ?= python3
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
-.PHONY: run install check test test-tools test-rerun bench bench-quick jitter soak
+.PHONY: run install check test test-fast test-tools test-rerun bench bench-quick jitter soak
 
 # Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
@@ -27,6 +27,13 @@ test:
 	@if cargo nextest --version >/dev/null 2>&1; \
 	then cargo nextest run --locked; \
 	else cargo test --locked --lib --bins --tests; \
+	fi
+
+# The logic, in a minute and a half: no run of the program, no vendor's tool.
+test-fast:
+	@if cargo nextest --version >/dev/null 2>&1; \
+	then cargo nextest run --locked --profile fast --lib --test logic; \
+	else cargo test --locked --lib; \
 	fi
 
 # What tests compare with and run in: other people's readers of logs; as root, also cyclictest, and a guest kernel that
@@ -67,8 +74,10 @@ bench-quick:
 jitter:
 	cargo bench --locked --bench jitter
 
-# Arms idle and moving beside eight busy processes, half an hour each, and runs that are stopped and continued 200 times:
-# no arm may be held by that. Two and a half hours.
+# Arms idle and moving beside eight busy processes for half an hour, and runs that are stopped and continued 200 times: no
+# arm may be held by that. An hour and a half.
 soak:
-	DIMOS_SOAK=1800 DIMOS_STALLS=200 cargo test --locked --test realtime stalls -- --nocapture --test-threads 1
-	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --locked --test realtime stalls_soak -- --nocapture --test-threads 1
+	DIMOS_SOAK=1800 DIMOS_SOAK_BUSY=4 cargo test --locked --test realtime stalls_soak -- --nocapture --test-threads 2
+	DIMOS_SOAK=120 DIMOS_SOAK_BUSY=4 DIMOS_SOAK_ALL=1 cargo test --locked --test realtime stalls_soak -- --nocapture --test-threads 2
+	DIMOS_STALLS=200 cargo test --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
+	DIMOS_WIRE=full cargo test --locked --test realtime wire_stalls -- --nocapture --test-threads 1

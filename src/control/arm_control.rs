@@ -8,7 +8,7 @@ use super::config::ArmConfig;
 use super::estimate::VelocityEstimator;
 use super::failsafe::{Failsafe, Freshness};
 use super::limit::{Bounds, Limiter, Refusal};
-use super::set_points::SetPoints;
+use super::set_points::{Range, SetPoints};
 use super::stalls::Stalls;
 use super::task::Demand;
 use super::written::{Issued, Written};
@@ -43,8 +43,8 @@ pub struct ArmControl {
     first: usize,
     /// The latest state that is believed, with estimated velocities.
     pub state: ArmState,
-    /// The latest state as it was read.
-    raw: ArmState,
+    /// The latest state as it was read, while it is not believed.
+    raw: Option<ArmState>,
     belief: Belief,
     estimator: VelocityEstimator,
     freshness: Freshness,
@@ -64,6 +64,10 @@ pub struct ArmControl {
     /// Nothing reached the arm for more than two periods, or what did is not what is commanded: the first command that
     /// was made from what had been written.
     gap_since: Option<u64>,
+    /// How far each joint is outside the range of its set points of the last `lag` seconds [rad]; 0 in velocity mode.
+    tracking_errors: Joints,
+    /// `supervision.lag`.
+    lag: Duration,
     /// How far each joint coasts beyond the last set point that it got before a gap [rad], and for how long that counts.
     coast: (Joints, Mono),
     /// How long a joint has been too far from its set points [s].
@@ -107,6 +111,7 @@ impl ArmControl {
         let read = config.read_period.max(Duration::from_micros(100));
         let belief = Belief::new(own, &l.position_lower, &l.position_upper, read.as_secs_f64());
         let window = config.supervision.lag + config.supervision.stale_after.as_secs_f64() + 2.0 * period.as_secs_f64();
+        let lag = Duration::from_secs_f64(config.supervision.lag);
         let bound = |j: usize| {
             let at = |list: &[f64], otherwise: f64| list.get(j).copied().unwrap_or(otherwise);
             Bounds::inside(
@@ -124,7 +129,7 @@ impl ArmControl {
             config,
             first,
             state: ArmState::default(),
-            raw: ArmState::default(),
+            raw: None,
             belief,
             estimator: VelocityEstimator::default(),
             freshness: Freshness::default(),
@@ -134,6 +139,8 @@ impl ArmControl {
             seed: [0.0; MAX_DOF],
             starting: None,
             gap_since: None,
+            tracking_errors: [0.0; MAX_DOF],
+            lag,
             coast: ([0.0; MAX_DOF], Mono::ZERO),
             astray: 0.0,
             drawing: DRAW_TIME,
@@ -170,10 +177,13 @@ impl ArmControl {
 
     /// The state as it was read, refused positions included, with estimated velocities: for the log.
     pub fn measured(&self) -> ArmState {
-        if self.raw.position.iter().take(self.config.dof).any(|q| !q.is_finite()) {
-            return self.state; // what is not a number is no measurement
+        match &self.raw {
+            // What is not a number is no measurement.
+            Some(raw) if raw.position.iter().take(self.config.dof).all(|q| q.is_finite()) => {
+                ArmState { velocity: self.state.velocity, velocity_source: self.state.velocity_source, ..*raw }
+            }
+            _ => self.state,
         }
-        ArmState { velocity: self.state.velocity, velocity_source: self.state.velocity_source, ..self.raw }
     }
 
     /// When nothing reached the arm for too long: the time of the command that was written last.
@@ -184,25 +194,39 @@ impl ArmControl {
     /// How far a joint is outside the range of its set points of the last `lag` seconds [rad]; 0 inside, and in velocity
     /// mode.
     pub fn tracking_error(&self, joint: usize) -> f64 {
+        self.tracking_errors.get(joint).copied().unwrap_or_default()
+    }
+
+    /// Compares the latest positions with their set points.
+    fn compare(&mut self) {
+        self.tracking_errors = [0.0; MAX_DOF];
         if !self.command.mode.is_some_and(ControlMode::is_position) || self.starting.is_some() {
-            return 0.0;
+            return;
         }
-        let (Some(q), Some(limiter)) = (self.state.position.get(joint), self.limiters.get(joint)) else { return 0.0 };
         // The newest set point is in every window.
-        if (q - limiter.position()).abs() <= DRAW / 4.0 {
-            return 0.0;
+        let near = |(q, limiter): (&f64, &Limiter)| (q - limiter.position()).abs() <= DRAW / 4.0;
+        if self.state.position.iter().zip(&self.limiters).all(near) {
+            return;
         }
-        let distance = self.set_points.distance(joint, *q, self.window_start());
-        let coast = self.coast.0.get(joint).copied().unwrap_or_default();
-        if coast * distance > 0.0 && self.state.stamp < self.coast.1 {
-            return distance - distance.clamp(-coast.abs(), coast.abs());
+        let Some(range) = self.set_points.range(self.window_start()) else { return };
+        let coasting = self.state.stamp < self.coast.1;
+        let joints = self.state.position.iter().zip(&self.limiters).zip(&self.coast.0).enumerate();
+        for ((j, ((q, limiter), coast)), error) in joints.zip(&mut self.tracking_errors) {
+            if near((q, limiter)) {
+                continue;
+            }
+            let distance = range.distance(j, *q);
+            *error = if coasting && coast * distance > 0.0 {
+                distance - distance.clamp(-coast.abs(), coast.abs())
+            } else {
+                distance
+            };
         }
-        distance
     }
 
     /// Where the set points begin that the latest state may still be following.
     fn window_start(&self) -> Mono {
-        self.state.stamp.before(Duration::from_secs_f64(self.config.supervision.lag))
+        self.state.stamp.before(self.lag)
     }
 
     /// Whether nothing that it commands moves.
@@ -226,6 +250,7 @@ impl ArmControl {
         if moved && self.gap_since.is_none() && self.written.gap(now) {
             self.begin_to_coast(now);
         }
+        self.compare();
         self.failsafe.update(&self.state, self.freshness, now);
         if let Verdict::Jumped(joint, step) = verdict {
             self.failsafe.hold(Cause::PositionJump(joint as u16, step), now);
@@ -239,16 +264,20 @@ impl ArmControl {
     /// Takes what is believed of a state.
     fn take(&mut self, state: &ArmState) -> Verdict {
         let finite = |values: &Joints| values.iter().take(self.config.dof).all(|v| v.is_finite());
-        self.raw = *state;
-        let before = std::mem::replace(&mut self.state, *state);
         // Positions that are not numbers are no measurement.
         let verdict = if finite(&state.position) { self.belief.take(state) } else { Verdict::Refused };
         if verdict == Verdict::Refused || (verdict == Verdict::Same && self.belief.refused() > 0) {
             // The last believed measurement stays, and ages.
+            self.raw = Some(*state);
+            let before = std::mem::replace(&mut self.state, *state);
             (self.state.seq, self.state.stamp) = (before.seq, before.stamp);
             (self.state.position, self.state.velocity) = (before.position, before.velocity);
             (self.state.velocity_source, self.state.effort) = (before.velocity_source, before.effort);
-        } else if !finite(&state.velocity) {
+            return verdict;
+        }
+        self.raw = None;
+        self.state = *state;
+        if !finite(&state.velocity) {
             self.state.velocity_source = VelocitySource::Absent;
         }
         verdict
@@ -260,7 +289,7 @@ impl ArmControl {
         // While readings are refused, the arm still answers: they have three readings to agree with each other.
         let waiting = 3 * self.config.read_period.max(Duration::from_millis(1));
         let refused = self.belief.refused() > 0 && now.since(self.belief.stamp()) <= limit + waiting;
-        let stamp = if refused { self.raw.stamp } else { self.state.stamp };
+        let stamp = self.raw.as_ref().filter(|_| refused).map_or(self.state.stamp, |raw| raw.stamp);
         let age = now.since(stamp);
         let device = Duration::from_nanos(self.state.own_delay_ns);
         let device = if device < LONGEST_DELAY { device } else { Duration::ZERO };
@@ -284,8 +313,12 @@ impl ArmControl {
             }
             Phase::Ready if supervised => {
                 let velocity = self.command.mode == Some(ControlMode::Velocity);
-                let error = |joint| if velocity { self.velocity_error(joint) } else { self.tracking_error(joint) };
-                let (joint, by) = furthest((0..self.config.dof).map(error))?;
+                let (joint, by) = if velocity {
+                    let range = self.set_points.range(self.window_start())?;
+                    furthest((0..self.config.dof).map(|j| self.velocity_error(&range, j)))?
+                } else {
+                    furthest(self.tracking_errors.iter().copied().take(self.config.dof))?
+                };
                 let tolerance = if velocity { 0.0 } else { self.config.supervision.tracking_tolerance };
                 self.astray = if by.abs() > tolerance { self.astray + dt } else { 0.0 };
                 let limit = if velocity { TRACKING_LIMIT.1 } else { TRACKING_LIMIT.0 };
@@ -299,10 +332,10 @@ impl ArmControl {
     }
 
     /// How far a joint's velocity is beyond the tolerance around its set points of the last `lag` seconds [rad/s].
-    fn velocity_error(&self, joint: usize) -> f64 {
+    fn velocity_error(&self, range: &Range, joint: usize) -> f64 {
         let Some(v) = self.state.velocity.get(joint) else { return 0.0 };
         let tolerance = VELOCITY_TOLERANCE.0.max(VELOCITY_TOLERANCE.1 * v.abs());
-        let distance = self.set_points.distance(joint, *v, self.window_start());
+        let distance = range.distance(joint, *v);
         if distance.abs() > tolerance { distance } else { 0.0 }
     }
 
@@ -438,15 +471,15 @@ impl ArmControl {
             }
         }
         let moved = self.starting.is_none() && self.command.mode.is_some();
-        let last = *self.written.last();
         // A command from before the gap may still have been written after its beginning was seen.
-        let late = self.gap_since.is_some_and(|first| last.seq < first);
+        let late = self.gap_since.is_some_and(|first| self.written.last().seq < first);
         if !(moved && (late || self.written.gap(now))) {
             self.gap_since = None;
             return;
         }
         self.gap_since.get_or_insert(self.command.seq);
         let rest = self.command.mode.is_some_and(ControlMode::is_position);
+        let last = self.written.last();
         for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
             // Joints that follow positions have come to rest at the last one; velocities go on.
             limiter.rewind(*q, if rest { 0.0 } else { *v });
@@ -545,14 +578,13 @@ impl ArmControl {
         if self.gap_since.is_some() {
             return self.wait_for_the_wire(mode, ask, dt);
         }
-        let ahead = self.ahead(dt);
-        let mut before = [None; MAX_DOF];
-        for (b, l) in before.iter_mut().zip(&self.limiters) {
-            *b = Some(*l);
+        if let Some((j, refusal)) = self.refused(mode, &ask) {
+            self.hold(mode, dt);
+            return Routed::Refused(j, refusal);
         }
+        let ahead = if mode == ControlMode::Velocity { self.ahead(dt) } else { None };
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
             let at = self.state.position.get(j).copied().unwrap_or_default();
-            let within = ahead.get(j).copied().unwrap_or((at, at));
             let value = match ask(j) {
                 None if mode == ControlMode::Velocity => limiter.hold_velocity(at, dt),
                 None => limiter.hold_position(dt),
@@ -561,7 +593,10 @@ impl ArmControl {
                         limiter.hand_over();
                     }
                     let limited = match mode {
-                        ControlMode::Velocity => limiter.follow_velocity(ask.value, within, dt),
+                        ControlMode::Velocity => {
+                            let within = ahead.as_ref().and_then(|a| a.get(j)).copied().unwrap_or((at, at));
+                            limiter.follow_velocity(ask.value, within, dt)
+                        }
                         _ => limiter.follow_position(ask.value, dt),
                     };
                     match limited {
@@ -574,13 +609,8 @@ impl ArmControl {
                             }
                             limited.value
                         }
-                        Err(refusal) => {
-                            for (l, b) in self.limiters.iter_mut().zip(before) {
-                                *l = b.unwrap_or(*l);
-                            }
-                            self.hold(mode, dt);
-                            return Routed::Refused(j, refusal);
-                        }
+                        // Asked above.
+                        Err(refusal) => return Routed::Refused(j, refusal),
                     }
                 }
             };
@@ -613,18 +643,29 @@ impl ArmControl {
 
     /// Where each joint may be by the time a velocity command takes effect [rad], lowest and highest: the measurement is
     /// old, and the joint still follows what was commanded since.
-    fn ahead(&self, dt: f64) -> [(f64, f64); MAX_DOF] {
-        let mut out = [(0.0, 0.0); MAX_DOF];
-        if self.command.mode != Some(ControlMode::Velocity) {
-            return out;
-        }
+    fn ahead(&self, dt: f64) -> Option<[(f64, f64); MAX_DOF]> {
+        let range = self.set_points.range(self.window_start())?;
         let age = f64::from(self.freshness.age.age_us + self.freshness.age.own_us) * 1e-6;
         let time = self.config.supervision.lag + age + dt;
-        for (j, (out, q)) in out.iter_mut().zip(&self.state.position).enumerate().take(self.config.dof) {
-            let (low, high) = self.set_points.range(j, self.window_start()).unwrap_or_default();
+        let mut out = [(0.0, 0.0); MAX_DOF];
+        for (out, (q, (low, high))) in
+            out.iter_mut().zip(self.state.position.iter().zip(range.low.iter().zip(&range.high)))
+        {
             *out = (q + low.min(0.0) * time, q + high.max(0.0) * time);
         }
-        out
+        Some(out)
+    }
+
+    /// The first of an arm's asks that is unfit, and why.
+    fn refused(&self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>) -> Option<(usize, Refusal)> {
+        self.limiters.iter().enumerate().find_map(|(j, limiter)| {
+            let ask = ask(j)?;
+            let refusal = match mode {
+                ControlMode::Velocity => (!ask.value.is_finite()).then_some(Refusal::NonFinite),
+                _ => limiter.refuses(ask.value, ask.new_hands),
+            };
+            Some((j, refusal?))
+        })
     }
 
     fn mode_for(&self, demand: Demand) -> Option<ControlMode> {

@@ -119,7 +119,7 @@ impl Belief {
         for j in 0..self.dof {
             let (Some(a), Some(b), Some(speed)) = (from.0.get(j), to.0.get(j), self.speed.get(j)) else { continue };
             let mut step = b - a;
-            if self.turning.get(j).copied().unwrap_or(false) {
+            if step.abs() > TURN / 2.0 && self.turning.get(j).copied().unwrap_or(false) {
                 step -= TURN * (step / TURN).round();
             }
             let beyond = step.abs() - (SPEED_MARGIN * speed * dt + NOISE);

@@ -72,6 +72,8 @@ impl TickOutput {
 #[derive(Debug)]
 pub struct Coordinator {
     period: f64,
+    /// The same [ns].
+    period_ns: u64,
     arms: Vec<ArmControl>,
     tasks: Vec<Task>,
     arbiter: Arbiter,
@@ -103,6 +105,7 @@ impl Coordinator {
         let events = 2 * REQUESTS_PER_TICK + 4 * (arms.len() + tasks.len()) + arm_of.len();
         Self {
             period: 1.0 / config.rate,
+            period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
             arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
             joints: vec![JointView::default(); arm_of.len()],
             output: TickOutput {
@@ -141,8 +144,7 @@ impl Coordinator {
         // Whoever runs the ticks has freed them elsewhere; what is left is only what it could not take.
         self.output.retired.clear();
         let late = Duration::from_nanos(time.woke_late_ns);
-        let period = Duration::from_secs_f64(self.period).as_nanos().max(1) as u64;
-        self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % period)), late);
+        self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % self.period_ns)), late);
         self.read(time, states);
         self.account_for_lost_time(time);
         for _ in 0..REQUESTS_PER_TICK {

@@ -69,26 +69,43 @@ impl SetPoints {
         }
     }
 
-    /// Lowest and highest set point of a joint since `since`, with the one that was in force then.
-    pub fn range(&self, joint: usize, since: Mono) -> Option<(f64, f64)> {
-        let mut range: Option<(f64, f64)> = None;
-        for back in 0..self.count {
-            let index = (self.newest + self.parts.len() - back) % self.parts.len();
-            let part = self.parts.get(index)?;
-            let (low, high) = (*part.low.get(joint)?, *part.high.get(joint)?);
-            range = Some(range.map_or((low, high), |(l, h)| (l.min(low), h.max(high))));
-            if part.to < since {
+    /// The range of the set points since `since`, with the one that was in force then. `None` when there are none.
+    pub fn range(&self, since: Mono) -> Option<Range> {
+        let mut range =
+            self.parts.get(self.newest).filter(|_| self.count > 0).map(|p| Range { low: p.low, high: p.high })?;
+        let (first, last) = self.parts.split_at_checked(self.newest)?;
+        let mut newest = self.parts.get(self.newest)?;
+        // From the newest back: the ring is wrapped around once.
+        let older = first.iter().rev().chain(last.iter().skip(1).rev());
+        for part in older.take(self.count - 1) {
+            if newest.to < since {
                 break;
             }
+            let bounds = range.low.iter_mut().zip(&mut range.high).zip(part.low.iter().zip(&part.high));
+            for ((low, high), (l, h)) in bounds.take(self.dof) {
+                (*low, *high) = (low.min(*l), high.max(*h));
+            }
+            newest = part;
         }
-        range
+        Some(range)
     }
+}
 
-    /// How far `value` is outside the range of the set points since `since`; 0 inside, or when there are none.
-    pub fn distance(&self, joint: usize, value: f64, since: Mono) -> f64 {
-        match self.range(joint, since) {
-            Some((low, _)) if value < low => value - low,
-            Some((_, high)) if value > high => value - high,
+/// Lowest and highest set point of each joint [rad or rad/s].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Range {
+    /// Lowest.
+    pub low: Joints,
+    /// Highest.
+    pub high: Joints,
+}
+
+impl Range {
+    /// How far `value` is outside; 0 inside.
+    pub fn distance(&self, joint: usize, value: f64) -> f64 {
+        match (self.low.get(joint), self.high.get(joint)) {
+            (Some(low), _) if value < *low => value - low,
+            (_, Some(high)) if value > *high => value - high,
             _ => 0.0,
         }
     }
@@ -114,11 +131,11 @@ mod tests {
     fn a_joint_that_lags_is_inside_the_window() {
         let points = ramp();
         let since = ms(990 - 60);
-        assert_eq!(points.distance(0, 0.03 * 99.0, since), 0.0);
-        assert_eq!(points.distance(0, 0.03 * 93.0, since), 0.0);
-        let behind = points.distance(0, 0.03 * 80.0, since);
+        assert_eq!(points.range(since).unwrap().distance(0, 0.03 * 99.0), 0.0);
+        assert_eq!(points.range(since).unwrap().distance(0, 0.03 * 93.0), 0.0);
+        let behind = points.range(since).unwrap().distance(0, 0.03 * 80.0);
         assert!((-0.39..-0.33).contains(&behind), "{behind}");
-        assert!((points.distance(0, 3.5, since) - (3.5 - 2.97)).abs() < 1e-12);
+        assert!((points.range(since).unwrap().distance(0, 3.5) - (3.5 - 2.97)).abs() < 1e-12);
     }
 
     #[test]
@@ -127,10 +144,10 @@ mod tests {
         for k in 100..120u64 {
             points.push(ms(10 * k), &crate::joint::joints_of(&[2.97]));
         }
-        let off = points.distance(0, 2.8, ms(1190 - 60));
+        let off = points.range(ms(1190 - 60)).unwrap().distance(0, 2.8);
         assert!((off + 0.17).abs() < 1e-12, "{off}");
         points.clear();
-        assert!(points.is_empty() && points.distance(0, 9.0, ms(0)) == 0.0);
+        assert!(points.is_empty() && points.range(ms(0)).is_none());
     }
 
     #[test]
@@ -139,7 +156,8 @@ mod tests {
         for k in 0..1000u64 {
             points.push(ms(k), &crate::joint::joints_of(&[0.003 * k as f64]));
         }
-        let (low, high) = points.range(0, ms(999 - 60)).unwrap();
+        let range = points.range(ms(999 - 60)).unwrap();
+        let (low, high) = (range.low[0], range.high[0]);
         assert!((2.997 - 1e-9..2.998).contains(&high) && (2.75..=0.003 * 939.0).contains(&low), "{low} {high}");
     }
 }

@@ -16,6 +16,8 @@ pub struct Stalls {
     /// End and length of each.
     kept: [(Mono, Duration); KEPT],
     next: usize,
+    /// End of the latest.
+    latest: Mono,
 }
 
 impl Stalls {
@@ -28,10 +30,14 @@ impl Stalls {
             *slot = (woke, late);
         }
         self.next = (self.next + 1) % KEPT;
+        self.latest = self.latest.max(woke);
     }
 
     /// How much of the time from `from` to `until` was lost.
     pub fn between(&self, from: Mono, until: Mono) -> Duration {
+        if self.latest <= from {
+            return Duration::ZERO;
+        }
         let overlap = |&(end, length): &(Mono, Duration)| end.min(until).since(end.before(length).max(from));
         self.kept.iter().map(overlap).sum()
     }

@@ -103,10 +103,32 @@ fn set_other() {
     unsafe { libc::sched_setscheduler(0, libc::SCHED_OTHER, &param) };
 }
 
-/// Makes the calling thread fit for timed work: FIFO when permitted, otherwise the shortest timer slack; its stack
-/// is touched, and locked as far as the limit allows, so that no page fault comes later. Returns whether it runs under FIFO.
+/// The slice of processor time that ordinary timed threads ask for [ns], the shortest that Linux grants.
+const SLICE: u64 = 100_000;
+
+/// Lets an ordinary thread wait less for a processor: since Linux 6.12 a thread that asks for short slices is run the sooner
+/// after it wakes. Needs no right; older kernels ignore it.
+fn ask_for_short_slices() {
+    const SIZE: libc::c_uint = size_of::<libc::sched_attr>() as libc::c_uint;
+    // SAFETY: sched_attr is plain data, zero is a valid value for it.
+    let mut attr: libc::sched_attr = unsafe { std::mem::zeroed() };
+    attr.size = SIZE;
+    // SAFETY: pid 0 is the calling thread; the kernel writes at most SIZE bytes.
+    if unsafe { libc::syscall(libc::SYS_sched_getattr, 0, &mut attr, SIZE, 0) } != 0 {
+        return;
+    }
+    attr.sched_runtime = SLICE;
+    // SAFETY: the pointer is valid for the call; only the calling thread is concerned.
+    unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &attr, 0) };
+}
+
+/// Makes the calling thread fit for timed work: FIFO when permitted, otherwise short slices and the shortest timer slack; its
+/// stack is touched, and locked as far as the limit allows, so that no page fault comes later. Returns whether it runs under FIFO.
 pub fn enter_realtime(priority: i32) -> bool {
     let fifo = set_fifo(priority).is_ok();
+    if !fifo {
+        ask_for_short_slices();
+    }
     // SAFETY: PR_SET_TIMERSLACK takes one integer and concerns the calling thread only.
     unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, 1) };
     touch_stack();
@@ -181,4 +203,26 @@ pub fn sleep_until(deadline: Mono) {
 pub fn thread_cpu_time() -> Duration {
     let t = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
     Duration::new(t.tv_sec as u64, t.tv_nsec as u32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_ordinary_timed_thread_has_short_slices() {
+        let slice = std::thread::spawn(|| {
+            ask_for_short_slices();
+            // SAFETY: as above.
+            let mut attr: libc::sched_attr = unsafe { std::mem::zeroed() };
+            let size = size_of::<libc::sched_attr>();
+            // SAFETY: as above.
+            assert_eq!(unsafe { libc::syscall(libc::SYS_sched_getattr, 0, &mut attr, size, 0) }, 0);
+            attr.sched_runtime
+        });
+        let slice = slice.join().unwrap();
+        // A kernel that knows no slices of a thread's own tells 0; since 6.6 it tells the default one.
+        println!("slice {slice} ns");
+        assert!(slice == 0 || slice == SLICE || slice >= 700_000, "{slice} ns");
+    }
 }

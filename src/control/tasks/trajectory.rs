@@ -150,7 +150,7 @@ impl TrajectoryTask {
             if self.clock.rate() <= 0.0 || self.clock.elapsed() >= duration {
                 return Some((TaskState::Aborted, Reason::Cancelled));
             }
-        } else if granted {
+        } else if granted && !self.clock.full() {
             self.clock.speed_up(rate_limits(cx, motion, &self.samples, self.clock.rate()), cx.dt);
         }
         if granted && self.at_end {
