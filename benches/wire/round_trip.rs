@@ -1,11 +1,9 @@
-//! Round trip of `adapter_type: remote`: a command to a peer, and the state measured after it.
+//! Round trip of `adapter_type: remote`: a command to the server, and the state measured after it.
 
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use dimos::hardware::arms::remote::address::Address;
-use dimos::hardware::arms::remote::peer::Peer;
 use dimos::hardware::registry;
 use dimos::hardware::spec::{AdapterResult, JointReading};
 use dimos::joint::ControlMode;
@@ -15,7 +13,7 @@ use dimos::rt::wake::Wake;
 use crate::support::Effort;
 use crate::support::measure::{Goal, Measure, print, quantile};
 
-/// Joints of the arm behind the peer.
+/// Joints of the arm behind the server.
 const DOF: usize = 6;
 /// Timeout of all waits.
 const TIMEOUT: Duration = Duration::from_secs(5);
@@ -49,17 +47,15 @@ class IdleArm:
     def write_clear_errors(self): return True
 ";
 
-/// Measures both peers.
+/// Measures both servers.
 pub fn measure(effort: Effort) -> Result<(), String> {
     let text = |e: dimos::hardware::spec::AdapterError| e.to_string();
     let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
-    let socket = folder.path().join("rust.sock");
-    let at = Address::parse(&format!("unix:{}", socket.display()))?;
-    let peer = Peer::start(registry::create("mock", "", DOF).map_err(text)?, &at).map_err(text)?;
-    let rust = repeats(effort, &peer.address().to_string())?;
-    drop(peer);
+    let emulator = registry::emulate("remote", DOF).map_err(text)?;
+    let rust = repeats(effort, &emulator.address())?;
+    drop(emulator);
     let goal = |p99: Vec<f64>, most| Measure::new("p99", "µs", p99).goal(Goal::AtMost(most));
-    print("round trip to a Rust peer on a Unix socket", &[Measure::new("p50", "µs", rust.0), goal(rust.1, 500.0)]);
+    print("round trip to the emulator on a loopback port", &[Measure::new("p50", "µs", rust.0), goal(rust.1, 500.0)]);
     let shim = Shim::start(folder.path().to_owned())?;
     let python = repeats(effort, &shim.address)?;
     print("round trip to the Python shim", &[Measure::new("p50", "µs", python.0), goal(python.1, 2000.0)]);

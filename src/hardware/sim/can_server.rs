@@ -1,25 +1,28 @@
-//! An emulated arm on a CAN bus: it hears commands, and sends by itself in a rhythm of its own.
+//! An emulated arm on a CAN bus: it takes commands, and sends its state in a rhythm of its own, whether anything listens
+//! or not.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::io;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use super::arm::{Delivery, HasArm};
+use super::can_seat::Seat;
 use super::diary::{self, Happening};
+use super::faults::{Fault, FaultKind};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::registry::{Emulator, Place};
-use crate::hardware::sim::arm::{Delivery, HasArm};
-use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{AdapterError, AdapterResult};
-use crate::hardware::transport::can::bus::Bus;
-use crate::hardware::transport::can::slcan_pty::SlcanPty;
-use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanPort};
+use crate::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame};
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
 
-/// How long a fault that cuts the wire keeps it cut: longer than any adapter should believe in a silent arm.
+/// How long a fault that cuts the wire keeps it cut at least: longer than any adapter should believe in a silent arm.
 const CUT: Duration = Duration::from_millis(800);
+/// Missed periods that are made up for at most, after the computer has stalled.
+const MAKES_UP: u32 = 10;
 
 /// The faults that a `SimArm` can play on a bus whose frames hold integers: no byte is damaged there, nothing is NaN.
 pub const PLAYABLE: &[FaultKind] = &[
@@ -39,19 +42,32 @@ pub const PLAYABLE: &[FaultKind] = &[
 
 /// The arm's side of a bus.
 pub trait CanController: Send + 'static {
-    /// Takes a frame. What it answers goes into `answers`, and out with the next [`CanController::tick`].
+    /// Takes a frame. What the arm answers at once goes into `answers`.
     fn hear(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>);
 
     /// A period has passed: puts what the arm sends by itself into `frames`, and says how it is delivered.
     fn tick(&mut self, now: Mono, frames: &mut Vec<CanFrame>) -> Delivery;
+
+    /// The frames that the arm hears; all of them without filters.
+    fn filters(&self) -> &'static [CanFilter] {
+        &[]
+    }
+
+    /// Frames that no client knows, for the fault `garbage`: identifiers and bytes.
+    fn noise(&self) -> &'static [(u16, &'static [u8])] {
+        &[(0x7FF, b"garbage")]
+    }
+
+    /// The least time from a loss of power until the arm is heard again.
+    fn start_time(&self) -> Duration {
+        CUT
+    }
 }
 
 /// An arm on a bus. It ends when it is dropped.
 pub struct CanServer<C: CanController> {
     shared: Arc<Shared<C>>,
     address: CanAddress,
-    /// The bus in memory, where it is one.
-    bus: Option<Bus>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -59,6 +75,8 @@ struct Shared<C> {
     controller: Mutex<C>,
     closing: AtomicBool,
     wake: Wake,
+    sent: AtomicU64,
+    not_taken: AtomicU64,
 }
 
 impl<C> Shared<C> {
@@ -70,35 +88,28 @@ impl<C> Shared<C> {
 impl<C: CanController> CanServer<C> {
     /// An arm at `place` that sends every `period`. `name` is the arm's, for messages.
     pub fn start(name: &str, controller: C, place: &Place, period: Duration) -> AdapterResult<Self> {
-        let (bus, address, port): (_, _, Box<dyn CanPort>) = match place {
-            Place::InProcess => {
-                let bus = Bus::new();
-                let port = bus.attach()?;
-                let address = bus.address();
-                (Some(bus), address, Box::new(port))
-            }
-            Place::Can(interface) => {
-                let address = CanAddress::Interface(interface.clone());
-                let port = can::open(&format!("the {name} emulator"), &address, &[])?;
-                (None, address, port)
-            }
-            Place::Pty => {
-                let pty = SlcanPty::open()?;
-                let address = pty.address();
-                (None, address, Box::new(pty))
-            }
-            Place::Bind(_) => {
-                let what = "is on a CAN bus: its emulator has an interface or a pseudo-terminal, no IP address";
-                return Err(AdapterError::Rejected(format!("{name} {what}")));
-            }
+        let failed = |e: io::Error| AdapterError::Io(format!("{name} emulator: {e}"));
+        let (seat, address) = Seat::take(name, place, controller.filters())?;
+        let shared = Arc::new(Shared {
+            controller: Mutex::new(controller),
+            closing: AtomicBool::new(false),
+            wake: Wake::new().map_err(failed)?,
+            sent: AtomicU64::new(0),
+            not_taken: AtomicU64::new(0),
+        });
+        let mut arm = Arm {
+            shared: shared.clone(),
+            seat,
+            period,
+            frames: Vec::with_capacity(64),
+            stalled: Mono::ZERO,
+            deaf: Mono::ZERO,
+            silent: false,
+            heard: false,
         };
-        let failed = |e: std::io::Error| AdapterError::Io(format!("{name} emulator: {e}"));
-        let wake = Wake::new().map_err(failed)?;
-        let shared = Arc::new(Shared { controller: Mutex::new(controller), closing: AtomicBool::new(false), wake });
-        let for_thread = shared.clone();
         let builder = std::thread::Builder::new().name(format!("{name}-sim"));
-        let thread = builder.spawn(move || live(&for_thread, port, period)).map_err(failed)?;
-        Ok(Self { shared, address, bus, thread: Some(thread) })
+        let thread = builder.spawn(move || arm.run()).map_err(failed)?;
+        Ok(Self { shared, address, thread: Some(thread) })
     }
 
     /// Where adapters find the bus.
@@ -106,15 +117,20 @@ impl<C: CanController> CanServer<C> {
         &self.address
     }
 
-    /// The bus in memory, where it is one.
-    pub fn bus(&self) -> Option<&Bus> {
-        self.bus.as_ref()
-    }
-
     /// Does something with the controller, now.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         let mut controller = self.shared.controller();
         f(&mut controller, MonotonicClock.now())
+    }
+
+    /// How many frames it has sent.
+    pub fn sent(&self) -> u64 {
+        self.shared.sent.load(Relaxed)
+    }
+
+    /// How many frames its bus did not take.
+    pub fn not_taken(&self) -> u64 {
+        self.shared.not_taken.load(Relaxed)
     }
 }
 
@@ -128,13 +144,13 @@ impl<C: CanController + HasArm> Emulator for CanServer<C> {
     }
 
     fn true_positions(&self) -> Option<Joints> {
-        Some(self.with(|controller, now| controller.arm().positions_at(now)))
+        Some(self.with(|controller, now| controller.joints_at(now).0))
     }
 }
 
 impl<C: CanController> Drop for CanServer<C> {
     fn drop(&mut self) {
-        self.shared.closing.store(true, Ordering::Relaxed);
+        self.shared.closing.store(true, Relaxed);
         self.shared.wake.raise();
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
@@ -142,63 +158,115 @@ impl<C: CanController> Drop for CanServer<C> {
     }
 }
 
-/// The arm's thread: hears, and sends once a period; a period that was missed is left out. Ends with the bus.
-fn live<C: CanController>(shared: &Shared<C>, mut port: Box<dyn CanPort>, period: Duration) {
-    host::enter_realtime(host::EMULATOR_PRIORITY);
-    let mut frames = Vec::with_capacity(64);
-    let mut heard = false;
-    let mut next = Instant::now();
-    // Until then the arm neither hears nor sends.
-    let mut deaf_until = next;
-    while !shared.closing.load(Ordering::Relaxed) {
-        loop {
-            match port.receive() {
-                Ok(Some(CanEvent::Frame(frame))) if Instant::now() >= deaf_until => {
-                    if !std::mem::replace(&mut heard, true) {
-                        diary::note(Happening::Came);
-                    }
-                    shared.controller().hear(&frame, MonotonicClock.now(), &mut frames);
-                }
-                Ok(Some(_)) => {}
-                Ok(None) => break,
-                Err(_) => return,
+/// What the arm's thread works with.
+struct Arm<C> {
+    shared: Arc<Shared<C>>,
+    seat: Seat,
+    period: Duration,
+    frames: Vec<CanFrame>,
+    /// It does nothing until then; what arrives waits.
+    stalled: Mono,
+    /// It neither hears nor sends until then.
+    deaf: Mono,
+    /// In this period it sends nothing.
+    silent: bool,
+    /// A frame has come.
+    heard: bool,
+}
+
+impl<C: CanController> Arm<C> {
+    fn run(&mut self) {
+        host::enter_realtime(host::EMULATOR_PRIORITY);
+        let mut next = MonotonicClock.now().after(self.period);
+        while !self.shared.closing.load(Relaxed) {
+            let now = MonotonicClock.now();
+            // An arm is not late because this computer is: what it would have sent meanwhile is sent now.
+            next = next.max(now.before(self.period * MAKES_UP));
+            while next <= now {
+                self.tick(next);
+                next = next.after(self.period);
             }
-        }
-        let now = Instant::now();
-        if now < next {
-            shared.wake.wait_or_readable(port.fd(), next - now);
-            continue;
-        }
-        next = (next + period).max(now);
-        if now < deaf_until {
-            frames.clear();
-            continue;
-        }
-        let delivery = shared.controller().tick(MonotonicClock.now(), &mut frames);
-        match delivery {
-            Delivery::Send => {}
-            Delivery::Silent => frames.clear(),
-            Delivery::Stall(time) => {
-                // What arrives meanwhile waits.
-                let end = now + time;
-                while !shared.closing.load(Ordering::Relaxed) && Instant::now() < end {
-                    shared.wake.wait(end.saturating_duration_since(Instant::now()));
-                }
+            if now >= self.stalled {
+                self.listen(now);
             }
-            Delivery::Garbage => frames.insert(0, CanFrame::new(0x7FF, b"garbage")),
-            // A bus knows no damaged frames: they are repeated. It knows short ones.
-            Delivery::Corrupt | Delivery::Truncated => {
-                frames.iter_mut().for_each(|frame| {
-                    *frame = CanFrame::new(frame.id, frame.bytes().split_at(frame.bytes().len() / 2).0)
-                });
-            }
-            Delivery::Disconnect => deaf_until = now + CUT,
-            // Starting takes its time, too.
-            Delivery::PowerLoss(time) => deaf_until = now + time.max(CUT),
+            let left = next.since(MonotonicClock.now());
+            match self.seat.fd().filter(|_| now >= self.stalled) {
+                Some(fd) => self.shared.wake.wait_or_readable(fd, left),
+                None => self.shared.wake.wait(left),
+            };
         }
-        if now >= deaf_until && port.send(&frames).is_err() {
+    }
+
+    /// Once per period: faults begin and end, and the state is sent.
+    fn tick(&mut self, now: Mono) {
+        self.seat.mend(now);
+        if now < self.stalled || now < self.deaf {
             return;
         }
-        frames.clear();
+        self.frames.clear();
+        let shared = self.shared.clone();
+        let mut controller = shared.controller();
+        let delivery = controller.tick(now, &mut self.frames);
+        self.silent = delivery == Delivery::Silent;
+        self.seat.refuse(delivery);
+        match delivery {
+            Delivery::Garbage => {
+                let noise = controller.noise().iter().map(|(id, bytes)| CanFrame::new(*id, bytes));
+                self.frames.splice(0..0, noise);
+            }
+            // A bus knows no damaged frames: they are repeated. It knows short ones.
+            Delivery::Corrupt | Delivery::Truncated => {
+                let half =
+                    |frame: &CanFrame| CanFrame::new(frame.id, frame.bytes().split_at(frame.bytes().len() / 2).0);
+                self.frames.iter_mut().for_each(|frame| *frame = half(frame));
+            }
+            Delivery::Stall(time) => self.stalled = now.after(time),
+            Delivery::PowerLoss(time) => {
+                self.deaf = now.after(time.max(controller.start_time()));
+                self.seat.lose_power(self.deaf);
+            }
+            Delivery::Disconnect(time) => self.disconnect(now, time),
+            Delivery::BusOff => self.seat.bus_off(),
+            _ => {}
+        }
+        drop(controller);
+        if now >= self.stalled && now >= self.deaf {
+            self.send();
+        }
+    }
+
+    /// The interface goes down; where it cannot, the arm neither hears nor sends.
+    fn disconnect(&mut self, now: Mono, time: Duration) {
+        if !self.seat.go_down(now, time) {
+            self.deaf = now.after(time.max(CUT));
+        }
+    }
+
+    /// Does what has arrived.
+    fn listen(&mut self, now: Mono) {
+        self.frames.clear();
+        self.seat.open(now);
+        while let Some(event) = self.seat.receive(now) {
+            if let CanEvent::Frame(frame) = event
+                && now >= self.deaf
+            {
+                if !std::mem::replace(&mut self.heard, true) {
+                    diary::note(Happening::Came);
+                }
+                self.shared.controller().hear(&frame, now, &mut self.frames);
+            }
+        }
+        self.send();
+    }
+
+    /// Sends `frames`, unless the arm is silent.
+    fn send(&mut self) {
+        if self.silent {
+            self.frames.clear();
+        }
+        let sent = self.seat.send(&self.frames);
+        self.shared.sent.fetch_add(sent as u64, Relaxed);
+        self.shared.not_taken.fetch_add((self.frames.len() - sent) as u64, Relaxed);
+        self.frames.clear();
     }
 }

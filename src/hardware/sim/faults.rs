@@ -237,7 +237,12 @@ impl FaultScript {
 
     /// The fault of this kind that strikes at `now` [s since the first connection], counted as one strike.
     pub fn take(&mut self, kind: FaultKind, now: f64) -> Option<Fault> {
-        let entry = self.entries.iter_mut().find(|entry| entry.is(kind, now))?;
+        self.take_if(kind, now, |_| true)
+    }
+
+    /// The same, for a fault that `wanted` accepts; others stay.
+    pub fn take_if(&mut self, kind: FaultKind, now: f64, wanted: impl Fn(&Fault) -> bool) -> Option<Fault> {
+        let entry = self.entries.iter_mut().find(|entry| entry.is(kind, now) && wanted(&entry.fault))?;
         entry.struck += 1;
         entry.note();
         Some(entry.fault)

@@ -4,16 +4,13 @@
 //! motion however often somebody looks. Nothing here allocates after construction.
 
 use crate::hardware::sim::delay::DelayLine;
+use crate::hardware::sim::plant_joint::{CREDIT, Joint, braking_speed};
 use crate::joint::{JointLimits, Joints, MAX_DOF};
 
 /// The step of integration [s].
 const STEP: f64 = 0.0005;
-/// The most waiting time that an ideal joint may make up for in one jump [s].
-const CREDIT: f64 = 0.1;
 /// Speed at which a sagging joint sinks [rad/s].
 const SAG_SPEED: f64 = 0.25;
-/// Part of its acceleration that a joint plans to brake with: the rest is for landing in a whole number of steps.
-const BRAKING: f64 = 0.85;
 /// Viscous friction [Nm·s/rad].
 const FRICTION: f64 = 0.5;
 /// How much more than the acceleration limit the drives can do when they follow set points: one that could do no more
@@ -21,9 +18,6 @@ const FRICTION: f64 = 0.5;
 const HEADROOM: f64 = 2.0;
 /// The part of a lag that is first-order at most [s]; the rest is dead time.
 const FIRST_ORDER: f64 = 0.02;
-/// Below these a joint that follows a target has arrived [rad, rad/s].
-const ARRIVED: (f64, f64) = (1e-7, 1e-4);
-
 /// How joints follow servo set points and velocities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Tracking {
@@ -48,25 +42,6 @@ pub enum Drive {
     Velocity,
 }
 
-#[derive(Debug, Clone, Copy, Default)]
-struct Joint {
-    position: f64,
-    velocity: f64,
-    /// Target position [rad] or velocity [rad/s].
-    target: f64,
-    /// How fast the set points move, by the last two of them [rad/s].
-    pace: f64,
-    lower: f64,
-    upper: f64,
-    velocity_max: f64,
-    acceleration: f64,
-    /// Time in which an ideal joint has not moved although it might have [s].
-    credit: f64,
-    blocked: bool,
-    /// Where it comes to rest when it falls [rad]; `None`: friction holds it.
-    rest: Option<f64>,
-}
-
 /// Up to [`MAX_DOF`] joints with their motors.
 #[derive(Debug, Clone)]
 pub struct Plant {
@@ -76,6 +51,8 @@ pub struct Plant {
     tracking: Tracking,
     /// Servo set points that have not taken effect.
     delayed: DelayLine,
+    /// How far below its target a joint rests, under load [rad].
+    droop: f64,
     /// Fraction of the top speed in drive `Position` (0–1].
     speed: f64,
     /// Speed at which joints fall to their lower limits when disabled [rad/s]; 0 = brakes hold.
@@ -111,6 +88,7 @@ impl Plant {
             drive: Drive::Disabled,
             tracking,
             delayed: DelayLine::new(0.0),
+            droop: 0.0,
             speed: 1.0,
             fall,
             sag: 0.0,
@@ -128,6 +106,12 @@ impl Plant {
         let plant = Self::new(limits, initial, Tracking::Lag(first_order), 0.0);
         // A set point is followed from the end of the present step on: half a step later, on average.
         Self { delayed: DelayLine::new(lag - first_order - 0.5 * STEP), ..plant }
+    }
+
+    /// The same joints with position controllers that have no integral part: under load each rests `droop` [rad] below
+    /// its target. An arm that is commanded to where it is measured, again and again, sinks.
+    pub fn drooping(self, droop: f64) -> Self {
+        Self { droop, ..self }
     }
 
     /// Joint positions [rad].
@@ -153,31 +137,43 @@ impl Plant {
         self.drive
     }
 
-    /// Whether the motors are on.
+    /// Whether all motors are on.
     pub fn enabled(&self) -> bool {
-        self.drive != Drive::Disabled
+        self.active().iter().all(|joint| joint.on)
+    }
+
+    /// Whether the motor of a joint (index from 0) is on.
+    pub fn motor(&self, joint: usize) -> bool {
+        self.active().get(joint).is_some_and(|joint| joint.on)
     }
 
     /// Whether any joint is faster than 1 mrad/s, or has still to move to a target of its own.
     pub fn moving(&self) -> bool {
         self.active().iter().any(|joint| {
             joint.velocity.abs() > 1e-3
-                || (self.drive == Drive::Position && joint.position != joint.target && !joint.blocked)
+                || (self.drive == Drive::Position && joint.on && joint.position != joint.target && !joint.blocked)
         })
     }
 
-    /// Switches the motors on, holding where the arm is, or off.
+    /// Switches all motors on, holding where the arm is, or off.
     pub fn enable(&mut self, on: bool) {
-        if on != self.enabled() {
-            self.delayed.clear();
-            self.drive = if on { Drive::Stop } else { Drive::Disabled };
+        (0..self.dof).for_each(|joint| self.enable_joint(joint, on));
+    }
+
+    /// Switches the motor of one joint (index from 0). The other joints stop and hold.
+    pub fn enable_joint(&mut self, joint: usize, on: bool) {
+        match self.active_mut().get_mut(joint) {
+            Some(joint) if joint.on != on => joint.on = on,
+            _ => return,
         }
+        self.delayed.clear();
+        self.drive = if self.active().iter().any(|joint| joint.on) { Drive::Stop } else { Drive::Disabled };
     }
 
     /// Decelerates to standstill and holds. Nothing when disabled.
     pub fn stop(&mut self) {
         self.delayed.clear();
-        if self.enabled() {
+        if self.drive != Drive::Disabled {
             self.drive = Drive::Stop;
         }
     }
@@ -191,7 +187,7 @@ impl Plant {
 
     /// Follows a set point [rad], after the dead time.
     pub fn servo(&mut self, target: &[f64]) {
-        if !self.enabled() {
+        if self.drive == Drive::Disabled {
             return;
         }
         if let Some(target) = self.delayed.push(target) {
@@ -212,7 +208,7 @@ impl Plant {
             joint.pace = if following { (joint.target - before) / interval } else { 0.0 };
         }
         if self.tracking == Tracking::Ideal {
-            for joint in self.active_mut().iter_mut().filter(|joint| !joint.blocked) {
+            for joint in self.active_mut().iter_mut().filter(|joint| joint.on && !joint.blocked) {
                 let reach = joint.velocity_max * (joint.credit - ahead).max(0.0);
                 let step = (joint.target - joint.position).clamp(-reach, reach);
                 joint.position += step;
@@ -286,30 +282,31 @@ impl Plant {
 
     /// Takes over new targets; a joint whose value is missing or not finite stays where it is. `false` when disabled.
     fn drive_to(&mut self, drive: Drive, target: &[f64]) -> bool {
-        if !self.enabled() {
+        if self.drive == Drive::Disabled {
             return false;
         }
         self.drive = drive;
+        let droop = self.droop;
         for (i, joint) in self.active_mut().iter_mut().enumerate() {
             let value = target.get(i).copied().unwrap_or(f64::NAN);
-            let (low, high, stay) = match drive {
-                Drive::Velocity => (-joint.velocity_max, joint.velocity_max, 0.0),
-                _ => (joint.lower, joint.upper, joint.position),
+            let (low, high, below, stay) = match drive {
+                Drive::Velocity => (-joint.velocity_max, joint.velocity_max, 0.0, 0.0),
+                _ => (joint.lower, joint.upper, droop, joint.position),
             };
-            joint.target = if value.is_finite() { value.clamp(low, high) } else { stay };
+            joint.target = if value.is_finite() { (value - below).clamp(low, high) } else { stay };
         }
         true
     }
 
     fn at_rest(&self) -> bool {
-        let still = |joint: &Joint| joint.velocity == 0.0;
-        self.sag <= 0.0
-            && match self.drive {
-                Drive::Disabled => self.active().iter().all(|j| still(j) && (self.fall == 0.0 || j.fallen())),
-                Drive::Stop => self.active().iter().all(still),
-                Drive::Position | Drive::Servo => self.active().iter().all(|j| still(j) && j.position == j.target),
-                Drive::Velocity => self.active().iter().all(|j| still(j) && j.target == 0.0),
-            }
+        let fallen = |joint: &Joint| self.fall == 0.0 || joint.fallen();
+        let arrived = |joint: &Joint| match self.drive {
+            _ if !joint.on => fallen(joint),
+            Drive::Disabled | Drive::Stop => true,
+            Drive::Position | Drive::Servo => joint.position == joint.target,
+            Drive::Velocity => joint.target == 0.0,
+        };
+        self.sag <= 0.0 && self.active().iter().all(|joint| joint.velocity == 0.0 && arrived(joint))
     }
 
     fn step(&mut self, h: f64) {
@@ -321,7 +318,7 @@ impl Plant {
                 joint.velocity = 0.0;
                 continue;
             }
-            match (drive, tracking) {
+            match (if joint.on { drive } else { Drive::Disabled }, tracking) {
                 (Drive::Disabled, _) => joint.fall(fall, h),
                 (Drive::Stop, _) => joint.accelerate(0.0, joint.acceleration, h),
                 (Drive::Position, _) => joint.approach(joint.velocity_max * speed, 0.0, 0.0, joint.acceleration, h),
@@ -347,75 +344,6 @@ impl Plant {
             if let Some(joint) = self.active_mut().get_mut(1) {
                 joint.position = (joint.position - sink).max(joint.lower);
             }
-        }
-    }
-}
-
-/// The speed from which a joint can still stop within `distance` [rad], braking at `acceleration` [rad/s²] in
-/// steps of `h` [s].
-fn braking_speed(distance: f64, acceleration: f64, h: f64) -> f64 {
-    let acceleration = acceleration * BRAKING;
-    let dv = acceleration * h;
-    let speed = 0.5 * ((dv * dv + 8.0 * acceleration * distance).sqrt() - dv);
-    speed.min(distance / h)
-}
-
-impl Joint {
-    fn travel(&mut self, h: f64) {
-        self.position += self.velocity * h;
-        if self.position < self.lower || self.position > self.upper {
-            self.position = self.position.clamp(self.lower, self.upper);
-            self.velocity = 0.0;
-        }
-    }
-
-    fn accelerate(&mut self, velocity: f64, acceleration: f64, h: f64) {
-        let dv = acceleration * h;
-        self.velocity += (velocity - self.velocity).clamp(-dv, dv);
-        self.travel(h);
-    }
-
-    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time: not before a
-    /// target that moves on at `pace` [rad/s], only relative to it.
-    fn approach(&mut self, top: f64, lag: f64, pace: f64, acceleration: f64, h: f64) {
-        let error = self.target - self.position;
-        let arrived = error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(acceleration * h);
-        if arrived && pace == 0.0 {
-            (self.position, self.velocity) = (self.target, 0.0);
-            return;
-        }
-        let wanted = error.abs() / lag.max(h);
-        let brake = braking_speed(error.abs(), acceleration, h) + (pace * error.signum()).max(0.0);
-        self.accelerate(wanted.min(brake).min(top).copysign(error), acceleration, h);
-    }
-
-    /// An ideal joint between set points: makes the rest of its way at top speed, then stands.
-    fn follow(&mut self, pause: bool, h: f64) {
-        let error = self.target - self.position;
-        if error != 0.0 {
-            let step = error.clamp(-self.velocity_max * h, self.velocity_max * h);
-            self.position = if step == error { self.target } else { self.position + step };
-            self.velocity = step / h;
-            self.credit = 0.0;
-        } else {
-            self.credit = (self.credit + h).min(CREDIT);
-            if pause {
-                self.velocity = 0.0;
-            }
-        }
-    }
-
-    fn fallen(&self) -> bool {
-        self.rest.is_none_or(|rest| self.position == rest)
-    }
-
-    fn fall(&mut self, speed: f64, h: f64) {
-        let way = self.rest.map_or(0.0, |rest| rest - self.position);
-        if way.abs() <= speed * h {
-            (self.position, self.velocity) = (self.position + way, 0.0);
-        } else {
-            self.velocity = speed.copysign(way);
-            self.travel(h);
         }
     }
 }

@@ -67,7 +67,7 @@ impl<C: Controller + HasArm> Emulator for SerialServer<C> {
     }
 
     fn true_positions(&self) -> Option<Joints> {
-        Some(self.with(|controller, now| controller.arm().positions_at(now)))
+        Some(self.with(|controller, now| controller.joints_at(now).0))
     }
 }
 
@@ -86,11 +86,10 @@ fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
     let mut line = Line { pty, shared, heard: false };
     while !shared.closing() {
-        let silence = match shared.serve(&mut line) {
+        let silence = match shared.serve(0, &mut line) {
             Ending::Closed => LOOK,
-            Ending::Cut => CUT,
             // Starting takes its time, too.
-            Ending::Dark(time) => time.max(CUT),
+            Ending::Cut(time) => time.max(CUT),
         };
         shared.with(|controller, now| controller.client_gone(now));
         lock(&shared.line).dark_until = Instant::now() + silence;

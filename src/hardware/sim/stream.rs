@@ -1,4 +1,4 @@
-//! Emulated controllers on a stream of bytes: requests in, answers out, and what faults leave of them. The streams
+//! Emulated controllers on streams of bytes: requests in, answers out, and what faults leave of them. The streams
 //! themselves are TCP connections ([`super::tcp_server`]) and serial lines ([`super::serial_server`]).
 
 use std::io::{Read, Write};
@@ -9,6 +9,11 @@ use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::sim::arm::Delivery;
 use crate::hardware::transport::tcp::Scan;
 
+/// Noise on a line: among it the beginning of a frame.
+const NOISE: &[u8] = b"\x00\xffgarbage\x59";
+/// Most bytes that may wait for the rest of their request.
+const MAX_PENDING: usize = 32_768;
+
 /// The controller's side of a stream of bytes.
 pub trait Controller: Send + 'static {
     /// Looks at the front of what has arrived. Where a request stands there: does what it asks, puts the answer into
@@ -18,9 +23,27 @@ pub trait Controller: Send + 'static {
     /// The client is gone.
     fn client_gone(&mut self, now: Mono);
 
-    /// What a second client hears: puts an answer to its first request at the front of `bytes` into `answer`. Without
-    /// an answer it is only hung up on.
+    /// What a client hears that is one too many: puts an answer to its first request at the front of `bytes` into
+    /// `answer`. Without an answer the connection is only closed.
     fn turn_away(&self, _bytes: &[u8], _answer: &mut Vec<u8>) {}
+
+    /// What the faults `garbage`, `corrupt` and `truncated` do to an answer or report.
+    fn damage(&self, delivery: Delivery, answer: &mut Vec<u8>) {
+        // Behind the noise, the beginning of an answer that never goes on.
+        let noise = [NOISE, answer.get(..2).unwrap_or_default()].concat();
+        delivery.damage(answer, &noise, answer.len().saturating_sub(1));
+    }
+
+    /// [`Controller::serve`] for a controller with several ports, which count from 0.
+    fn serve_port(&mut self, _port: usize, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
+        self.serve(bytes, now, answer)
+    }
+
+    /// Puts what the controller sends by itself over a connection to `port` into `packet` (which is empty), once a period;
+    /// `None` ends the connection.
+    fn report(&mut self, _port: usize, _now: Mono, _packet: &mut Vec<u8>) -> Option<Delivery> {
+        None
+    }
 }
 
 /// What the threads of a server share.
@@ -34,12 +57,19 @@ pub(super) struct Shared<C, Client> {
 pub(super) struct Line<Client> {
     /// The emulator ends.
     pub closing: bool,
-    /// The client being served.
-    pub client: Option<Client>,
-    /// Nobody is served until then.
+    /// The clients being served.
+    pub clients: Vec<Client>,
+    /// No client is served until then.
     pub stalled_until: Instant,
-    /// Nobody is even listening until then.
+    /// The controller does not even listen until then.
     pub dark_until: Instant,
+}
+
+impl<Client> Line<Client> {
+    /// Nothing is served: the emulator ends, or the controller has no power.
+    pub fn dead(&self) -> bool {
+        self.closing || self.dark_until > Instant::now()
+    }
 }
 
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -49,7 +79,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl<C: Controller, Client> Shared<C, Client> {
     pub fn new(controller: C) -> Self {
         let now = Instant::now();
-        let line = Line { closing: false, client: None, stalled_until: now, dark_until: now };
+        let line = Line { closing: false, clients: Vec::new(), stalled_until: now, dark_until: now };
         Self { controller: Mutex::new(controller), line: Mutex::new(line), changed: Condvar::new() }
     }
 
@@ -75,70 +105,68 @@ impl<C: Controller, Client> Shared<C, Client> {
         }
     }
 
-    /// Answers what arrives on a stream until it ends.
-    pub fn serve(&self, stream: &mut (impl Read + Write)) -> Ending {
-        let mut buffer = [0; 1024];
-        let mut filled = 0;
-        let mut answer = Vec::with_capacity(512);
-        while let Ok(n @ 1..) = stream.read(buffer.get_mut(filled..).unwrap_or_default()) {
-            filled += n;
+    /// Answers what arrives on a stream to `port` until it ends.
+    pub fn serve(&self, port: usize, stream: &mut (impl Read + Write)) -> Ending {
+        let (mut arrived, mut answer) = (Vec::with_capacity(4096), Vec::with_capacity(1024));
+        let mut buffer = [0; 4096];
+        while let Ok(n @ 1..) = stream.read(&mut buffer) {
+            arrived.extend_from_slice(buffer.get(..n).unwrap_or_default());
             let mut used = 0;
-            while used < filled {
+            while let Some(bytes @ [_, ..]) = arrived.get(used..) {
                 answer.clear();
-                let bytes = buffer.get(used..filled).unwrap_or_default();
-                match self.with(|controller, now| controller.serve(bytes, now, &mut answer)) {
+                match self.with(|controller, now| controller.serve_port(port, bytes, now, &mut answer)) {
                     Scan::More => break,
                     Scan::Skip(n) => used += n.max(1),
                     Scan::Take(n, delivery) => {
                         used += n.max(1);
-                        if let Err(ending) = self.deliver(stream, delivery, &mut answer) {
-                            return ending;
+                        match self.play(delivery, &mut answer) {
+                            // A client that is gone gets no answer; what it had sent before still counts.
+                            Ok(true) => drop(stream.write_all(&answer)),
+                            Ok(false) => {}
+                            Err(ending) => return ending,
+                        }
+                        if delivery == Delivery::HangUp {
+                            return Ending::Closed;
                         }
                     }
                 }
             }
-            used = used.min(filled);
-            buffer.copy_within(used..filled, 0);
-            filled -= used;
+            arrived.drain(..used.min(arrived.len()));
+            if arrived.len() > MAX_PENDING {
+                break;
+            }
         }
         Ending::Closed
     }
 
-    /// Sends an answer, or what a fault leaves of it.
-    fn deliver(&self, stream: &mut impl Write, delivery: Delivery, answer: &mut [u8]) -> Result<(), Ending> {
-        let mut send = |bytes: &[u8]| stream.write_all(bytes).map_err(|_| Ending::Closed);
+    /// Lets a fault strike at an answer or report: whether what is left of it is to be sent.
+    pub fn play(&self, delivery: Delivery, answer: &mut Vec<u8>) -> Result<bool, Ending> {
         match delivery {
-            Delivery::Send => {}
-            Delivery::Silent => return Ok(()),
+            Delivery::Silent => return Ok(false),
+            Delivery::Late(time) => {
+                let due = Instant::now() + time;
+                self.wait(|_| due);
+            }
             Delivery::Stall(time) => {
                 lock(&self.line).stalled_until = Instant::now() + time;
                 self.wait(|line| line.stalled_until);
             }
-            Delivery::Garbage => {
-                // Noise, and the beginning of an answer that never goes on.
-                send(b"\x00\xffgarbage\x59")?;
-                send(answer.get(..answer.len().min(2)).unwrap_or_default())?;
+            Delivery::Garbage | Delivery::Corrupt | Delivery::Truncated => {
+                lock(&self.controller).damage(delivery, answer);
             }
-            Delivery::Corrupt => {
-                if let Some(byte) = answer.last_mut() {
-                    *byte ^= 0x40;
-                }
-            }
-            Delivery::Truncated => return send(answer.get(..answer.len() / 2).unwrap_or_default()),
-            Delivery::Disconnect => return Err(Ending::Cut),
-            Delivery::PowerLoss(time) => return Err(Ending::Dark(time)),
+            Delivery::Disconnect(_) => return Err(Ending::Cut(Duration::ZERO)),
+            Delivery::PowerLoss(time) => return Err(Ending::Cut(time)),
+            Delivery::Send | Delivery::HangUp | Delivery::Frozen | Delivery::BusOff | Delivery::NoBuffers(_) => {}
         }
-        send(answer)
+        Ok(true)
     }
 }
 
 /// Why serving a client ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ending {
-    /// The client hung up.
+    /// The client, or the controller, hung up.
     Closed,
-    /// A fault cuts the connection.
-    Cut,
-    /// A fault takes the power for so long.
-    Dark(Duration),
+    /// A fault ends all connections, and takes the power for this long.
+    Cut(Duration),
 }

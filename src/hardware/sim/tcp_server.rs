@@ -1,10 +1,16 @@
-//! An emulated controller on a TCP port of this computer: it serves one client at a time.
+//! An emulated controller on TCP ports of this computer: ports for requests, which it answers, and ports where it sends
+//! reports by itself.
 //!
-//! A thread waits for clients, another serves the one that is connected; both sleep in the kernel while nothing comes.
+//! ```text
+//!  listening thread ── waits for clients, sends reports when they are due, listens again after a loss of power
+//!   └─▶ a thread per client of a port for requests: reads, asks the controller, answers
+//! ```
+//!
+//! All of them sleep in the kernel while nothing happens.
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -12,15 +18,26 @@ use std::time::{Duration, Instant};
 use super::arm::HasArm;
 use super::diary::{self, Happening};
 use super::faults::Fault;
-use super::stream::{Controller, Ending, Shared, lock};
+use super::stream::{Controller, Ending, Line, Shared, lock};
+use super::tcp_listen::Floor;
 use crate::clock::Mono;
 use crate::hardware::registry::Emulator;
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
 use crate::rt::host;
+use crate::rt::wake::Wake;
 
 /// How long a new client waits for the end of one that has just gone.
 const GRACE: Duration = Duration::from_millis(200);
+
+/// What a port is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Port {
+    /// Clients send requests, and get an answer to each.
+    Requests,
+    /// The controller sends a report once in this time to every client.
+    Reports(Duration),
+}
 
 /// A listening controller. It ends when it is dropped.
 pub struct TcpServer<C: Controller> {
@@ -28,28 +45,59 @@ pub struct TcpServer<C: Controller> {
     thread: Option<JoinHandle<()>>,
 }
 
-struct Inner<C> {
-    address: SocketAddr,
-    shared: Shared<C, TcpStream>,
+/// What the threads share.
+pub(super) struct Inner<C> {
+    /// The arm's, for the names of threads.
+    pub name: String,
+    pub ports: Vec<(SocketAddr, Port)>,
+    /// Most clients that send requests.
+    seats: usize,
+    pub shared: Shared<C, Client>,
+    /// All connections have been ended: readers of reports, too.
+    pub ended: AtomicBool,
+    pub wake: Wake,
+    next_client: AtomicU64,
     refused: AtomicU64,
 }
 
+/// A client with requests: its number, and its connection.
+type Client = (u64, TcpStream);
+
 impl<C: Controller> TcpServer<C> {
-    /// Listens at `address`, which should be a loopback address. `name` is the arm's, for messages.
+    /// Listens at `address`, which should be a loopback address, and serves one client at a time. `name` is the arm's, for
+    /// messages.
     pub fn start(name: &str, controller: C, address: SocketAddr) -> AdapterResult<Self> {
         let failed = |e| cannot_listen(&format!("{name} emulator"), address, &e);
         let listener = TcpListener::bind(address).map_err(failed)?;
-        let address = listener.local_addr().map_err(failed)?;
-        let inner = Arc::new(Inner { address, shared: Shared::new(controller), refused: AtomicU64::new(0) });
-        let for_thread = inner.clone();
+        Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1).map_err(failed)
+    }
+
+    /// Serves several ports, and at most `seats` clients with requests at a time. A controller knows its ports by their
+    /// order here.
+    pub fn with_ports(name: &str, controller: C, ports: Vec<(TcpListener, Port)>, seats: usize) -> io::Result<Self> {
+        let addresses = ports.iter().map(|(listener, port)| Ok((listener.local_addr()?, *port)));
+        let inner = Arc::new(Inner {
+            name: name.to_owned(),
+            ports: addresses.collect::<io::Result<_>>()?,
+            seats,
+            shared: Shared::new(controller),
+            ended: AtomicBool::new(false),
+            wake: Wake::new()?,
+            next_client: AtomicU64::new(0),
+            refused: AtomicU64::new(0),
+        });
+        let floor = Floor::new(inner.clone(), ports.into_iter().map(|(listener, _)| listener).collect());
         let builder = std::thread::Builder::new().name(format!("{name}-sim"));
-        let thread = builder.spawn(move || listen(&for_thread, listener)).map_err(failed)?;
+        let thread = builder.spawn(move || {
+            host::enter_realtime(host::EMULATOR_PRIORITY);
+            floor.run();
+        })?;
         Ok(Self { inner, thread: Some(thread) })
     }
 
-    /// Where it listens.
+    /// Where it listens: its first port.
     pub fn address(&self) -> SocketAddr {
-        self.inner.address
+        self.inner.ports.first().map_or(SocketAddr::from(([0; 4], 0)), |(address, _)| *address)
     }
 
     /// Does something with the controller, now.
@@ -57,7 +105,7 @@ impl<C: Controller> TcpServer<C> {
         self.inner.shared.with(f)
     }
 
-    /// How many clients were turned away because another one was connected.
+    /// How many clients were turned away because others were connected.
     pub fn refused(&self) -> u64 {
         self.inner.refused.load(Ordering::Relaxed)
     }
@@ -65,7 +113,7 @@ impl<C: Controller> TcpServer<C> {
 
 impl<C: Controller + HasArm> Emulator for TcpServer<C> {
     fn address(&self) -> String {
-        self.inner.address.to_string()
+        Self::address(self).to_string()
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
@@ -73,20 +121,14 @@ impl<C: Controller + HasArm> Emulator for TcpServer<C> {
     }
 
     fn true_positions(&self) -> Option<Joints> {
-        Some(self.with(|controller, now| controller.arm().positions_at(now)))
+        Some(self.with(|controller, now| controller.joints_at(now).0))
     }
 }
 
 impl<C: Controller> Drop for TcpServer<C> {
     fn drop(&mut self) {
-        let mut line = lock(&self.inner.shared.line);
-        line.closing = true;
-        if let Some(client) = &line.client {
-            let _ = client.shutdown(Shutdown::Both);
-        }
-        drop(line);
-        self.inner.shared.changed.notify_all();
-        self.inner.wake();
+        lock(&self.inner.shared.line).closing = true;
+        self.inner.cut(Duration::ZERO);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -94,28 +136,51 @@ impl<C: Controller> Drop for TcpServer<C> {
 }
 
 impl<C: Controller> Inner<C> {
-    /// Waits a moment for the last client to be gone; `false` when it stays.
-    fn wait_for_free(&self) -> bool {
-        let shared = &self.shared;
-        let line = lock(&shared.line);
-        let result = shared.changed.wait_timeout_while(line, GRACE, |line| line.client.is_some() && !line.closing);
-        result.unwrap_or_else(PoisonError::into_inner).0.client.is_none()
+    /// Ends all connections, and for `dark` nothing listens.
+    pub fn cut(&self, dark: Duration) {
+        let mut line = lock(&self.shared.line);
+        self.ended.store(true, Ordering::Release);
+        line.dark_until = Instant::now() + dark;
+        line.clients.iter().for_each(|(_, client)| drop(client.shutdown(Shutdown::Both)));
+        drop(line);
+        self.shared.changed.notify_all();
+        self.wake.raise();
     }
 
-    /// Makes the waiting thread look up.
-    fn wake(&self) {
-        drop(TcpStream::connect_timeout(&self.address, GRACE));
-    }
-
-    /// Listens again on the same port after a loss of power; `None` when the emulator ends.
-    fn relisten(&self) -> Option<TcpListener> {
-        while !self.shared.closing() {
-            match TcpListener::bind(self.address) {
-                Ok(listener) => return Some(listener),
-                Err(_) => std::thread::sleep(Duration::from_millis(20)),
-            }
+    /// Serves a client with requests until it is gone, unless there are too many.
+    pub fn attend(&self, mut stream: TcpStream, port: usize) {
+        host::enter_realtime(host::EMULATOR_PRIORITY);
+        self.shared.wait(|line| line.stalled_until);
+        let Some(number) = self.take_seat(&stream) else {
+            self.refused.fetch_add(1, Ordering::Relaxed);
+            diary::note(Happening::TurnedAway);
+            return self.turn_away(stream);
+        };
+        diary::note(Happening::Came);
+        let ending = self.shared.serve(port, &mut stream);
+        diary::note(Happening::Gone);
+        if let Ending::Cut(dark) = ending {
+            self.cut(dark);
         }
-        None
+        let _ = stream.shutdown(Shutdown::Both);
+        self.shared.with(|controller, now| controller.client_gone(now));
+        lock(&self.shared.line).clients.retain(|(client, _)| *client != number);
+        self.shared.changed.notify_all();
+    }
+
+    /// Waits a moment for a client to be gone, where there are enough; `None` when all stay.
+    fn take_seat(&self, stream: &TcpStream) -> Option<u64> {
+        let copy = stream.try_clone().ok()?;
+        let line = lock(&self.shared.line);
+        let full = |line: &mut Line<Client>| line.clients.len() >= self.seats && !line.closing;
+        let waited = self.shared.changed.wait_timeout_while(line, GRACE, full);
+        let mut line = waited.unwrap_or_else(PoisonError::into_inner).0;
+        if line.clients.len() >= self.seats || line.dead() {
+            return None;
+        }
+        let number = self.next_client.fetch_add(1, Ordering::Relaxed);
+        line.clients.push((number, copy));
+        Some(number)
     }
 
     /// Answers the first request of a client that cannot be served, and hangs up.
@@ -129,24 +194,18 @@ impl<C: Controller> Inner<C> {
         });
         let _ = stream.write_all(&answer);
     }
+}
 
-    /// Serves one client until it is gone.
-    fn serve(&self, mut stream: TcpStream) {
-        let _ = stream.set_nodelay(true);
-        diary::note(Happening::Came);
-        let ending = self.shared.serve(&mut stream);
-        diary::note(Happening::Gone);
-        if let Ending::Dark(time) = ending {
-            lock(&self.shared.line).dark_until = Instant::now() + time;
-        }
-        let _ = stream.shutdown(Shutdown::Both);
-        if matches!(ending, Ending::Dark(_)) {
-            self.wake();
-        }
-        self.shared.with(|controller, now| controller.client_gone(now));
-        lock(&self.shared.line).client = None;
-        self.shared.changed.notify_all();
+/// Listens at `count` ports in a row from `first` on; from any on where that is 0.
+pub fn ports_in_a_row(ip: IpAddr, first: u16, count: u16) -> io::Result<Vec<TcpListener>> {
+    let listener = TcpListener::bind((ip, first))?;
+    let first = listener.local_addr()?.port();
+    let mut all = vec![listener];
+    for offset in 1..count {
+        let port = first.checked_add(offset).ok_or(ErrorKind::AddrNotAvailable)?;
+        all.push(TcpListener::bind((ip, port))?);
     }
+    Ok(all)
 }
 
 /// Why `who` cannot have a port of this computer, and what to do.
@@ -161,59 +220,4 @@ pub fn cannot_listen(who: &str, at: SocketAddr, error: &io::Error) -> AdapterErr
         _ => String::new(),
     };
     AdapterError::Io(format!("{who}: cannot listen at {at}: {error}{hint}"))
-}
-
-/// The thread that waits for clients.
-fn listen<C: Controller>(inner: &Arc<Inner<C>>, mut listener: TcpListener) {
-    let shared = &inner.shared;
-    let mut session: Option<JoinHandle<()>> = None;
-    while !shared.closing() {
-        let accepted = listener.accept();
-        if lock(&shared.line).dark_until > Instant::now() {
-            drop((accepted, listener));
-            shared.wait(|line| line.dark_until);
-            match inner.relisten() {
-                Some(again) => listener = again,
-                None => break,
-            }
-            continue;
-        }
-        shared.wait(|line| line.stalled_until);
-        let Ok((stream, _)) = accepted else {
-            std::thread::sleep(Duration::from_millis(10)); // out of descriptors, say: do not spin
-            continue;
-        };
-        if shared.closing() {
-            break;
-        }
-        if !inner.wait_for_free() {
-            inner.refused.fetch_add(1, Ordering::Relaxed);
-            diary::note(Happening::TurnedAway);
-            inner.turn_away(stream);
-            continue;
-        }
-        if let Some(ended) = session.take() {
-            let _ = ended.join();
-        }
-        let Ok(copy) = stream.try_clone() else { continue };
-        let mut line = lock(&shared.line);
-        if line.closing {
-            break;
-        }
-        line.client = Some(copy);
-        drop(line);
-        let for_thread = inner.clone();
-        let name = std::thread::current().name().map(|name| format!("{name}-client")).unwrap_or_default();
-        let spawned = std::thread::Builder::new().name(name).spawn(move || {
-            host::enter_realtime(host::EMULATOR_PRIORITY);
-            for_thread.serve(stream);
-        });
-        match spawned {
-            Ok(thread) => session = Some(thread),
-            Err(_) => lock(&shared.line).client = None,
-        }
-    }
-    if let Some(session) = session {
-        let _ = session.join();
-    }
 }

@@ -8,7 +8,6 @@ use super::{MODES, NATIVE_RATE, fit, limits};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::sim::plant::Drive;
 use crate::hardware::spec::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
@@ -19,7 +18,6 @@ pub struct MockArm {
     options: Options,
     dof: usize,
     device: Device,
-    mode: ControlMode,
     /// The last reading, for the fault that shows nothing newer.
     measured: Option<JointReading>,
 }
@@ -34,18 +32,12 @@ impl MockArm {
     pub fn with_clock(config: &AdapterConfig, clock: Arc<dyn Clock>) -> AdapterResult<Self> {
         config.fit(fit)?;
         let (options, dof) = (config.options::<Options>()?, config.dof);
-        Ok(Self {
-            device: Device::new(dof, &options, clock),
-            options,
-            dof,
-            mode: ControlMode::Position,
-            measured: None,
-        })
+        Ok(Self { device: Device::new(dof, &options, clock)?, options, dof, measured: None })
     }
 
-    /// Lets a fault happen `fault.at` seconds from now.
-    pub fn inject(&mut self, fault: Fault) {
-        self.device.inject(fault);
+    /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that can be played.
+    pub fn inject(&mut self, fault: Fault) -> Result<(), String> {
+        self.device.inject(fault)
     }
 
     fn check_joints(&self, values: &[f64]) -> AdapterResult<()> {
@@ -104,18 +96,11 @@ impl ManipulatorAdapter for MockArm {
             return Err(AdapterError::Unsupported);
         }
         self.device.write()?;
-        if mode != self.mode {
-            if self.device.plant.moving() {
-                return Err(AdapterError::Rejected("the mode cannot change while the arm moves".into()));
-            }
-            self.device.plant.stop();
-            self.mode = mode;
-        }
-        Ok(())
+        self.device.arm.set_mode(mode).map_err(|refusal| self.device.refused(refusal))
     }
 
     fn get_control_mode(&self) -> ControlMode {
-        self.mode
+        self.device.arm.mode()
     }
 
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
@@ -127,20 +112,20 @@ impl ManipulatorAdapter for MockArm {
 
     fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
         self.device.answer()?;
-        fill(velocities, &self.device.plant.velocities());
+        fill(velocities, &self.device.arm.joints().1);
         Ok(self.options.velocity_feedback)
     }
 
     fn read_joint_efforts(&mut self, efforts: &mut [f64]) -> AdapterResult<bool> {
         self.device.answer()?;
-        fill(efforts, &self.device.plant.efforts());
+        fill(efforts, &self.device.arm.efforts());
         Ok(self.options.effort_feedback)
     }
 
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         self.device.read()?;
         if let Some(before) = self.measured
-            && self.device.strikes(FaultKind::Frozen).is_some()
+            && self.device.arm.take_fault(FaultKind::Frozen).is_some()
         {
             *reading = before;
             return Ok(());
@@ -150,82 +135,73 @@ impl ManipulatorAdapter for MockArm {
         // Entries past dof stay zero, also when the others are NaN.
         reading.position = zero;
         fill(reading.position.get_mut(..self.dof).unwrap_or_default(), &position);
-        reading.velocity = self.options.velocity_feedback.then(|| self.device.plant.velocities());
-        reading.effort = self.options.effort_feedback.then(|| self.device.plant.efforts());
-        reading.stamp = Some(self.device.advanced_to);
-        reading.valid = Some(position == self.device.plant.positions());
+        reading.velocity = self.options.velocity_feedback.then(|| self.device.arm.joints().1);
+        reading.effort = self.options.effort_feedback.then(|| self.device.arm.efforts());
+        reading.stamp = Some(self.device.arm.now());
+        reading.valid = Some(position == self.device.arm.joints().0);
         self.measured = Some(*reading);
         Ok(())
     }
 
     fn read_state(&mut self) -> AdapterResult<RobotState> {
         self.device.answer()?;
-        let state = match (self.device.error, self.device.plant.drive()) {
-            (0, Drive::Disabled) => 0,
-            (0, _) if self.device.plant.moving() => 2,
-            (0, _) => 1,
+        let arm = &self.device.arm;
+        let state = match (arm.error(), arm.enabled()) {
+            (0, false) => 0,
+            (0, true) if arm.moving() => 2,
+            (0, true) => 1,
             _ => 3,
         };
-        let mode = MODES.iter().position(|mode| *mode == self.mode).unwrap_or_default();
+        let mode = MODES.iter().position(|mode| *mode == arm.mode()).unwrap_or_default();
         Ok(RobotState { state, mode: mode as i32 })
     }
 
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
         self.device.answer()?;
-        Ok((self.device.error.into(), self.device.error_text()))
+        Ok((self.device.arm.error().into(), self.device.error_text()))
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
         self.device.answer()?;
-        Ok(self.device.plant.enabled())
+        Ok(self.device.arm.enabled())
     }
 
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         self.check_joints(positions)?;
         self.device.write_motion()?;
-        match self.mode {
-            ControlMode::Position => self.device.plant.move_to(positions, velocity),
-            ControlMode::ServoPosition => self.device.plant.servo(positions),
+        let result = match self.device.arm.mode() {
+            ControlMode::Position => self.device.arm.move_to(positions, velocity),
+            ControlMode::ServoPosition => self.device.arm.servo(positions),
             _ => return Err(AdapterError::Rejected("joint positions in velocity mode".into())),
-        }
-        Ok(())
+        };
+        result.map_err(|refusal| self.device.refused(refusal))
     }
 
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         self.check_joints(velocities)?;
         self.device.write_motion()?;
-        if self.mode != ControlMode::Velocity {
-            return Err(AdapterError::Rejected(format!("joint velocities in {} mode", self.mode.name())));
+        let mode = self.device.arm.mode();
+        if mode != ControlMode::Velocity {
+            return Err(AdapterError::Rejected(format!("joint velocities in {} mode", mode.name())));
         }
-        self.device.plant.velocity(velocities);
-        Ok(())
+        self.device.arm.velocity(velocities).map_err(|refusal| self.device.refused(refusal))
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.device.write()?;
-        self.device.plant.stop();
+        self.device.arm.stop();
         self.device.gripper.stop();
         Ok(Stop::Confirmed)
     }
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         self.device.write()?;
-        if enable && self.device.error != 0 {
-            return Err(self.device.fault());
-        }
-        if enable
-            && !self.device.plant.enabled()
-            && let Some(sag) = self.device.strikes(FaultKind::Sag)
-        {
-            self.device.plant.sag(sag.amount);
-        }
-        self.device.plant.enable(enable);
-        Ok(())
+        self.device.arm.enable(enable).map_err(|refusal| self.device.refused(refusal))
     }
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.device.write()?;
-        self.device.clear_error()
+        self.device.arm.clear_error().map_err(|refusal| self.device.refused(refusal))
     }
 
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {

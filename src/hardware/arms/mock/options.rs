@@ -5,11 +5,11 @@ use serde::{Deserialize, Serialize};
 
 use super::limits;
 use crate::hardware::fit::Misfit;
-use crate::hardware::sim::arm::check_pose;
+use crate::hardware::sim::arm::{SimOptions, check_pose};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_script};
 
 /// The faults that a mock arm can play.
-const PLAYABLE: &[FaultKind] = &[
+pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::ReadError,
     FaultKind::WriteError,
     FaultKind::Stall,
@@ -83,5 +83,11 @@ impl Options {
             }
         }
         check_script("mock", &self.faults, PLAYABLE)
+    }
+
+    /// What all simulated arms have.
+    pub(super) fn sim(&self) -> SimOptions {
+        let (initial_positions, faults) = (self.initial_positions.clone(), self.faults.clone());
+        SimOptions { initial_positions, faults, ..SimOptions::default() }
     }
 }

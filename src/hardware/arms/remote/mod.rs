@@ -5,8 +5,8 @@
 
 mod adapter;
 pub mod address;
+pub mod emulator;
 mod link;
-pub mod peer;
 mod protocol;
 mod session;
 #[cfg(test)]
@@ -20,8 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::hardware::fit::{Fit, Misfit};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::sim::arm::check_pose;
-use crate::hardware::sim::faults::{Fault, check_script};
+use crate::hardware::sim::arm::SimOptions;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use address::Address;
 
@@ -55,15 +54,13 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     options: OptionsSpec::of::<Options>(),
     fit,
     create: |config| Ok(Box::new(adapter::RemoteAdapter::new(config)?)),
-    emulate: Some(|config, place| Ok(Box::new(peer::start_emulator(config, place)?))),
+    emulate: Some(emulator::start),
 };
 
 fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
     config.check_dof("a remote arm", SPEC.dof)?;
     let (sim, limits) = (config.options::<Options>()?.sim, limits(config.dof));
-    check_script("the peer", &sim.faults, peer::PLAYABLE)
-        .and_then(|()| check_pose(&sim.initial_positions, &limits))
-        .map_err(|misfit| misfit.within("sim"))?;
+    sim.check("remote", &limits, emulator::PLAYABLE)?;
     Ok(Fit { limits })
 }
 
@@ -93,16 +90,6 @@ fn same_modes(given: &[ControlMode]) -> &'static [ControlMode] {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// What the peer does that stands in for the arm with `address: sim`.
+    /// What the emulator does, when one stands in for the arm. It starts at zero where `initial_positions` is empty.
     pub sim: SimOptions,
-}
-
-/// What the simulated arm behind the protocol does.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct SimOptions {
-    /// Joint positions at the start [rad], one per joint; all zero when empty.
-    pub initial_positions: Vec<f64>,
-    /// What goes wrong, and when (seconds after the first connection).
-    pub faults: Vec<Fault>,
 }

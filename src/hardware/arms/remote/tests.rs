@@ -1,14 +1,14 @@
-//! The protocol against the sheet, and the adapter against a peer over real sockets.
+//! The protocol against the sheet, and the adapter against the emulator over real sockets.
 
 use std::time::{Duration, Instant};
 
 use super::SPEC;
-use super::address::Address;
-use super::peer::{Peer, wire};
+use super::emulator::wire;
 use super::protocol::{self, Act, Command, Description, Reply, WirePose};
-use crate::hardware::registry::{self, AdapterConfig};
+use crate::hardware::registry::{self, AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::transport::Scan;
 use crate::joint::ControlMode;
 
 /// The lines of the sheet that begin so.
@@ -40,11 +40,15 @@ fn the_requests_of_the_sheet_are_these() {
     let ours = Command { mode: ControlMode::ServoPosition, values, velocity };
     assert_eq!(command, written(|out| protocol::cycle(5, Some(ours), out)));
     // The double reads the same out of them, to the last bit.
-    let mut arrived = format!("{hello}\n{command}\n").into_bytes();
-    assert_eq!(wire::take(&mut arrived).unwrap().unwrap().what, "hello");
-    let request = wire::take(&mut arrived).unwrap().unwrap();
-    assert_eq!(request.command.unwrap().values, values);
-    assert_eq!((request.id, wire::take(&mut arrived)), (5, Ok(None)));
+    let scanned = |line: &str| match wire::scan(format!("{line}\n").as_bytes()) {
+        Scan::Take(n, request) if n == line.len() + 1 => request.unwrap(),
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(scanned(hello).what, "hello");
+    let request = scanned(command);
+    assert_eq!((request.id, request.command.unwrap().values.as_slice()), (5, values));
+    assert_eq!(wire::scan(command.as_bytes()), Scan::More);
+    assert_eq!(wire::scan(b"GET /\n"), Scan::Take(6, Err("a line that is not JSON")));
 }
 
 #[test]
@@ -82,11 +86,10 @@ fn what_is_no_reply_is_an_error_and_never_a_panic() {
     assert_eq!(text, "ä".repeat(120));
 }
 
-fn served(dof: usize) -> (Peer, Box<dyn ManipulatorAdapter>) {
-    let any_port = Address::Tcp(([127, 0, 0, 1], 0).into());
-    let peer = Peer::start(registry::create("mock", "", dof).unwrap(), &any_port).unwrap();
-    let adapter = registry::create("remote", &peer.address().to_string(), dof).unwrap();
-    (peer, adapter)
+fn served(dof: usize) -> (Box<dyn Emulator>, Box<dyn ManipulatorAdapter>) {
+    let emulator = registry::emulate("remote", dof).unwrap();
+    let adapter = registry::create("remote", &emulator.address(), dof).unwrap();
+    (emulator, adapter)
 }
 
 fn ready(adapter: &mut dyn ManipulatorAdapter, mode: ControlMode) {
@@ -106,7 +109,7 @@ fn until(what: &str, mut done: impl FnMut() -> bool) {
 
 #[test]
 fn a_reply_wakes_and_brings_what_was_commanded() {
-    let (_peer, mut arm) = served(2);
+    let (_emulator, mut arm) = served(2);
     ready(&mut *arm, ControlMode::ServoPosition);
     let mut reading = JointReading::default();
     until("the set point", || {
@@ -121,7 +124,7 @@ fn a_reply_wakes_and_brings_what_was_commanded() {
 
 #[test]
 fn a_client_that_falls_silent_loses_the_arm() {
-    let (_peer, mut arm) = served(1);
+    let (_emulator, mut arm) = served(1);
     ready(&mut *arm, ControlMode::Position);
     arm.write_joint_positions(&[2.0], 0.1).unwrap();
     std::thread::sleep(Duration::from_millis(1500));
@@ -138,11 +141,11 @@ fn a_client_that_falls_silent_loses_the_arm() {
 
 #[test]
 fn refusals_come_with_the_next_command_and_stale_states_are_said() {
-    let (peer, mut arm) = served(2);
+    let (emulator, mut arm) = served(2);
     ready(&mut *arm, ControlMode::Position);
     let limit = arm.get_limits().unwrap().position_upper[0];
-    assert!(limit > 6.0 && arm.get_info().model == "mock");
-    peer.inject(Fault::new(FaultKind::Silent).lasting(60.0)).unwrap();
+    assert!(limit > 6.0 && arm.get_info().model == "simulated");
+    emulator.inject(Fault::new(FaultKind::Silent).lasting(60.0)).unwrap();
     let mut reading = JointReading::default();
     until("a late reply", || matches!(arm.read_joints(&mut reading), Err(AdapterError::Timeout(_))));
     assert!(arm.is_connected(), "late is not gone");
@@ -151,21 +154,15 @@ fn refusals_come_with_the_next_command_and_stale_states_are_said() {
 }
 
 #[test]
-fn a_peer_on_a_unix_socket_is_for_its_user_and_takes_a_dead_ones_place() {
-    let folder = tempfile::tempdir().unwrap();
-    let address = Address::Unix(folder.path().join("arm.sock"));
-    for _ in 0..2 {
-        let peer = Peer::start(registry::create("mock", "", 3).unwrap(), &address).unwrap();
-        let mut arm = registry::create("remote", &address.to_string(), 3).unwrap();
-        arm.connect().unwrap();
-        let again = Peer::start(registry::create("mock", "", 3).unwrap(), &address);
-        assert!(again.is_err(), "one that lives stays");
-        let mut second = registry::create("remote", &address.to_string(), 3).unwrap();
-        let error = second.connect().unwrap_err().to_string();
-        assert!(error.contains("serves another client already"), "{error}");
-        drop(peer);
-        drop(std::os::unix::net::UnixListener::bind(folder.path().join("arm.sock")).unwrap());
-    }
+fn a_second_client_is_refused_and_the_first_one_goes_on() {
+    let (emulator, mut arm) = served(3);
+    arm.connect().unwrap();
+    let mut second = registry::create("remote", &emulator.address(), 3).unwrap();
+    let error = second.connect().unwrap_err().to_string();
+    assert!(error.contains("serves another client already"), "{error}");
+    assert!(arm.read_joint_positions(&mut [0.0; 3]).is_ok());
+    arm.disconnect();
+    until("the free place", || second.connect().is_ok());
 }
 
 #[test]

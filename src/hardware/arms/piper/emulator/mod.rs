@@ -2,15 +2,17 @@
 //! a serial line.
 //!
 //! Like the arm it sends its state by itself, at the arm's rates (3 040 frames/s in all), whether somebody listens or
-//! not, and takes commands from whoever sends them. Its motions and its faults are in `controller.rs`, its bus and its
-//! thread in `server.rs`.
+//! not, and takes commands from every node on its bus. The bus and the joints are those of the simulation kit
+//! ([`crate::hardware::sim`]).
 
 mod controller;
+mod feedback;
 mod kinematics;
-mod server;
+mod power;
 mod wire;
 
 use std::ops::RangeInclusive;
+use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -19,13 +21,13 @@ use super::{GripperKind, NATIVE_RATE, Options, limits};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::arm::{check_lag, check_pose};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
+use crate::hardware::sim::arm::{self, HasArm};
+use crate::hardware::sim::can_server::{CanController, CanServer};
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
-use server::Server;
 
 /// The faults that the emulator can play on any bus.
 pub(super) const PLAYABLE: &[FaultKind] = &[
@@ -64,6 +66,9 @@ pub struct SimOptions {
     /// How far joints are behind their servo set points, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
+    /// How far below their targets joints rest under load, 0 to 0.1 [rad].
+    #[schemars(range(min = 0, max = 0.1))]
+    pub droop: f64,
     /// What goes wrong, and when (seconds after the first frame to the arm).
     pub faults: Vec<Fault>,
 }
@@ -75,6 +80,7 @@ impl Default for SimOptions {
             feedback_hz: NATIVE_RATE,
             firmware: "S-V1.8-5".to_owned(),
             lag: 0.02,
+            droop: 0.0,
             faults: Vec::new(),
         }
     }
@@ -83,14 +89,17 @@ impl Default for SimOptions {
 impl SimOptions {
     /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
     pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), Misfit> {
-        check_script("the piper emulator", &self.faults, playable)
-            .and_then(|()| check_lag(self.lag))
-            .and_then(|()| check_pose(&self.initial_positions, &stops()))
-            .map_err(|misfit| misfit.within("sim"))?;
+        self.common().check("piper", &stops(), playable)?;
         match self.firmware.len() {
             8 => Ok(()),
             _ => Err(Misfit::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
         }
+    }
+
+    /// What all emulated arms have.
+    fn common(&self) -> arm::SimOptions {
+        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults }
     }
 }
 
@@ -114,8 +123,7 @@ fn rate<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
 
 /// A running emulator. Ends when it is dropped.
 pub struct PiperEmulator {
-    server: Server,
-    playable: &'static [FaultKind],
+    server: CanServer<Controller>,
 }
 
 impl PiperEmulator {
@@ -129,21 +137,19 @@ impl PiperEmulator {
     pub fn with(options: &SimOptions, gripper: GripperKind, place: &Place) -> AdapterResult<Self> {
         let playable = if *place == Place::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
         options.check(playable)?;
-        let controller = Controller::new(options, gripper, MonotonicClock.now());
-        Ok(Self { server: Server::start(controller, place, options.feedback_hz)?, playable })
+        let controller = Controller::new(options, gripper, playable, MonotonicClock.now())?;
+        let period = Duration::from_secs_f64(1.0 / options.feedback_hz);
+        Ok(Self { server: CanServer::start("piper", controller, place, period)? })
     }
 
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
-        self.server.with(|controller, now| {
-            controller.advance(now);
-            controller.true_joints()
-        })
+        self.server.with(Controller::joints_at)
     }
 
     /// Whether the motors are on.
     pub fn enabled(&self) -> bool {
-        self.server.with(|controller, _| controller.enabled())
+        self.server.with(|controller, _| controller.arm().enabled())
     }
 
     /// Whether it refuses targets outside its limits (it does, unless told otherwise) or takes them.
@@ -154,7 +160,7 @@ impl PiperEmulator {
     /// Does as a frame says that a program sends which other programs on this computer do not hear, as the vendor's SDK
     /// does (it switches local loopback off).
     pub fn obey_unheard(&self, frame: &CanFrame) {
-        self.server.with(|controller, now| controller.handle(frame, now, &mut Vec::new()));
+        self.server.with(|controller, now| controller.hear(frame, now, &mut Vec::new()));
     }
 
     /// How often a client has let the motors lose their power by a reset (0x150).
@@ -169,12 +175,12 @@ impl PiperEmulator {
 
     /// Starts to record what comes over the bus, up to 200 000 frames; forgets what was recorded before.
     pub fn record(&self) {
-        self.server.with(|controller, _| controller.record());
+        self.server.with(|controller, _| controller.trace.start());
     }
 
     /// What came over the bus since [`PiperEmulator::record`], and when.
     pub fn trace(&self) -> Vec<(Mono, CanFrame)> {
-        self.server.with(|controller, _| controller.trace())
+        self.server.with(|controller, _| controller.trace.entries())
     }
 
     /// How many frames it has sent.
@@ -190,16 +196,14 @@ impl PiperEmulator {
 
 impl Emulator for PiperEmulator {
     fn address(&self) -> String {
-        self.server.address()
+        Emulator::address(&self.server)
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kind("the piper emulator", &fault, self.playable)?;
-        self.server.with(|controller, now| controller.inject(fault, now));
-        Ok(())
+        self.server.inject(fault)
     }
 
     fn true_positions(&self) -> Option<Joints> {
-        Some(self.joints().0)
+        self.server.true_positions()
     }
 }

@@ -3,9 +3,10 @@
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use nalgebra::{Isometry3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 use super::super::model::Model;
+use crate::hardware::sim::reach::{Chain, from_values, to_values};
 
 type Offset = ([f64; 3], [f64; 3]);
 
@@ -56,17 +57,12 @@ const XARM850: [Offset; 6] = [
     ([0.0, -0.09, 0.0], UP),
 ];
 
-/// Most steps of the inverse, when it has arrived [m and rad], and its damping.
-const STEPS: usize = 200;
-const CLOSE: f64 = 1e-6;
-const DAMPING: f64 = 1e-4;
-
-/// A chain of up to seven joints.
+/// The links of up to seven joints.
 #[derive(Debug, Clone, Copy)]
-pub struct Chain(&'static [Offset]);
+pub struct Links(&'static [Offset]);
 
-impl Chain {
-    /// The chain of a model.
+impl Links {
+    /// The links of a model.
     pub fn of(model: Model) -> Self {
         Self(match model {
             Model::Xarm5 => &XARM5,
@@ -76,73 +72,32 @@ impl Chain {
             Model::Xarm850 => &XARM850,
         })
     }
+}
 
-    /// The tool's pose in the base frame [m] for joint positions [rad].
-    pub fn forward(&self, joints: &[f64; 7]) -> Isometry3<f64> {
-        self.frames(joints).last().unwrap_or_else(Isometry3::identity)
-    }
-
-    /// The frame after each joint.
-    fn frames<'a>(&'a self, joints: &'a [f64; 7]) -> impl Iterator<Item = Isometry3<f64>> + 'a {
-        let mut pose = Isometry3::identity();
-        self.0.iter().zip(joints).map(move |(([x, y, z], [roll, pitch, yaw]), angle)| {
-            let turn = UnitQuaternion::from_euler_angles(*roll, *pitch, *yaw);
-            pose *= Isometry3::from_parts(Translation3::new(*x, *y, *z), turn);
-            pose *= UnitQuaternion::from_scaled_axis(Vector3::z() * *angle);
-            pose
-        })
-    }
-
-    /// Joint positions [rad] near `start` that bring the tool to `goal`, by damped least squares; `None` when that does
-    /// not lead there. Knows no joint limits.
-    pub fn inverse(&self, goal: &Isometry3<f64>, start: &[f64; 7]) -> Option<[f64; 7]> {
-        let mut joints = *start;
-        for _ in 0..STEPS {
-            let pose = self.forward(&joints);
-            let turn = (goal.rotation * pose.rotation.inverse()).scaled_axis();
-            let way = goal.translation.vector - pose.translation.vector;
-            let error = Vector6::new(way.x, way.y, way.z, turn.x, turn.y, turn.z);
-            if error.norm() < CLOSE {
-                return Some(joints);
-            }
-            let jacobian = self.jacobian(&joints);
-            let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING;
-            let step = jacobian.transpose() * square.cholesky()?.solve(&error);
-            let scale = (0.3 / step.amax()).min(1.0);
-            joints.iter_mut().zip(step.iter()).for_each(|(joint, d)| *joint += d * scale);
-        }
-        None
-    }
-
-    /// How the tool moves [m, rad] per joint [rad].
-    fn jacobian(&self, joints: &[f64; 7]) -> SMatrix<f64, 6, 7> {
-        let tool = self.forward(joints).translation.vector;
-        let mut jacobian = SMatrix::<f64, 6, 7>::zeros();
-        for (frame, mut column) in self.frames(joints).zip(jacobian.column_iter_mut()) {
-            let axis = frame.rotation * Vector3::z();
-            let linear = axis.cross(&(tool - frame.translation.vector));
-            column.copy_from_slice(&[linear.x, linear.y, linear.z, axis.x, axis.y, axis.z]);
-        }
-        jacobian
+impl Chain for Links {
+    fn link(&self, joint: usize, position: f64) -> Option<Isometry3<f64>> {
+        let ([x, y, z], [roll, pitch, yaw]) = *self.0.get(joint)?;
+        let turn = UnitQuaternion::from_scaled_axis(Vector3::z() * position);
+        Some(from_values([x, y, z, roll, pitch, yaw]) * turn)
     }
 }
 
 /// x, y, z [mm], roll, pitch, yaw [rad] (R = Rz·Ry·Rx) of a pose.
 pub fn to_wire(pose: &Isometry3<f64>) -> [f32; 6] {
-    let (v, (roll, pitch, yaw)) = (pose.translation.vector * 1000.0, pose.rotation.euler_angles());
-    [v.x, v.y, v.z, roll, pitch, yaw].map(|value| value as f32)
+    let [x, y, z, roll, pitch, yaw] = to_values(pose);
+    [x * 1000.0, y * 1000.0, z * 1000.0, roll, pitch, yaw].map(|value| value as f32)
 }
 
 /// The pose of x, y, z [mm], roll, pitch, yaw [rad].
 pub fn from_wire(values: [f32; 6]) -> Isometry3<f64> {
     let [x, y, z, roll, pitch, yaw] = values.map(f64::from);
-    let place = Translation3::new(x / 1000.0, y / 1000.0, z / 1000.0);
-    Isometry3::from_parts(place, UnitQuaternion::from_euler_angles(roll, pitch, yaw))
+    from_values([x / 1000.0, y / 1000.0, z / 1000.0, roll, pitch, yaw])
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hardware::sim::reach::tests::leads_back;
 
     #[test]
     fn zero_poses_are_those_of_the_makers() {
@@ -153,7 +108,7 @@ mod tests {
             (Model::Lite6, [0.087, 0.0, 0.1542]),
             (Model::Xarm850, [0.15, 0.0, 0.238]),
         ] {
-            let pose = Chain::of(model).forward(&[0.0; 7]);
+            let pose = Links::of(model).forward(&[0.0; 7]);
             let off = (pose.translation.vector - Vector3::from(expected)).norm();
             assert!(off < 1e-9, "{model:?}: {:?}", pose.translation);
             let (x, z) = model.zero_pose();
@@ -166,13 +121,8 @@ mod tests {
     #[test]
     fn the_inverse_leads_back() {
         for model in [Model::Xarm6, Model::Xarm7, Model::Lite6, Model::Xarm850] {
-            let chain = Chain::of(model);
             let start = [0.1, 0.2, if model == Model::Lite6 { 1.0 } else { -1.0 }, 0.3, 0.8, 0.2, 0.1];
-            let there = start.map(|angle| angle + 0.1);
-            let goal = from_wire(to_wire(&chain.forward(&there)));
-            let found = chain.inverse(&goal, &start).unwrap();
-            assert!((chain.forward(&found).translation.vector - goal.translation.vector).norm() < 1e-5);
-            assert_eq!(chain.inverse(&from_wire([5000.0, 0.0, 0.0, 0.0, 0.0, 0.0]), &start), None);
+            leads_back(&Links::of(model), start, start.map(|angle| angle + 0.1));
         }
     }
 }

@@ -1,17 +1,15 @@
 //! The emulator: plays the control box of an xArm, Lite 6 or 850 on a loopback address, for `address: sim`, for tests,
 //! and for the vendor's own client. It serves any number of clients at once, as the real one does.
 //!
-//! ```text
-//!  server ── sockets, threads, faults of the wire
-//!   ├─▶ wire, registers ─▶ controller (modes, states, errors, joints) ─▶ plant
-//!   └─▶ report ◀── snapshot of the controller
-//! ```
+//! The sockets, the arm and its faults are those of the simulation kit ([`crate::hardware::sim`]); here is what the
+//! controller makes of a request (`wire`, `registers`), what it reports (`report`), and its modes, states and errors
+//! (`controller`).
 
 mod controller;
 mod kinematics;
+mod ports;
 mod registers;
 mod report;
-mod server;
 #[cfg(test)]
 mod tests;
 mod tool;
@@ -19,6 +17,7 @@ mod wire;
 
 use std::io;
 use std::net::{IpAddr, SocketAddr, TcpListener};
+use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -31,14 +30,14 @@ use super::{Options, model_of};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::fit::Misfit;
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
-use crate::hardware::sim::arm::{check_lag, check_pose};
-use crate::hardware::sim::faults::{Fault, FaultKind, check_kind, check_script};
-use crate::hardware::sim::tcp_server::cannot_listen;
+use crate::hardware::sim::arm::{self, HasArm};
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 pub use controller::Received;
-use server::Server;
+use report::Kind;
 
 /// The faults that the emulator can play.
 const PLAYABLE: &[FaultKind] = &[
@@ -62,8 +61,12 @@ const PLAYABLE: &[FaultKind] = &[
 
 /// Who speaks in messages.
 const WHO: &str = "xarm emulator";
-/// The report ports follow one another.
-const REPORT_PORTS: u16 = 4;
+/// The report ports follow one another; they come first among the emulator's ports.
+const REPORT_PORTS: u16 = Kind::ALL.len() as u16;
+/// The second control port comes last.
+const SECOND: usize = Kind::ALL.len() + 1;
+/// Most control connections at once.
+const CLIENTS: usize = 16;
 /// Attempts to find so many free ports in a row.
 const ATTEMPTS: u32 = 200;
 
@@ -82,6 +85,9 @@ pub struct SimOptions {
     /// How far joints are behind their servo set points, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
+    /// How far below their targets joints rest under load, 0 to 0.1 [rad].
+    #[schemars(range(min = 0, max = 0.1))]
+    pub droop: f64,
     /// What goes wrong, and when (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
@@ -94,6 +100,7 @@ impl Default for SimOptions {
             port_503: true,
             slow_replies: Vec::new(),
             lag: 0.01,
+            droop: 0.0,
             faults: Vec::new(),
         }
     }
@@ -115,14 +122,17 @@ pub struct SlowReply {
 impl SimOptions {
     /// Refuses a pose outside `limits`, firmware that has no version, and faults that the emulator cannot play.
     pub(super) fn check(&self, limits: &JointLimits) -> Result<(), Misfit> {
-        check_script("the xarm emulator", &self.faults, PLAYABLE)
-            .and_then(|()| check_lag(self.lag))
-            .and_then(|()| check_pose(&self.initial_positions, limits))
-            .map_err(|misfit| misfit.within("sim"))?;
+        self.common().check("xarm", limits, PLAYABLE)?;
         if let Some(i) = self.slow_replies.iter().position(|slow| !(0.0..=3600.0).contains(&slow.delay)) {
             return Err(Misfit::new(format!("sim.slow_replies.{i}.delay"), "a delay is between 0 and 3600 s"));
         }
         self.firmware().map(drop)
+    }
+
+    /// What all emulated arms have.
+    fn common(&self) -> arm::SimOptions {
+        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults }
     }
 
     fn firmware(&self) -> Result<[u16; 3], Misfit> {
@@ -134,7 +144,8 @@ impl SimOptions {
 
 /// A running emulator. Ends when it is dropped.
 pub struct XArmEmulator {
-    server: Server,
+    server: TcpServer<Controller>,
+    address: String,
 }
 
 impl XArmEmulator {
@@ -156,11 +167,30 @@ impl XArmEmulator {
     ) -> AdapterResult<Self> {
         options.check(&model.limits())?;
         let firmware = options.firmware()?;
-        let ports = Ports::bind(ip, in_process, options.port_503)?;
-        let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now());
-        let server = Server::start(controller, ports, firmware >= [2, 1, 0])
-            .map_err(|e| AdapterError::Io(format!("{WHO}: cannot serve: {e}")))?;
-        Ok(Self { server })
+        let (control, reports) = if in_process {
+            let free = |_| {
+                let control = ports_in_a_row(ip, 0, 1 + u16::from(options.port_503)).ok()?;
+                Some((control, ports_in_a_row(ip, 0, REPORT_PORTS).ok()?))
+            };
+            let found = (0..ATTEMPTS).find_map(free);
+            found.ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))?
+        } else {
+            let at = |first, count| {
+                let failed = |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, first), &e);
+                ports_in_a_row(ip, first, count).map_err(failed)
+            };
+            (at(CONTROL_PORT, 1 + u16::from(options.port_503))?, at(REPORT_PORT, REPORT_PORTS)?)
+        };
+        let failed = |e: io::Error| AdapterError::Io(format!("{WHO}: cannot serve: {e}"));
+        let port = |listeners: &[TcpListener]| {
+            listeners.first().map_or(Ok(0), |first| first.local_addr().map(|at| at.port())).map_err(failed)
+        };
+        let address = format!("{}:{}", SocketAddr::new(ip, port(&control)?), port(&reports)?);
+        let periods = Kind::ALL.map(|kind| Port::Reports(Duration::from_micros(kind.period_us())));
+        let ports = reports.into_iter().zip(periods).chain(control.into_iter().map(|port| (port, Port::Requests)));
+        let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now())?;
+        let server = TcpServer::with_ports("xarm", controller, ports.collect(), CLIENTS).map_err(failed)?;
+        Ok(Self { server, address })
     }
 
     /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
@@ -173,7 +203,7 @@ impl XArmEmulator {
 
     /// Releases the E-stop button. Nothing else changes.
     pub fn release_estop(&self) {
-        self.server.with(|controller, _| controller.release_estop());
+        self.server.with(|controller, _| controller.arm().release_estop());
     }
 
     /// Lets it stay in its mode whatever it is told, or obey again.
@@ -198,15 +228,12 @@ impl XArmEmulator {
 
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
-        self.server.with(|controller, now| {
-            controller.advance(now);
-            controller.joints()
-        })
+        self.server.with(Controller::joints_at)
     }
 
     /// Whether all motors are on.
     pub fn enabled(&self) -> bool {
-        self.server.with(|controller, _| controller.all_enabled())
+        self.server.with(|controller, _| controller.arm().enabled())
     }
 
     /// The gripper's true opening now [m].
@@ -219,28 +246,26 @@ impl XArmEmulator {
 
     /// Starts to record what comes over the wire, up to 200 000 requests; forgets what was recorded before.
     pub fn record(&self) {
-        self.server.with(|controller, _| controller.record());
+        self.server.with(|controller, _| controller.trace.start());
     }
 
     /// What came over the wire since [`XArmEmulator::record`].
     pub fn trace(&self) -> Vec<Received> {
-        self.server.with(|controller, _| controller.trace())
+        self.server.with(|controller, _| controller.trace.entries())
     }
 }
 
 impl Emulator for XArmEmulator {
     fn address(&self) -> String {
-        self.server.address()
+        self.address.clone()
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        check_kind("the xarm emulator", &fault, PLAYABLE)?;
-        self.server.with(|controller, now| controller.inject(fault, now));
-        Ok(())
+        self.server.inject(fault)
     }
 
     fn true_positions(&self) -> Option<Joints> {
-        Some(self.joints().0)
+        self.server.true_positions()
     }
 }
 
@@ -254,50 +279,4 @@ pub enum Withhold {
     Close,
     /// Connections stay, and nothing is sent.
     Silence,
-}
-
-/// The sockets that wait for clients.
-struct Ports {
-    ip: IpAddr,
-    control: TcpListener,
-    /// The second control port, one above the first.
-    second: Option<TcpListener>,
-    /// In the order of their ports.
-    reports: Vec<TcpListener>,
-}
-
-impl Ports {
-    /// Listens at the arm's own ports, or at free ones.
-    fn bind(ip: IpAddr, in_process: bool, second: bool) -> AdapterResult<Self> {
-        if !in_process {
-            return Self::at(ip, CONTROL_PORT, REPORT_PORT, second);
-        }
-        let free = |_| {
-            let mut control = Self::block(ip, 0, 1 + u16::from(second)).ok()?.into_iter();
-            let reports = Self::block(ip, 0, REPORT_PORTS).ok()?;
-            Some(Self { ip, control: control.next()?, second: control.next(), reports })
-        };
-        (0..ATTEMPTS).find_map(free).ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))
-    }
-
-    /// Listens at these ports.
-    fn at(ip: IpAddr, control: u16, reports: u16, second: bool) -> AdapterResult<Self> {
-        let failed = |port: u16| move |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, port), &e);
-        let above = control.saturating_add(1);
-        let second = second.then(|| TcpListener::bind((ip, above)).map_err(failed(above))).transpose()?;
-        let control = TcpListener::bind((ip, control)).map_err(failed(control))?;
-        Ok(Self { ip, control, second, reports: Self::block(ip, reports, REPORT_PORTS).map_err(failed(reports))? })
-    }
-
-    /// Listens at so many ports in a row.
-    fn block(ip: IpAddr, first: u16, count: u16) -> io::Result<Vec<TcpListener>> {
-        let listener = TcpListener::bind((ip, first))?;
-        let first = listener.local_addr()?.port();
-        let mut all = vec![listener];
-        for offset in 1..count {
-            let port = first.checked_add(offset).ok_or(io::ErrorKind::AddrNotAvailable)?;
-            all.push(TcpListener::bind((ip, port))?);
-        }
-        Ok(all)
-    }
 }

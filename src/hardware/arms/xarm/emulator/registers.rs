@@ -4,8 +4,8 @@
 use super::controller::{Controller, Move, QUEUE, fraction, state};
 use super::kinematics::{from_wire, to_wire};
 use super::wire::{self, Request, number, numbers, put_numbers};
-use crate::clock::Mono;
 use crate::hardware::sim::faults::FaultKind;
+use crate::hardware::sim::reach::Chain;
 use std::time::Duration;
 
 /// Warnings.
@@ -19,8 +19,6 @@ const JOINT_LIMIT: u8 = 23;
 
 /// The state byte's bit "no valid result": a command that the mode does not know (our choice).
 const INVALID: u8 = 0x08;
-/// Positions this close to a limit count as inside [rad]: the vendor's client allows as much.
-const TOLERANCE: f64 = 0.00175;
 /// The bus number of the tool flange.
 const TOOL: u8 = 9;
 
@@ -38,10 +36,10 @@ use Refusal::{Error, NotNow, Warning};
 
 impl Controller {
     /// Does what a request asks; answers the state byte of the response in `out`.
-    pub(super) fn respond(&mut self, request: &Request<'_>, now: Mono, t: f64, out: &mut Vec<u8>) -> u8 {
+    pub(super) fn respond(&mut self, request: &Request<'_>, out: &mut Vec<u8>) -> u8 {
         wire::begin(out, request);
         let mut extra = 0;
-        match self.execute(request.register, request.payload, now, t, out) {
+        match self.execute(request.register, request.payload, out) {
             Ok(()) => {}
             Err(Warning(code)) => self.warning = code,
             Err(Error(code)) => self.fail(code),
@@ -52,20 +50,20 @@ impl Controller {
         status
     }
 
-    fn execute(&mut self, register: u8, data: &[u8], now: Mono, t: f64, out: &mut Vec<u8>) -> Result<(), Refusal> {
+    fn execute(&mut self, register: u8, data: &[u8], out: &mut Vec<u8>) -> Result<(), Refusal> {
         match (register, data) {
-            (1, _) => self.version(t, out),
+            (1, _) => self.version(out),
             (2, _) => {
                 let serial = &self.identity.serial;
                 out.extend(format!("{serial}C07L01\0AC1305C07L01\n\0").bytes().chain([0; 40]).take(40));
             }
             (5, _) => out.push(u8::from(self.settings.currents)),
             (70, [kind]) => self.settings.currents = *kind == 1,
-            (11, [joint, on]) => self.switch(*joint, *on == 1, t),
+            (11, [joint, on]) => self.switch(*joint, *on == 1),
             (12, [wanted]) => self.set_state(*wanted),
             (13, _) => out.push(self.reported_state()),
             (14, _) => self.put_queue(out),
-            (15, _) => out.extend([self.error, self.warning]),
+            (15, _) => out.extend([self.error(), self.warning]),
             (16, _) => self.clear_error(),
             (17, _) => self.warning = 0,
             (19, [mode, ..]) if *mode <= 11 => self.set_mode(*mode),
@@ -79,7 +77,7 @@ impl Controller {
             (41, _) => put_numbers(out, to_wire(&self.pose())),
             (42, [wanted @ 1..=3, ..]) => {
                 put_numbers(out, self.seven().map(|v| v as f32));
-                let (_, velocity) = self.joints();
+                let (_, velocity) = self.arm.joints();
                 let velocity = velocity.iter().take(7).map(|v| *v as f32);
                 (*wanted > 1).then(|| put_numbers(out, velocity));
                 (*wanted > 2).then(|| put_numbers(out, self.torques()));
@@ -96,7 +94,7 @@ impl Controller {
             }
             (45, _) => {
                 let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);
-                out.push(u8::from(!self.inside(&joints)));
+                out.push(u8::from(self.arm.within(&joints).is_err()));
             }
             (55, _) => put_numbers(out, self.torques()),
             (91, _) => {
@@ -105,7 +103,7 @@ impl Controller {
                 put_numbers(out, place.iter().chain(turn.iter()).map(|v| *v as f32));
             }
             (106, _) => {
-                let failed = self.error.checked_sub(11).filter(|joint| *joint < 7);
+                let failed = self.error().checked_sub(11).filter(|joint| *joint < 7);
                 out.extend((0..8).flat_map(|joint| [0, if failed == Some(joint) { 23 } else { 0 }]));
             }
             (124, [TOOL, telegram @ ..]) => {
@@ -124,16 +122,16 @@ impl Controller {
             (201, [on]) => self.settings.wrench_on = *on == 1,
             (202, _) => {}
             (206, _) => self.settings.wrench_zero = self.wrench().1,
-            (21..=30 | 81, _) => self.motion(register, data, now, out)?,
+            (21..=30 | 81, _) => self.motion(register, data, out)?,
             (1..=254, _) if (11..=45).contains(&register) => return Err(Warning(BAD_PARAMETER)),
             _ => return Err(Warning(UNKNOWN)),
         }
         Ok(())
     }
 
-    fn version(&mut self, t: f64, out: &mut Vec<u8>) {
-        let axes = self.identity.axes + usize::from(self.script.take(FaultKind::WrongDof, t).is_some());
-        let another = self.script.take(FaultKind::WrongModel, t).is_some();
+    fn version(&mut self, out: &mut Vec<u8>) {
+        let axes = self.arm.claimed_dof();
+        let another = self.arm.take_fault(FaultKind::WrongModel).is_some();
         let kind = match self.identity.kind {
             6 if another => 9, // a Lite 6
             _ if another => 6,
@@ -157,24 +155,21 @@ impl Controller {
         self.put_queue(out);
     }
 
-    fn switch(&mut self, joint: u8, on: bool, t: f64) {
-        if on && self.error != 0 {
+    fn switch(&mut self, joint: u8, on: bool) {
+        if on && self.error() != 0 {
             return;
         }
-        let all = ((1_u16 << self.identity.axes) - 1) as u8;
-        let which = match joint {
-            8 => all,
-            1..=7 => all & 1 << (joint - 1),
-            _ => 0,
-        };
-        self.enabled = if on { self.enabled | which } else { self.enabled & !which };
-        self.halt(if self.all_enabled() { state::CHANGED } else { state::STOPPED });
-        self.power(t);
+        match joint {
+            8 => (0..self.identity.axes).for_each(|joint| self.arm.enable_joint(joint, on)),
+            1..=7 => self.arm.enable_joint(usize::from(joint - 1), on),
+            _ => {}
+        }
+        self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED });
     }
 
     fn set_state(&mut self, wanted: u8) {
         match wanted {
-            0 if self.error == 0 && self.all_enabled() => {
+            0 if self.arm.ready().is_ok() => {
                 if self.state == state::PAUSED
                     && let Some(halted) = self.current.take()
                 {
@@ -184,7 +179,7 @@ impl Controller {
             }
             3 if self.state == state::STANDING => {
                 self.state = state::PAUSED;
-                self.plant.stop();
+                self.arm.stop();
             }
             4 => self.halt(state::STOPPED),
             6 => self.halt(state::STOPPING),
@@ -200,18 +195,18 @@ impl Controller {
             _ if silently_0 => 0,
             mode => mode,
         };
-        self.halt(if self.all_enabled() { state::CHANGED } else { state::STOPPED });
+        self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED });
     }
 
     // --- Motion ---
 
-    fn motion(&mut self, register: u8, data: &[u8], now: Mono, out: &mut Vec<u8>) -> Result<(), Refusal> {
+    fn motion(&mut self, register: u8, data: &[u8], out: &mut Vec<u8>) -> Result<(), Refusal> {
         let mode = match register {
             29 | 30 => 1,
             81 => 4,
             _ => 0,
         };
-        if self.error != 0 || !self.all_enabled() || self.state != state::STANDING || self.mode != mode {
+        if self.arm.ready().is_err() || self.state != state::STANDING || self.mode != mode {
             return Err(NotNow);
         }
         match register {
@@ -235,14 +230,12 @@ impl Controller {
             }
             29 => {
                 let target = self.checked(numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from))?;
-                self.plant.servo(&target);
-                Ok(())
+                self.arm.servo(&target).map_err(|_| NotNow)
             }
             30 => {
                 let target = self.inverse(numbers(data).ok_or(Warning(BAD_PARAMETER))?)?;
                 let target = self.checked(target)?;
-                self.plant.servo(&target);
-                Ok(())
+                self.arm.servo(&target).map_err(|_| NotNow)
             }
             81 => {
                 let speeds = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?;
@@ -250,9 +243,8 @@ impl Controller {
                     return Err(Warning(BAD_PARAMETER));
                 }
                 let duration = number(data, 29, 0).filter(|duration| *duration > 0.0);
-                self.velocity_until = duration.map(|d| now.after(Duration::from_secs_f32(d.min(3600.0))));
-                self.plant.velocity(&speeds.map(f64::from));
-                Ok(())
+                let duration = duration.map(|duration| Duration::from_secs_f32(duration.min(3600.0)));
+                self.arm.velocity_for(&speeds.map(f64::from), duration).map_err(|_| NotNow)
             }
             _ => Err(Warning(UNKNOWN)),
         }
@@ -279,11 +271,6 @@ impl Controller {
         if !target.iter().all(|value| value.is_finite()) {
             return Err(Warning(BAD_PARAMETER));
         }
-        if self.inside(&target) { Ok(target) } else { Err(Error(JOINT_LIMIT)) }
-    }
-
-    fn inside(&self, joints: &[f64; 7]) -> bool {
-        let range = self.limits.position_lower.iter().zip(&self.limits.position_upper);
-        joints.iter().zip(range).all(|(q, (lower, upper))| (lower - TOLERANCE..=upper + TOLERANCE).contains(q))
+        self.arm.within(&target).map(|()| target).map_err(|_| Error(JOINT_LIMIT))
     }
 }

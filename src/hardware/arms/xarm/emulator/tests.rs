@@ -9,7 +9,7 @@ use crate::hardware::arms::xarm::golden::{self, DEGREES, POSE, TORQUES, VELOCITI
 use crate::hardware::transport::tcp::Scan;
 
 fn controller() -> Controller {
-    Controller::new(Model::Xarm6, [2, 5, 1], GripperKind::Xarm, &SimOptions::default(), Mono(1))
+    Controller::new(Model::Xarm6, [2, 5, 1], GripperKind::Xarm, &SimOptions::default(), Mono(1)).unwrap()
 }
 
 /// The response to a golden request, at a time [s].
@@ -40,7 +40,7 @@ fn golden_requests_get_golden_responses() {
     let mut arm = controller();
     assert_eq!(answer(&mut arm, &bytes(golden::VERSION), 0.0), bytes(golden::VERSION_REPLY));
     answer(&mut arm, &bytes(golden::ENABLE), 0.0);
-    assert!(arm.all_enabled());
+    assert!(arm.arm.enabled());
     answer(&mut arm, &bytes(golden::SET_MODE), 0.0);
     answer(&mut arm, &bytes(golden::READY), 0.0);
     assert_eq!((arm.mode, arm.reported_state()), (1, 2));
@@ -53,9 +53,9 @@ fn golden_requests_get_golden_responses() {
     ready(&mut arm, 4);
     answer(&mut arm, &bytes(golden::VELOCITY), 4.0);
     arm.advance(Mono(4_150_000_000));
-    assert!((arm.joints().1[0] - 1.5).abs() < 0.05, "{:?}", arm.joints().1);
+    assert!((arm.arm.joints().1[0] - 1.5).abs() < 0.05, "{:?}", arm.arm.joints().1);
     arm.advance(Mono(5_000_000_000));
-    assert_eq!(arm.joints().1, [0.0; 16], "its time is over");
+    assert_eq!(arm.arm.joints().1, [0.0; 16], "its time is over");
     assert_eq!(answer(&mut arm, &bytes(golden::GRIPPER_READ), 5.0), bytes(golden::GRIPPER_READ_REPLY));
     arm.fail(31);
     assert_eq!(answer(&mut arm, &bytes(golden::GET_ERROR), 5.0), bytes(golden::ERROR_REPLY));
@@ -123,7 +123,7 @@ fn modes_and_states_are_those_of_the_sheet() {
     ask(&mut arm, 12, &[4], 0.0);
     assert_eq!(arm.reported_state(), 4);
     ask(&mut arm, 11, &[3, 0], 0.0);
-    assert!(!arm.all_enabled() && arm.enabled == 0b11_1011);
+    assert!(!arm.arm.enabled() && arm.motors() == 0b11_1011);
 }
 
 #[test]
@@ -143,7 +143,7 @@ fn queued_moves_follow_one_another_pause_and_end() {
     arm.advance(Mono(1_000_000_000));
     let paused = arm.seven();
     assert_eq!(arm.reported_state(), 3);
-    assert!(arm.joints().1.iter().all(|v| *v == 0.0) && (paused[0] - start[0]).abs() < 0.19);
+    assert!(arm.arm.joints().1.iter().all(|v| *v == 0.0) && (paused[0] - start[0]).abs() < 0.19);
     ask(&mut arm, 12, &[0], 1.0);
     arm.advance(Mono(4_000_000_000));
     assert!((arm.seven()[0] - (start[0] - 0.1)).abs() < 1e-6, "the second after the first");
@@ -171,14 +171,14 @@ fn wrong_requests_raise_what_the_sheet_says() {
     assert_eq!(ask(&mut arm, 23, &beyond, 0.0).0, 0x50);
     assert_eq!(ask(&mut arm, 15, &[], 0.0).1, [23, 0], "beyond a limit");
     ask(&mut arm, 16, &[], 0.0);
-    assert_eq!((arm.error, arm.reported_state()), (0, 5));
+    assert_eq!((arm.error(), arm.reported_state()), (0, 5));
     arm.press_estop();
     ask(&mut arm, 16, &[], 0.0);
-    assert_eq!((arm.error, arm.enabled), (1, 0), "not while it is pressed");
-    arm.release_estop();
+    assert_eq!((arm.error(), arm.motors()), (1, 0), "not while it is pressed");
+    arm.arm.release_estop();
     ask(&mut arm, 16, &[], 0.0);
     ask(&mut arm, 124, &[9, 7, 3, 0, 0, 0, 1], 0.0);
-    assert_eq!(arm.error, 19, "nobody of that number at the tool");
+    assert_eq!(arm.error(), 19, "nobody of that number at the tool");
 }
 
 #[test]

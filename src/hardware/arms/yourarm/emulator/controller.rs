@@ -2,13 +2,15 @@
 //! its own. Time is passed in and nothing here knows of sockets.
 
 use super::super::{GRIPPER_MAX, limits, protocol::DOF};
-use super::kinematics;
+use super::kinematics::Links;
 use super::wire::{self, Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
-use crate::hardware::sim::arm::{Delivery, Refusal, SimArm, SimOptions};
+use crate::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
+use crate::hardware::sim::reach::{self, Chain};
 use crate::hardware::sim::stream;
+use crate::hardware::sim::trace::Trace;
 use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, Joints};
@@ -21,8 +23,6 @@ const VELOCITY_TIMEOUT: f64 = 0.2;
 const GRIPPER_SPEED: f64 = 0.1;
 /// The modes, by their numbers on the wire.
 const MODES: [ControlMode; 3] = [ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
-/// Most requests that are kept when recording.
-const TRACE: usize = 200_000;
 
 /// A request as it came over the wire.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,9 +39,8 @@ pub struct Received {
 pub struct Controller {
     pub(super) arm: SimArm,
     gripper: Gripper,
-    /// Until when the gripper has moved.
-    gripper_at: Mono,
-    trace: Option<Vec<Received>>,
+    /// Requests that came over the wire.
+    pub trace: Trace<Received>,
     /// The last report, for the fault that shows nothing newer.
     reported: Option<Report>,
 }
@@ -49,38 +48,14 @@ pub struct Controller {
 impl Controller {
     /// A controller that was just switched on: disabled, in position mode.
     pub fn new(options: &SimOptions, playable: &'static [FaultKind], now: Mono) -> AdapterResult<Self> {
-        let mut options = options.clone();
-        if options.initial_positions.is_empty() {
-            options.initial_positions = INITIAL.to_vec();
-        }
+        let options = options.clone().starting_at(&INITIAL);
         let arm = SimArm::new("yourarm", &limits(), &options, playable, now)?;
         Ok(Self {
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
-            gripper_at: now,
-            trace: None,
+            trace: Trace::default(),
             reported: None,
         })
-    }
-
-    /// Brings everything up to `now`.
-    pub fn advance(&mut self, now: Mono) {
-        self.arm.advance(now);
-        self.gripper.advance(now.seconds_since(self.gripper_at));
-        self.gripper_at = now.max(self.gripper_at);
-        if self.arm.estop_open() {
-            self.gripper.stop();
-        }
-    }
-
-    /// Starts recording requests, forgetting those recorded before.
-    pub fn record(&mut self) {
-        self.trace = Some(Vec::new());
-    }
-
-    /// What was recorded.
-    pub fn trace(&self) -> Vec<Received> {
-        self.trace.clone().unwrap_or_default()
     }
 
     /// Does what a frame asks and writes the reply into `out`.
@@ -91,15 +66,13 @@ impl Controller {
         }
         let outcome = frame.request.and_then(|request| self.execute(&request).map_err(status_of));
         let status = outcome.err().unwrap_or(status::OK);
-        if let (Some(trace), Ok(request)) = (&mut self.trace, frame.request)
-            && trace.len() < TRACE
-        {
-            trace.push(Received { at: now, request, status });
+        if let Ok(request) = frame.request {
+            self.trace.push(|| Received { at: now, request, status });
         }
         match (outcome, frame.request) {
             (Ok(()), Ok(Request::Hello)) => {
                 let dof = self.arm.claimed_dof() as u8;
-                let other = self.arm.struck_by(FaultKind::WrongModel).is_some();
+                let other = self.arm.take_fault(FaultKind::WrongModel).is_some();
                 let model = if other { "YOURARM-6L" } else { "YOURARM-6" };
                 reply(out, frame, status, |out| put_hello(out, model, dof, [2, 1, 3], "YA6-00042"));
             }
@@ -132,8 +105,8 @@ impl Controller {
                 arm.may_move(ControlMode::Position)?;
                 let [x, y, z] = [x, y, z].map(|mm| f64::from(mm) / 1000.0);
                 let [roll, pitch, yaw] = [roll, pitch, yaw].map(|deg| f64::from(deg).to_radians());
-                let goal = kinematics::from_values([x, y, z, roll, pitch, yaw]);
-                let joints = kinematics::inverse(&goal, &first(&arm.joints().0)).ok_or(Refusal::OutOfRange)?;
+                let goal = reach::from_values([x, y, z, roll, pitch, yaw]);
+                let joints = Links.inverse(&goal, &first(&arm.joints().0)).ok_or(Refusal::OutOfRange)?;
                 arm.move_to(&joints, f64::from(speed) / 100.0)
             }
             Request::Gripper(mm) => {
@@ -150,7 +123,7 @@ impl Controller {
 
     fn report(&mut self) -> Report {
         if let Some(old) = self.reported
-            && self.arm.struck_by(FaultKind::Frozen).is_some()
+            && self.arm.take_fault(FaultKind::Frozen).is_some()
         {
             return old;
         }
@@ -164,7 +137,7 @@ impl Controller {
             (0, true) => 2,
             _ => 3,
         };
-        let [x, y, z, roll, pitch, yaw] = kinematics::to_values(&kinematics::forward(&first(&arm.joints().0)));
+        let [x, y, z, roll, pitch, yaw] = reach::to_values(&Links.forward(&first(&arm.joints().0)));
         let report = Report {
             time_us: arm.uptime().as_micros() as u64,
             state,
@@ -200,6 +173,21 @@ fn status_of(refusal: Refusal) -> u8 {
 
 fn radians(degrees: [f32; DOF]) -> [f64; DOF] {
     degrees.map(|v| f64::from(v).to_radians())
+}
+
+impl HasArm for Controller {
+    fn arm(&mut self) -> &mut SimArm {
+        &mut self.arm
+    }
+
+    fn advance(&mut self, now: Mono) {
+        let before = self.arm.now();
+        self.arm.advance(now);
+        self.gripper.advance(self.arm.now().seconds_since(before));
+        if self.arm.estop_open() {
+            self.gripper.stop();
+        }
+    }
 }
 
 impl stream::Controller for Controller {

@@ -12,6 +12,7 @@ use std::net::SocketAddr;
 use super::protocol::PORT;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::sim::arm::HasArm;
 pub use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::TcpServer;
@@ -76,10 +77,7 @@ impl YourArmEmulator {
 
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
-        self.server.with(|controller, now| {
-            controller.advance(now);
-            controller.arm.joints()
-        })
+        self.server.with(Controller::joints_at)
     }
 
     /// Whether the motors are on.
@@ -89,12 +87,12 @@ impl YourArmEmulator {
 
     /// Starts to record what comes over the wire, up to 200 000 requests; forgets what was recorded before.
     pub fn record(&self) {
-        self.server.with(|controller, _| controller.record());
+        self.server.with(|controller, _| controller.trace.start());
     }
 
     /// What came over the wire since [`YourArmEmulator::record`].
     pub fn trace(&self) -> Vec<Received> {
-        self.server.with(|controller, _| controller.trace())
+        self.server.with(|controller, _| controller.trace.entries())
     }
 
     /// How many clients were turned away because another one was connected.
@@ -109,10 +107,10 @@ impl Emulator for YourArmEmulator {
     }
 
     fn inject(&self, fault: Fault) -> Result<(), String> {
-        self.server.with(|controller, now| controller.arm.inject(fault, now))
+        self.server.inject(fault)
     }
 
     fn true_positions(&self) -> Option<Joints> {
-        Some(self.joints().0)
+        self.server.true_positions()
     }
 }

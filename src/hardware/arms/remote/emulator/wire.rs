@@ -1,9 +1,10 @@
-//! The protocol as a peer sees it: requests in, replies out. Written from the sheet a second time, on purpose without
-//! `protocol.rs`: a double that shared the adapter's encoders would share its mistakes.
+//! The protocol as the server sees it: requests in, replies out. Written from the sheet a second time, on purpose without
+//! `protocol.rs`: an emulator that shared the adapter's encoders would share its mistakes.
 
 use serde_json::{Map, Value, json};
 
 use crate::hardware::spec::AdapterError;
+use crate::hardware::transport::Scan;
 
 /// Longest line of a client [bytes].
 const LONGEST: usize = 16384;
@@ -32,14 +33,16 @@ pub struct Command {
     pub velocity: f64,
 }
 
-/// Takes the first request off what has arrived; an error is what to tell a client that speaks something else.
-pub fn take(arrived: &mut Vec<u8>) -> Result<Option<Request>, &'static str> {
-    let Some(end) = arrived.iter().position(|byte| *byte == b'\n') else {
-        return if arrived.len() > LONGEST { Err("a line without end") } else { Ok(None) };
+/// Finds a line at the front of what has arrived: a request, or what to tell a client that speaks something else.
+pub fn scan(bytes: &[u8]) -> Scan<Result<Request, &'static str>> {
+    let Some(end) = bytes.iter().position(|byte| *byte == b'\n') else {
+        let endless = bytes.len() > LONGEST;
+        return if endless { Scan::Take(bytes.len(), Err("a line without end")) } else { Scan::More };
     };
-    let line: Vec<u8> = arrived.drain(..=end).collect();
-    let request = serde_json::from_slice::<Value>(&line).map_err(|_| "a line that is not JSON")?;
-    understand(&request).map(Some).ok_or("a request without id or do, or with a command that is none")
+    let line = bytes.get(..end).unwrap_or_default();
+    let request = serde_json::from_slice::<Value>(line).map_err(|_| "a line that is not JSON");
+    let what = "a request without id or do, or with a command that is none";
+    Scan::Take(end + 1, request.and_then(|request| understand(&request).ok_or(what)))
 }
 
 fn understand(request: &Value) -> Option<Request> {
@@ -60,16 +63,14 @@ fn understand(request: &Value) -> Option<Request> {
     })
 }
 
-/// A good reply.
-pub fn done(id: u64, mut content: Map<String, Value>) -> Vec<u8> {
+/// Writes a good reply.
+pub fn done(out: &mut Vec<u8>, id: u64, mut content: Map<String, Value>) {
     content.insert("id".to_owned(), id.into());
-    let mut line = Value::Object(content).to_string().into_bytes();
-    line.push(b'\n');
-    line
+    out.extend(Value::Object(content).to_string().bytes().chain([b'\n']));
 }
 
-/// A reply that says why not.
-pub fn refused(id: u64, error: &AdapterError) -> Vec<u8> {
+/// Writes a reply that says why not.
+pub fn refused(out: &mut Vec<u8>, id: u64, error: &AdapterError) {
     let (name, code) = match error {
         AdapterError::Io(_) => ("io", 0),
         AdapterError::Timeout(_) => ("timeout", 0),
@@ -81,5 +82,5 @@ pub fn refused(id: u64, error: &AdapterError) -> Vec<u8> {
     };
     let text = if let AdapterError::Fault { text, .. } = error { text.clone() } else { error.to_string() };
     let content = json!({ "error": name, "text": text, "code": code });
-    done(id, content.as_object().cloned().unwrap_or_default())
+    done(out, id, content.as_object().cloned().unwrap_or_default())
 }

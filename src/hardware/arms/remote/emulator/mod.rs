@@ -1,0 +1,42 @@
+//! The emulator: the other process and its arm, for `address: sim`, for tests and for other clients of the protocol. An
+//! example of a server in other languages, too.
+
+mod controller;
+pub mod wire;
+
+use std::time::Duration;
+
+use super::{Options, limits};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::sim::faults::FaultKind;
+use crate::hardware::sim::tcp_server::TcpServer;
+use crate::hardware::spec::AdapterResult;
+use controller::Controller;
+
+/// Without a request for this long, the server stops an arm that was commanded.
+const SILENCE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Its port on an address of its own.
+const PORT: u16 = 7450;
+
+/// The faults that the emulator can play.
+pub(super) const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::Nan,
+    FaultKind::WrongDof,
+    FaultKind::Frozen,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+];
+
+/// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
+pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
+    config.fit(super::fit)?;
+    let sim = config.options::<Options>()?.sim;
+    let controller = Controller::new(&limits(config.dof), &sim, MonotonicClock.now())?;
+    Ok(Box::new(TcpServer::start("remote", controller, place.tcp(PORT)?)?))
+}

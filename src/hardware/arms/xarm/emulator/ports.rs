@@ -1,0 +1,139 @@
+//! What comes and goes at the controller's ports: requests and responses, reports, and what faults leave of them.
+
+use std::time::Duration;
+
+use super::controller::{Controller, Received, first, state};
+use super::kinematics::to_wire;
+use super::report::{Kind, Snapshot};
+use super::wire::{self, Request};
+use super::{SECOND, Withhold};
+use crate::clock::Mono;
+use crate::hardware::sim::arm::{Delivery, HasArm};
+use crate::hardware::sim::faults::FaultKind;
+use crate::hardware::sim::stream;
+use crate::hardware::transport::Scan;
+
+/// What noise looks like: among it the beginning of a header.
+const NOISE: &[u8] = b"\x00\xffnoise\x00\x02\x00\x00\x00\x00";
+
+impl Controller {
+    /// What reports show now.
+    pub fn snapshot(&mut self, now: Mono) -> Snapshot {
+        self.advance(now);
+        let (wrench, wrench_raw) = self.wrench();
+        self.counter = self.counter.wrapping_add(1);
+        let scale = if self.settings.currents { 0.1 } else { 1.0 };
+        let mut snapshot = Snapshot {
+            time_us: self.arm.uptime().as_micros() as u64,
+            state: self.reported_state(),
+            mode: self.mode,
+            queued: (self.queue.len() + usize::from(self.current.is_some() && self.arm.moving())) as u16,
+            position: self.seven().map(|v| v as f32),
+            velocity: first(&self.arm.joints().1).map(|v| v as f32),
+            torque: self.torques().map(|v| v * scale),
+            pose: to_wire(&self.pose()),
+            enabled: self.motors(),
+            error: self.error(),
+            warning: self.warning,
+            axes: self.identity.axes as u8,
+            kind: self.identity.kind as u8,
+            firmware: self.firmware,
+            offset: self.settings.offset,
+            load: self.settings.load,
+            sensitivity: self.settings.sensitivity,
+            wrench,
+            wrench_raw,
+            counter: self.counter,
+        };
+        if self.arm.take_fault(FaultKind::Nan).is_some() {
+            snapshot.position = [f32::NAN; 7];
+        } else if self.arm.take_fault(FaultKind::ZeroState).is_some() {
+            // A controller that has not measured yet has no pose either.
+            (snapshot.position, snapshot.velocity, snapshot.pose) = ([0.0; 7], [0.0; 7], [0.0; 6]);
+        }
+        snapshot
+    }
+
+    /// Does what a request asks and writes the response into `out`; what becomes of it on its way.
+    pub fn handle(&mut self, request: &Request<'_>, second: bool, now: Mono, out: &mut Vec<u8>) -> Delivery {
+        self.advance(now);
+        self.arm.client_came();
+        let status = self.respond(request, out);
+        let Request { protocol, register, payload, .. } = *request;
+        self.trace.push(|| Received { at: now, protocol, register, payload: payload.to_vec(), status, second });
+        match (self.delivery(), self.reply_time(register)) {
+            (Delivery::Send, time) if !time.is_zero() => Delivery::Late(time),
+            (delivery, _) => delivery,
+        }
+    }
+
+    /// How long the reply to a register takes.
+    fn reply_time(&self, register: u8) -> Duration {
+        let slow = self.slow.iter().find(|slow| slow.register == register);
+        slow.map_or(Duration::ZERO, |slow| Duration::from_secs_f64(slow.delay))
+    }
+
+    /// Faults of the wire that also strike at the slow reports.
+    fn lasting(&self) -> Delivery {
+        match (self.arm.fault_lasts(FaultKind::Silent), self.arm.fault_lasts(FaultKind::Frozen)) {
+            (true, _) => Delivery::Silent,
+            (_, true) => Delivery::Frozen,
+            _ => Delivery::Send,
+        }
+    }
+
+    /// Faults of the wire, for the next response or report.
+    fn delivery(&mut self) -> Delivery {
+        let delivery = self.arm.delivery();
+        match delivery {
+            Delivery::PowerLoss(_) => {
+                self.halt(state::STOPPED);
+                (self.mode, self.warning) = (0, 0);
+            }
+            Delivery::Send if self.arm.take_fault(FaultKind::Frozen).is_some() => return Delivery::Frozen,
+            _ => {}
+        }
+        delivery
+    }
+}
+
+impl stream::Controller for Controller {
+    fn serve(&mut self, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
+        self.serve_port(0, bytes, now, answer)
+    }
+
+    fn serve_port(&mut self, port: usize, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
+        match wire::scan(bytes) {
+            Scan::More => Scan::More,
+            Scan::Skip(n) => Scan::Skip(n),
+            Scan::Take(n, ()) => match bytes.get(..n).and_then(wire::parts) {
+                Some(request) => Scan::Take(n, self.handle(&request, port == SECOND, now, answer)),
+                None => Scan::Skip(n),
+            },
+        }
+    }
+
+    /// The arm goes on.
+    fn client_gone(&mut self, _now: Mono) {}
+
+    fn damage(&self, delivery: Delivery, packet: &mut Vec<u8>) {
+        // The highest byte of the first measured joint in a full report; the state byte of a response.
+        let spot = if packet.len() > 119 { 119 } else { packet.len().saturating_sub(1) };
+        delivery.damage(packet, NOISE, spot);
+    }
+
+    fn report(&mut self, port: usize, now: Mono, packet: &mut Vec<u8>) -> Option<Delivery> {
+        let kind = *Kind::ALL.get(port)?;
+        match (kind, self.withhold) {
+            (Kind::Normal, _) if self.condition_muted => return Some(Delivery::Silent),
+            // Older firmware has no such report.
+            (Kind::Full, Withhold::Close) => return None,
+            (Kind::Full, _) if self.firmware < [2, 1, 0] => return None,
+            (Kind::Full, Withhold::Silence) => return Some(Delivery::Silent),
+            _ => {}
+        }
+        kind.write(&self.snapshot(now), packet);
+        // Damage strikes where it matters: at the reports with the joints.
+        Some(if matches!(kind, Kind::Full | Kind::Real) { self.delivery() } else { self.lasting() })
+    }
+}

@@ -1,0 +1,136 @@
+//! What a [`SimArm`] is commanded, and what it refuses.
+
+use std::time::Duration;
+
+use super::{Refusal, STREAM, SimArm};
+use crate::hardware::sim::faults::FaultKind;
+use crate::joint::ControlMode;
+
+impl SimArm {
+    /// Changes the mode, at a standstill only.
+    pub fn set_mode(&mut self, mode: ControlMode) -> Result<(), Refusal> {
+        if mode == self.mode {
+            return Ok(());
+        }
+        if self.plant.moving() {
+            return Err(Refusal::Moving);
+        }
+        self.plant.stop();
+        self.mode = mode;
+        Ok(())
+    }
+
+    /// Switches all motors on, holding where the arm is, or off.
+    pub fn enable(&mut self, on: bool) -> Result<(), Refusal> {
+        if on && self.error != 0 {
+            return Err(Refusal::InError);
+        }
+        (0..self.dof()).for_each(|joint| self.enable_joint(joint, on));
+        Ok(())
+    }
+
+    /// Switches the motor of one joint (index from 0), also in error. A sagging arm sinks when the last of them comes on.
+    pub fn enable_joint(&mut self, joint: usize, on: bool) {
+        let before = self.plant.enabled();
+        self.plant.enable_joint(joint, on);
+        if !before
+            && self.plant.enabled()
+            && let Some(fault) = self.take_fault(FaultKind::Sag)
+        {
+            self.plant.sag(fault.amount);
+        }
+    }
+
+    /// Clears the error; not while the E-stop line is open.
+    pub fn clear_error(&mut self) -> Result<(), Refusal> {
+        if self.estop_open {
+            return Err(Refusal::InError);
+        }
+        self.error = 0;
+        Ok(())
+    }
+
+    /// Decelerates to standstill; the motors stay on.
+    pub fn stop(&mut self) {
+        self.plant.stop();
+    }
+
+    /// Moves to `target` [rad] at a fraction of the top speed, in position mode.
+    pub fn move_to(&mut self, target: &[f64], speed: f64) -> Result<(), Refusal> {
+        self.may_move(ControlMode::Position)?;
+        self.within(target)?;
+        self.plant.move_to(target, speed);
+        Ok(())
+    }
+
+    /// Follows a set point [rad], in servo mode.
+    pub fn servo(&mut self, target: &[f64]) -> Result<(), Refusal> {
+        self.may_move(ControlMode::ServoPosition)?;
+        self.within(target)?;
+        self.plant.servo(target);
+        Ok(())
+    }
+
+    /// Keeps velocities [rad/s], in velocity mode, for as long as the arm keeps one by default.
+    pub fn velocity(&mut self, velocities: &[f64]) -> Result<(), Refusal> {
+        self.velocity_for(velocities, self.velocity_timeout)
+    }
+
+    /// Keeps velocities [rad/s], in velocity mode, for this long; `None`: until it is told something else.
+    pub fn velocity_for(&mut self, velocities: &[f64], duration: Option<Duration>) -> Result<(), Refusal> {
+        self.may_move(ControlMode::Velocity)?;
+        self.velocity_until = duration.map(|duration| self.advanced_to.after(duration));
+        self.plant.velocity(velocities);
+        Ok(())
+    }
+
+    /// Takes a goal [rad] as servos do, whose controllers know no modes: goals that come close together are a stream and
+    /// followed, others are moves at a fraction of the top speed. `direct`: every goal is followed. A goal that comes while
+    /// the motors are off is kept, for [`SimArm::resume_goal`].
+    pub fn take_goal(&mut self, goal: &[f64], speed: f64, direct: bool) {
+        let mut joints = [0.0; crate::joint::MAX_DOF];
+        joints.iter_mut().zip(goal).for_each(|(joint, value)| *joint = *value);
+        let (pause, step) =
+            self.goal.replace((joints, self.advanced_to)).map_or((f64::MAX, f64::MAX), |(before, at)| {
+                let steps = before.iter().zip(&joints).map(|(a, b)| (a - b).abs());
+                (self.advanced_to.seconds_since(at), steps.fold(0.0, f64::max))
+            });
+        let streamed = pause < STREAM.0 && step < STREAM.1;
+        if direct || (streamed && step > 0.0) {
+            self.plant.servo(goal);
+        } else if !streamed {
+            self.plant.move_to(goal, speed);
+        }
+    }
+
+    /// Goes to the goal that it was given last, at top speed, if it was given one since power-up: what careless servos do
+    /// when their motors come on.
+    pub fn resume_goal(&mut self) {
+        if let Some((goal, _)) = self.goal {
+            self.plant.move_to(&goal, 1.0);
+        }
+    }
+
+    /// Refuses what moves anything while the motors are off or the arm is in error.
+    pub fn ready(&self) -> Result<(), Refusal> {
+        match (self.error, self.plant.enabled()) {
+            (0, true) => Ok(()),
+            (0, false) => Err(Refusal::Disabled),
+            _ => Err(Refusal::InError),
+        }
+    }
+
+    /// The same, and what needs a mode that the arm is not in.
+    pub fn may_move(&self, mode: ControlMode) -> Result<(), Refusal> {
+        self.ready()?;
+        if !self.has_modes || self.mode == mode { Ok(()) } else { Err(Refusal::WrongMode) }
+    }
+
+    /// Refuses positions [rad] outside the limits.
+    pub fn within(&self, positions: &[f64]) -> Result<(), Refusal> {
+        let mut range = self.limits.position_lower.iter().zip(&self.limits.position_upper).zip(positions);
+        let inside =
+            range.all(|((lower, upper), value)| (lower - self.tolerance..=upper + self.tolerance).contains(value));
+        if inside { Ok(()) } else { Err(Refusal::OutOfRange) }
+    }
+}

@@ -1,0 +1,78 @@
+//! What goes wrong with a [`SimArm`], and with its wire.
+
+use super::{Delivery, SimArm};
+use crate::clock::Mono;
+use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, check_kind};
+
+impl SimArm {
+    /// Lets the faults of the arm happen that are due at the time of the last [`SimArm::integrate`].
+    pub fn apply_faults(&mut self) {
+        if let Some(fault) = self.take_fault(FaultKind::Estop) {
+            self.press_estop();
+            self.estop_until = fault.left(self.script_time()).map(|left| self.advanced_to.after(left));
+        }
+        if let Some(fault) = self.take_fault(FaultKind::ErrorCode) {
+            self.fail(fault.code);
+        }
+        let blocked = self.take_fault(FaultKind::Blocked).map(|fault| fault.joint.saturating_sub(1));
+        (0..self.dof()).for_each(|joint| self.plant.block(joint, blocked == Some(joint)));
+    }
+
+    /// Lets a fault happen `fault.at` seconds from `now`; an error names the kinds that can be played.
+    pub fn inject(&mut self, fault: Fault, now: Mono) -> Result<(), String> {
+        check_kind(&format!("the {} emulator", self.name), &fault, self.playable)?;
+        let t = self.first_client.map_or(0.0, |first| now.seconds_since(first));
+        self.script.inject(fault, t);
+        Ok(())
+    }
+
+    /// The fault of a kind that strikes now, if one does; counted as one strike.
+    pub fn take_fault(&mut self, kind: FaultKind) -> Option<Fault> {
+        self.take_fault_if(kind, |_| true)
+    }
+
+    /// The same, for a fault that `wanted` accepts; others stay.
+    pub fn take_fault_if(&mut self, kind: FaultKind, wanted: impl Fn(&Fault) -> bool) -> Option<Fault> {
+        let t = self.script_time();
+        self.script.take_if(kind, t, wanted)
+    }
+
+    /// Whether a fault of a kind with a duration is active now. No strike is counted.
+    pub fn fault_lasts(&self, kind: FaultKind) -> bool {
+        self.script.lasts(kind, self.script_time())
+    }
+
+    /// What the wire does to the answer or report that is due now.
+    pub fn delivery(&mut self) -> Delivery {
+        let t = self.script_time();
+        let left = |fault: &Fault| fault.left(t);
+        if let Some(fault) = self.take_fault(FaultKind::PowerLoss) {
+            let dark = left(&fault).unwrap_or_default();
+            self.restart();
+            self.powered_up = self.advanced_to.after(dark);
+            return Delivery::PowerLoss(dark);
+        }
+        if let Some(fault) = self.take_fault(FaultKind::Stall) {
+            return Delivery::Stall(left(&fault).unwrap_or(DEFAULT_STALL));
+        }
+        if let Some(fault) = self.take_fault(FaultKind::Disconnect) {
+            return Delivery::Disconnect(left(&fault).unwrap_or_default());
+        }
+        if let Some(fault) = self.take_fault(FaultKind::NoBuffers) {
+            return Delivery::NoBuffers(left(&fault).is_some());
+        }
+        let faults = [
+            (FaultKind::BusOff, Delivery::BusOff),
+            (FaultKind::Silent, Delivery::Silent),
+            (FaultKind::Truncated, Delivery::Truncated),
+            (FaultKind::Corrupt, Delivery::Corrupt),
+            (FaultKind::Garbage, Delivery::Garbage),
+        ];
+        let struck = faults.iter().find(|(kind, _)| self.take_fault(*kind).is_some());
+        struck.map_or(Delivery::Send, |(_, delivery)| *delivery)
+    }
+
+    fn script_time(&self) -> f64 {
+        self.first_client.map_or(0.0, |first| self.advanced_to.seconds_since(first))
+    }
+}

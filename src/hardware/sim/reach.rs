@@ -1,0 +1,85 @@
+//! Poses of an emulated arm's end: x, y, z and roll, pitch, yaw, and the joint positions that bring it to one.
+
+use nalgebra::{Isometry3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3, Vector6};
+
+/// Most steps of the inverse.
+const STEPS: usize = 200;
+/// Error at which it has arrived [m and rad].
+const TOLERANCE: f64 = 1e-6;
+/// Damping of the least squares.
+const DAMPING: f64 = 1e-4;
+/// Longest step of a joint [rad].
+const LONGEST_STEP: f64 = 0.3;
+
+/// A chain of turning joints, from the base to the end.
+pub trait Chain {
+    /// The way from the frame before a joint (index from 0) to the one that it turns [m], at a position [rad]; `None`
+    /// behind the last joint.
+    fn link(&self, joint: usize, position: f64) -> Option<Isometry3<f64>>;
+
+    /// The axis of a joint in the frame that it turns: z, unless the arm says otherwise.
+    fn axis(&self, _joint: usize) -> Vector3<f64> {
+        Vector3::z()
+    }
+
+    /// The end in the last joint's frame [m]: that frame, unless the arm says otherwise.
+    fn end(&self) -> Isometry3<f64> {
+        Isometry3::identity()
+    }
+
+    /// The end's pose in the base frame [m] for joint positions [rad].
+    fn forward(&self, joints: &[f64]) -> Isometry3<f64> {
+        let links = joints.iter().enumerate().map_while(|(joint, position)| self.link(joint, *position));
+        links.fold(Isometry3::identity(), |pose, link| pose * link) * self.end()
+    }
+
+    /// Joint positions [rad] near `start` that bring the end to `goal`, by damped least squares; `None` when that does not
+    /// lead there. Knows no joint limits.
+    fn inverse<const N: usize>(&self, goal: &Isometry3<f64>, start: &[f64; N]) -> Option<[f64; N]> {
+        let mut joints = *start;
+        for _ in 0..STEPS {
+            let end = self.forward(&joints);
+            let turn = (goal.rotation * end.rotation.inverse()).scaled_axis();
+            let way = goal.translation.vector - end.translation.vector;
+            let error = Vector6::new(way.x, way.y, way.z, turn.x, turn.y, turn.z);
+            if error.norm() < TOLERANCE {
+                return Some(joints);
+            }
+            let jacobian = self.jacobian(&joints, &end.translation.vector);
+            let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING;
+            let step = jacobian.transpose() * square.cholesky()?.solve(&error);
+            let scale = (LONGEST_STEP / step.amax()).min(1.0);
+            joints.iter_mut().zip(step.iter()).for_each(|(joint, d)| *joint += d * scale);
+        }
+        None
+    }
+
+    /// How the end, which is at `end` [m], moves [m, rad] per joint [rad].
+    fn jacobian<const N: usize>(&self, joints: &[f64; N], end: &Vector3<f64>) -> SMatrix<f64, 6, N> {
+        let mut jacobian = SMatrix::<f64, 6, N>::zeros();
+        let mut frame = Isometry3::identity();
+        for ((joint, position), mut column) in joints.iter().enumerate().zip(jacobian.column_iter_mut()) {
+            let Some(link) = self.link(joint, *position) else { break };
+            frame *= link;
+            let axis = frame.rotation * self.axis(joint);
+            let linear = axis.cross(&(end - frame.translation.vector));
+            column.copy_from_slice(&[linear.x, linear.y, linear.z, axis.x, axis.y, axis.z]);
+        }
+        jacobian
+    }
+}
+
+/// x, y, z [m], roll, pitch, yaw [rad] (R = Rz·Ry·Rx) of a pose.
+pub fn to_values(pose: &Isometry3<f64>) -> [f64; 6] {
+    let (v, (roll, pitch, yaw)) = (pose.translation.vector, pose.rotation.euler_angles());
+    [v.x, v.y, v.z, roll, pitch, yaw]
+}
+
+/// The pose of x, y, z [m], roll, pitch, yaw [rad].
+pub fn from_values([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Isometry3<f64> {
+    Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
+}
+
+#[cfg(test)]
+#[path = "reach_tests.rs"]
+pub mod tests;
