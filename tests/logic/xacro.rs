@@ -133,7 +133,7 @@ fn every_case_of_the_original_matches() {
 /// One feature each, with what the original (2.1.1) made of it.
 #[test]
 fn every_construct_comes_to_what_the_original_makes_of_it() {
-    let text = include_str!("fixtures/xacro/constructs.txt");
+    let text = include_str!("../fixtures/xacro/constructs.txt");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("t.xacro");
     let mut bad = Vec::new();

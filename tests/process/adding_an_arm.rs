@@ -17,7 +17,7 @@ use std::os::unix::process::CommandExt;
 
 use crate::support::program::{Home, Started};
 
-const PAGE: &str = include_str!("../docs/adding-an-arm.md");
+const PAGE: &str = include_str!("../../docs/adding-an-arm.md");
 /// The longest that a command may take: the first builds all of dimos for another crate, on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(1500);
 
@@ -274,7 +274,7 @@ fn the_page_is_true_from_beginning_to_end() {
 
 #[test]
 fn the_table_has_every_method_of_the_trait() {
-    let spec = include_str!("../src/hardware/spec.rs");
+    let spec = include_str!("../../src/hardware/spec.rs");
     let body = spec.split("pub trait ManipulatorAdapter").nth(1).unwrap();
     let methods: Vec<&str> =
         body.lines().filter_map(|line| line.strip_prefix("    fn ")?.split(['(', '<']).next()).collect();

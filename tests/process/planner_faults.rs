@@ -19,7 +19,7 @@ use dimos::runtime::{Record, Run};
 
 use crate::support::program::{Home, eventually};
 
-const BLUEPRINT: &str = include_str!("support/lab.yaml");
+const BLUEPRINT: &str = include_str!("../support/lab.yaml");
 /// Seeds of requests that break the solver of these tests.
 const PANICS: u64 = 13;
 const HANGS: u64 = 14;

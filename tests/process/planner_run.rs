@@ -9,7 +9,7 @@ use rustix::process::Signal;
 use crate::support::program::{Home, Started, eventually};
 
 /// An ideal arm in memory, with YourArm's description.
-const BLUEPRINT: &str = include_str!("support/lab.yaml");
+const BLUEPRINT: &str = include_str!("../support/lab.yaml");
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// Two walls that leave no way from one side of the arm to the other, as far as a search can tell in a minute.
 const WALLS: [&str; 2] = ["world add front --box 2 0.02 4 --at 1.1 0 0", "world add back --box 2 0.02 4 --at -1.1 0 0"];

@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use crate::support::program::{Home, PATIENCE, eventually};
 
-const PAGE: &str = include_str!("../docs/rpc.md");
+const PAGE: &str = include_str!("../../docs/rpc.md");
 
 /// One message of an example.
 struct Step {
@@ -167,7 +167,7 @@ impl Stage {
 #[test]
 fn every_example_is_what_a_run_says() {
     let home = Home::new();
-    home.write("streams.yaml", include_str!("fixtures/streams.yaml"));
+    home.write("streams.yaml", include_str!("../fixtures/streams.yaml"));
     let _run = home.run("streams.yaml --no-record");
     let watcher = home.client();
     let mut stage = Stage { home, watcher, motion: (Value::Null, Value::Null), plan: Default::default() };
@@ -190,7 +190,7 @@ fn the_blueprint_of_the_page_is_the_one_that_is_run() {
     let block = PAGE.split("```yaml\n").nth(1).unwrap().split("```").next().unwrap();
     let home = Home::new();
     home.write("page.yaml", block);
-    home.write("streams.yaml", include_str!("fixtures/streams.yaml"));
+    home.write("streams.yaml", include_str!("../fixtures/streams.yaml"));
     let tasks = |name: &str| home.dimos(&format!("check {name} --json")).with(0).json()["blueprint"]["tasks"].take();
     assert_eq!(tasks("page.yaml"), tasks("streams.yaml"));
 }
@@ -202,12 +202,12 @@ fn every_method_stream_and_code_is_on_the_page() {
         let asked = format!("\"method\": \"{method}\"");
         assert!(*method == "shutdown" || PAGE.contains(&asked), "no example of {method}");
     }
-    let streams = include_str!("../src/rpc/streams.rs").split("pub fn name(self)").nth(1).unwrap();
+    let streams = include_str!("../../src/rpc/streams.rs").split("pub fn name(self)").nth(1).unwrap();
     let streams = streams.split("\n    }").next().unwrap().split('"').skip(1).step_by(2);
     assert_eq!(streams.inspect(|s| assert!(PAGE.contains(&format!("| `{s}` |")), "{s}")).count(), 2);
 
     let table = PAGE.split("## Errors").nth(1).unwrap();
-    let variants = include_str!("../src/rpc/error.rs").split("pub enum Code {").nth(1).unwrap();
+    let variants = include_str!("../../src/rpc/error.rs").split("pub enum Code {").nth(1).unwrap();
     let variants = variants.split("\n}").next().unwrap().lines().filter_map(|l| l.trim().strip_suffix(','));
     let mut known = 0;
     for variant in variants {
