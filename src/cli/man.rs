@@ -3,8 +3,6 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use clap::CommandFactory;
-
 use super::exit::{Exit, Failure, Result};
 use super::output;
 
@@ -21,7 +19,7 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let command = super::Cli::command();
+    let command = super::command();
     let Some(dir) = &args.dir else {
         let mut page = Vec::new();
         let rendered = clap_mangen::Man::new(command).render(&mut page);

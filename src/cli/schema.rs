@@ -1,17 +1,23 @@
-//! `dimos schema`: the JSON Schema of blueprints.
+//! `dimos schema`: the JSON Schema of blueprints, and of the rpc protocol.
 
 use super::exit::{Exit, Result};
 use super::output;
 use crate::blueprint;
 use crate::hardware::registry::Registry;
+use crate::rpc;
 
 /// Arguments of `schema`.
 #[derive(Debug, clap::Args)]
-pub struct Args {}
+pub struct Args {
+    /// Print the schema of the rpc protocol instead: methods, parameters, replies, streams
+    #[arg(long)]
+    rpc: bool,
+}
 
 /// Runs the verb.
-pub fn run(_: &Args, registry: &Registry) -> Result {
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    let schema = if args.rpc { rpc::schema::json_schema() } else { blueprint::json_schema(registry) };
     // A value made of maps and lists always encodes.
-    output::line(serde_json::to_string_pretty(&blueprint::json_schema(registry)).unwrap_or_default());
+    output::line(serde_json::to_string_pretty(&schema).unwrap_or_default());
     Ok(Exit::Ok)
 }

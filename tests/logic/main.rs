@@ -32,6 +32,7 @@ mod planning;
 mod planning_timing;
 mod robot_models;
 mod rpc;
+mod surface;
 mod templates;
 mod verify;
 mod xacro;

@@ -12,7 +12,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pty::{OpenptFlags, grantpt, ioctl_tiocgptpeer, openpt, unlockpt};
 use rustix::termios::{LocalModes, Winsize, tcgetattr, tcsetwinsize};
 
-use crate::program::{Home, PATIENCE, Started};
+use super::program::{Home, PATIENCE, Started};
 
 /// A pseudo-terminal, and the screen that it would show.
 pub struct Terminal {
