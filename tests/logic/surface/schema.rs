@@ -25,14 +25,14 @@ impl Flat<'_> {
 
     /// The keys of a node at the path `at`; `indent` is the part before the path.
     fn node(&mut self, node: &Value, at: &str, indent: &str) {
-        if let Some(name) = node.get("$ref").and_then(Value::as_str) {
-            if !self.open.iter().any(|open| open == name) {
-                self.open.push(name.to_owned());
-                if let Some(target) = self.root.pointer(name.trim_start_matches('#')) {
-                    self.node(target, at, indent);
-                }
-                self.open.pop();
+        if let Some(name) = node.get("$ref").and_then(Value::as_str)
+            && !self.open.iter().any(|open| open == name)
+        {
+            self.open.push(name.to_owned());
+            if let Some(target) = self.root.pointer(name.trim_start_matches('#')) {
+                self.node(target, at, indent);
             }
+            self.open.pop();
         }
         let required: Vec<&str> =
             node.get("required").and_then(Value::as_array).into_iter().flatten().filter_map(Value::as_str).collect();
