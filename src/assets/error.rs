@@ -40,12 +40,14 @@ impl AssetError {
     }
 
     /// The address gave another file.
+    #[cfg(feature = "fetch")]
     pub(super) fn other_file(url: &str, wanted: &str, found: &str) -> Self {
         let error = Self::new(format!("{url} is another file: its SHA-256 is {found}, and should be {wanted}"));
         error.hint("if this is the file that you mean, put its check sum into the blueprint; nothing of it was kept")
     }
 
     /// An archive holds what is not unpacked.
+    #[cfg(feature = "fetch")]
     pub(super) fn entry(name: &str, what: &str) -> Self {
         Self::new(format!("its archive is refused: {name:?} {what}")).hint("nothing of it was kept")
     }
