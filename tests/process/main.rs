@@ -11,6 +11,7 @@ mod adapter_new;
 mod adapter_test;
 mod adding_an_arm;
 mod arms_in_the_box;
+#[cfg(feature = "fetch")]
 mod assets;
 mod changed_world;
 mod cli_verbs;
@@ -22,6 +23,7 @@ mod jog;
 mod leases;
 mod library;
 mod onto;
+mod packages;
 mod planner_attach;
 mod planner_faults;
 mod planner_run;
