@@ -1,24 +1,56 @@
-# run install check test test-fast · test-tools test-rerun · bench bench-quick jitter soak
+# run install dist check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
 
 PYTHON ?= python3
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
 
-.PHONY: run install check test test-fast test-tools test-rerun bench bench-quick jitter soak
+TARGET := $(or $(CARGO_TARGET_DIR),target)
+# Where the stripped program, its debug file and the packages go.
+SHIPPED := $(TARGET)/shipped
+# Largest program that is shipped [bytes].
+LARGEST := 12000000
+# For all users where root installs, else for this user.
+PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
+# Without objcopy the linker drops the debug information.
+STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
+
+.PHONY: run install dist shipped check test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
 
 # Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
-	cargo run --release -- run coordinator-yourarm
+	@[ -e $(TARGET)/release/dimos ] || echo "building dimos: a few minutes the first time, seconds from then on" >&2
+	cargo run --release --locked -- run coordinator-yourarm
 
-# Installs `dimos` for this user.
-install:
-	cargo install --path . --locked
+# Installs program, man pages, completions and blueprints below PREFIX; below /usr/local also the systemd unit.
+install: shipped
+	packaging/install.sh $(SHIPPED)/dimos $(PREFIX) $(DESTDIR)
+	@case ":$$PATH:" in *:$(PREFIX)/bin:*) ;; *) echo "note: $(PREFIX)/bin is not in PATH" ;; esac
+
+# Makes a tarball and a Debian package in target/shipped.
+dist: shipped
+	packaging/dist.sh $(SHIPPED)/dimos $(SHIPPED)
+
+# The optimized program without debug information, and its debug file.
+shipped:
+	@echo "building dimos as it is shipped: several minutes" >&2
+	$(STRIP) cargo build --profile dist --locked --bin dimos
+	packaging/strip.sh $(TARGET)/dist/dimos $(SHIPPED)
+	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
+	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }
 
 check:
 	cargo fmt --check
 	cargo clippy --all-targets --locked -- -D warnings
 	cargo clippy --no-default-features --locked -- -D warnings
+	@if [ -x .venv/bin/codespell ]; then .venv/bin/codespell; \
+	else echo "note: spelling is not checked; make test-tools installs codespell"; fi
+	@if cargo deny --version >/dev/null 2>&1; then $(MAKE) --no-print-directory deny; \
+	else echo "note: licences and sources of crates are not checked; cargo install --locked cargo-deny"; fi
+
+# Licences, sources and duplicates of all crates (deny.toml).
+deny:
+	cargo deny --all-features check bans licenses sources
 
 # Installs nothing: tests whose tools are missing are skipped.
 test:
@@ -57,6 +89,15 @@ test-rerun: .venv/readers-installed
 	.venv/bin/pip install -q rerun-sdk==0.41.0
 	.venv/bin/rerun analytics disable
 	DIMOS_RERUN=1 cargo test --locked --test process readers::rerun
+
+# Changes the code of the control path a little, hundreds of times, and runs the fast tests on each change: what no test
+# notices is listed, without those in tests/mutants-equivalent.txt. Hours; `make mutants MUTANTS="--file src/control/limit.rs"`
+# is one file. Wants cargo-mutants and cargo-nextest.
+mutants:
+	cargo mutants $(MUTANTS) || [ $$? -eq 2 ] || [ $$? -eq 3 ]
+	@sed '/^#/d; /^$$/d; s/  #.*//' tests/mutants-equivalent.txt >mutants.out/equivalent.txt
+	@if sed 's/:[0-9]*:[0-9]*: /: /' mutants.out/missed.txt | grep -vxF -f mutants.out/equivalent.txt; \
+	then echo "error: no test notices these changes" >&2; exit 1; fi
 
 # Compute time of a tick, cost per arm, memory, start-up, processor time; the way to the wire and back; what talking to a
 # run costs; how fast logs

@@ -10,7 +10,8 @@ use ureq::Agent;
 use ureq::http::{Response, StatusCode};
 use ureq::tls::{Certificate, RootCerts, TlsConfig};
 
-use super::{AssetError, Progress, percent_decoded};
+use super::fetch::percent_decoded;
+use super::{AssetError, Progress};
 
 /// Maximum file size [bytes].
 pub const MAX_BYTES: u64 = 4 << 30;

@@ -40,12 +40,14 @@ impl AssetError {
     }
 
     /// Creates the error of a file with another checksum.
+    #[cfg(feature = "fetch")]
     pub(super) fn other_file(url: &str, wanted: &str, found: &str) -> Self {
         let error = Self::new(format!("{url}: the SHA-256 of the file is {found}, expected {wanted}"));
         error.hint("if this is the intended file, update the checksum in the blueprint; the download was discarded")
     }
 
     /// Creates the error of an unsafe archive entry.
+    #[cfg(feature = "fetch")]
     pub(super) fn entry(name: &str, what: &str) -> Self {
         Self::new(format!("the archive is rejected: {name:?} {what}")).hint("the download was discarded")
     }

@@ -8,21 +8,23 @@
 //! two blueprints share it. Interrupted downloads resume; only one process at a time downloads an asset. Nothing can be
 //! unpacked outside the asset's folder.
 
+#[cfg(feature = "fetch")]
 mod download;
 mod error;
+#[cfg(feature = "fetch")]
+mod fetch;
+#[cfg(feature = "fetch")]
 mod unpack;
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod without_fetch;
 
-use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-
-use percent_encoding::percent_decode_str;
-use sha2::{Digest, Sha256};
 
 pub use error::AssetError;
 
@@ -124,45 +126,19 @@ impl Cache {
     }
 
     fn fetch_now(&self, asset: &Asset, progress: &mut dyn Progress) -> Result<PathBuf, AssetError> {
-        let (folder, sum) = (self.folder(&asset.sha256), asset.sha256.to_ascii_lowercase());
-        if sum.len() != 64 || !sum.bytes().all(|b| b.is_ascii_hexdigit()) {
+        if asset.sha256.len() != 64 || !asset.sha256.bytes().all(|b| b.is_ascii_hexdigit()) {
             return Err(AssetError::new("the SHA-256 does not have 64 hexadecimal digits"));
         }
-        if folder.is_dir() {
-            return Ok(folder);
-        }
-        fs::create_dir_all(&self.0).map_err(|e| AssetError::io(&self.0, &e))?;
-        let _lock = self.lock(&asset.sha256, progress)?;
-        if folder.is_dir() {
-            return Ok(folder);
-        }
-        let part = self.file(&asset.sha256, ".part");
-        let resumed = part.exists();
-        download::download(&asset.url, &part, progress)?;
-        let found = sum_of(&part)?;
-        if found != sum {
-            fs::remove_file(&part).map_err(|e| AssetError::io(&part, &e))?;
-            if resumed {
-                // The address may now return another file than when the download began.
-                progress.note("an earlier partial download does not match: downloading from scratch");
-                download::download(&asset.url, &part, progress)?;
-            }
-            if !resumed || sum_of(&part)? != sum {
-                let _ = fs::remove_file(&part);
-                return Err(AssetError::other_file(&asset.url, &sum, &found));
-            }
-        }
-        let fresh = self.file(&asset.sha256, ".new");
-        let _ = fs::remove_dir_all(&fresh);
-        let unpacked = unpack::unpack(&part, &file_name(&asset.url), &fresh);
-        if let Err(error) = unpacked {
-            let _ = fs::remove_dir_all(&fresh);
-            let _ = fs::remove_file(&part);
-            return Err(error);
-        }
-        fs::rename(&fresh, &folder).map_err(|e| AssetError::io(&folder, &e))?;
-        let _ = fs::remove_file(&part);
-        Ok(folder)
+        let folder = self.folder(&asset.sha256);
+        if folder.is_dir() { Ok(folder) } else { self.fetch_missing(asset, progress) }
+    }
+
+    #[cfg(not(feature = "fetch"))]
+    fn fetch_missing(&self, asset: &Asset, _: &mut dyn Progress) -> Result<PathBuf, AssetError> {
+        let folder = self.folder(&asset.sha256);
+        let error = AssetError::new("not in the cache, and this program was built without asset download");
+        let build = "build it with the feature `fetch` (on by default)";
+        Err(error.hint(format!("{build}, or unpack the file into {}", folder.display())))
     }
 
     /// Removes an asset and its partial download; returns whether there was anything. Waits for a process that is
@@ -212,20 +188,6 @@ impl Cache {
     }
 }
 
-fn sum_of(path: &Path) -> Result<String, AssetError> {
-    let sum = || -> io::Result<String> {
-        let (mut file, mut sum, mut room) = (File::open(path)?, Sha256::new(), vec![0; 1 << 16]);
-        loop {
-            match file.read(&mut room)? {
-                0 => break,
-                n => sum.update(room.get(..n).unwrap_or_default()),
-            }
-        }
-        Ok(sum.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
-    };
-    sum().map_err(|e| AssetError::io(path, &e))
-}
-
 fn size_of(folder: &Path) -> u64 {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     entries
@@ -235,20 +197,4 @@ fn size_of(folder: &Path) -> u64 {
             Err(_) => 0,
         })
         .sum()
-}
-
-/// Returns the name of a plain file: the last part of its address.
-fn file_name(url: &str) -> String {
-    let path = url.split(['?', '#']).next().unwrap_or_default();
-    let last = path.rsplit('/').next().unwrap_or_default();
-    let name = percent_decoded(last);
-    match Path::new(&name).file_name() {
-        Some(plain) if plain == OsStr::new(&name) && !name.contains('\0') => name,
-        _ => "file".to_owned(),
-    }
-}
-
-/// Decodes `%20` in an address's path.
-fn percent_decoded(text: &str) -> String {
-    percent_decode_str(text).decode_utf8().map_or_else(|_| text.to_owned(), Into::into)
 }

@@ -1,6 +1,10 @@
+#![cfg(feature = "fetch")]
+
 use std::io::Write;
 use std::path::Path;
 use std::sync::Barrier;
+
+use sha2::{Digest, Sha256};
 
 use super::*;
 

@@ -2,7 +2,6 @@
 
 use std::io::{self, Write};
 
-use clap::CommandFactory;
 use clap_complete::Shell;
 
 use super::exit::{Exit, Result};
@@ -21,7 +20,7 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let mut text = Vec::new();
-    clap_complete::generate(args.shell, &mut super::Cli::command(), "dimos", &mut text);
+    clap_complete::generate(args.shell, &mut super::command(), "dimos", &mut text);
     // A closed pipe is not an error.
     let _ = io::stdout().lock().write_all(&text);
     Ok(Exit::Ok)

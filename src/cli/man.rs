@@ -4,7 +4,6 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::CommandFactory;
 
 use super::exit::{Exit, Result};
 use super::output;
@@ -22,7 +21,7 @@ pub struct Args {
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
-    let command = super::Cli::command();
+    let command = super::command();
     let Some(dir) = &args.dir else {
         let mut page = Vec::new();
         let rendered = clap_mangen::Man::new(command).render(&mut page);

@@ -43,7 +43,7 @@ pub mod world;
 use std::ffi::OsString;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 
 use crate::blueprint::{self, Catalog};
 use crate::control::task_spec::{TaskSpec, TaskTable};
@@ -190,6 +190,11 @@ impl Program {
     }
 }
 
+/// The command line: verbs, options, help texts. For man pages, completions and tests.
+pub fn command() -> clap::Command {
+    Cli::command()
+}
+
 /// Runs the command line with more adapters than those in the box. [`Program`] can add more than that.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
     command_line(Catalog::from(&Registry::with(adapters)))
@@ -243,8 +248,6 @@ fn spelled_out(argument: OsString) -> OsString {
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory;
-
     use super::*;
 
     /// Stands in for the program, to read the arguments of one verb.

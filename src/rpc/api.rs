@@ -6,6 +6,7 @@ use std::future::Future;
 use std::pin::Pin;
 use std::sync::Arc;
 
+use schemars::{JsonSchema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -19,6 +20,7 @@ pub use super::motion_api::*;
 pub use super::planner_api::*;
 use super::planner_line::PlannerLine;
 use super::report::{MotionReport, StateReport, StatusReport};
+use super::schema::MethodSchema;
 use super::streams::Streams;
 
 /// Longest request line, newline included [bytes].
@@ -60,11 +62,11 @@ pub trait Backend: Send + Sync + 'static {
 }
 
 /// The parameters of a method, which know the method's name and reply.
-pub trait Method: Serialize + DeserializeOwned {
+pub trait Method: Serialize + DeserializeOwned + JsonSchema {
     /// The method's name.
     const NAME: &'static str;
     /// What comes back.
-    type Reply: Serialize + DeserializeOwned;
+    type Reply: Serialize + DeserializeOwned + JsonSchema;
     /// Says what is wrong with the values, in a sentence without full stop.
     fn check(&self) -> Result<(), String> {
         Ok(())
@@ -94,6 +96,11 @@ macro_rules! methods {
         /// Names of all methods, those that the connection itself answers at the end.
         pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe", "lease", "release",
             "register_planner", "planner_answer"];
+
+        /// Name, parameters and reply of each method in the table.
+        pub(super) fn method_schemas(generator: &mut SchemaGenerator) -> Vec<MethodSchema> {
+            vec![$(MethodSchema::of::<$variant>(generator),)*]
+        }
 
         impl Reply {
             /// Reads what came back from a method.
@@ -209,22 +216,22 @@ pub(super) fn read_params<M: Method>(params: Value) -> Result<M, RpcError> {
 }
 
 /// Parameters of `status`: none.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Status {}
 
 /// Parameters of `state`: none.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct State {}
 
 /// Parameters of `shutdown`: none.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Shutdown {}
 
 /// Done; nothing to tell.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Done {}
 
 /// JSON has no infinities, but callers in this process do.

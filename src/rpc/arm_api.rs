@@ -2,12 +2,13 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{Method, finite};
 
 /// Parameters of `stop`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Stop {
     /// Stops this arm only; without it, all.
@@ -16,14 +17,14 @@ pub struct Stop {
 }
 
 /// What `stop` achieved, per arm.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct StopReply {
     /// Confirmation per arm.
     pub arms: BTreeMap<String, Confirmation>,
 }
 
 /// How far a stop is known to have reached the arm.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Confirmation {
     /// The device answered that it stops.
@@ -46,7 +47,7 @@ impl Confirmation {
 }
 
 /// Parameters of `arm_reset`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ArmReset {
     /// The arm's `hardware_id`.
@@ -54,7 +55,7 @@ pub struct ArmReset {
 }
 
 /// Parameters of `arm_enable`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ArmEnable {
     /// The arm's `hardware_id`.
@@ -62,7 +63,7 @@ pub struct ArmEnable {
 }
 
 /// Parameters of `arm_disable`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ArmDisable {
     /// The arm's `hardware_id`.
@@ -73,7 +74,7 @@ pub struct ArmDisable {
 }
 
 /// An arm after `arm_reset`, `arm_enable` or `arm_disable`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ArmReply {
     /// The arm's `hardware_id`.
     pub arm: String,
@@ -85,7 +86,7 @@ pub struct ArmReply {
 }
 
 /// Parameters of `lease`: takes the right to move one arm, or all, for this connection.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Lease {
     /// This arm only; without it, all.
@@ -94,7 +95,7 @@ pub struct Lease {
 }
 
 /// Parameters of `release`: gives back what this connection took.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Release {
     /// This arm only; without it, all.
@@ -103,7 +104,7 @@ pub struct Release {
 }
 
 /// Reply to `lease` and `release`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct LeaseReply {
     /// The arms that were taken, or given back.
     pub arms: Vec<String>,
@@ -120,7 +121,7 @@ impl Method for Release {
 }
 
 /// Parameters of `gripper`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Gripper {
     /// The arm's `hardware_id`.

@@ -4,6 +4,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -17,7 +18,7 @@ pub const PLANNER_REQUESTS: &str = "planner_requests";
 pub const MAX_ANSWER: usize = 16 << 20;
 
 /// Parameters of `register_planner`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RegisterPlanner {
     /// What the planner is called, in `status`.
@@ -27,7 +28,7 @@ pub struct RegisterPlanner {
 }
 
 /// A robot of a planner that registers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RegisteredRobot {
     /// Its name in the planner.
@@ -40,7 +41,7 @@ pub struct RegisteredRobot {
 }
 
 /// Reply to `register_planner`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Registered {
     /// The run.
     pub run: String,
@@ -49,7 +50,7 @@ pub struct Registered {
 }
 
 /// How far and how fast a joint may be commanded.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CommandLimits {
     /// Lowest and highest position [rad]: the arm's own limits, narrowed by the blueprint, 0.01 rad inside.
     pub position: [f64; 2],
@@ -62,7 +63,7 @@ pub struct CommandLimits {
 }
 
 /// What a run asks its planner: `data` of a message of the stream `planner_requests`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PlannerRequest {
     /// Its number, for the answer.
     pub request: u64,
@@ -77,7 +78,7 @@ pub struct PlannerRequest {
 }
 
 /// What a planner needs to know of the run at the moment of a request.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Moment {
     /// The number of the plan that begins now.
     pub plan: u64,
@@ -90,7 +91,7 @@ pub struct Moment {
 }
 
 /// Parameters of `planner_answer`: one of `result` and `error`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlannerAnswer {
     /// Number of the request.
@@ -107,7 +108,7 @@ pub struct PlannerAnswer {
 pub const RECHECK: &str = "recheck";
 
 /// Parameters of `recheck`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Recheck {
     /// The plan that is being carried out.
@@ -117,7 +118,7 @@ pub struct Recheck {
 }
 
 /// Reply to `recheck`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RecheckReply {
     /// What is in the way of the rest of the motion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -125,7 +126,7 @@ pub struct RecheckReply {
 }
 
 /// What is in the way of a motion.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BlockedReport {
     /// Up to here the motion keeps its distance [s since its start].
     pub free_until: f64,
@@ -134,7 +135,7 @@ pub struct BlockedReport {
 }
 
 /// A plan that is still free, for the coordinator to execute.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ReleasedPlan {
     /// The plan's number.
     pub plan: u64,

@@ -1,12 +1,13 @@
 //! Parameters of the methods that stream targets of an end effector.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::finite;
 use super::planner_api::PoseSpec;
 
 /// Parameters of `twist`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Twist {
     /// The `eef_twist` task's name.
@@ -21,7 +22,7 @@ pub struct Twist {
 }
 
 /// Whose axes the parts of a twist are along.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TwistFrame {
     /// Those of the robot's base.
@@ -39,7 +40,7 @@ impl Twist {
 }
 
 /// Parameters of `pose`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Pose {
     /// The `cartesian_ik` task's name.

@@ -1,5 +1,6 @@
 //! How a request is refused: a code for programs, a sentence and a hint for people.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -7,7 +8,7 @@ use crate::telemetry::Outcome;
 use crate::yaml::{did_you_mean, quote};
 
 /// What went wrong, for programs. In JSON: `START_STATE_MISMATCH`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum Code {
     /// The line is not a JSON object with `id`, `method`, `params`.
@@ -114,7 +115,7 @@ impl Code {
 }
 
 /// A refused request.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, thiserror::Error)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, thiserror::Error)]
 #[error("{message}")]
 pub struct RpcError {
     /// What went wrong, for programs.

@@ -27,6 +27,7 @@ mod planner_api;
 pub mod planner_end;
 pub mod planner_line;
 pub mod report;
+pub mod schema;
 mod seats;
 pub mod server;
 pub mod streams;

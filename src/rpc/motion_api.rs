@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
@@ -9,7 +10,7 @@ use crate::joint::MAX_DOF;
 use crate::trajectory::MAX_DURATION;
 
 /// Parameters of `move`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Move {
     /// The arm's `hardware_id`.
@@ -39,7 +40,7 @@ impl Move {
 }
 
 /// A motion that began with `move`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MoveReply {
     /// The motion's number, for `motion`.
     pub motion: u64,
@@ -56,7 +57,7 @@ pub struct MoveReply {
 }
 
 /// Parameters of `execute`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Execute {
     /// What to follow.
@@ -67,7 +68,7 @@ pub struct Execute {
 }
 
 /// A trajectory as it travels: ROS names and meaning.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Trajectory {
     /// The joints, in the order of every point's values.
@@ -77,7 +78,7 @@ pub struct Trajectory {
 }
 
 /// A point of a trajectory.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Point {
     /// Time since the trajectory's start [s].
@@ -122,7 +123,7 @@ impl Execute {
 }
 
 /// A motion that began with `execute`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ExecuteReply {
     /// The motion's number, for `motion`.
     pub motion: u64,
@@ -133,7 +134,7 @@ pub struct ExecuteReply {
 }
 
 /// Parameters of `motion`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Motion {
     /// The motion's number.
@@ -141,7 +142,7 @@ pub struct Motion {
 }
 
 /// Parameters of `cancel`: without any, every motion ends.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Cancel {
     /// Ends the motions that move this arm.
@@ -153,7 +154,7 @@ pub struct Cancel {
 }
 
 /// What `cancel` did, per task.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CancelReply {
     /// The status word of each task asked: `CANCELLED` or `ALREADY_STOPPED`.
     pub tasks: BTreeMap<String, String>,
@@ -163,7 +164,7 @@ pub struct CancelReply {
 }
 
 /// Parameters of `servo`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Servo {
     /// The servo task's name.
@@ -179,7 +180,7 @@ impl Servo {
 }
 
 /// Parameters of `velocity`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Velocity {
     /// The velocity task's name.

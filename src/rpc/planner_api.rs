@@ -4,13 +4,14 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::api::{MIN_SPEED, finite};
 use super::motion_api::{DEFAULT_SPEED, Trajectory};
 
 /// A pose in the frame `map`.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PoseSpec {
     /// x, y, z [m].
@@ -41,7 +42,7 @@ impl PoseSpec {
 }
 
 /// Where one robot shall go: exactly one of `joints`, `pose`, `named`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
     /// The robot's name in the planner.
@@ -61,7 +62,7 @@ pub struct PlanGoal {
 }
 
 /// Parameters of `plan`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
     /// Where the robots shall go, one entry each. The others stay where they are.
@@ -114,14 +115,14 @@ impl Plan {
 }
 
 /// Planning that began.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct PlanReply {
     /// The plan's number, for `planning`, `preview` and `execute_plan`.
     pub plan: u64,
 }
 
 /// Parameters of `planning`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Planning {
     /// The plan's number.
@@ -129,7 +130,7 @@ pub struct Planning {
 }
 
 /// How planning goes, or what came of it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PlanningReport {
     /// The plan's number.
     pub plan: u64,
@@ -149,7 +150,7 @@ pub struct PlanningReport {
 }
 
 /// A plan in figures.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PlanSummary {
     /// The coordinator's joints that it moves.
     pub joints: Vec<String>,
@@ -185,7 +186,7 @@ pub struct PlanSummary {
 }
 
 /// A pair that does not keep the padding, near the start or the goal, where it is closer itself.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PaddingGivenUp {
     /// `start`, `goal`, or `everywhere`: the two are closer in every pose.
     pub near: String,
@@ -198,7 +199,7 @@ pub struct PaddingGivenUp {
 }
 
 /// Parameters of `preview`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Preview {
     /// The plan's number; without it the newest plan.
@@ -207,7 +208,7 @@ pub struct Preview {
 }
 
 /// A plan in full.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PreviewReply {
     /// The plan's number.
     pub plan: u64,
@@ -220,7 +221,7 @@ pub struct PreviewReply {
 }
 
 /// Parameters of `execute_plan`.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
     /// The plan's number; without it the newest plan.
@@ -259,12 +260,12 @@ impl PartialEq for Presence {
 impl Eq for Presence {}
 
 /// Parameters of `planner`: none.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Planner {}
 
 /// What the planner is and does.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PlannerReport {
     /// `IDLE`, `PLANNING`, `EXECUTING`, `COMPLETED`, `FAULT`.
     pub state: String,
@@ -281,7 +282,7 @@ pub struct PlannerReport {
 }
 
 /// A robot that is planned for.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RobotReport {
     /// Its name.
     pub name: String,
@@ -299,7 +300,7 @@ pub struct RobotReport {
 }
 
 /// Shape of an obstacle. Every shape's frame is at its middle; a cylinder stands along z.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum ShapeSpec {
     /// Edge lengths x, y, z [m].
@@ -331,7 +332,7 @@ impl ShapeSpec {
 }
 
 /// An object of the world.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldObject {
     /// Its name.
@@ -350,7 +351,7 @@ pub struct WorldObject {
 }
 
 /// Parameters of `world_add`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
 pub struct WorldAdd(pub WorldObject);
 
@@ -369,7 +370,7 @@ impl WorldAdd {
 }
 
 /// An object as it stands under its name, in a blueprint's `planner.world` and in files.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldEntry {
     /// What it is.
@@ -390,19 +391,19 @@ impl WorldEntry {
 }
 
 /// Parameters of `world`: none.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct World {}
 
 /// The world that is planned in.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct WorldReport {
     /// Its objects, by name.
     pub objects: Vec<WorldObject>,
 }
 
 /// Parameters of `world_move`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldMove {
     /// The object's name.
@@ -418,7 +419,7 @@ impl WorldMove {
 }
 
 /// Parameters of `world_remove`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldRemove {
     /// The object's name; without it, all objects go.
@@ -427,7 +428,7 @@ pub struct WorldRemove {
 }
 
 /// Parameters of `attach`: from now on the robot holds the object where it is.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Attach {
     /// The object's name.
@@ -443,7 +444,7 @@ pub struct Attach {
 }
 
 /// Parameters of `detach`: the object stays where it is.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Detach {
     /// The object's name.

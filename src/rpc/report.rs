@@ -3,10 +3,11 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Reply to `status`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct StatusReport {
     /// Name of the run.
     pub run: String,
@@ -42,7 +43,7 @@ pub struct StatusReport {
 }
 
 /// The planner in `status`.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PlannerStatus {
     /// `IDLE`, `PLANNING`, `EXECUTING`, `COMPLETED`, `FAULT`.
     pub state: String,
@@ -55,7 +56,7 @@ pub struct PlannerStatus {
 }
 
 /// A planner in a process of its own.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct AttachedReport {
     /// What it is called.
     pub name: String,
@@ -64,7 +65,7 @@ pub struct AttachedReport {
 }
 
 /// One real-time measure.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RealtimeReport {
     /// What was asked: `SCHED_FIFO 80 for the tick`.
     pub what: String,
@@ -75,7 +76,7 @@ pub struct RealtimeReport {
 }
 
 /// Timing of the tick since the run's start.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct TickReport {
     /// Ticks done.
     pub count: u64,
@@ -90,7 +91,7 @@ pub struct TickReport {
 }
 
 /// A distribution.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Percentiles {
     /// Half of all values are below.
     pub p50: f64,
@@ -103,7 +104,7 @@ pub struct Percentiles {
 }
 
 /// The recorder.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RecorderReport {
     /// Messages written.
     pub messages: u64,
@@ -114,7 +115,7 @@ pub struct RecorderReport {
 }
 
 /// One arm in `status`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct ArmReport {
     /// Its name in the blueprint.
     pub hardware_id: String,
@@ -168,7 +169,7 @@ pub struct ArmReport {
 }
 
 /// Who commands an arm.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CommanderReport {
     /// Its process; absent where the system does not tell.
     pub pid: Option<i32>,
@@ -179,7 +180,7 @@ pub struct CommanderReport {
 }
 
 /// Why an arm is held.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CauseReport {
     /// For programs: `operator_stop`.
     pub name: String,
@@ -197,7 +198,7 @@ pub struct DeviceState {
 }
 
 /// A device's own error.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct DeviceError {
     /// The device's code.
     pub code: i32,
@@ -206,7 +207,7 @@ pub struct DeviceError {
 }
 
 /// An episode of trouble with an arm.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct FaultReport {
     /// How long ago it began [s].
     pub since: f64,
@@ -219,7 +220,7 @@ pub struct FaultReport {
 }
 
 /// One task in `status`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct TaskReport {
     /// Its name.
     pub name: String,
@@ -254,7 +255,7 @@ impl TaskReport {
 }
 
 /// Reply to `state`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct StateReport {
     /// Index of the tick.
     pub tick: u64,
@@ -265,7 +266,7 @@ pub struct StateReport {
 }
 
 /// One arm in `state`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct ArmStateReport {
     /// Its name in the blueprint.
     pub hardware_id: String,
@@ -284,7 +285,7 @@ pub struct ArmStateReport {
 }
 
 /// One joint in `state`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct JointReport {
     /// Its name.
     pub name: String,
@@ -301,7 +302,7 @@ pub struct JointReport {
 }
 
 /// An end-effector pose in the arm's base frame.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PoseReport {
     /// x, y, z [m].
     pub xyz: [f64; 3],
@@ -310,7 +311,7 @@ pub struct PoseReport {
 }
 
 /// Reply to `motion`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct MotionReport {
     /// The motion's number.
     pub motion: u64,
@@ -339,7 +340,7 @@ pub struct MotionReport {
 }
 
 /// How far off a joint ended.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Deviation {
     /// The joint.
     pub joint: String,

@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
@@ -18,7 +19,7 @@ const EVENTS_KEPT: usize = 1024;
 
 named! {
     /// The streams of a run.
-    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+    #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
     #[serde(rename_all = "snake_case")]
     pub enum Stream {
         /// One [`JointState`] per tick.
@@ -29,7 +30,7 @@ named! {
 }
 
 /// Parameters of `subscribe`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Subscribe {
     /// Which stream.
@@ -40,14 +41,14 @@ pub struct Subscribe {
 }
 
 /// Reply to `subscribe`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SubscribeReply {
     /// The subscription's number on this connection.
     pub subscription: u64,
 }
 
 /// Parameters of `unsubscribe`.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Unsubscribe {
     /// The subscription's number.
@@ -74,7 +75,7 @@ impl Method for Unsubscribe {
 }
 
 /// The joints of all arms after a tick: the guide's `coordinator_joint_state`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct JointState {
     /// Index of the tick.
     pub tick: u64,
@@ -93,7 +94,7 @@ pub struct JointState {
 }
 
 /// Something that happened.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct EventReport {
     /// Index of the tick in which it happened.
     pub tick: u64,
@@ -118,7 +119,7 @@ pub struct EventReport {
 }
 
 /// How much an event matters.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Level {
     /// The ordinary course of things.

@@ -35,6 +35,7 @@ mod planning;
 mod planning_timing;
 mod robot_models;
 mod rpc;
+mod surface;
 mod task_conformance;
 mod templates;
 mod verify;

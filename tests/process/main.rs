@@ -11,6 +11,7 @@ mod adapter_new;
 mod adapter_test;
 mod adding_an_arm;
 mod arms_in_the_box;
+#[cfg(feature = "fetch")]
 mod assets;
 mod changed_world;
 mod cli_verbs;
@@ -24,6 +25,7 @@ mod leases;
 mod library;
 mod onto;
 mod orders;
+mod packages;
 mod planner_attach;
 mod planner_faults;
 mod planner_run;

@@ -57,6 +57,46 @@ fn the_example_follows_its_policy() {
     assert!(ended.with(0).out.contains(" targets in 1."), "it says how it kept its time");
 }
 
+const PAGE: &str = include_str!("../../docs/python.md");
+
+/// The blocks of a language on the page.
+fn blocks(language: &str) -> Vec<&'static str> {
+    let begin = format!("\n```{language}\n");
+    PAGE.split(begin.as_str()).skip(1).map(|rest| rest.split("\n```").next().unwrap()).collect()
+}
+
+#[test]
+fn every_example_of_the_page_runs() {
+    let home = Home::new();
+    let [blueprint] = blocks("yaml")[..] else { panic!("one blueprint") };
+    home.write("streams.yaml", blueprint);
+    let _run = home.run("streams.yaml --no-record");
+    let examples = blocks("python");
+    assert!(examples.len() >= 6, "{}", examples.len());
+    for example in examples {
+        let Some(ended) = python(&home, &["-c", example]) else { return };
+        assert!(!ended.with(0).err.contains("Traceback"), "{example}");
+    }
+}
+
+/// A method that is added is added to the page too.
+#[test]
+fn the_page_names_every_public_method_and_class() {
+    let client = std::fs::read_to_string(file("assets/python/dimos_client.py")).unwrap();
+    let mut named = 0;
+    for line in client.lines() {
+        let line = line.trim_start();
+        let Some(rest) = line.strip_prefix("def ").or_else(|| line.strip_prefix("class ")) else { continue };
+        let name = rest.split(['(', ':']).next().unwrap();
+        if !name.starts_with('_') {
+            named += 1;
+            let shown = [format!("`{name}"), format!("{name}("), format!(".{name}")];
+            assert!(shown.iter().any(|form| PAGE.contains(form.as_str())), "{name} is not on docs/python.md");
+        }
+    }
+    assert!(named > 25, "{named}");
+}
+
 #[test]
 fn the_files_are_python_3_9_of_bounded_length() {
     let home = Home::new();

@@ -178,6 +178,13 @@ fn completions_and_manual_know_the_verbs() {
 }
 
 #[test]
+fn schemas_are_printed() {
+    let home = Home::new();
+    assert!(home.dimos("schema").with(0).json()["properties"]["hardware"].is_object());
+    assert!(home.dimos("schema --rpc").with(0).json()["methods"]["move"]["params"].is_object());
+}
+
+#[test]
 fn the_doctor_finds_what_prevents_a_run() {
     let home = Home::new();
     let findings = home.dimos("doctor --json").with(0).json();
