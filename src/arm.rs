@@ -1,5 +1,5 @@
-//! What crosses between an arm's device thread and the tick: the latest state one way, the latest command the
-//! other. Plain data of fixed size, so that neither side ever allocates or waits.
+//! Data between an arm's device thread and the tick: the latest state one way, the latest command the other. Plain
+//! data of fixed size, so that neither side ever allocates or waits.
 
 use std::time::Duration;
 
@@ -12,13 +12,13 @@ use crate::named::named;
 /// Figures with which an arm's measurements and its motion are checked: the adapter's row, overridden by the blueprint.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Supervision {
-    /// How far a joint at rest may be from its set point under load [rad].
+    /// Largest distance of a joint at rest from its setpoint under load [rad].
     pub accuracy: f64,
-    /// Time from a set point to the measured motion that follows it [s].
+    /// Time from a setpoint to the measured motion that follows it [s].
     pub lag: f64,
     /// Age limit of a state.
     pub stale_after: Duration,
-    /// Largest distance of a joint from its set points of the last `lag` seconds [rad].
+    /// Largest distance of a joint from its setpoints of the last `lag` seconds [rad].
     pub tracking_tolerance: f64,
     /// Whether a pose with every joint at exactly zero is believed without the device's confirmation.
     pub accept_zero_pose: bool,
@@ -28,7 +28,7 @@ impl Supervision {
     /// Default of `tracking_tolerance` [rad].
     pub const TRACKING_TOLERANCE: f64 = 0.15;
 
-    /// How far the first set point after enabling may be from the measured position [rad].
+    /// Returns the largest distance of the first setpoint after enabling from the measured position [rad].
     pub fn seed_tolerance(&self) -> f64 {
         self.accuracy.max(0.005)
     }
@@ -81,7 +81,7 @@ named! {
     /// How the device thread's connection to the arm is doing.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
     pub enum Link {
-        /// Not connected, or not any more.
+        /// Not connected.
         #[default]
         Down = "down",
         /// Connected; states arrive.
@@ -133,7 +133,7 @@ pub struct ArmState {
     pub error: i32,
     /// State of the connection.
     pub link: Link,
-    /// The device thread saw no heartbeat of the tick and held the arm by itself.
+    /// The device thread saw no heartbeat of the tick and held the arm on its own.
     pub self_held: bool,
     /// `ArmCommand::seq` of the newest command that was written to the wire.
     pub written: u64,
@@ -173,7 +173,7 @@ impl Default for ArmState {
 pub struct ArmCommand {
     /// Counts the commands of this arm; 0 = none yet.
     pub seq: u64,
-    /// `None` leaves the arm alone (not enabled, not known, handed over); otherwise how to read `values`.
+    /// `None` leaves the arm alone (not enabled, not known, released); otherwise how to read `values`.
     pub mode: Option<ControlMode>,
     /// Joint positions [rad] or velocities [rad/s], by `mode`.
     pub values: Joints,
@@ -187,7 +187,7 @@ pub struct ArmCommand {
     pub next_tick: Mono,
     /// The tick's time of this command.
     pub at: Mono,
-    /// Counts the starts of commanded motion: after enabling and after a change of mode. The first set point of each is
+    /// Counts the starts of commanded motion: after enabling and after a change of mode. The first setpoint of each is
     /// compared with the measured pose before it is written.
     pub start_seq: u32,
 }

@@ -9,7 +9,7 @@ use std::time::Duration;
 pub struct Mono(pub u64);
 
 impl Mono {
-    /// The earliest point in time; also stands for "never".
+    /// The earliest point in time; also means "never".
     pub const ZERO: Mono = Mono(0);
 
     /// Time since `earlier` [s]; negative when `earlier` is in fact later.
@@ -50,7 +50,7 @@ impl Clock for MonotonicClock {
     }
 }
 
-/// A clock that stands still until it is told to move. Clones share their time.
+/// A clock that advances only when it is set. Clones share their time.
 #[derive(Debug, Clone, Default)]
 pub struct VirtualClock(Arc<AtomicU64>);
 

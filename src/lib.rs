@@ -15,7 +15,7 @@
 //! A module may use only those above it in this list; `tests/logic/layering.rs` checks that.
 //!
 //! As a library: [`runtime::Run`] builds a run from a blueprint, [`hardware::registry`] makes adapters,
-//! [`hardware::spec::ManipulatorAdapter`] is what a new arm implements, [`testing`] stands in for one in unit tests,
+//! [`hardware::spec::ManipulatorAdapter`] is what a new arm implements, [`testing`] has a mock for unit tests,
 //! [`cli::main_with`] is the whole program with more arms. `docs/library.md` shows each.
 //!
 //! ```
@@ -27,7 +27,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-#![allow(rustdoc::broken_intra_doc_links, reason = "units stand in brackets: [rad]")]
+#![allow(rustdoc::broken_intra_doc_links, reason = "units are in brackets: [rad]")]
 
 /// Version of this program, with the commit it was built from where that is known.
 pub const VERSION: &str = env!("DIMOS_VERSION");

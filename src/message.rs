@@ -1,12 +1,12 @@
-//! What went wrong, and what to do about it. Errors of adapters and readers travel as text, the hint in a line of its
-//! own; this is the one place that writes and reads that line.
+//! A message: what went wrong, and what to do about it. Errors of adapters and readers are text with the hint in a
+//! separate line; only this module writes and reads that line.
 
 use std::fmt;
 
-/// Between what went wrong and the hint, in text.
+/// Separates what went wrong from the hint.
 const HINT: &str = "\nhint: ";
 
-/// A sentence without full stop, and a hint where there is one.
+/// A sentence without full stop, with an optional hint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Message {
     /// What went wrong and where.
@@ -16,12 +16,12 @@ pub struct Message {
 }
 
 impl Message {
-    /// Reads the text of an error.
+    /// Returns the message in the text of an error.
     pub fn of(error: impl fmt::Display) -> Self {
         error.to_string().into()
     }
 
-    /// What went wrong, and the hint or else a general one.
+    /// Returns what went wrong, and the hint or else the given one.
     pub fn or_hint(self, general: impl Into<String>) -> (String, String) {
         (self.what, self.hint.unwrap_or_else(|| general.into()))
     }

@@ -1,4 +1,4 @@
-//! Enums whose variants have names, in tables, rpc and logs.
+//! Enums whose variants have names in tables, rpc and logs.
 
 /// Defines an enum from rows `variant = name`, with `ALL`, `name` and `of_name`.
 macro_rules! named {
@@ -9,15 +9,15 @@ macro_rules! named {
         pub enum $enum { $($(#[$variant_meta])* $variant,)* }
 
         impl $enum {
-            /// All of them.
+            /// All variants.
             pub const ALL: &[Self] = &[$(Self::$variant),*];
 
-            /// The name used in tables, rpc and logs.
+            /// Returns the name used in tables, rpc and logs.
             pub const fn name(self) -> &'static str {
                 match self { $(Self::$variant => $name,)* }
             }
 
-            /// The one of that name.
+            /// Returns the variant with that name.
             pub fn of_name(name: &str) -> Option<Self> {
                 Self::ALL.iter().copied().find(|one| one.name() == name)
             }
@@ -30,12 +30,12 @@ pub(crate) use named;
 #[cfg(test)]
 mod tests {
     named! {
-        /// For this test.
+        /// Example of a test.
         #[derive(Debug, Clone, Copy, PartialEq)]
         pub enum Colour {
-            /// Like blood.
+            /// Red.
             Red = "red",
-            /// None.
+            /// Without colour.
             Clear = "",
         }
     }

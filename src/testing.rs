@@ -1,5 +1,4 @@
-//! For the unit tests of programs that use this crate: an adapter that answers what it is told to and remembers
-//! what it was asked.
+//! For the unit tests of programs that use this crate: a mock adapter with scripted answers that records its calls.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -209,7 +208,7 @@ impl MockAdapter {
         lock(&self.0)
     }
 
-    /// Records a call and fails if it was told to.
+    /// Records a call; fails if the script says so.
     fn called(&self, call: Call) -> AdapterResult<MutexGuard<'_, Shared>> {
         let mut shared = self.lock();
         let name = call.name();

@@ -29,17 +29,17 @@ pub enum Exit {
 }
 
 impl Exit {
-    /// What readers of logs end with when a log is cut, or data is missing in it.
+    /// Exit code of log readers when a log is cut or data is missing.
     pub const DATA_LOST: Self = Self::Hardware;
 
-    /// All of them, with what they mean.
+    /// All exit codes with their meaning.
     pub const ALL: &[(Self, &str)] = &[
         (Self::Ok, "done"),
         (Self::Failed, "failed, refused, or not confirmed"),
         (Self::Usage, "the command line, a blueprint, a model or a file is wrong"),
         (Self::Hardware, "hardware unreachable; replay: the log is cut or has lost data"),
         (Self::Fault, "a run ended by a fault"),
-        (Self::Log, "a run ended because its log could not go on"),
+        (Self::Log, "a run ended because its log could not be written"),
         (Self::Interrupted, "ended by SIGINT, after the controlled stop"),
         (Self::Terminated, "ended by SIGTERM, after the controlled stop"),
     ];
@@ -76,7 +76,7 @@ impl Failure {
         Self { exit, what: what.into(), hint: None }
     }
 
-    /// An error's text as a failure: it may end with a hint.
+    /// Creates a failure from the text of an error, which may end with a hint.
     pub fn of(exit: Exit, error: impl Display) -> Self {
         let Message { what, hint } = Message::of(error);
         Self { exit, what, hint }
@@ -94,7 +94,7 @@ impl Failure {
     }
 }
 
-/// At the program's edge an error of the system is told with its context: `FILE: permission denied`.
+/// At the program's edge an error of the system is shown with its context: `FILE: permission denied`.
 impl From<anyhow::Error> for Failure {
     fn from(error: anyhow::Error) -> Self {
         error.downcast().unwrap_or_else(|error| Self::of(Exit::Failed, format_args!("{error:#}")))
@@ -140,8 +140,8 @@ mod tests {
     #[test]
     fn an_error_of_the_system_has_its_context_and_a_failure_stays_what_it_is() {
         let denied = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
-        let told: Failure = Err::<(), _>(denied()).context("plan.json").unwrap_err().into();
-        assert_eq!(told, Failure::new(Exit::Failed, "plan.json: permission denied"));
+        let failure: Failure = Err::<(), _>(denied()).context("plan.json").unwrap_err().into();
+        assert_eq!(failure, Failure::new(Exit::Failed, "plan.json: permission denied"));
         let usage = Failure::usage("no such arm").hint("there is `left`");
         assert_eq!(Failure::from(anyhow::Error::from(usage.clone())), usage);
     }

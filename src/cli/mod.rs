@@ -98,17 +98,17 @@ enum Command {
     Jog(jog::Args),
     /// List tasks, ask something of one, or stream targets to it
     Task(task::Args),
-    /// End a run, controlled: decelerate, release the arms, close the log
+    /// Shut down a run: decelerate, release the arms, close the log
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
-    /// Bring your own arm: write the start of its adapter, test one, run an emulator by itself
+    /// Bring your own arm: generate its adapter, test one, run an emulator in its own process
     Adapter(adapter::Args),
     /// List the arms that this program can talk to
     ListAdapters(list_adapters::Args),
     /// List the blueprints that `run` finds by name
     ListBlueprints(list_blueprints::Args),
-    /// Report every mistake of a blueprint, or show what it comes to
+    /// Validate a blueprint and print the resolved configuration
     Check(check::Args),
     /// Print the JSON Schema of blueprints, for editors
     Schema(schema::Args),
@@ -151,7 +151,7 @@ impl Program {
         Self::default()
     }
 
-    /// Adds an adapter; it wins over one of the same name in the box.
+    /// Adds an adapter; it wins over a built-in one of the same name.
     pub fn adapter(mut self, row: AdapterSpec) -> Self {
         self.adapters.push(row);
         self
@@ -195,7 +195,7 @@ pub fn command() -> clap::Command {
     Cli::command()
 }
 
-/// Runs the command line with more adapters than those in the box. [`Program`] can add more than that.
+/// Runs the command line with adapters besides the built-in ones. [`Program`] can add more than that.
 pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
     command_line(Catalog::from(&Registry::with(adapters)))
 }
@@ -250,7 +250,7 @@ fn spelled_out(argument: OsString) -> OsString {
 mod tests {
     use super::*;
 
-    /// Stands in for the program, to read the arguments of one verb.
+    /// A program with one verb, to read its arguments.
     #[derive(Debug, Parser)]
     struct Only<A: clap::Args> {
         #[command(flatten)]

@@ -1,4 +1,4 @@
-//! A robot to and from [`urdf_rs::Robot`], which other Rust programs (openrr, k …) work with.
+//! Converts a robot to and from [`urdf_rs::Robot`], which other Rust programs (openrr, k …) use.
 
 use nalgebra::{Isometry3, Vector3};
 use urdf_rs::{Axis, Collision, Color, JointLimit, JointType, LinkName, Mass, Material, Pose, Vec3, Vec4, Visual};
@@ -9,7 +9,7 @@ use super::urdf;
 /// Below this cosine of the pitch, roll and yaw turn about the same axis.
 const GIMBAL_LOCK: f64 = 1e-9;
 
-/// Why a description is no robot: every mistake, in words.
+/// All mistakes that prevent reading a description.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct NoRobot(String);
@@ -17,8 +17,8 @@ pub struct NoRobot(String);
 impl TryFrom<&urdf_rs::Robot> for RobotModel {
     type Error = NoRobot;
 
-    /// Reads the robot by the same rules as a file. Its meshes are not looked for. An inertial of zeros, which is what
-    /// `urdf_rs` has where a link states none, is none.
+    /// Reads the robot by the same rules as a file. Meshes are not located. An inertial of zeros counts as absent:
+    /// `urdf_rs` uses zeros for a link without one.
     fn try_from(robot: &urdf_rs::Robot) -> Result<Self, NoRobot> {
         let text = urdf_rs::write_to_string(robot).map_err(|e| NoRobot(e.to_string()))?;
         let mut model = urdf::from_text(&robot.name, &text).map_err(NoRobot)?;

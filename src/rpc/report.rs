@@ -189,7 +189,7 @@ pub struct CauseReport {
 }
 
 /// A device's own codes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct DeviceState {
     /// Its state.
     pub state: i32,

@@ -222,7 +222,7 @@ mod tests {
             attr.sched_runtime
         });
         let slice = slice.join().unwrap();
-        // A kernel that knows no slices of a thread's own tells 0; since 6.6 it tells the default one.
+        // A kernel without slices per thread returns 0; since 6.6 it returns the default slice.
         println!("slice {slice} ns");
         assert!(slice == 0 || slice == SLICE || slice >= 700_000, "{slice} ns");
     }
