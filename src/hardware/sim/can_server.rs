@@ -3,7 +3,7 @@
 
 use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -18,6 +18,7 @@ use crate::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame}
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
+use crate::sync::lock;
 
 /// How long a fault that cuts the wire keeps it cut at least: longer than any adapter should believe in a silent arm.
 const CUT: Duration = Duration::from_millis(800);
@@ -81,7 +82,7 @@ struct Shared<C> {
 
 impl<C> Shared<C> {
     fn controller(&self) -> MutexGuard<'_, C> {
-        self.controller.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.controller)
     }
 }
 

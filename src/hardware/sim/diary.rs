@@ -3,10 +3,11 @@
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 use super::faults::FaultKind;
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::sync::lock;
 
 /// So many entries wait for a reader; newer ones are then lost.
 const LONGEST: usize = 256;
@@ -29,7 +30,7 @@ static ENTRIES: Mutex<VecDeque<(Mono, Happening)>> = Mutex::new(VecDeque::new())
 
 /// From now on everything is noted that happens to emulators of this program.
 pub fn open() {
-    ENTRIES.lock().unwrap_or_else(PoisonError::into_inner).reserve(LONGEST);
+    lock(&ENTRIES).reserve(LONGEST);
     OPEN.store(true, Ordering::Relaxed);
 }
 
@@ -38,7 +39,7 @@ pub fn note(what: Happening) {
     if !OPEN.load(Ordering::Relaxed) {
         return;
     }
-    let mut entries = ENTRIES.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut entries = lock(&ENTRIES);
     if entries.len() < LONGEST {
         entries.push_back((MonotonicClock.now(), what));
     }
@@ -46,5 +47,5 @@ pub fn note(what: Happening) {
 
 /// Takes out the oldest entry.
 pub fn take() -> Option<(Mono, Happening)> {
-    ENTRIES.lock().unwrap_or_else(PoisonError::into_inner).pop_front()
+    lock(&ENTRIES).pop_front()
 }

@@ -8,13 +8,14 @@ use std::time::{Duration, Instant};
 use super::arm::HasArm;
 use super::diary::{self, Happening};
 use super::faults::Fault;
-use super::stream::{Controller, Ending, Shared, lock};
+use super::stream::{Controller, Ending, Shared};
 use crate::clock::Mono;
 use crate::hardware::registry::{Emulator, Place};
 use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::serial::Pty;
 use crate::joint::Joints;
 use crate::rt::host;
+use crate::sync::lock;
 
 /// How long a fault that cuts the line keeps it cut: longer than any adapter should believe in a silent arm.
 const CUT: Duration = Duration::from_millis(800);

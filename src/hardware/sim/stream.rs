@@ -2,12 +2,13 @@
 //! themselves are TCP connections ([`super::tcp_server`]) and serial lines ([`super::serial_server`]).
 
 use std::io::{Read, Write};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::sim::arm::Delivery;
 use crate::hardware::transport::tcp::Scan;
+use crate::sync::lock;
 
 /// Noise on a line: among it the beginning of a frame.
 const NOISE: &[u8] = b"\x00\xffgarbage\x59";
@@ -70,10 +71,6 @@ impl<Client> Line<Client> {
     pub fn dead(&self) -> bool {
         self.closing || self.dark_until > Instant::now()
     }
-}
-
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl<C: Controller, Client> Shared<C, Client> {

@@ -11,8 +11,9 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::arm::Delivery;
-use super::stream::{Controller, Ending, lock};
+use super::stream::{Controller, Ending};
 use super::tcp_server::{Inner, Port};
+use crate::sync::lock;
 
 /// Time between attempts to listen again after a loss of power.
 const RETRY: Duration = Duration::from_millis(20);

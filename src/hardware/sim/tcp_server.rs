@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use super::arm::HasArm;
 use super::diary::{self, Happening};
 use super::faults::Fault;
-use super::stream::{Controller, Ending, Line, Shared, lock};
+use super::stream::{Controller, Ending, Line, Shared};
 use super::tcp_listen::Floor;
 use crate::clock::Mono;
 use crate::hardware::registry::Emulator;
@@ -26,6 +26,7 @@ use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
+use crate::sync::lock;
 
 /// How long a new client waits for the end of one that has just gone.
 const GRACE: Duration = Duration::from_millis(200);
