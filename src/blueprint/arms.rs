@@ -260,7 +260,7 @@ fn adapter(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>) -> Option<
     row
 }
 
-/// Where the number of joints stands.
+/// Returns the node with the number of joints.
 fn counted_at(entry: &HardwareEntry) -> NodeId {
     match &entry.joints.value {
         Joints::Counted(counted) => counted.count.at,

@@ -65,7 +65,7 @@ impl<'t> Includer<'t> {
                 self.incomplete = true;
                 continue;
             };
-            // These speak of the file they stand in.
+            // These describe the file that contains them.
             for key in ["name", "description", "include"] {
                 self.tree.remove(next, key);
             }

@@ -23,8 +23,8 @@ pub struct PlannerConfig {
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub planning_timeout: f64,
-    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Given up near a start or goal
-    /// that is closer itself, which every plan tells.
+    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Reduced near a start or goal
+    /// that is closer itself; every such plan reports it.
     #[serde(deserialize_with = "non_negative")]
     #[schemars(range(min = 0.0))]
     pub padding: f64,
@@ -54,10 +54,10 @@ impl Default for PlannerConfig {
 pub struct RobotConfig {
     /// Unique name of the robot: letters, digits, `_` and `-`.
     pub name: Located<String>,
-    /// The robot's `.urdf` or `.xacro` file, as seen from this file; `builtin:NAME`, a description in the box; or
+    /// The robot's `.urdf` or `.xacro` file, as seen from this file; `builtin:NAME`, a built-in description; or
     /// `asset:NAME/path`, a file of an asset.
     pub model_path: Located<String>,
-    /// Folders that `package://NAME` stands for, by name; `asset:NAME` or `asset:NAME/path` for those of an asset.
+    /// Folders of `package://NAME`, by name; `asset:NAME` or `asset:NAME/path` for those of an asset.
     #[serde(default)]
     pub package_paths: BTreeMap<String, String>,
     /// Arguments of the xacro file.
@@ -222,7 +222,7 @@ pub struct ObjectEntry {
     pub padding: f64,
 }
 
-/// Shape of an obstacle: one of these. A cylinder stands along z.
+/// Shape of an obstacle: one of these. The axis of a cylinder is z.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ShapeEntry {

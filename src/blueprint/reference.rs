@@ -158,7 +158,7 @@ fn text(value: &Value, key: &str) -> String {
     value.get(key).and_then(Value::as_str).unwrap_or_default().to_owned()
 }
 
-/// The schema that a reference stands for.
+/// Returns the schema that a reference points to.
 fn follow<'s>(value: &'s Value, schema: &'s Value) -> &'s Value {
     let target = value.get("$ref").and_then(Value::as_str).and_then(|r| r.strip_prefix('#'));
     target.and_then(|pointer| schema.pointer(pointer)).unwrap_or(value)
@@ -244,7 +244,7 @@ mod tests {
         let committed = std::fs::read_to_string(&file).unwrap_or_default();
         assert!(
             committed == generated,
-            "{path} is out of date; write it anew with: DIMOS_REGENERATE=1 cargo test --lib blueprint"
+            "{path} is out of date; regenerate it with: DIMOS_REGENERATE=1 cargo test --lib blueprint"
         );
     }
 

@@ -1,4 +1,4 @@
-//! Which file a blueprint's name stands for.
+//! Finds the file of a blueprint by its name.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
@@ -18,8 +18,7 @@ const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints
 /// Those that the program which embeds this crate brings along.
 static MORE: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 
-/// Lets the names of `more` stand for their texts, like the blueprints in the box and before those of the same name. For
-/// `main`, once, before anything else.
+/// Adds blueprints to the built-in ones; they win over those of the same name. For `main`, once, before anything else.
 pub fn embed(more: Vec<(&'static str, &'static str)>) {
     let _ = MORE.set(more);
 }
@@ -138,7 +137,7 @@ impl SearchPath {
         file.or_else(|| Found::embedded(name).map(Ok))
     }
 
-    /// The file that an `include` stands for: a path relative to the including file, a file beside it, or a name.
+    /// Returns the file of an `include`: a path relative to the including file, a file beside it, or a name.
     pub(super) fn find_include(&self, from: &Found, name: &str) -> Result<Found, FindError> {
         let path = Path::new(name);
         if path.is_absolute() || path.components().any(|c| c == std::path::Component::ParentDir) {

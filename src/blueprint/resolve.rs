@@ -84,7 +84,7 @@ pub struct Arm {
     pub adapter_type: String,
     /// Where the arm is; `sim` for the emulator; empty where no address is needed.
     pub address: String,
-    /// Whether the adapter's emulator stands in for the arm.
+    /// Whether the adapter's emulator replaces the arm.
     pub simulated: bool,
     /// Whether the motors are enabled when the run starts.
     pub auto_enable: bool,
@@ -132,7 +132,7 @@ pub struct TaskRobot {
     pub joints: Vec<String>,
     /// The link that is moved.
     pub link: String,
-    /// Where it stands, if it is a robot of the planner; else all is in the frame of the model's root.
+    /// Its base pose if it is a robot of the planner; otherwise everything is in the frame of the model's root.
     pub base: Option<Base>,
 }
 
@@ -156,7 +156,7 @@ impl Checker<'_> {
         self.tree.report(diag);
     }
 
-    /// Whether a key of a group was read as it stands there (or is rightly absent).
+    /// Returns whether a key of a group was read as written (or may be absent).
     pub(super) fn has(&self, group: NodeId, key: &str) -> bool {
         !self.lost.key(group, key)
     }

@@ -87,11 +87,11 @@ pub struct HardwareEntry {
     /// disabled, `disable` where it has brakes.
     #[serde(default)]
     pub on_exit: Option<OnExit>,
-    /// How far a joint at rest may be from its set point under load [rad]. Default: the adapter's.
+    /// Largest distance of a joint at rest from its setpoint under load [rad]. Default: the adapter's.
     #[serde(default, deserialize_with = "range::maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub accuracy: Option<f64>,
-    /// Time from a set point to the measured motion that follows it [s]; `dimos adapter test --lag` measures it. Default:
+    /// Time from a setpoint to the measured motion that follows it [s]; `dimos adapter test --lag` measures it. Default:
     /// the adapter's.
     #[serde(default, deserialize_with = "range::maybe_lag")]
     #[schemars(extend("minimum" = 0, "maximum" = 1))]
@@ -101,7 +101,7 @@ pub struct HardwareEntry {
     #[serde(default, deserialize_with = "range::maybe_age")]
     #[schemars(extend("minimum" = 0.02, "maximum" = 2))]
     pub stale_after: Option<f64>,
-    /// Largest distance of a joint from its set points of the last `lag` seconds [rad]: beyond it for 100 ms, the arm is
+    /// Largest distance of a joint from its setpoints of the last `lag` seconds [rad]: beyond it for 100 ms, the arm is
     /// held. Default: 0.15.
     #[serde(default, deserialize_with = "range::maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0))]

@@ -17,7 +17,7 @@ named! {
         Adapter = "adapter",
         /// The blueprint says so.
         Blueprint = "blueprint",
-        /// Nobody says anything.
+        /// Neither of them states it.
         Default = "default",
     }
 }
@@ -59,7 +59,7 @@ pub struct ArmSummary {
     pub level: String,
     /// Where the arm is; empty where no address is needed.
     pub address: String,
-    /// Whether the emulator stands in for it.
+    /// Whether the emulator replaces it.
     pub simulated: bool,
     /// Whether the motors are enabled at the start.
     pub auto_enable: bool,

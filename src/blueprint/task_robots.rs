@@ -41,7 +41,7 @@ pub(super) fn resolve(
     }
 }
 
-/// Where a task stands in its file.
+/// Position of a task in its file.
 struct Place<'e> {
     entry: &'e Located<TaskEntry>,
     params: Option<NodeId>,
@@ -90,7 +90,7 @@ fn robot(
         Some(link) => robot.link.clone_from(link),
         None if params.model_path.is_some() => {
             let diag = Diag::error("the end effector is missing");
-            let hint = "name the link that shall be moved: `end_effector_link: flange`";
+            let hint = "name the link to move: `end_effector_link: flange`";
             checker.error(place.of(checker, "model_path"), diag.hint(hint));
             return None;
         }
@@ -174,7 +174,7 @@ fn check(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, ours: 
     }
     let loaded = load(&robot.source);
     let first = loaded.reports().into_iter().find(|report| report.severity == Severity::Error);
-    // That of a planner's robot is told there.
+    // A mistake in a planner's robot is reported there.
     if let Some(first) = first.filter(|_| robot.base.is_none()) {
         let diag = Diag::error(format!("the robot's description cannot be used: {}", first.message));
         let more = format!("`dimos model check {}` shows all that is wrong with it", robot.source.path.display());
@@ -222,12 +222,12 @@ fn check_chain(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, 
     let independent = chain.iter().filter_map(|j| model.joints.get(*j)).filter(|j| j.is_independent());
     if let Some(other) = { independent }.find(|j| !robot.joints.contains(&j.name)) {
         let what = format!("the joint {} carries the end effector and is not of the task", quote(&other.name));
-        let diag = Diag::warning(what).note("the task takes it to stand still at 0");
+        let diag = Diag::warning(what).note("the task assumes that it is fixed at 0");
         checker.error(place.entry.joint_names.at, diag.hint("add it to the task's joints, if the coordinator has it"));
     }
 }
 
-/// Where a planner's robot stands: its base link, and that link's pose in the frame `map`.
+/// Base of a planner's robot: its base link, and that link's pose in the frame `map`.
 pub type Base = (String, Isometry3<f64>);
 
 impl TaskRobot {

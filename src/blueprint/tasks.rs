@@ -217,7 +217,7 @@ fn report_sharing(checker: &mut Checker<'_>, tasks: &[Checked<'_>], found: &Foun
             let diag = if both { Diag::error(message) } else { Diag::warning(message) };
             let diag = diag.note(match both {
                 true => "both are started with the run, so one of them would never get its joints",
-                false => "when both are active, the one that stands first wins",
+                false => "when both are active, the one listed first wins",
             });
             let at = checker.tree.get(b.at, "priority").unwrap_or(b.name.at);
             let also = checker.tree.label(checker.tree.get(a.at, "priority").unwrap_or(a.name.at));

@@ -78,6 +78,6 @@ fn limits() -> JointLimits {
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
     // YOUR ARM: options of its own, each with a default: a payload, a tool, a serial number to insist on.
-    /// What the emulator does, when one stands in for the arm.
+    /// Settings of the emulator.
     pub sim: SimOptions,
 }

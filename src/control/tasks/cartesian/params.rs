@@ -13,10 +13,10 @@ use crate::yaml::range::{non_negative, positive};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CartesianParams {
-    /// The robot's `.urdf` or `.xacro` file, as seen from this file; or `builtin:NAME`, a description in the box. Poses
+    /// The robot's `.urdf` or `.xacro` file, as seen from this file; or `builtin:NAME`, a built-in description. Poses
     /// and twists are then in the frame of its root link.
     pub model_path: Option<String>,
-    /// Folders that `package://NAME` stands for, by name.
+    /// Folders of `package://NAME`, by name.
     pub package_paths: BTreeMap<String, String>,
     /// Arguments of the xacro file.
     pub xacro_args: BTreeMap<String, Text>,
@@ -26,7 +26,7 @@ pub struct CartesianParams {
     pub joint_prefix: Option<String>,
     /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
     pub joint_name_mapping: BTreeMap<String, String>,
-    /// Without a new target for this long the end effector comes to rest, and the task lets go of its joints [s];
+    /// Without a new target for this long the end effector decelerates to rest, and the task releases its joints [s];
     /// 0 = never.
     #[serde(deserialize_with = "non_negative")]
     #[schemars(range(min = 0.0))]

@@ -135,11 +135,11 @@ pub struct Options {
     pub follow: Follow,
     /// Which gripper is fitted.
     pub gripper: GripperKind,
-    /// With how much torque the gripper closes at most (0–5] [Nm].
+    /// Maximum torque of the closing gripper (0–5] [Nm].
     #[serde(deserialize_with = "torque")]
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 5))]
     pub gripper_torque: f64,
-    /// What the emulator does, when one stands in for the arm.
+    /// Settings of the emulator.
     pub sim: emulator::SimOptions,
 }
 

@@ -90,6 +90,6 @@ fn same_modes(given: &[ControlMode]) -> &'static [ControlMode] {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// What the emulator does, when one stands in for the arm. It starts at zero where `initial_positions` is empty.
+    /// Settings of the emulator. It starts at zero where `initial_positions` is empty.
     pub sim: SimOptions,
 }

@@ -86,7 +86,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// Which arm it is: `xarm5`, `xarm6`, `xarm7`, `lite6` or `xarm850`. By default the xArm with so many joints. An
+    /// Which arm it is: `xarm5`, `xarm6`, `xarm7`, `lite6` or `xarm850`. By default the xArm with that number of joints. An
     /// arm that is another model is refused.
     pub model: Option<Model>,
     /// The gripper at the tool flange: `xarm`, `xarm_g2`, or `none`.
@@ -97,7 +97,7 @@ pub struct Options {
     #[serde(deserialize_with = "fraction")]
     #[schemars(extend("exclusiveMinimum" = 0, "maximum" = 1))]
     pub speed_scale: f64,
-    /// What the emulator does, when one stands in for the arm.
+    /// Settings of the emulator.
     pub sim: emulator::SimOptions,
 }
 

@@ -101,7 +101,7 @@ pub struct Options {
     pub speed_scale: f64,
     /// Whether to use the gripper.
     pub gripper: bool,
-    /// What the emulator does, when one stands in for the arm.
+    /// Settings of the emulator.
     pub sim: SimOptions,
 }
 
