@@ -37,7 +37,7 @@ pub const MIN_SPEED: f64 = 0.1;
 /// A boxed future, as trait objects need it.
 pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
 
-/// What stands behind the server: the run itself.
+/// What the server serves: the run itself.
 pub trait Backend: Send + Sync + 'static {
     /// Answers one request. Called from the server's threads, several at once; it may wait but must not block, or a
     /// stop would wait for it. When it takes longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is dropped.
@@ -154,7 +154,7 @@ methods! {
     /// The latest joint states and commands.
     "state" State -> StateReport;
     /// Moves an arm from where it is to a joint target, directly: not collision-checked. Answers when the motion
-    /// begins; `motion` tells how it goes.
+    /// begins; `motion` reports its progress.
     "move" Move -> MoveReply, check Move::valid;
     /// Follows a trajectory. Answers when the motion begins.
     "execute" Execute -> ExecuteReply, check Execute::valid;
@@ -180,7 +180,7 @@ methods! {
     "twist" Twist -> Done, check Twist::valid;
     /// Next target of a `cartesian_ik` task; repeat it within the task's timeout.
     "pose" Pose -> Done, check Pose::valid;
-    /// Plans a collision-free motion. Answers when planning begins; `planning` tells how it goes. Moves nothing.
+    /// Plans a collision-free motion. Answers when planning begins; `planning` reports its progress. Moves nothing.
     "plan" Plan -> PlanReply, check Plan::valid;
     /// How planning goes, or what came of it.
     "planning" Planning -> PlanningReport;

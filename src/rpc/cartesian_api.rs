@@ -45,7 +45,7 @@ impl Twist {
 pub struct Pose {
     /// The `cartesian_ik` task's name.
     pub task: String,
-    /// Where the end effector shall be: x, y, z [m].
+    /// Target position of the end effector: x, y, z [m].
     pub xyz: [f64; 3],
     /// Its roll, pitch, yaw about fixed axes [rad].
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -23,7 +23,7 @@ const KEPT: usize = 1024;
 /// Why a client got no reply.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// No run lives.
+    /// No run is live.
     #[error("no run is live")]
     NoRun,
     /// Several runs live, and none was named.
@@ -71,7 +71,7 @@ impl ClientError {
             Self::UnknownRun { name, live } => did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live"),
             Self::Place(error) => Some(error.hint().into()),
             Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
-                Some("the process lives but does not answer; its log may say why".into())
+                Some("the process is live but does not answer; its log may say why".into())
             }
             Self::Io { .. } => Some("the run is starting or has just ended; see `dimos status`".into()),
             Self::Protocol { .. } => Some("is it another version of dimos?".into()),

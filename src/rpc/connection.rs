@@ -38,7 +38,7 @@ use super::wire;
 const QUEUE: usize = 64;
 /// Targets of one client that may wait for the tick at once.
 const IN_FLIGHT: usize = 32;
-/// A connection that says nothing for so long is given back.
+/// A connection that is silent for this long is given back.
 const SILENT_FOR: Duration = Duration::from_millis(250);
 /// Time for the client to take the last replies, and for the rest of an oversize line to pass.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -86,7 +86,7 @@ pub(super) async fn serve(arrival: Arrival, backend: Arc<dyn Backend>) -> Option
 /// Gives its half back when nothing more is to be written.
 async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) -> Option<OwnedWriteHalf> {
     while let Some(line) = waiting.recv().await {
-        // The client is gone; dropping the queue tells the rest of the conversation.
+        // The client is gone; dropping the queue ends the rest of the conversation.
         to.write_all(line.as_bytes()).await.ok()?;
     }
     Some(to)
@@ -182,7 +182,7 @@ impl Connection {
         }
     }
 
-    /// Whether it asks and is answered, and nothing else goes on here.
+    /// Returns whether the connection only sends requests and receives replies.
     fn is_plain(&self) -> bool {
         self.in_flight.is_empty() && self.next == 1 && self.planner.is_none()
     }

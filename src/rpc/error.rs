@@ -63,7 +63,7 @@ pub enum Code {
     ArmNotReady,
     /// The arm is held and must be reset first.
     ArmLatched,
-    /// What latched the arm still stands.
+    /// The fault that latched the arm is still present.
     StillFaulted,
     /// The task cannot do that.
     WrongTask,

@@ -2,7 +2,7 @@
 //!
 //! A connection takes the lease of an arm with its first request that is taken on and moves it, or with `lease`, and has it until
 //! `release` or its own end. The rest of the program knows nothing of it: a stream of targets that ends with its
-//! commander goes stale like any other, and a trajectory that has begun goes on.
+//! commander goes stale like any other, and a trajectory that has begun continues.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -37,7 +37,7 @@ pub(super) enum Need<'a> {
     Lease(Subject<'a>),
     /// The leases of the arms that a plan moves; without a number, the newest plan.
     Plan(Option<u64>),
-    /// That nobody else commands the arm: it changes what the arm is ready for.
+    /// No other client may command the arm: the request changes what the arm is ready for.
     Peace(Subject<'a>),
 }
 
@@ -95,7 +95,7 @@ impl Leases {
         self.lock().values().any(|holder| holder.connection == connection)
     }
 
-    /// Adds to a reply what only the connections know: `status` tells who commands the arms.
+    /// Adds to a reply what only the connections know: `status` reports who commands the arms.
     pub fn complete(&self, mut reply: Reply) -> Reply {
         if let Reply::Status(status) = &mut reply {
             let held = self.lock();
@@ -123,7 +123,7 @@ impl Lessee {
         Self { leases, connection, pid, alive: Arc::default() }
     }
 
-    /// The process at the connection's other end, where the system tells.
+    /// Returns the process at the other end of the connection, if the system knows it.
     pub fn pid(&self) -> Option<i32> {
         self.pid
     }
@@ -136,7 +136,7 @@ impl Lessee {
     /// Lets a request through, or says who is in its way. The newest plan is named by its number from here on, so that
     /// the plan whose arms are leased is the one that is carried out.
     ///
-    /// Answers the arms whose leases it needs and has now; what came of it must be told to [`settle`](Self::settle).
+    /// Answers the arms whose leases it needs and has now; pass the result to [`settle`](Self::settle).
     pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<(Request, Vec<String>), RpcError> {
         match need(&request) {
             Need::Nothing => {}

@@ -11,7 +11,7 @@
 //! Requests that move an arm need its lease, which one connection has at a time: `lease.rs`.
 //!
 //! [`api`] says what may be asked, [`report`] what comes back, [`error`] how it is refused. [`place`] says where the
-//! sockets are and who lives, [`server`] and [`client`] are the two ends.
+//! sockets are and which runs are live, [`server`] and [`client`] are the two ends.
 
 pub mod api;
 mod arm_api;

@@ -15,7 +15,7 @@ use crate::trajectory::MAX_DURATION;
 pub struct Move {
     /// The arm's `hardware_id`.
     pub arm: String,
-    /// Where its joints shall go [rad], one value per joint of the arm.
+    /// Target of its joints [rad], one value per joint of the arm.
     pub target: Vec<f64>,
     /// Fraction of the velocity and acceleration limits to use, 0.1–1.
     #[serde(default = "default_speed")]

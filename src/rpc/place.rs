@@ -1,7 +1,7 @@
-//! Where the sockets of runs are, who lives, and that a run's name is taken once.
+//! Where the sockets of runs are, who is, and that a run's name is taken once.
 //!
 //! A run holds a locked file `<run>.lock` with its pid in it, next to its socket `<run>.sock`. The lock dies with the
-//! process, however that ends, so what is not locked is stale and removed by whoever notices.
+//! process, however that ends, so what is not locked is stale and removed by the process that finds it.
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Read, Write};
@@ -67,7 +67,7 @@ impl PlaceError {
 #[derive(Debug, Clone)]
 pub struct RunFolder(PathBuf);
 
-/// A run that lives.
+/// A live run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LiveRun {
     /// Its name.
@@ -78,7 +78,7 @@ pub struct LiveRun {
     pub socket: PathBuf,
 }
 
-/// A run's name, taken for as long as this lives. Dropping it removes the socket and the lock.
+/// A run's name, taken for as long as this value exists. Dropping it removes the socket and the lock.
 #[derive(Debug)]
 pub struct Claim {
     run: String,
@@ -217,8 +217,8 @@ impl Claim {
 
 impl Drop for Claim {
     fn drop(&mut self) {
-        // Removed while still locked, so that nobody else's files are hit. A failure leaves stale files, which are
-        // removed by whoever comes next.
+        // Removed while still locked, so that no other run's files are hit. A failure leaves stale files, which the
+        // next run removes.
         let _ = remove(&self.socket);
         let _ = remove(&self.lock_path);
     }

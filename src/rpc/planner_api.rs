@@ -1,5 +1,5 @@
 //! Parameters and replies of the methods of the planner. Like motions, plans are numbered: `plan` answers when planning
-//! begins, `planning` tells how it goes.
+//! begins, `planning` reports its progress.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -41,7 +41,7 @@ impl PoseSpec {
     }
 }
 
-/// Where one robot shall go: exactly one of `joints`, `pose`, `named`.
+/// Goal of one robot: exactly one of `joints`, `pose`, `named`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PlanGoal {
@@ -50,7 +50,7 @@ pub struct PlanGoal {
     /// Joint positions [rad], in the order of the robot's `joint_names`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub joints: Option<Vec<f64>>,
-    /// Where its end effector shall be; without `rpy` and `quat` only the position counts.
+    /// Target pose of its end effector; without `rpy` and `quat` only the position counts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pose: Option<PoseSpec>,
     /// One of its named poses.
@@ -65,7 +65,7 @@ pub struct PlanGoal {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
-    /// Where the robots shall go, one entry each. The others stay where they are.
+    /// Goals of the robots, one entry each. The others stay where they are.
     pub goals: Vec<PlanGoal>,
     /// Fraction of the velocity and acceleration limits to use, 0.1–1.
     #[serde(default = "default_speed")]
@@ -227,7 +227,7 @@ pub struct ExecutePlan {
     /// The plan's number; without it the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
-    /// Whether a motion that must end before something that gets in its way is planned again from there and goes on.
+    /// Whether a motion that must end before something that gets in its way is planned again from there and continues.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub replan: bool,
     /// The connection that asks for it, where there is one: with its end nothing is planned again.
@@ -235,7 +235,7 @@ pub struct ExecutePlan {
     pub presence: Option<Presence>,
 }
 
-/// Whether a connection still lives.
+/// Whether a connection is still open.
 #[derive(Debug, Clone)]
 pub struct Presence(Weak<()>);
 
@@ -299,7 +299,7 @@ pub struct RobotReport {
     pub named_poses: BTreeMap<String, Vec<f64>>,
 }
 
-/// Shape of an obstacle. Every shape's frame is at its middle; a cylinder stands along z.
+/// Shape of an obstacle. Every shape's frame is at its middle; the axis of a cylinder is z.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum ShapeSpec {
@@ -369,7 +369,7 @@ impl WorldAdd {
     }
 }
 
-/// An object as it stands under its name, in a blueprint's `planner.world` and in files.
+/// An object as written under its name, in a blueprint's `planner.world` and in files.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldEntry {

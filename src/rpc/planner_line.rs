@@ -22,7 +22,7 @@ type Answer = Result<Value, RpcError>;
 /// The line to a planner that registered.
 #[derive(Debug)]
 pub struct PlannerLine {
-    /// The process at the other end, where the system tells.
+    /// The process at the other end, if the system knows it.
     pid: Option<i32>,
     state: Mutex<State>,
 }
@@ -40,7 +40,7 @@ impl PlannerLine {
         Self { pid, state: Mutex::new(State { queue: Some(queue), next: 1, waiting: HashMap::new() }) }
     }
 
-    /// The process at the other end, where the system tells.
+    /// Returns the process at the other end, if the system knows it.
     pub fn pid(&self) -> Option<i32> {
         self.pid
     }
@@ -50,7 +50,7 @@ impl PlannerLine {
         self.lock().queue.is_none()
     }
 
-    /// Asks the planner, and waits so long for its answer at most.
+    /// Sends a request to the planner and waits for its answer, at most `limit`.
     pub async fn ask(&self, method: &str, params: Value, moment: Moment, limit: Duration) -> Answer {
         let (sender, receiver) = oneshot::channel();
         let (queue, request) = {
@@ -85,10 +85,10 @@ impl PlannerLine {
     fn silent(&self, what: String) -> RpcError {
         let process = self.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
         let error = RpcError::new(Code::NoAnswer, what);
-        error.hint(format!("its process{process} lives but hangs: end it, and start the planner again"))
+        error.hint(format!("its process{process} is live but hangs: end it, and start the planner again"))
     }
 
-    /// Hands an answer to whoever waits for it. Who has given up waiting is not there any more.
+    /// Delivers the reply to the pending request; drops it if that request has timed out.
     pub(super) fn answered(&self, answer: PlannerAnswer) {
         let sender = self.lock().waiting.remove(&answer.request);
         let result = match answer.error {

@@ -1,4 +1,4 @@
-//! What a run tells about itself: the replies to `status`, `state` and `motion`. SI units; a field in another unit
+//! Reports of a run: the replies to `status`, `state` and `motion`. SI units; a field in another unit
 //! says so in its name.
 
 use std::collections::BTreeMap;
@@ -23,7 +23,7 @@ pub struct StatusReport {
     pub uptime: f64,
     /// Ticks per second [Hz].
     pub tick_rate: f64,
-    /// Whether an emulator stands in for any of the arms.
+    /// Whether an emulator replaces any of the arms.
     pub simulated: bool,
     /// The log that is being written; absent when there is none.
     pub log: Option<String>,
@@ -55,7 +55,7 @@ pub struct PlannerStatus {
     pub attached: Option<AttachedReport>,
 }
 
-/// A planner in a process of its own.
+/// A planner in its own process.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct AttachedReport {
     /// What it is called.
@@ -86,7 +86,7 @@ pub struct TickReport {
     pub skipped: u64,
     /// Wake-up after the deadline [µs].
     pub lateness_us: Percentiles,
-    /// Time from wake-up to the last command handed over [µs].
+    /// Time from wake-up to the last command passed on [µs].
     pub compute_us: Percentiles,
 }
 
@@ -123,7 +123,7 @@ pub struct ArmReport {
     pub adapter: String,
     /// Where its device is.
     pub address: String,
-    /// Whether an emulator stands in for it.
+    /// Whether an emulator replaces it.
     pub simulated: bool,
     /// State of the connection: `down`, `up`, `stale`, `faulted`.
     pub link: String,
@@ -151,7 +151,7 @@ pub struct ArmReport {
     pub native_rate_hz: f64,
     /// Recent episodes of trouble, the newest last.
     pub faults: Vec<FaultReport>,
-    /// Who holds its lease and may move it; absent when nobody does.
+    /// Lease holder, which may move it; absent without one.
     #[serde(default)]
     pub commander: Option<CommanderReport>,
     /// How far its gripper closes and opens [m]; absent without a gripper, or where its adapter does not say.
@@ -270,7 +270,7 @@ pub struct StateReport {
 pub struct ArmStateReport {
     /// Its name in the blueprint.
     pub hardware_id: String,
-    /// Whether an emulator stands in for it.
+    /// Whether an emulator replaces it.
     pub simulated: bool,
     /// Age of its latest state [ms]; absent before the first.
     pub age_ms: Option<f64>,
@@ -319,7 +319,7 @@ pub struct MotionReport {
     pub task: String,
     /// The task's state in this motion: `EXECUTING`, `COMPLETED`, `ABORTED`, …
     pub state: String,
-    /// Whether it is over, and where the arm stands now is where it ended.
+    /// Whether it is over: the arm is where it ended.
     pub done: bool,
     /// How far it is, 0–1.
     pub progress: f64,
@@ -332,7 +332,7 @@ pub struct MotionReport {
     /// Whether it had to end before something in its way, and is being planned again; until then it is not done.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub replanning: bool,
-    /// The motion that goes on in its place, around what was in its way.
+    /// The motion that continues in its place, around the obstacle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<u64>,
     /// When done: how far off each joint ended.

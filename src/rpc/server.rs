@@ -5,8 +5,8 @@
 //!                    ▲──────────── connections that say nothing for a while ───────────────────┘
 //! ```
 //!
-//! A connection that asks more than the requests that always get through has a thread of its own: what one client
-//! sends holds up nobody else, and the thread that stops arms is idle but for that. Nothing here is real-time, and
+//! A connection that asks more than the requests that always get through has its own thread: what one client
+//! sends delays no other client, and the thread that stops arms is idle but for that. Nothing here is real-time, and
 //! nothing real-time waits for it.
 
 use std::io;
@@ -55,7 +55,7 @@ impl Server {
     /// Opens the socket of a claimed name and answers from now on.
     pub fn start(claim: Claim, backend: Arc<dyn Backend>) -> io::Result<Self> {
         let listener = StdListener::bind(claim.socket())?;
-        // The folder is closed to others, so nobody could connect before this.
+        // The folder is closed to others, so no client could connect before this.
         std::fs::set_permissions(claim.socket(), std::fs::Permissions::from_mode(0o600))?;
         listener.set_nonblocking(true)?;
         let runtime = runtime()?;
@@ -168,7 +168,7 @@ fn converse(
             match runtime() {
                 Ok(runtime) => until_the_end(runtime, ended, async move {
                     if let Some(silent) = connection::serve(arrival, backend).await {
-                        // Only a server that is ending takes none any more.
+                        // Fails only when the server is ending.
                         let _ = back.send(silent);
                     }
                 }),

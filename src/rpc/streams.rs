@@ -1,7 +1,7 @@
 //! What a run publishes while it runs, and how clients ask for it.
 //!
 //! Each message is encoded once, by the publisher, and kept in a ring of fixed length. Every subscriber reads the ring
-//! at its own pace: who is too slow loses its own oldest messages, is told how many, and holds up nobody.
+//! at its own pace: a slow subscriber loses its own oldest messages, learns how many, and delays no other.
 
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ named! {
 pub struct Subscribe {
     /// Which stream.
     pub stream: Stream,
-    /// At most so many messages per second [Hz]; without it, all of them.
+    /// Maximum rate of messages [Hz]; without it, all of them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rate: Option<f64>,
 }

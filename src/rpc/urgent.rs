@@ -1,6 +1,6 @@
 //! The requests that always get through: `stop`, `cancel`, `status`, `shutdown`. The thread that takes connections
-//! answers them by itself as long as a connection asks nothing else; so they wait for nobody's JSON, and need no place
-//! among the other connections.
+//! answers them itself as long as a connection asks nothing else; so they never wait for another client's JSON, and need
+//! no place among the other connections.
 
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
@@ -25,7 +25,7 @@ const MAX_URGENT: usize = 1024;
 const IDLE_LIMIT: Duration = Duration::from_secs(2);
 /// How long a client gets to take a reply.
 const WRITE_LIMIT: Duration = Duration::from_secs(1);
-/// `status` is answered here so often per connection: a client that asks again and again is one like all others.
+/// `status` is answered here at most this many times per connection: a client that polls is served like all others.
 const STATUS_LIMIT: u32 = 8;
 
 /// A connection on its way from one thread to another.
@@ -113,7 +113,7 @@ async fn hand_on(mut stream: UnixStream, read: Vec<u8>, lessee: Lessee, seat: Se
         return;
     }
     if let Ok(stream) = stream.into_std() {
-        // Only a server that is ending takes none any more.
+        // Fails only when the server is ending.
         let _ = others.send(Arrival { stream, read, lessee, seat });
     }
 }

@@ -66,7 +66,7 @@ pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> St
     }
 }
 
-/// A message of a subscription, as a line. `data` is JSON already; `lost` tells of messages that this reader missed
+/// A message of a subscription, as a line. `data` is JSON already; `lost` counts messages that this reader missed
 /// before this one.
 pub(super) fn message(stream: &str, subscription: u64, lost: u64, data: &str) -> String {
     let lost = if lost == 0 { String::new() } else { format!(r#","lost":{lost}"#) };
