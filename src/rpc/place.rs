@@ -1,4 +1,4 @@
-//! Where the sockets of runs are, who is, and that a run's name is taken once.
+//! Location of the sockets of runs, which runs are live, and that a run name is taken once.
 //!
 //! A run holds a locked file `<run>.lock` with its pid in it, next to its socket `<run>.sock`. The lock dies with the
 //! process, however that ends, so what is not locked is stale and removed by the process that finds it.
