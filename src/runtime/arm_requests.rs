@@ -18,17 +18,17 @@ use crate::rpc::{Code, RpcError};
 use crate::telemetry::describe::cause_text;
 use crate::telemetry::{ArmSample, Outcome, Phase};
 
-/// How long a stopped arm gets to come to rest and confirm.
+/// Timeout for a stopped arm to decelerate to rest and confirm.
 const STOP_LIMIT: Duration = Duration::from_secs(3);
 /// What a braking arm gets beside the time that its limits need: a few ticks, and its lag.
 const REACTION: Duration = Duration::from_millis(250);
-/// How long an arm at rest gets until nothing is commanded any more.
+/// Timeout for an arm at rest until no command is sent to it.
 const SETTLING_LIMIT: Duration = Duration::from_secs(1);
 /// How long a request to disable waits at most: clients wait 10 s for an answer, and the device needs some of that.
 const BRAKING_LIMIT: Duration = Duration::from_secs(7);
 /// How long an order to a device may take.
 const ORDER_LIMIT: Duration = Duration::from_secs(8);
-/// Reports within which an arm tells what an order changed.
+/// Maximum number of reports until an arm reports the effect of an order.
 const REPORTS: u32 = 3;
 /// How often an enabled arm is asked for again that is not ready yet.
 const ASK_AGAIN: Duration = Duration::from_millis(100);
@@ -88,8 +88,8 @@ impl Service {
                 Ok(()) | Err(AdapterError::NotConnected) => {}
                 Err(e) => return Err(refused(&id, "did not clear its error", &e)),
             }
-            // The tick must see the state after the clearing, and an arm that sends its state by itself tells it in its
-            // next report.
+            // The tick must see the state after the clearing, and an arm that streams its state reports it in its next
+            // report.
             self.next_tick().await;
             self.until(self.next_report(arm), || self.seen(arm, |view| view.state.error == 0)).await;
         }
@@ -177,8 +177,7 @@ impl Service {
     async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
         let device = self.device(arm)?;
         let late = || Instant::now() >= limit;
-        // Where nothing is commanded any more the arm is asked to stop, or was not moved by us. The motors wait for that
-        // stop.
+        // Without a command the arm is being stopped, or this run did not move it. The motors wait for that stop.
         let stopped = |seq| device.health().stop_sent.load(Ordering::Acquire) == seq;
         let rests = || {
             self.arm_view(arm as usize)

@@ -136,7 +136,7 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     Ok(config)
 }
 
-/// What the blueprint says of an arm does not go together: nobody was asked yet, so nobody needs power.
+/// Creates the error of contradictory settings of an arm. No arm was contacted yet, so the hint about power is absent.
 fn unfit(arm: &Arm, error: &AdapterError) -> StartError {
     if !matches!(error, AdapterError::Rejected(_)) {
         return hardware(arm, error);

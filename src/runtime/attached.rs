@@ -1,4 +1,4 @@
-//! A planner in a process of its own, attached to a run: it registers over the run's socket, answers what the run asks,
+//! A planner in its own process, attached to a run: it registers over the run's socket, answers what the run asks,
 //! and when the run goes away it tries again until it is back.
 
 use std::path::{Path, PathBuf};
@@ -28,7 +28,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(3);
 pub enum Turn {
     /// The run is back, and the planner attached to it again.
     Back,
-    /// The run is gone, or refuses the planner since it is back: why. The planner goes on trying.
+    /// The run is gone, or refuses the planner since it is back: why. The planner keeps trying.
     Fault(String),
 }
 
@@ -40,13 +40,13 @@ pub struct AttachedPlanner {
 }
 
 impl AttachedPlanner {
-    /// Reads the robots' descriptions and attaches to the run of that socket, as `name`. `told` hears what becomes of it
-    /// from then on, on a thread of the planner's.
+    /// Reads the robots' descriptions and attaches to the run of that socket, as `name`. `report` receives its
+    /// later changes of state, on a thread of the planner.
     pub fn start(
         name: &str,
         config: &PlannerConfig,
         socket: &Path,
-        told: impl FnMut(Turn) + Send + 'static,
+        report: impl FnMut(Turn) + Send + 'static,
     ) -> Result<Self, StartError> {
         let setup = robots(config)?;
         let robots = registered(&setup);
@@ -59,11 +59,11 @@ impl AttachedPlanner {
         let thread = std::thread::Builder::new().name("attached".into()).spawn(move || {
             runtime.block_on(async {
                 tokio::select! {
-                    () = process.live(setup, &ready, told) => {}
+                    () = process.live(setup, &ready, report) => {}
                     _ = stopped => {}
                 }
             });
-            // A large file that is still being read keeps nobody from ending.
+            // A large file that is still being read delays no shutdown.
             runtime.shutdown_background();
         });
         let thread = thread.map_err(|e| StartError::other(e, "see ulimit -u"))?;
@@ -99,7 +99,7 @@ struct Process {
 
 impl Process {
     /// Attaches, says so, and answers for as long as it is let.
-    async fn live(self, setup: PlanningScene, ready: &Sender<Result<(), StartError>>, mut told: impl FnMut(Turn)) {
+    async fn live(self, setup: PlanningScene, ready: &Sender<Result<(), StartError>>, mut report: impl FnMut(Turn)) {
         let begun = async {
             let end = PlannerEnd::register(&self.socket, &self.registration).await.map_err(refused)?;
             let limits = &end.registered.limits;
@@ -124,15 +124,15 @@ impl Process {
             let lost = lost.await;
             // Its numbers mean nothing to the run that comes next.
             port.desk.forget();
-            told(Turn::Fault(format!("the run is gone ({lost})")));
-            end = self.again(&limits, &mut told).await;
+            report(Turn::Fault(format!("the run is gone ({lost})")));
+            end = self.again(&limits, &mut report).await;
             port.desk.forget();
-            told(Turn::Back);
+            report(Turn::Back);
         }
     }
 
-    /// Tries until the run is back and takes the planner. A run that refuses is told of once.
-    async fn again(&self, limits: &Limits, told: &mut impl FnMut(Turn)) -> PlannerEnd {
+    /// Retries until the run is back and accepts the planner. A refusal is reported once.
+    async fn again(&self, limits: &Limits, report: &mut impl FnMut(Turn)) -> PlannerEnd {
         let (mut pause, mut last) = (FIRST_PAUSE, String::new());
         loop {
             tokio::time::sleep(pause).await;
@@ -144,7 +144,7 @@ impl Process {
                 Err(NoLine::Refused(refusal)) => refusal.message,
             };
             if why != last {
-                told(Turn::Fault(why.clone()));
+                report(Turn::Fault(why.clone()));
                 last = why;
             }
         }

@@ -74,7 +74,7 @@ impl Builder {
         self
     }
 
-    /// Lets emulators stand in for all arms, like `--sim`.
+    /// Replaces all arms by their emulators, like `--sim`.
     pub fn sim(mut self) -> Self {
         self.overrides.sim = true;
         self
@@ -92,7 +92,7 @@ impl Builder {
         self
     }
 
-    /// Adapters besides those in the box, which win over those of the same name.
+    /// Adapters besides the built-in ones; they win over those of the same name.
     pub fn adapters(mut self, more: &[AdapterSpec]) -> Self {
         self.adapters = Registry::with(more);
         self

@@ -17,7 +17,7 @@ const MAX_NAME: usize = 107;
 /// How long the look-up of a host may take.
 const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);
 
-/// A device that is ours for as long as this lives.
+/// A lock on devices, held for the lifetime of this value.
 #[derive(Debug)]
 pub struct DeviceLock(#[expect(dead_code, reason = "the names are ours while the sockets are open")] Vec<UnixListener>);
 
@@ -64,7 +64,7 @@ pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
     Ok(DeviceLock(taken))
 }
 
-/// Who has a name: the kernel tells whoever connects. Waits for nobody.
+/// Returns the pid that holds the name, taken from the socket's peer credentials. Never blocks.
 fn holder(name: &str) -> Option<i32> {
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
     let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).ok()?;
@@ -81,7 +81,7 @@ fn places(address: &str) -> BTreeSet<String> {
         return BTreeSet::from([format!("{text} of process {}", std::process::id())]);
     }
     if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
-        // What stands behind an `@` is how to talk to it.
+        // The part after an `@` is how to talk to it.
         let path = path.split_once('@').map_or(path, |(path, _)| path);
         let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
         return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), real.display())]);
@@ -95,7 +95,7 @@ fn places(address: &str) -> BTreeSet<String> {
         Err(_) => look_up(host, port),
     };
     if ips.is_empty() {
-        // It cannot be reached by a name that nobody knows either.
+        // An unknown host name cannot be reached either.
         return BTreeSet::from([format!("{host}:{port}")]);
     }
     ips.into_iter().map(|ip| SocketIp::new(canonical(ip), port).to_string()).collect()
@@ -122,7 +122,7 @@ fn canonical(ip: IpAddr) -> IpAddr {
 
 /// All addresses of a host name; none where it is not known in time.
 fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
-    // The system's resolver knows no deadline, so it gets a thread of its own, left behind when it is late.
+    // The system's resolver has no deadline, so it runs on its own thread, which is abandoned when it is late.
     let (sender, found) = mpsc::channel();
     let target = (host.to_owned(), port);
     let asked = std::thread::Builder::new().name("resolve".into()).spawn(move || {
@@ -156,7 +156,7 @@ mod tests {
         let held = take("test", &at("LOCALHOST")).unwrap();
         for _ in 0..200 {
             let refused = take("test", &at("127.0.0.1")).unwrap_err().to_string();
-            // A queue of those who ask is full some time: then nobody is named, and nobody waits.
+            // The queue of connections fills up; then no process is named, and the call does not block.
             assert!(refused.contains(&format!("process {port}")) || refused.contains("unknown"), "{refused}");
         }
         assert!(take("test", &at("127.0.0.2")).is_ok());

@@ -59,7 +59,7 @@ impl Dispatcher {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// Sends a request; the answer comes with the tick that handles it. `log` is how the log tells it.
+    /// Sends a request; the answer comes with the tick that handles it. `log` is its log entry.
     pub fn send(&self, request: Request, log: Value) -> Result<oneshot::Receiver<Outcome>, NotTold> {
         self.push(request, |id, stamp| Note::Request { id, stamp, json: log.to_string() })
     }
@@ -84,14 +84,14 @@ impl Dispatcher {
         let ends_motion = matches!(request, Request::Stop { .. } | Request::Cancel { .. } | Request::Shutdown);
         let id = self.number();
         let (sender, receiver) = oneshot::channel();
-        // Made before the lock: a stop waits for nobody's text.
+        // Made before the lock: a stop never waits for the text of another request.
         let note = note(id, MonotonicClock.now());
         let mut ring = lock(&self.requests);
         if ring.slots() <= if ends_motion { 0 } else { RESERVED } {
             return Err(NotTold::Full);
         }
         lock(&self.waiting).insert(id, sender);
-        // The recorder counts what it has no room for; only a run that is ending has no recorder any more.
+        // The recorder counts what it has no room for; only a run that is ending has no recorder.
         let _ = self.notes.send(note);
         if ring.push(Envelope { id, request }).is_err() {
             lock(&self.waiting).remove(&id);
@@ -112,7 +112,7 @@ impl Dispatcher {
 
     fn answered(&self, id: u64, outcome: Outcome) {
         if let Some(sender) = lock(&self.waiting).remove(&id) {
-            // Whoever asked may have gone.
+            // The client may have gone.
             let _ = sender.send(outcome);
         }
     }
@@ -125,7 +125,7 @@ async fn answer(answer: oneshot::Receiver<Outcome>) -> Result<Outcome, NotTold> 
     }
 }
 
-/// How the log tells a request that carries no trajectory.
+/// Returns the log entry of a request without a trajectory.
 pub fn log_of(request: &Request) -> Value {
     match request {
         Request::Execute { task, motion } => json!({"execute": {"task": task, "motion": motion.id}}),
@@ -166,7 +166,7 @@ impl Courier {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopping, waiting) = (stop.clone(), wake.clone());
         let thread = std::thread::Builder::new().name("courier".into()).spawn(move || {
-            // It tells operators that their stop was taken; where this is not granted it competes like any other thread.
+            // It confirms operators' stops; without this right it competes like any other thread.
             let _ = host::set_fifo(host::STOP_PRIORITY);
             while !stopping.load(Ordering::Acquire) {
                 let woken = waiting.wait(SWEEP);

@@ -12,7 +12,7 @@ use crate::rpc::api::{
 use crate::rpc::report::{MotionReport, StateReport, StatusReport};
 use crate::rpc::{Code, RpcError};
 
-/// How often a motion that is waited for is looked at.
+/// Poll period while waiting for a motion.
 const INTERVAL: Duration = Duration::from_millis(10);
 
 /// A way to talk to a run of this process. Clones talk to the same run, from any thread.
@@ -60,7 +60,7 @@ impl Handle {
     }
 
     /// Waits for the end of a motion. Its `state` is `COMPLETED` when the arm has arrived; else `error` says why not.
-    /// Where it was planned again around something, that of the motion that went on.
+    /// After replanning around an obstacle: the report of the motion that continued.
     pub fn wait(&self, motion: u64) -> Result<MotionReport, RpcError> {
         let mut motion = motion;
         loop {
@@ -93,7 +93,7 @@ impl Handle {
         self.call(Stop { arm: Some(arm.to_owned()) })
     }
 
-    /// Clears a latched hold or a fault of an arm. Moves nothing, enables nothing. Refused while the cause stands.
+    /// Clears a latched hold or a fault of an arm. Moves nothing, enables nothing. Refused while the cause is present.
     pub fn reset(&self, arm: &str) -> Result<ArmReply, RpcError> {
         self.call(ArmReset { arm: arm.to_owned() })
     }

@@ -1,4 +1,4 @@
-//! Stops that could not be sent because an arm could not be reached: whoever asked was told so, and hears when the
+//! Stops that could not be sent because an arm could not be reached: the client was informed, and is notified when the
 //! device thread delivers them after all.
 
 use std::collections::BTreeMap;
@@ -15,7 +15,7 @@ use crate::telemetry::describe::{Described, Severity};
 /// The stops of a run that were not sent.
 #[derive(Debug, Default)]
 pub(super) struct LateStops {
-    /// Whether there are any: this is looked at with every tick.
+    /// Whether there are any: checked with every tick.
     any: AtomicBool,
     /// By arm: the number of the last stop that had been sent.
     sent_before: Mutex<BTreeMap<usize, u32>>,
@@ -34,7 +34,7 @@ impl LateStops {
 }
 
 impl Service {
-    /// An operator was told that an arm's stop was not sent.
+    /// Records that an operator was informed of an arm's undelivered stop.
     pub(super) fn stop_not_sent(&self, arm: usize) {
         if let Some(device) = self.parts.devices.get(arm) {
             self.late_stops.add(arm, device.health().stop_sent.load(Ordering::Acquire));
@@ -54,7 +54,7 @@ impl Service {
                 let confirmed = device.health().stop_confirmed.load(Ordering::Relaxed) == sent;
                 self.report_late_stop(arm, confirmed, wall);
             }
-            // An arm that was reset is not to be stopped any more.
+            // An arm that was reset must not be stopped later.
             sent == *before && self.phase(arm) == Phase::Held
         });
         self.late_stops.any.store(!waiting.is_empty(), Ordering::Release);

@@ -82,7 +82,7 @@ pub(super) fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
     ])
 }
 
-/// Tells an episode of a device to the text log and to the recorder.
+/// Logs and records an episode of a device.
 pub(super) fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: device::Note) {
     let id = names.arm(arm as u16);
     let (severity, text) = match note {
@@ -95,7 +95,7 @@ pub(super) fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: d
         _ => tracing::warn!("{text}"),
     }
     let stamp = MonotonicClock.now();
-    // Only a run that is ending has no recorder any more.
+    // Only a run that is ending has no recorder.
     let _ = notes.send(Note::ArmText { arm: arm as u16, text: text.clone() });
     let _ = notes.send(Note::Log { severity, stamp, text });
 }

@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! start: claim the name ─▶ lock the devices ─▶ emulators ─▶ connect all ─▶ tick, recorder ─▶ enable ─▶ rpc
-//! stop:  come to rest ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
+//! stop:  decelerate ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
 //! ```
 
 mod arm_requests;
@@ -62,9 +62,9 @@ use dispatch::{Courier, Dispatcher};
 use tick::Tick;
 use watchdog::Watchdog;
 
-/// How long moving arms get to come to rest.
+/// Timeout for moving arms to decelerate to rest.
 const REST_LIMIT: Duration = Duration::from_secs(2);
-/// How long an arm stands still before it is taken to be at rest: an instant is also where it turns round.
+/// An arm counts as at rest after this time at standstill: a reversal also has zero velocity for an instant.
 const STILL_FOR: Duration = Duration::from_millis(50);
 
 /// Where a run is logged.
@@ -93,7 +93,7 @@ pub struct Options {
     pub solver: Option<Solver>,
     /// Whether idle states of the processor are held off.
     pub hold_latency: bool,
-    /// Who is told when the run is up, beats and ends: systemd, for a run that is a service.
+    /// Receives start, heartbeat and end of the run: systemd, for a run that is a service.
     pub service_manager: Option<ServiceManager>,
 }
 
@@ -181,7 +181,7 @@ pub struct Ended {
     pub log_cut: Option<String>,
 }
 
-/// A run that is up. Everything it can be asked is a method of its [`Handle`], and thereby of the run itself.
+/// A run that is up. Everything it can be asked is a method of its [`Handle`], and so of the run itself.
 ///
 /// ```
 /// use dimos::runtime::{Record, Run};
@@ -245,7 +245,7 @@ impl Run {
         self.endings.0.clone()
     }
 
-    /// Waits until someone or something ends it ([`endings`](Self::endings), `dimos down`, a fault), so long at most.
+    /// Waits until it is ended ([`endings`](Self::endings), `dimos down`, a fault), at most `limit`.
     /// It is still up then, until it is stopped.
     pub fn wait_for_end(&self, limit: Option<Duration>) -> Ending {
         let received = match limit {

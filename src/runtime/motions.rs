@@ -7,10 +7,10 @@ use crate::rpc::api::Presence;
 use crate::telemetry::{Reason, TaskState};
 use crate::trajectory::Spline;
 
-/// So many motions are remembered.
+/// Maximum number of remembered motions.
 const REMEMBERED: usize = 256;
 
-/// A motion as it was handed over.
+/// A motion as it was sent to the coordinator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Planned {
     /// The task that carries it out.
@@ -45,7 +45,7 @@ pub struct Carried {
 pub enum Next {
     /// It is being planned again.
     Planning,
-    /// The motion that goes on.
+    /// The motion that continues.
     Motion(u64),
     /// There is none: why.
     None(String),
@@ -84,7 +84,7 @@ pub struct End {
 pub struct Motions(BTreeMap<u64, (Planned, Option<End>)>);
 
 impl Motions {
-    /// A motion is about to be handed over.
+    /// Notes a motion that is about to be sent.
     pub fn plan(&mut self, number: u64, planned: Planned) {
         while self.0.len() >= REMEMBERED {
             self.0.pop_first();

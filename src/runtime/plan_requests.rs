@@ -1,4 +1,4 @@
-//! Plans, over rpc: begun, looked at, and handed to the coordinator.
+//! Plans, over rpc: started, queried, and passed to the coordinator.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

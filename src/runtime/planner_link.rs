@@ -32,7 +32,7 @@ const LONG: Duration = Duration::from_secs(9);
 /// How long `status` waits for it.
 const GLANCE: Duration = Duration::from_millis(500);
 
-/// A planner in a process of its own.
+/// A planner in its own process.
 pub(super) struct Attached {
     name: String,
     robots: Vec<api::RegisteredRobot>,
@@ -248,7 +248,7 @@ impl Service {
         Ok(Registered { run: self.parts.run.clone(), limits })
     }
 
-    /// Whether this run has the joints of a robot, and the task that shall move them.
+    /// Whether this run has the joints of a robot, and the task that moves them.
     fn fits(&self, robot: &api::RegisteredRobot) -> Result<(), RpcError> {
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
         let index = |name: &String| {
@@ -309,7 +309,7 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
     all
 }
 
-/// A planner in a process of its own: answers what a run asks, as it travels.
+/// A planner in its own process: answers requests of a run in their encoded form.
 pub(super) async fn answer_travelling(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
     let encoded = |e: serde_json::Error| RpcError::new(Code::Internal, e.to_string());
     if asked.method == RECHECK {

@@ -25,7 +25,7 @@ pub struct PlannerPort {
     pub(super) desk: PlannerThread,
     /// The objects of the world, as they were given.
     pub(super) objects: Mutex<BTreeMap<String, WorldObject>>,
-    /// The plans that were handed over, by number.
+    /// The plans that were executed, by number.
     pub(super) released: Mutex<BTreeMap<u64, Released>>,
 }
 
@@ -102,7 +102,7 @@ pub(super) fn positions_of(robot: &str, joints: &[String], moment: &Moment) -> R
     })
 }
 
-/// Does work of the planner on a thread of its own: neither what it reads nor a panic in it may keep other requests
+/// Does work of the planner on its own thread: neither what it reads nor a panic in it may keep other requests
 /// waiting, `stop` least of all.
 pub(super) async fn apart<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, RpcError> {
     let failed = |_| RpcError::new(Code::Internal, "the planner failed at this request: a defect of the program");

@@ -23,11 +23,11 @@ const LIMIT: Duration = Duration::from_secs(1);
 /// Plans that were carried out and may be under way.
 const RELEASED: usize = 64;
 
-/// A plan that was handed over, and the version of the world in which its motion was found free.
+/// A plan that was executed, and the version of the world in which its motion was found free.
 pub(super) type Released = (Arc<PlannedMotion>, u64);
 
 impl PlannerPort {
-    /// Remembers a plan that is handed over: it may be asked about while it is carried out.
+    /// Remembers a plan that is executed: it may be queried meanwhile.
     pub(super) fn remember(&self, plan: u64, found: Arc<PlannedMotion>, version: u64) {
         let mut released = lock(&self.released);
         while released.len() >= RELEASED {

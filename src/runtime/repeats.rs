@@ -1,5 +1,4 @@
-//! Keeps the text log readable: what repeats itself at the rate of the tick is told every ten
-//! seconds, with a count.
+//! Keeps the text log readable: events that repeat at the rate of the tick are logged every ten seconds, with a count.
 
 use std::collections::HashMap;
 use std::sync::Mutex;
@@ -8,18 +7,18 @@ use std::time::{Duration, Instant};
 use crate::sync::lock;
 use crate::telemetry::describe::Described;
 
-/// How often lines of one kind are told.
+/// Shortest interval between lines of one kind.
 const EVERY: Duration = Duration::from_secs(10);
 
-/// When lines of each kind were told last, and how many were not since.
+/// Time of the last line of each kind, and how many were suppressed since.
 #[derive(Debug, Default)]
 pub struct Repeats(Mutex<HashMap<Kind, (Instant, u64)>>);
 
-/// Kind and status of what is told.
+/// Kind and status of a line.
 type Kind = (&'static str, &'static str);
 
 impl Repeats {
-    /// The line to tell now, if any. What arms and tasks do is told always: it happens once an episode.
+    /// Returns the line to log now, if any. Events of arms and tasks are always logged: they occur once an episode.
     pub fn line(&self, told: &Described, now: Instant) -> Option<String> {
         if matches!(told.kind, "arm" | "task") {
             return Some(told.text.clone());

@@ -1,5 +1,5 @@
 //! Around what got in the way: a planned motion that had to end before an obstacle is planned again from where it rests,
-//! to the goal that was asked for, and goes on as another motion. Done by a thread of its own: it waits for the arm and
+//! to the goal that was asked for, and continues as another motion. It runs on its own thread: it waits for the arm and
 //! for the planner.
 
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::{Phase, TaskState};
 
-/// How long the arm may take to come to rest.
+/// Timeout for the arm to decelerate to rest.
 const REST: Duration = Duration::from_secs(10);
 /// How often is looked whether it rests, or whether there is a plan.
 const INTERVAL: Duration = Duration::from_millis(10);
@@ -51,7 +51,7 @@ impl Service {
 
     async fn plan_again(&self, motion: &UnderWay) -> Result<u64, RpcError> {
         self.rested(motion).await?;
-        let unknown = || RpcError::new(Code::UnknownPlan, "it is not known any more what was asked for");
+        let unknown = || RpcError::new(Code::UnknownPlan, "the request of this plan is no longer known");
         let request = lock(&self.plan_requests).get(&motion.plan).cloned().ok_or_else(unknown)?;
         let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
         loop {
@@ -98,7 +98,7 @@ impl Service {
         }
     }
 
-    /// Whether nobody has ended it meanwhile: by `cancel`, by a stop, or by going away with the lease.
+    /// Returns whether it was not ended meanwhile: by `cancel`, by a stop, or by the end of the lease.
     fn may_go_on(&self, motion: &UnderWay) -> Result<(), RpcError> {
         let ended = |what: &str| Err(RpcError::new(Code::ShuttingDown, what));
         if self.is_closed() {

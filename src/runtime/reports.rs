@@ -1,4 +1,4 @@
-//! What a run tells of itself: status, state, motions, streams.
+//! Reports of a run: status, state, motions, streams.
 
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::Instant;
@@ -288,7 +288,7 @@ impl Service {
         });
     }
 
-    /// Tells an event to the text log and to those who listen.
+    /// Logs an event and publishes it to subscribers.
     pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
         if let Some(line) = self.repeats.line(described, Instant::now()) {
             match described.severity {

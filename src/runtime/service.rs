@@ -137,7 +137,7 @@ impl Service {
         lock(&self.parts.arm_views).get_mut(arm).map(SlotReader::read)
     }
 
-    /// Whether every arm that can be seen is measured to stand still.
+    /// Returns whether every arm with known state is measured at rest.
     pub fn at_standstill(&self) -> bool {
         let still = |state: &ArmState| state.velocity.iter().take(state.dof).all(|v| v.abs() <= STANDSTILL);
         let mut views = lock(&self.parts.arm_views);
@@ -148,7 +148,7 @@ impl Service {
         lock(&self.parts.task_views).get_mut(task).map(SlotReader::read).unwrap_or_default()
     }
 
-    /// What the recorder tells, on the recorder's thread.
+    /// Handles a notice of the recorder, on the recorder's thread.
     pub fn notice(&self, notice: Notice<'_>, wall: WallOffset) {
         match notice {
             Notice::Event { tick, event, described } => {

@@ -1,7 +1,7 @@
-//! The service manager (systemd), where there is one: told when the run is up and when it ends, and kept content only
+//! The service manager (systemd), where there is one: informed when the run is up and when it ends; its watchdog is fed only
 //! while the tick beats.
 //!
-//! It is told by datagrams to the socket that `NOTIFY_SOCKET` names: `READY=1`, `WATCHDOG=1` and the like.
+//! It receives datagrams on the socket that `NOTIFY_SOCKET` names: `READY=1`, `WATCHDOG=1` and the like.
 
 use std::ffi::OsString;
 use std::io;
@@ -27,7 +27,7 @@ impl ServiceManager {
         Self::at(std::env::var_os("NOTIFY_SOCKET")?, watchdog).ok()
     }
 
-    /// One that listens at an address (a path, or `@` and an abstract name), and that wants a sign of life so often.
+    /// One that listens at an address (a path, or `@` and an abstract name), with the given watchdog interval.
     pub fn at(address: OsString, watchdog: Option<Duration>) -> io::Result<Self> {
         let address = match address.as_bytes().strip_prefix(b"@") {
             Some(name) => SocketAddr::from_abstract_name(name)?,
@@ -50,7 +50,7 @@ impl ServiceManager {
 
     /// The run ends.
     pub fn stopping(&self) {
-        self.tell("STOPPING=1\nSTATUS=coming to rest, then releasing the arms");
+        self.tell("STOPPING=1\nSTATUS=decelerating, then releasing the arms");
     }
 
     /// What the watchdog does each time it found that the tick beats: a sign of life, twice as often as asked for.

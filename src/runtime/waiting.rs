@@ -1,5 +1,5 @@
-//! Waiting for what a tick or a device thread brings: whoever waits looks again after every tick and after every
-//! answer of an arm. No pause is guessed.
+//! Waits for the effect of a tick or a device thread: the condition is checked after every tick and after every answer
+//! of an arm, without polling.
 
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use tokio::sync::watch;
 use super::service::Service;
 use crate::control::tick_loop::Pulse;
 
-/// How long a tick may take to come, before nobody waits for it any more.
+/// Maximum wait for a tick.
 const TICK_LIMIT: Duration = Duration::from_secs(1);
 
 /// Counts ticks and answers of arms, and wakes those who wait for them.
@@ -23,7 +23,7 @@ impl Progress {
     }
 }
 
-/// Somebody waits: the tick wakes the courier for as long as this lives.
+/// A request that waits: while this exists, the tick wakes the courier.
 struct Waiting<'a>(&'a Pulse);
 
 impl<'a> Waiting<'a> {

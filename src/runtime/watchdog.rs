@@ -1,4 +1,4 @@
-//! Sees that the tick is alive: the checker is not the checked. The device threads hold their arms by themselves
+//! Sees that the tick is alive: the checker is not the checked. The device threads hold their arms on their own
 //! when the tick falls silent; the watchdog ends the run.
 
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use crate::rt::host;
 /// How often it looks: each look costs a wake-up of the processor.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
-/// A tick silent for this long is taken to hang: long enough for a machine that stalls, short enough to end a run
+/// A tick silent for this time counts as hung: long enough for a machine that stalls, short enough to end a run
 /// within a second.
 pub fn silence_limit(period: Duration) -> Duration {
     (5 * period).max(Duration::from_millis(400))
@@ -45,7 +45,7 @@ impl Watchdog {
                 std::thread::park_timeout(LOOK_EVERY);
                 let now = MonotonicClock.now();
                 let beat = beat.last();
-                // A process that was stopped and goes on finds its tick silent, but the tick has had no chance to beat:
+                // A process that was stopped and continued finds its tick silent, but the tick has had no chance to beat:
                 // only time counts in which this thread could look.
                 let passed = now.since(looked).min(2 * LOOK_EVERY);
                 silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };

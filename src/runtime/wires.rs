@@ -14,7 +14,7 @@ use crate::rt::slot::{SlotReader, slot};
 use crate::rt::wake::Wake;
 use crate::telemetry::{ArmSample, Cause, Outcome, Phase, Sample, TaskView, TickSample};
 
-/// So many seconds of samples fit into the recorder's ring.
+/// Capacity of the recorder's ring [s].
 const RING_SECONDS: f64 = 5.0;
 
 /// The ends that are not the tick's.

@@ -1,5 +1,5 @@
-//! The planner's world, over rpc: objects that come, go, move, are held. As they were given they stand in
-//! [`PlannerPort::objects`], as shapes in the desk's world; the two change together.
+//! The planner's world, over rpc: objects that come, go, move, are held. [`PlannerPort::objects`] has them as given, the planner
+//! thread's world as shapes; the two change together.
 
 use std::path::PathBuf;
 
@@ -55,7 +55,7 @@ impl PlannerPort {
     pub(super) fn detach(&self, name: &str, moment: &Moment) -> Result<Done, RpcError> {
         let mut object = known(self, name)?;
         let Some([robot, link]) = object.held_by.take() else {
-            return Err(wrong(format!("nobody holds {name}")));
+            return Err(wrong(format!("no robot holds {name}")));
         };
         self.measured(moment);
         let setup = &*self.desk.now();
@@ -134,7 +134,7 @@ fn link_index(robot: &PlannedRobot, link: &str) -> Result<usize, RpcError> {
     robot.model.link_index(link).ok_or_else(unknown)
 }
 
-/// An object that nobody holds.
+/// An object that no robot holds.
 fn named(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
     not_held(port, name)?;
     known(port, name)

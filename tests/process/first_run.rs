@@ -289,7 +289,7 @@ fn a_signal_in_mid_motion_is_a_controlled_stop_and_a_second_one_changes_nothing(
         home.dimos("move arm 2 -0.3 0.6 0 0.8 0 --speed 1 --no-wait").with(0);
         eventually("it moves", || home.positions("arm")[0] > 0.2);
         run.signal(signal);
-        run.until("coming to rest");
+        run.until("decelerating to rest");
         run.signal(if signal == Signal::INT { Signal::TERM } else { Signal::INT });
         let ended = run.wait().with(code);
         assert!(ended.took < Duration::from_secs(5), "{:?}", ended.took);

@@ -278,7 +278,7 @@ fn the_world_is_changed_while_it_runs() {
         ("world add bad --cloud /dev/zero --at 0 0 1", 2, &["/dev/zero: not a file"]),
         ("world move nobody --at 0 0 1", 1, &["UNKNOWN_OBJECT"]),
         ("world remove nobody", 1, &["UNKNOWN_OBJECT"]),
-        ("world detach box", 2, &["nobody holds box"]),
+        ("world detach box", 2, &["no robot holds box"]),
         ("world attach box amr", 1, &["did you mean `arm`?"]),
         ("world attach box arm --link fingr", 2, &["no link named `fingr`"]),
         ("world attach box arm --touch link9", 2, &["no link named `link9`"]),
