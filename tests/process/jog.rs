@@ -347,7 +347,7 @@ tasks:
 #[test]
 fn what_is_missing_is_said_before_the_screen_is_taken() {
     let home = Home::new();
-    home.dimos("jog arm").with(2).says(&["error: jog reads keys from a terminal", "hint: `dimos task stream"]);
+    home.dimos("jog arm").with(2).says(&["error: jog needs a terminal", "hint: `dimos task stream"]);
     let _run = home.run("coordinator-mock --no-record");
     let terminal = Terminal::new(100, 24);
     terminal.start(&home, "jog arm").wait().with(2);
