@@ -62,7 +62,7 @@ fn a_scripted_fault_strikes() {
         let line = told.lines().find(|line| line.ends_with(what)).unwrap_or_else(|| panic!("{what}: {told}"));
         line.split_whitespace().find_map(|word| word.parse::<f64>().ok()).unwrap()
     };
-    let (came, struck) = (at(" s  a client connected"), at(" s  the fault error_code strikes"));
+    let (came, struck) = (at(" s  a client connected"), at(" s  the fault error_code begins"));
     assert!(struck >= came + 0.5 && at(" s  the client is gone") >= struck, "{told}");
     assert!(!told.contains("estop"), "{told}");
 }

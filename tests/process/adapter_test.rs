@@ -131,7 +131,7 @@ fn nobody_to_ask_no_motion() {
     let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
     let line = format!("adapter test yourarm --address {address} --only row --allow-motion");
-    home.dimos(&line).with(2).says(&["will come on", "E-stop", "no terminal", "hint: add --yes"]);
+    home.dimos(&line).with(2).says(&["will come on", "E-stop", "not a terminal", "hint: add --yes"]);
     assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
     home.dimos(&format!("adapter test yourarm --address {address} --yes")).with(2);
 }

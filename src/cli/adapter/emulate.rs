@@ -1,4 +1,4 @@
-//! `dimos adapter emulate NAME`: an arm's emulator by itself, so that any client of the arm can be tried against it.
+//! `dimos adapter emulate NAME`: an arm's emulator in its own process, so that any client of the arm can be tried against it.
 
 use std::io::{self, IsTerminal};
 use std::net::IpAddr;
@@ -27,7 +27,7 @@ const LOOK: Duration = Duration::from_millis(100);
 #[command(after_help = "\
 A fault script: at=2,kind=stall,duration=0.5 (repeatable), or a YAML or JSON file with a list of such.
 `at` counts seconds from the first client's connection. `--fault list` shows the kinds that this arm's emulator can play.
-Clients that come and go, and faults that strike, are told on stderr, in seconds since the start.")]
+Clients that connect and leave, and faults that begin, are logged on stderr, in seconds since the start.")]
 pub struct Args {
     #[command(flatten)]
     pub choice: Choice,
@@ -91,14 +91,14 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     Ok(ended)
 }
 
-/// Tells what has happened to the emulator since the last time: nobody who serves a client waits for a terminal.
+/// Prints the events of the emulator since the last call: no thread that serves a client waits for a terminal.
 fn tell(bar: &ProgressBar, zero: Mono) {
     while let Some((at, what)) = diary::take() {
         let what = match what {
             Happening::Came => "a client connected".to_owned(),
             Happening::Gone => "the client is gone".to_owned(),
-            Happening::TurnedAway => "another client was turned away".to_owned(),
-            Happening::Struck(kind) => format!("the fault {} strikes", kind.name()),
+            Happening::TurnedAway => "another client was rejected".to_owned(),
+            Happening::Struck(kind) => format!("the fault {} begins", kind.name()),
         };
         bar.suspend(|| output::note(format_args!("{:8.3} s  {what}", at.seconds_since(zero))));
     }
@@ -106,7 +106,7 @@ fn tell(bar: &ProgressBar, zero: Mono) {
 
 /// The kinds of faults that this arm's emulator can play, each with what it means.
 fn list_faults(args: &Args, row: &AdapterSpec) -> Result {
-    // Where nobody else is disturbed; on a bus, where it can play what it can play on any.
+    // At an address that disturbs no other program; for a bus, one with the faults that it can play on any.
     let place = if row.transport == "can" { Place::Pty } else { Place::InProcess };
     let (emulator, _) = start(args, row, &place)?;
     let mut table = Table::new(&["KIND", "WHAT GOES WRONG"]);
@@ -166,7 +166,7 @@ fn script(text: &str) -> Result<Vec<Fault>> {
         let (key, value) = part.split_once('=').ok_or_else(|| wrong(format!("{part:?} is not KEY=VALUE")))?;
         let value: Value = serde_yaml::from_str(value).map_err(|e| wrong(e.to_string()))?;
         if fault.insert(key.trim().to_owned(), value).is_some() {
-            return Err(wrong(format!("{key} stands there twice")));
+            return Err(wrong(format!("{key} is given twice")));
         }
     }
     serde_json::from_value(Value::Object(fault)).map(|fault| vec![fault]).map_err(|e| wrong(e.to_string()))

@@ -22,9 +22,9 @@ pub struct Args {
 enum Action {
     /// Write the start of an adapter for a new arm: it compiles, passes the conformance suite, and runs simulated
     New(new::Args),
-    /// Check an adapter on a real arm, without moving it unless told to, or on its emulator
+    /// Check an adapter on a real arm, without motion unless allowed, or on its emulator
     Test(test::Args),
-    /// Run an arm's emulator by itself, until Ctrl-C
+    /// Run an arm's emulator in its own process, until Ctrl-C
     Emulate(emulate::Args),
 }
 

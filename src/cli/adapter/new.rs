@@ -19,7 +19,7 @@ use name::Name;
 use templates::Arm;
 use write::{Change, Plan};
 
-/// Where the table of adapters stands in a checkout, and that of robot descriptions.
+/// Paths of the table of adapters and of that of robot descriptions in a checkout.
 const TABLE: &str = "src/hardware/arms/mod.rs";
 const ROBOTS: &str = "src/robot/builtin.rs";
 /// The checkout that this program was built from, wherever it is now.
@@ -70,7 +70,7 @@ pub struct Args {
 pub enum Transport {
     /// A TCP connection; the arm is asked and answers
     Tcp,
-    /// A CAN bus; the arm sends its state by itself
+    /// A CAN bus; the arm streams its state
     Can,
     /// A serial line; the arm is asked and answers
     Serial,
@@ -94,7 +94,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Commands to go on with, and what each is for.
+/// The next commands, and the purpose of each.
 type Next = [(String, &'static str); 4];
 
 fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {

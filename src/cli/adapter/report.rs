@@ -141,7 +141,7 @@ impl Report {
             Some(_) if odd => "; the motion was ODD and was stopped",
             Some(motion) if motion.interrupted => "; the motion was interrupted",
             Some(_) if self.lag.as_ref().is_some_and(|lag| !lag.complete()) => "; the lag was not measured",
-            Some(_) => "; each joint moved as it was told",
+            Some(_) => "; each joint moved as commanded",
         };
         let (passed, failed, skipped) = (self.count("passed"), self.count("failed"), self.count("skipped"));
         format!("{passed} checks passed, {failed} failed, {skipped} do not apply{motion}")
@@ -157,7 +157,7 @@ impl Report {
     }
 
     fn facts(&self) -> Vec<(&'static str, String)> {
-        let (arm, said) = (&self.arm, |text: &Option<String>| text.clone().unwrap_or_else(|| "not told".to_owned()));
+        let (arm, said) = (&self.arm, |text: &Option<String>| text.clone().unwrap_or_else(|| "not reported".to_owned()));
         vec![
             ("arm", format!("{} {}, {} joints", arm.vendor, arm.model, arm.dof)),
             ("firmware", said(&arm.firmware)),
@@ -257,7 +257,7 @@ fn state_part(figures: &Figures) -> Part {
     let ms = |spread: &Spread| [spread.p50, spread.p99, spread.max].map(|v| fixed(v, 3)).to_vec();
     let row = |what: &str, cells: Vec<String>| [vec![what.to_owned()], cells].concat();
     let one = |what: &str, text: String| row(what, vec![text, String::new(), String::new()]);
-    let how = if figures.sends_by_itself { "it sends by itself" } else { "it is asked" };
+    let how = if figures.sends_by_itself { "it streams" } else { "it is polled" };
     let mut rows = vec![
         one("how it comes", how.to_owned()),
         one("new states per second [Hz]", fixed(figures.rate, 1)),
@@ -287,7 +287,7 @@ fn lag_part(lag: &Lag) -> Part {
         let why = "not measured: over 500 ms, or other programs took the processor; try again without them";
         notes.push(why.to_owned());
     }
-    let title = "lag: from a set point to the measured motion";
+    let title = "lag: from a setpoint to the measured motion";
     Part { title, headings: vec![">JOINT", ">LAG ms"], rows: rows.collect(), notes }
 }
 
@@ -312,7 +312,7 @@ fn motion_part(motion: &Motion) -> Part {
     });
     let mut notes = Vec::new();
     notes.extend(motion.held.map(|held| format!("motors on: it moved by {}°", fixed(held.to_degrees(), 2))));
-    notes.extend(motion.stopped.map(|on| format!("a stop in motion: it went on for {}°", fixed(on.to_degrees(), 2))));
+    notes.extend(motion.stopped.map(|on| format!("a stop in motion: it moved another {}°", fixed(on.to_degrees(), 2))));
     notes.extend(motion.odd.as_ref().map(|odd| format!("ODD: {odd}; stopped there")));
     notes.extend(motion.interrupted.then(|| "interrupted; stopped there".to_owned()));
     notes.push(format!("left with {}", motion.left));

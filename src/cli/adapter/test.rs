@@ -30,7 +30,7 @@ const WATCH: Duration = Duration::from_secs(2);
 #[command(after_help = "\
 Without --allow-motion nothing is enabled and nothing moves. With it, and only when no check failed, after a question,
 each joint goes 2° to either side and back, one after the other, at 5 % of its top speed; whatever is odd, and Ctrl-C, ends that by a stop.
-With --lag this motion is streamed as set points, and the lag is measured: the time from a set point to the motion that follows it.
+With --lag this motion is streamed as setpoints, and the lag is measured: the time from a setpoint to the motion that follows it.
 Stay within reach of the arm's own E-stop button.
 
 Exit codes: 0 all passed, 1 something failed, 2 usage, 3 the arm cannot be reached.")]
@@ -111,7 +111,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         lag: None,
     };
     if !args.json {
-        report.print(); // before the motion: whoever is asked about that knows what was found
+        report.print(); // before the motion: the user who confirms it knows the result so far
     }
     let moved = match report.count("failed") {
         _ if !(args.allow_motion || args.lag) || signals.last().is_some() => Ok((None, None)),
@@ -272,7 +272,7 @@ impl Args {
     }
 }
 
-/// Connects to an arm that is to be moved, unless something speaks against moving it from where it stands.
+/// Connects to an arm that is to be moved; fails if something prevents moving it from its position.
 fn connect_to_move(adapter: &mut dyn ManipulatorAdapter) -> Result<()> {
     adapter.connect().map_err(|e| Failure::of(Exit::Hardware, e))?;
     let Err(why) = gently::refusal(adapter) else { return Ok(()) };
@@ -283,9 +283,9 @@ fn connect_to_move(adapter: &mut dyn ManipulatorAdapter) -> Result<()> {
 /// Asks, where somebody can answer.
 fn confirm(signals: &Signals) -> Result<()> {
     if !io::stdin().is_terminal() || !io::stderr().is_terminal() {
-        return Err(Failure::usage("nobody can be asked before the motion: this is no terminal").hint("add --yes"));
+        return Err(Failure::usage("the motion cannot be confirmed: stdin is not a terminal").hint("add --yes"));
     }
-    output::note("Type yes to go on:");
+    output::note("Type yes to continue:");
     if answered_yes(signals) {
         return Ok(());
     }
@@ -295,7 +295,7 @@ fn confirm(signals: &Signals) -> Result<()> {
     })
 }
 
-/// Waits for a line, and for a signal: reading alone would go on after Ctrl-C.
+/// Waits for a line, and for a signal: reading alone would continue after Ctrl-C.
 fn answered_yes(signals: &Signals) -> bool {
     let stdin = io::stdin();
     let moment = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };

@@ -1,6 +1,6 @@
-//! The first description of a new arm: a made-up arm of so many joints, for a planner to work with from the start.
+//! The first description of a new arm: a made-up arm with any number of joints, for a planner to work with from the start.
 //!
-//! It stands straight up when all joints are at zero. Its joints roll about z and pitch about y by turns, its shapes are
+//! It points straight up when all joints are at zero. Its joints roll about z and pitch about y by turns, its shapes are
 //! primitives, and it is about a metre long whatever the number of joints.
 
 use std::fmt::Write;
@@ -31,7 +31,7 @@ fn joints(dof: u8) -> impl Iterator<Item = Joint> {
     })
 }
 
-/// A pose in which it is bent over evenly [rad], as it stands in a blueprint.
+/// A pose in which it is bent over evenly [rad], as written in a blueprint.
 pub fn home(dof: u8) -> String {
     let pitches = joints(dof).filter(|joint| *joint == Joint::Pitch).count().max(1);
     let each = (100.0 * BENT / pitches as f64).round() / 100.0;
@@ -39,7 +39,7 @@ pub fn home(dof: u8) -> String {
     joints(dof).map(|joint| value(joint).to_string()).collect::<Vec<_>>().join(", ")
 }
 
-/// The names of its joints, as they stand in a blueprint.
+/// The names of its joints, as written in a blueprint.
 pub fn joint_names(dof: u8) -> String {
     (1..=dof).map(|number| format!("joint{number}")).collect::<Vec<_>>().join(", ")
 }

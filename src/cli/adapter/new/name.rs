@@ -2,7 +2,7 @@
 
 use crate::hardware::registry::Registry;
 
-/// Longest name: it stands in lines of code.
+/// Longest name: it is part of lines of code.
 const LONGEST: usize = 24;
 
 /// Words of Rust that no module can be called.
@@ -31,7 +31,7 @@ impl Name {
         let snake = parts.join("_");
         let is = |list: &str| list.split_whitespace().any(|word| word == snake);
         let problem = if !text.starts_with(|c: char| c.is_ascii_lowercase()) || !text.chars().all(good) {
-            "begin it with a lower-case letter, and go on with such, digits, - and _".to_owned()
+            "begin it with a lower-case letter; lower-case letters, digits, - and _ may follow".to_owned()
         } else if parts.iter().any(|part| part.is_empty()) {
             "- and _ stand between letters".to_owned()
         } else if text.len() > LONGEST {

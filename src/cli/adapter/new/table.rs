@@ -10,7 +10,7 @@ pub fn with_row(text: &str, module: &str) -> Result<String, String> {
     with_entry(&with_module(text, module, &declaration)?, module)
 }
 
-/// Modules stand in alphabetical order, each after its attributes.
+/// Modules are in alphabetical order, each after its attributes.
 fn with_module(text: &str, module: &str, declaration: &str) -> Result<String, String> {
     let lines: Vec<&str> = text.lines().collect();
     let named = |line: &str| line.strip_prefix("pub mod ").and_then(|rest| rest.strip_suffix(';')).map(str::to_owned);
@@ -52,7 +52,7 @@ pub fn with_robot(text: &str, name: &str) -> Result<String, String> {
     if names.contains(&own.as_str()) {
         return Err(format!("it has {own} already"));
     }
-    // Names stand in alphabetical order.
+    // Names are in alphabetical order.
     let at = names.iter().position(|other| *other > own.as_str()).unwrap_or(names.len());
     names.insert(at, &own);
     let list: Vec<String> = names.iter().map(|name| format!("    {name}")).collect();

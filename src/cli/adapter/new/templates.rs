@@ -150,7 +150,7 @@ impl Arm {
     }
 }
 
-/// The text with each pair's second in place of its first, in one go: what is put in is not looked at again. Where two
+/// Replaces the first of each pair by the second, in one pass: inserted text is not replaced again. Where two
 /// pairs begin at the same place, the first one counts.
 fn replace(text: &str, pairs: &[(&str, &str)]) -> String {
     let mut out = String::with_capacity(text.len());

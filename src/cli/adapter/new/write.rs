@@ -46,7 +46,7 @@ impl Plan {
     fn attempt(&self, made: &mut Made) -> io::Result<()> {
         for (path, text) in &self.new {
             made.folders_of(path)?;
-            // What has come into the way since is left alone.
+            // Files that appeared since are not touched.
             let mut file = fs::File::create_new(path).map_err(|e| at(path, &e))?;
             made.0.push(path.clone());
             file.write_all(text.as_bytes()).map_err(|e| at(path, &e))?;
