@@ -21,11 +21,11 @@ use crate::telemetry::{Age, Cause, LimitKind, Phase};
 const SETTLING_LIMIT: f64 = 0.5;
 /// A joint that moves this far while its arm is being enabled does so for another reason [rad].
 const MOVED: f64 = 0.02;
-/// How long a joint may be too far from its set points before the arm is held [s]: positions, velocities.
+/// How long a joint may be too far from its setpoints before the arm is held [s]: positions, velocities.
 const TRACKING_LIMIT: (f64, f64) = (0.1, 0.2);
-/// In velocity mode, how far the measured velocity may be from the set points [rad/s], and as a part of itself.
+/// In velocity mode, how far the measured velocity may be from the setpoints [rad/s], and as a part of itself.
 const VELOCITY_TOLERANCE: (f64, f64) = (0.2, 0.2);
-/// A held joint that stands still further than this from its set points, besides its accuracy, has its set point drawn to
+/// A held joint that stands still further than this from its setpoints, besides its accuracy, has its setpoint drawn to
 /// it [rad].
 const DRAW: f64 = 0.04;
 /// How long that takes at most, within the joint's top speed [s].
@@ -57,20 +57,20 @@ pub struct ArmControl {
     standing: bool,
     /// Where the joints were measured when the arm was enabled.
     seed: Joints,
-    /// The first set point after a start was not written yet: the sequence number of its first command.
+    /// The first setpoint after a start was not written yet: the sequence number of its first command.
     starting: Option<u64>,
     /// Nothing reached the arm for more than two periods, or what did is not what is commanded: the first command that
     /// was made from what had been written.
     gap_since: Option<u64>,
-    /// How far each joint is outside the range of its set points of the last `lag` seconds [rad]; 0 in velocity mode.
+    /// How far each joint is outside the range of its setpoints of the last `lag` seconds [rad]; 0 in velocity mode.
     tracking_errors: Joints,
     /// `supervision.lag`.
     lag: Duration,
-    /// How far each joint coasts beyond the last set point that it got before a gap [rad], and for how long that counts.
+    /// How far each joint coasts beyond the last setpoint that it got before a gap [rad], and for how long that counts.
     coast: (Joints, Mono),
-    /// How long a joint has been too far from its set points [s].
+    /// How long a joint has been too far from its setpoints [s].
     astray: f64,
-    /// Time left to draw set points to the measured pose [s].
+    /// Time left to draw setpoints to the measured pose [s].
     drawing: f64,
     /// The arm is to be asked to stop by its own means, once it is at rest.
     stop_owed: bool,
@@ -189,19 +189,19 @@ impl ArmControl {
         self.gap_since.map(|_| self.written.last().at)
     }
 
-    /// How far a joint is outside the range of its set points of the last `lag` seconds [rad]; 0 inside, and in velocity
+    /// How far a joint is outside the range of its setpoints of the last `lag` seconds [rad]; 0 inside, and in velocity
     /// mode.
     pub fn tracking_error(&self, joint: usize) -> f64 {
         self.tracking_errors.get(joint).copied().unwrap_or_default()
     }
 
-    /// Compares the latest positions with their set points.
+    /// Compares the latest positions with their setpoints.
     fn compare(&mut self) {
         self.tracking_errors = [0.0; MAX_DOF];
         if !self.command.mode.is_some_and(ControlMode::is_position) || self.starting.is_some() {
             return;
         }
-        // The newest set point is in every window.
+        // The newest setpoint is in every window.
         let near = |(q, limiter): (&f64, &Limiter)| (q - limiter.position()).abs() <= DRAW / 4.0;
         if self.state.position.iter().zip(&self.limiters).all(near) {
             return;
@@ -222,7 +222,7 @@ impl ArmControl {
         }
     }
 
-    /// Where the set points begin that the latest state may still be following.
+    /// Where the setpoints begin that the latest state may still be following.
     fn window_start(&self) -> Mono {
         self.state.stamp.before(self.lag)
     }
@@ -243,7 +243,7 @@ impl ArmControl {
         if !self.state.enabled || matches!(self.state.link, Link::Down | Link::Faulted) {
             self.standing = false;
         }
-        // Before anything is compared with the set points: an arm that got none is beyond the last one.
+        // Before anything is compared with the setpoints: an arm that got none is beyond the last one.
         let moved = self.starting.is_none() && self.command.mode.is_some_and(ControlMode::is_position);
         if moved && self.gap_since.is_none() && self.written.gap(now) {
             self.begin_to_coast(now);
@@ -329,7 +329,7 @@ impl ArmControl {
         }
     }
 
-    /// How far a joint's velocity is beyond the tolerance around its set points of the last `lag` seconds [rad/s].
+    /// How far a joint's velocity is beyond the tolerance around its setpoints of the last `lag` seconds [rad/s].
     fn velocity_error(&self, range: &Range, joint: usize) -> f64 {
         let Some(v) = self.state.velocity.get(joint) else { return 0.0 };
         let tolerance = VELOCITY_TOLERANCE.0.max(VELOCITY_TOLERANCE.1 * v.abs());
@@ -395,7 +395,7 @@ impl ArmControl {
         (self.command.at, self.command.next_tick) = (now, next_tick);
         let phase = self.failsafe.phase();
         let held = phase == Phase::Held;
-        // What somebody else does with the arm is theirs to end: it gets no set point and no stop.
+        // What somebody else does with the arm is theirs to end: it gets no setpoint and no stop.
         let foreign = held && self.failsafe.cause().is_foreign();
         self.stop_owed |= held && !self.was_held && !foreign;
         self.was_held = held;
@@ -443,7 +443,7 @@ impl ArmControl {
         self.standing &= mode.is_position();
     }
 
-    /// An arm at speed that gets no set point comes to rest beyond the last one, by its own means, and then returns to it.
+    /// An arm at speed that gets no setpoint comes to rest beyond the last one, by its own means, and then returns to it.
     fn begin_to_coast(&mut self, now: Mono) {
         let mut longest = 0.0f64;
         for (coast, limiter) in self.coast.0.iter_mut().zip(&self.limiters) {
@@ -458,7 +458,7 @@ impl ArmControl {
     /// Finds out whether what is commanded reaches the arm. Where it does not, the commands go back to what did.
     fn note_gap(&mut self, now: Mono) {
         if let Some(first) = self.starting {
-            // Until the first set point is written, each tick makes it again from the newest measurement.
+            // Until the first setpoint is written, each tick makes it again from the newest measurement.
             if self.state.written >= first
                 && let Some(mode) = self.command.mode
             {
@@ -503,17 +503,17 @@ impl ArmControl {
         }
     }
 
-    /// Draws the set points of joints that do not follow them to where they are. `true`: there are such joints.
+    /// Draws the setpoints of joints that do not follow them to where they are. `true`: there are such joints.
     fn draw(&mut self, dt: f64) -> bool {
         let tolerance = DRAW + self.config.supervision.accuracy;
         let mut drawn = false;
-        // A position that jumped may be wrong: no set point is made from it before a reset.
+        // A position that jumped may be wrong: no setpoint is made from it before a reset.
         if matches!(self.failsafe.cause(), Cause::PositionJump(..)) || self.belief.refused() > 0 {
             return false;
         }
         self.drawing = (self.drawing - dt).max(dt);
         for j in 0..self.config.dof {
-            // One that still moves is on its way, and its set point is brought to rest like any other.
+            // One that still moves is on its way, and its setpoint is brought to rest like any other.
             let stands = self.state.velocity.get(j).is_none_or(|v| v.abs() <= TICK_STANDSTILL);
             let off = stands && self.tracking_error(j).abs() > tolerance;
             let q = self.state.position.get(j).copied().unwrap_or_default();

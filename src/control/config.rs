@@ -69,7 +69,7 @@ pub struct ArmConfig {
     /// Period of the device's states, as the device thread reads them.
     #[serde(default)]
     pub read_period: Duration,
-    /// Longest regular time between two set points on the wire; the tick's period where that is longer.
+    /// Longest regular time between two setpoints on the wire; the tick's period where that is longer.
     #[serde(default)]
     pub write_period: Duration,
     /// Figures with which its measurements and its motion are checked.

@@ -1,5 +1,5 @@
-//! The set points of the last moments, and how far an arm is from them. A joint that follows with a delay is somewhere in
-//! the range of the set points of its `lag`; one that is outside is blocked, pushed or moved by somebody else.
+//! The setpoints of the last moments, and how far an arm is from them. A joint that follows with a delay is somewhere in
+//! the range of the setpoints of its `lag`; one that is outside is blocked, pushed or moved by somebody else.
 
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};
@@ -7,17 +7,17 @@ use crate::joint::{Joints, MAX_DOF};
 /// Parts that the window is kept in: its edge is exact to one of them.
 const PARTS: usize = 16;
 
-/// The range of the set points in one part of the window.
+/// The range of the setpoints in one part of the window.
 #[derive(Debug, Clone, Copy)]
 struct Part {
-    /// Time of its first and of its last set point.
+    /// Time of its first and of its last setpoint.
     from: Mono,
     to: Mono,
     low: Joints,
     high: Joints,
 }
 
-/// Set points of one arm over its `lag`.
+/// Setpoints of one arm over its `lag`.
 #[derive(Debug, Clone)]
 pub struct SetPoints {
     dof: usize,
@@ -46,7 +46,7 @@ impl SetPoints {
         self.count == 0
     }
 
-    /// Adds the set points of a tick [rad or rad/s].
+    /// Adds the setpoints of a tick [rad or rad/s].
     pub fn push(&mut self, now: Mono, values: &Joints) {
         let grown = self.count > 0
             && self.parts.get_mut(self.newest).is_some_and(|part| {
@@ -69,7 +69,7 @@ impl SetPoints {
         }
     }
 
-    /// The range of the set points since `since`, with the one that was in force then. `None` when there are none.
+    /// The range of the setpoints since `since`, with the one that was in force then. `None` when there are none.
     pub fn range(&self, since: Mono) -> Option<Range> {
         let mut range =
             self.parts.get(self.newest).filter(|_| self.count > 0).map(|p| Range { low: p.low, high: p.high })?;
@@ -91,7 +91,7 @@ impl SetPoints {
     }
 }
 
-/// Lowest and highest set point of each joint [rad or rad/s].
+/// Lowest and highest setpoint of each joint [rad or rad/s].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Range {
     /// Lowest.

@@ -29,7 +29,7 @@ pub struct JointView {
     pub velocity_limit: f64,
     /// Jerk limit [rad/s³].
     pub jerk: f64,
-    /// How far the joint is outside the range of its set points of the last `lag` seconds [rad].
+    /// How far the joint is outside the range of its setpoints of the last `lag` seconds [rad].
     pub tracking_error: f64,
 }
 

@@ -1,5 +1,5 @@
 //! What reached the wire. The device thread reports the newest command that it wrote; with the commands of the last ticks
-//! that is the set point the arm has. When nothing was written for more than two periods there is a gap: commands stay at
+//! that is the setpoint the arm has. When nothing was written for more than two periods there is a gap: commands stay at
 //! what was written last, and motion goes on from there.
 
 use std::time::Duration;
@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};
 
-/// Set points written later than this after the one before are a gap [periods].
+/// Setpoints written later than this after the one before are a gap [periods].
 const PERIODS: u32 = 2;
 
 /// A command as it was issued.
@@ -33,7 +33,7 @@ pub struct Written {
 }
 
 impl Written {
-    /// For a tick of this period and an arm that takes set points once in `write` at best.
+    /// For a tick of this period and an arm that takes setpoints once in `write` at best.
     pub fn new(tick: Duration, write: Duration) -> Self {
         let limit = PERIODS * tick.max(write);
         let kept = (limit.as_nanos() / tick.as_nanos().max(1)) as usize + 4;
@@ -64,7 +64,7 @@ impl Written {
         &self.last
     }
 
-    /// Whether more than two periods will have passed between the last written set point and one of `now`.
+    /// Whether more than two periods will have passed between the last written setpoint and one of `now`.
     pub fn gap(&self, now: Mono) -> bool {
         now.since(self.last.at) > self.limit
     }

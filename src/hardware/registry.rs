@@ -130,9 +130,9 @@ pub struct AdapterSpec {
     pub wire_units: &'static str,
     /// How often the device delivers its state [Hz].
     pub native_rate: f64,
-    /// How far a joint at rest may be from its set point under load [rad].
+    /// How far a joint at rest may be from its setpoint under load [rad].
     pub accuracy: f64,
-    /// Time from a set point to the measured motion that follows it [s]; `dimos adapter test --lag` measures it.
+    /// Time from a setpoint to the measured motion that follows it [s]; `dimos adapter test --lag` measures it.
     pub lag: f64,
     /// Age limit of a state: an arm without a newer one is held. At least three of the device's periods are granted.
     pub stale_after: Duration,

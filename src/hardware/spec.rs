@@ -38,8 +38,8 @@ pub enum AdapterError {
     /// The device refused a command.
     #[error("{0}")]
     Rejected(String),
-    /// Two set points are on their way and not acknowledged: this one was not sent. No failure of the device.
-    #[error("two set points are still unacknowledged")]
+    /// Two setpoints are on their way and not acknowledged: this one was not sent. No failure of the device.
+    #[error("two setpoints are still unacknowledged")]
     Busy,
     /// The device has no such feature.
     #[error("not supported by this arm")]
@@ -214,13 +214,13 @@ pub trait ManipulatorAdapter: Send {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
     /// Clears the device's error state. Moves nothing, enables nothing.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
-    /// Longest regular time between two set points that the device takes, known once it is connected. `None`: it takes one
+    /// Longest regular time between two setpoints that the device takes, known once it is connected. `None`: it takes one
     /// in every tick, or in every period of its states where that is longer.
     fn set_point_period(&self) -> Option<Duration> {
         None
     }
-    /// Discards set points that have not left this computer. Called when the arm stopped answering, before anything else
-    /// is sent: a set point that waits in a queue must not reach the arm later. By default the connection is dropped, and
+    /// Discards setpoints that have not left this computer. Called when the arm stopped answering, before anything else
+    /// is sent: a setpoint that waits in a queue must not reach the arm later. By default the connection is dropped, and
     /// the device thread connects again; a TCP connection is reset, not closed, so that its send buffer is discarded.
     fn discard_pending(&mut self) {
         self.disconnect();

@@ -246,7 +246,7 @@ fn a_wrong_reading_is_not_believed_and_three_that_agree_are_a_jump() {
     assert_eq!(rig.phase(0), Phase::Held);
     rig.run_for(0.5);
     let setpoint = rig.arms[0].setpoint.clone().unwrap()[0];
-    assert!(setpoint.abs() < 0.02, "no set point is made from a position that jumped: {setpoint}");
+    assert!(setpoint.abs() < 0.02, "no setpoint is made from a position that jumped: {setpoint}");
     assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::ArmLatched(0, Cause::PositionJump(0, by)));
     assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
 }
@@ -274,7 +274,7 @@ fn a_mode_or_power_that_nobody_here_ordered_holds_the_arm_and_is_left_alone() {
         rig.arms[0].state.interference = interference;
         rig.run(20);
         assert_eq!((rig.phase(0), rig.samples[0].cause.name()), (Phase::Held, cause));
-        assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, stops), "neither set points nor a stop");
+        assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, stops), "neither setpoints nor a stop");
     }
     let mut rig = Rig::new(100.0, vec![figured(0.05, 0.005)], one(servo()));
     rig.arms[0].enabled = false;

@@ -122,7 +122,7 @@ fn an_interface_may_go_down_and_come_back() {
     });
 }
 
-/// The interface sends nothing for a while: at most two set points wait, and after `discard_pending` nothing new goes out
+/// The interface sends nothing for a while: at most two setpoints wait, and after `discard_pending` nothing new goes out
 /// before they are transmitted.
 #[test]
 fn at_most_two_set_points_wait_in_the_kernel() {
@@ -140,7 +140,7 @@ fn at_most_two_set_points_wait_in_the_kernel() {
             arm.write_joint_positions(&target, 1.0).is_ok()
         });
         let taken = taken.count();
-        assert!((1..=2).contains(&taken), "{taken} set points wait");
+        assert!((1..=2).contains(&taken), "{taken} setpoints wait");
         arm.discard_pending();
         assert!(arm.write_stop().is_err() && arm.is_connected(), "they must be out first");
         sh("tc qdisc change dev can0 root plug release_indefinite");

@@ -34,10 +34,10 @@ fn a_set_point_that_is_refused_beside_a_gripper_order_is_not_blamed_on_the_gripp
     let written = || run.status().arms[0].counters["writes"];
     for opening in [0.03, 0.04, 0.05, 0.06] {
         let before = written();
-        refuse("write_joint_positions", "this set point is not for me");
+        refuse("write_joint_positions", "this setpoint is not for me");
         run.gripper("arm", opening).unwrap();
         // Three refusals in a row are a connection that does not work.
-        eventually("set points are taken again", || written() >= before + 3);
+        eventually("setpoints are taken again", || written() >= before + 3);
     }
     refuse("write_gripper_position", "something is between the fingers");
     let refused = run.gripper("arm", 0.0).unwrap_err();

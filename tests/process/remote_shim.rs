@@ -214,7 +214,7 @@ fn a_shim_that_is_killed_in_motion_is_told_and_the_arm_latched() {
 fn a_shim_that_hangs_is_told_and_stops_the_arm_when_it_wakes() {
     let Some((home, shim, run)) = on_its_way() else { return };
     shim.signal(Signal::STOP);
-    run.until("set points are not acknowledged");
+    run.until("setpoints are not acknowledged");
     run.until("is held (");
     shim.signal(Signal::CONT);
     shim.until("stopping the arm");

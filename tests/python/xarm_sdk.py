@@ -69,7 +69,7 @@ def session(host):
     check(near(arm.get_position()[1], target, 1.0), f"{arm.get_position()[1]} for {target}")
     ok(arm.set_servo_angle(angle=goal, speed=1.0, wait=True), "back")
 
-    # Set points, at 100 Hz.
+    # Setpoints, at 100 Hz.
     enable(arm, 1)
     for i in range(100):
         joints = list(goal)
@@ -77,7 +77,7 @@ def session(host):
         ok(arm.set_servo_angle_j(joints), "set_servo_angle_j")
         time.sleep(0.01)
     ok(arm.set_servo_angle_j(goal), "set_servo_angle_j")
-    until("the last set point", lambda: near(arm.get_servo_angle()[1], goal, 2e-3))
+    until("the last setpoint", lambda: near(arm.get_servo_angle()[1], goal, 2e-3))
 
     # Velocities, which end by themselves.
     enable(arm, 4)
@@ -104,7 +104,7 @@ def session(host):
     # A stop, and the mode that is lost when it is changed while ready.
     arm.emergency_stop()
     until("the stop", lambda: arm.state == 4)
-    check(arm.set_servo_angle_j(goal) != 0, "a set point after a stop is refused")
+    check(arm.set_servo_angle_j(goal) != 0, "a setpoint after a stop is refused")
     enable(arm, 1)
     ok(arm.set_mode(4), "set_mode")
     ok(arm.set_state(0), "set_state")

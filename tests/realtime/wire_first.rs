@@ -1,4 +1,4 @@
-//! The first set points an arm gets, and those after something went wrong with it, beside where it truly is: judged on the
+//! The first setpoints an arm gets, and those after something went wrong with it, beside where it truly is: judged on the
 //! wire of every arm whose emulator can play the fault.
 
 use std::time::{Duration, Instant};
@@ -10,7 +10,7 @@ use crate::support::wire;
 use crate::support::wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, World, XARM, YOURARM, furthest};
 use crate::support::wire::judge::position;
 
-/// How far a first set point may be from where the arm is [rad]: what a moved joint is told by, too.
+/// How far a first setpoint may be from where the arm is [rad]: what a moved joint is told by, too.
 const BESIDE: f64 = 0.02;
 
 fn arms() -> Vec<Arm> {
@@ -91,7 +91,7 @@ fn beside_the_truth(delivered: &[wire::Told]) -> Result<(), String> {
     let far = delivered.iter().filter_map(|t| Some((t, furthest(position(&t.what)?, t.truth.as_ref()?))));
     match far.max_by(|a, b| a.1.total_cmp(&b.1)) {
         Some((told, by)) if by > BESIDE => {
-            Err(format!("a set point {by:.4} rad from the true pose: {:?} at {:?}", told.what, told.truth))
+            Err(format!("a setpoint {by:.4} rad from the true pose: {:?} at {:?}", told.what, told.truth))
         }
         _ => Ok(()),
     }

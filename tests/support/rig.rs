@@ -59,7 +59,7 @@ pub struct SimArm {
     pub state: ArmState,
     pub stops: u32,
     pub gripper: f64,
-    /// The last set points that reached it, and the tick's time of them.
+    /// The last setpoints that reached it, and the tick's time of them.
     pub written: Option<Vec<f64>>,
     pub written_at: Mono,
     pub written_start: u32,
@@ -460,7 +460,7 @@ impl Rig {
                 }
             }
             for j in 0..arm.dof {
-                // A held joint that does not follow has its set point drawn to it.
+                // A held joint that does not follow has its setpoint drawn to it.
                 let (from, to, q) = (wire.values[j], values[j], arm.state.position[j]);
                 let drawn =
                     sample.phase == Phase::Held && (to - q).abs() <= (from - q).abs() && (from - q).abs() > 0.02;

@@ -341,7 +341,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         let targets = protocol::encode_targets(&to_wire(positions)?);
         self.may_move()?;
-        // At most two set points wait for the bus.
+        // At most two setpoints wait for the bus.
         if self.port()?.waiting() > PAIRS {
             return Err(AdapterError::Busy);
         }

@@ -8,7 +8,7 @@ use dimos::hardware::transport::can::CanFrame;
 
 /// Motors on.
 pub const ENABLE: &str = "150 01 01 00 00 00 00 00 00";
-/// Set points, speed 25 %.
+/// Setpoints, speed 25 %.
 pub const MODE: &str = "150 02 01 19 00 00 00 00 00";
 /// Clear the error.
 pub const CLEAR: &str = "150 03 00 00 00 00 00 00 00";
@@ -17,7 +17,7 @@ pub const STOP: &str = "150 04 00 00 00 00 00 00 00";
 /// Who are you?
 pub const IDENTIFY: &str = "150 05 00 00 00 00 00 00 00";
 
-/// Motors on, moving, set points, error 2.
+/// Motors on, moving, setpoints, error 2.
 pub const STATUS: &str = "2c0 03 01 00 02 00 00 00 00";
 /// Model 1, 6 joints, firmware 2.1, serial number 42.
 pub const IDENTITY: &str = "2d0 01 06 02 01 00 00 00 2a";

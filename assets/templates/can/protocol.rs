@@ -12,7 +12,7 @@
 //!
 //! Commands. Nothing is acknowledged: what became of them shows in 2C0.
 //! 150       01 on   0 motors off, 1 on (the arm holds where it is)
-//!           02 mode speed   0 planned, 1 set points; speed of planned moves [%]; the mode changes at a standstill only
+//!           02 mode speed   0 planned, 1 setpoints; speed of planned moves [%]; the mode changes at a standstill only
 //!           03      clears the error
 //!           04      stops: decelerates; the motors stay on
 //!           05      asks for 2D0

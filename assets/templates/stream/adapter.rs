@@ -25,7 +25,7 @@ use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
 const HELLO: Patience = Patience { each: Duration::from_millis(250), times: 5 };
 /// Longest wait for any other reply. YOUR ARM: several times what the controller needs.
 const REPLY: Patience = Patience::once(Duration::from_millis(100));
-/// Longest wait for measurements, and for the reply to a set point. YOUR ARM: all tries together stay below `stale_after`,
+/// Longest wait for measurements, and for the reply to a setpoint. YOUR ARM: all tries together stay below `stale_after`,
 /// so that a single lost reply does not hold the arm.
 const CYCLE: Patience = Patience { each: Duration::from_millis(30), times: 3 };
 /// A reply answers further questions for one period of the controller.
@@ -100,7 +100,7 @@ impl AcmeAdapter {
         self.request(command, REPLY, |_| Some(()))
     }
 
-    /// A set point: it may be obeyed twice, so it may be sent again when its reply is lost.
+    /// A setpoint: it may be obeyed twice, so it may be sent again when its reply is lost.
     fn set_point(&mut self, command: &Command) -> AdapterResult<()> {
         self.state = None;
         self.request(command, CYCLE, |_| Some(()))

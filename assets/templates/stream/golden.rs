@@ -9,7 +9,7 @@ use super::DOF;
 pub const HELLO: &str = "a5010100 00a7";
 /// STATE, number 2.
 pub const STATE: &str = "a5020200 00a9";
-/// MODE set points, number 3.
+/// MODE setpoints, number 3.
 pub const MODE: &str = "a5030301 01 00ad";
 /// ENABLE on, number 4.
 pub const ENABLE: &str = "a5040401 01 00af";
@@ -22,7 +22,7 @@ pub const STOP: &str = "a506ff00 01aa";
 pub const HELLO_REPLY: &str = "5a01010a 00 0001 06 0201 0000002a 009a";
 /// Refusal of [`MODE`]: the arm is moving.
 pub const MOVING_REPLY: &str = "5a030301 05 0066";
-/// What stands before the joints in the reply to [`STATE`]: done, 123.456789 s, motors on, moving, set points, error 2.
+/// What stands before the joints in the reply to [`STATE`]: done, 123.456789 s, motors on, moving, setpoints, error 2.
 pub const STATE_BEFORE_JOINTS: &str = "00 00000000075bcd15 03 01 0002";
 
 /// Values of the joints, and the same as floats of the wire.

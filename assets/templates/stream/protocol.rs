@@ -10,12 +10,12 @@
 //! 01 HELLO     –                          → model u16, joints u8, firmware major u8, minor u8, serial number u32
 //! 02 STATE     –                          → time u64 [µs], flags u8 (1 motors on, 2 moving), mode u8, error u16,
 //!                                           positions [deg], velocities [deg/s], torques [Nm]: a float per joint
-//! 03 MODE      0 planned, 1 set points, 2 velocities; refused while the arm moves
+//! 03 MODE      0 planned, 1 setpoints, 2 velocities; refused while the arm moves
 //! 04 ENABLE    0 motors off, 1 on (the arm holds where it is)
 //! 05 CLEAR     –   clears the error
 //! 06 STOP      –   decelerates; the motors stay on
 //! 10 MOVE      speed [%], target [deg] per joint
-//! 11 SERVO     next set point [deg] per joint
+//! 11 SERVO     next setpoint [deg] per joint
 //! 12 VELOCITY  [deg/s] per joint; the arm stops when no other follows within 200 ms
 //!
 //! status  0 done, 1 unknown, 2 malformed, 3 motors off, 4 wrong mode, 5 moving, 6 out of range, 7 in error, 8 busy
@@ -49,7 +49,7 @@ pub enum Command {
     Stop,
     /// Speed [%], target [deg].
     Move(f64, WireJoints),
-    /// Set point [deg].
+    /// Setpoint [deg].
     Servo(WireJoints),
     /// Velocities [deg/s].
     Velocity(WireJoints),

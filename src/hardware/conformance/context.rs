@@ -15,10 +15,10 @@ const PATIENCE: Duration = Duration::from_secs(10);
 /// connection [s].
 const STRIKES_AT: f64 = 1.0;
 
-/// Longest wait for room for a set point.
+/// Longest wait for room for a setpoint.
 const ROOM: Duration = Duration::from_secs(1);
 
-/// Writes again while two set points are unacknowledged, as the device thread does.
+/// Writes again while two setpoints are unacknowledged, as the device thread does.
 pub fn when_there_is_room(mut write: impl FnMut() -> AdapterResult<()>) -> AdapterResult<()> {
     let until = Instant::now() + ROOM;
     loop {

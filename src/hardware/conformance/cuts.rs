@@ -18,7 +18,7 @@ pub const CHECKS: &[Check] = &[
     Check::new(Faults, "cut_when_disabled", "a wire cut while disabled is noticed and mended", when_disabled),
     Check::new(Faults, "cut_when_enabled", "a wire cut while enabled: the same, and it holds", when_enabled),
     Check::new(Faults, "cut_in_motion", "a wire cut in motion: the same, and it can be stopped", in_motion),
-    Check::new(Faults, "cut_while_streaming", "a wire cut between set points: it stands still", while_streaming),
+    Check::new(Faults, "cut_while_streaming", "a wire cut between setpoints: it stands still", while_streaming),
     Check::new(Faults, "cut_in_error", "a wire cut in error: reconnecting clears nothing", in_error),
     Check::new(Faults, "power_cut", "after a loss of power nothing comes on by itself", power),
     Check::new(Faults, "stop_into_the_void", "no stop is confirmed once the wire is cut", stop_into_the_void),
@@ -131,10 +131,10 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     }
     cut(context)?;
     let refused = context.adapter.write_joint_positions(&point, 1.0);
-    require(refused == Err(AdapterError::NotConnected), || format!("a set point after the cut: {refused:?}"))?;
+    require(refused == Err(AdapterError::NotConnected), || format!("a setpoint after the cut: {refused:?}"))?;
     let here = mend(context)?;
     let off = farthest(&here, &point);
-    require(off < 0.02, || format!("it stands {off:.4} rad from its last set point"))?;
+    require(off < 0.02, || format!("it stands {off:.4} rad from its last setpoint"))?;
     context.stays(&here, 0.005)
 }
 

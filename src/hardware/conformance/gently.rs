@@ -30,7 +30,7 @@ const CLOSE: f64 = 0.3 * DEGREE;
 const STRAY: f64 = 0.5 * DEGREE;
 /// More than this beyond the target is odd [rad].
 const OVERSHOOT: f64 = 1.0 * DEGREE;
-/// Behind its set points by more than this, a joint does not follow [rad].
+/// Behind its setpoints by more than this, a joint does not follow [rad].
 const BEHIND: f64 = 1.5 * DEGREE;
 /// How long one way may take.
 const PATIENCE: Duration = Duration::from_secs(15);
@@ -44,15 +44,15 @@ const WATCH: Duration = Duration::from_millis(500);
 const OLD: f64 = 0.5;
 /// Time between looks.
 const PERIOD: Duration = Duration::from_micros(2500);
-/// Looks from one set point of a stream to the next. Looking only when one has just been sent would always see the
+/// Looks from one setpoint of a stream to the next. Looking only when one has just been sent would always see the
 /// joint in the same part of its step.
 const LOOKS: u32 = 4;
 /// Shortest time of a wave, and of one with which the lag is measured [s]: slow enough for the joint to stay near its
-/// set points in spite of a long lag.
+/// setpoints in spite of a long lag.
 const SHORTEST: (f64, f64) = (0.3, 0.8);
 /// Attempts to measure the lag of a joint while this program runs unevenly.
 const ATTEMPTS: u32 = 3;
-/// Set points go on by no more than this time at once [s].
+/// Setpoints go on by no more than this time at once [s].
 const LONGEST_STEP: f64 = 0.01;
 /// What the integral of a joint's velocity may be, as a fraction of its way: less where this program had to wait for a
 /// processor and missed the fast part, but never of the other sign, and never as much as degrees for radians.
@@ -156,7 +156,7 @@ pub fn move_gently(
     Gently { adapter, interrupted, tell, start: Vec::new(), motion: Motion::default(), trace: None }.run(Gently::all)
 }
 
-/// Moves each joint of a connected arm a little by streamed set points, as [`move_gently`] does but slower, and measures
+/// Moves each joint of a connected arm a little by streamed setpoints, as [`move_gently`] does but slower, and measures
 /// its lag. `row` is the row's [s].
 pub fn measure_lag(
     adapter: &mut dyn ManipulatorAdapter,
@@ -305,7 +305,7 @@ impl Gently<'_> {
         Ok(())
     }
 
-    /// Brings a joint from one offset to another [rad], by one command or by a stream of set points.
+    /// Brings a joint from one offset to another [rad], by one command or by a stream of setpoints.
     fn go(&mut self, joint: usize, mode: ControlMode, from: f64, to: f64) -> Result<Seen, End> {
         let limits = self.adapter.get_limits()?;
         let top = limits.velocity_max.get(joint).copied().unwrap_or(1.0);
@@ -324,7 +324,7 @@ impl Gently<'_> {
         for look in 0_u32.. {
             let now = MonotonicClock.now();
             let past = now.seconds_since(began);
-            // A pause of this program must not become a jump of the set points.
+            // A pause of this program must not become a jump of the setpoints.
             streamed += now.seconds_since(before_this).min(LONGEST_STEP);
             before_this = now;
             let part = (streamed / time).min(1.0);
@@ -349,7 +349,7 @@ impl Gently<'_> {
             }
             if stream && (seen.moved - point).abs() > BEHIND {
                 let behind = (seen.moved - point).abs().to_degrees();
-                return Err(End::Odd(format!("joint {} is {behind:.2}° from its set point", joint + 1)));
+                return Err(End::Odd(format!("joint {} is {behind:.2}° from its setpoint", joint + 1)));
             }
             if let Some(velocity) = reading.velocity.and_then(|v| v.get(joint).copied()) {
                 let dt = last.map_or(0.0, |then| at.seconds_since(then));
@@ -369,7 +369,7 @@ impl Gently<'_> {
         Ok(seen)
     }
 
-    /// Writes a set point of one joint, as an offset from the start [rad].
+    /// Writes a setpoint of one joint, as an offset from the start [rad].
     fn stream(&mut self, joint: usize, point: f64) -> Result<(), End> {
         let target = self.target(joint, point);
         let mut at = Mono::ZERO;

@@ -1,4 +1,4 @@
-//! An arm's lag: the time from a set point written to the measured motion that follows it.
+//! An arm's lag: the time from a setpoint written to the measured motion that follows it.
 
 use std::ops::Range;
 
@@ -12,9 +12,9 @@ const LONGEST: f64 = 0.5;
 const COARSE: f64 = 0.005;
 /// Steps of the refinement: each leaves two thirds of the interval.
 const REFINEMENTS: u32 = 25;
-/// Fewest measurements, and smallest range of set points [rad], from which a lag is estimated.
+/// Fewest measurements, and smallest range of setpoints [rad], from which a lag is estimated.
 const ENOUGH: (usize, f64) = (50, 0.005);
-/// Part of the set points' variance that may remain when the measurements do not follow them exactly.
+/// Part of the setpoints' variance that may remain when the measurements do not follow them exactly.
 const UNEXPLAINED: f64 = 0.2;
 /// From one look at the arm to the next, this much is a gap in which this program did not run [s] …
 const GAP: f64 = 0.008;
@@ -58,12 +58,12 @@ impl Lag {
     }
 }
 
-/// Estimates by which delay, 0 to 0.5 s, the `measured` positions of a joint follow the `written` set points [s]: the
+/// Estimates by which delay, 0 to 0.5 s, the `measured` positions of a joint follow the `written` setpoints [s]: the
 /// one with the least squared difference. `None` when there is too little to compare, or they do not follow.
 ///
-/// A set point holds until the next one, so a joint without lag moves in steps, and a real one moves smoothly through
+/// A setpoint holds until the next one, so a joint without lag moves in steps, and a real one moves smoothly through
 /// the middle of the steps. Both are the same on average, and the line through the middle of each hold is that average:
-/// it has no steps, between which the sum of squares would not change. A line through the set points at the times when
+/// it has no steps, between which the sum of squares would not change. A line through the setpoints at the times when
 /// they were written would be ahead of it by half a period, and the lag too long by that.
 ///
 /// A constant difference (a joint sags under load) is not lag: it is left out. Motion to both sides tells them apart.
@@ -93,7 +93,7 @@ pub fn delay(written: &[Point], measured: &[Point]) -> Option<f64> {
     (cost(delay) <= UNEXPLAINED * moved).then_some(delay)
 }
 
-/// Each set point at the middle of the time for which it holds [s]. The last one holds for as long as the one before.
+/// Each setpoint at the middle of the time for which it holds [s]. The last one holds for as long as the one before.
 fn middles(written: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let ends = written.iter().skip(1).map(|(at, _)| *at);
     let mut half = 0.0;
@@ -147,7 +147,7 @@ impl Trace {
         self.waves.push(self.looks.len());
     }
 
-    /// Notes a set point that was written.
+    /// Notes a setpoint that was written.
     pub fn wrote(&mut self, at: Mono, value: f64) {
         self.written.push(Point { at, value });
     }

@@ -16,7 +16,7 @@ fn wave(t: f64) -> f64 {
     reach * (part(t) - part(t - 1.0) - part(t - 2.0) + part(t - 3.0))
 }
 
-/// Set points each `period` [s].
+/// Setpoints each `period` [s].
 fn written(period: f64) -> Vec<Point> {
     (0..(4.2 / period) as usize).map(|i| i as f64 * period).map(|t| Point { at: at(t), value: wave(t) }).collect()
 }
@@ -35,7 +35,7 @@ fn holds(written: &[Point], t: f64) -> f64 {
     written[next.saturating_sub(1)].value
 }
 
-/// Positions each 2.7 ms, of a joint that repeats its set points after `lag` [s], off by a constant and noise [rad].
+/// Positions each 2.7 ms, of a joint that repeats its setpoints after `lag` [s], off by a constant and noise [rad].
 fn repeated(written: &[Point], lag: f64, off: f64, noisy: f64) -> Vec<Point> {
     let mut noise = noise();
     let times = (0..1500).map(|i| 0.0027 * f64::from(i));
@@ -79,7 +79,7 @@ fn what_does_not_follow_has_no_lag() {
     assert_eq!(delay(&written[..1], &still), None);
 }
 
-/// The lag of an emulated joint whose set points come each `period` [s].
+/// The lag of an emulated joint whose setpoints come each `period` [s].
 fn emulated(lag: f64, period: f64) -> Option<f64> {
     let limits = JointLimits { acceleration_max: vec![10.0], ..JointLimits::uniform(1, 2.0, 3.0) };
     let mut plant = Plant::lagging(&limits, &[0.5], lag);
@@ -109,7 +109,7 @@ fn emulated_joints_have_the_lag_that_they_are_given() {
 }
 
 /// A trace of four waves with looks each 2.7 ms; the program does not run for 50 ms amid the waves `stalled`, and the
-/// set points of that time come 50 ms late.
+/// setpoints of that time come 50 ms late.
 fn trace(lag: f64, stalled: &[usize]) -> Trace {
     let mut trace = Trace::default();
     let written = written(0.01);

@@ -44,7 +44,7 @@ fn set_points_are_followed(context: &mut Context) -> Result<(), String> {
         context.command(&point, 1.0)?;
         std::thread::sleep(Duration::from_millis(10));
     }
-    context.until("the last set point", |context| Ok(farthest(&context.positions()?, &target) < 1e-3))
+    context.until("the last setpoint", |context| Ok(farthest(&context.positions()?, &target) < 1e-3))
 }
 
 /// An adapter that is wrong in the same way in both directions agrees with itself. The emulator knows better.

@@ -15,7 +15,7 @@ use crate::joint::ControlMode;
 pub const CHECKS: &[Check] = &[
     Check::new(Motion, "stop_at_rest_is_harmless", "write_stop at rest changes nothing", stop_at_rest),
     Check::new(Motion, "stop_ends_motion", "write_stop in a planned move brings standstill", stop_ends_motion),
-    Check::new(Motion, "stop_ends_streaming", "write_stop between set points holds the arm", stop_ends_streaming),
+    Check::new(Motion, "stop_ends_streaming", "write_stop between setpoints holds the arm", stop_ends_streaming),
     Check::new(Motion, "stop_ends_velocity", "write_stop ends a velocity at once", stop_ends_velocity),
     Check::new(Motion, "stop_is_no_fault", "after a stop, activate and a mode are enough to move", stop_is_no_fault),
     Check::new(Motion, "stop_holds_the_gripper", "after a stop a moving gripper can be held", stop_holds_gripper),

@@ -30,7 +30,7 @@ use crate::rt::wake::Wake;
 
 /// Longest silence of the tick before the device thread holds the arm by itself, where the tick is fast.
 const BEAT_TIMEOUT: Duration = Duration::from_millis(40);
-/// The longest time between two set points that counts as regular, however seldom the device reports.
+/// The longest time between two setpoints that counts as regular, however seldom the device reports.
 const LONGEST_WRITE_PERIOD: Duration = Duration::from_millis(20);
 
 /// What a device thread is made from.
@@ -60,7 +60,7 @@ impl DeviceConfig {
         self.tick_period.min(Duration::from_millis(10)).max(own)
     }
 
-    /// The longer of the tick's period and the arm's own for set points.
+    /// The longer of the tick's period and the arm's own for setpoints.
     /// `own`: what the adapter says of it.
     pub fn write_period(&self, own: Option<Duration>) -> Duration {
         let states = Duration::from_secs_f64(1.0 / self.native_rate.max(0.1));
@@ -89,7 +89,7 @@ pub struct Connected {
     pub gripper_range: Option<(f64, f64)>,
     /// Period of its states, as they are read.
     pub read_period: Duration,
-    /// The longer of the tick's period and the arm's own for set points.
+    /// The longer of the tick's period and the arm's own for setpoints.
     pub write_period: Duration,
 }
 

@@ -21,7 +21,7 @@ use crate::rt::wake::Wake;
 
 /// Consecutive failures before the connection is `Stale` (reads) or `Faulted` (writes).
 const MAX_FAILURES: u32 = 3;
-/// Unacknowledged set points before the connection is dropped.
+/// Unacknowledged setpoints before the connection is dropped.
 const MAX_IN_FLIGHT: u32 = 2;
 /// Consecutive readings that show a change that this run did not order, before it is one: a report may be older than the
 /// order.
@@ -79,7 +79,7 @@ pub(super) struct Worker {
     /// The fastest joint's top speed [rad/s].
     speed: f64,
     guard: WireGuard,
-    /// Set points that may be on their way.
+    /// Setpoints that may be on their way.
     in_flight: u32,
     /// The newest command was not sent because others were on their way.
     again: bool,
@@ -197,7 +197,7 @@ impl Worker {
             self.drop_what_is_pending(adapter);
             if self.connected && (arrived || self.config.clock.now() >= self.next_read) {
                 self.read(adapter);
-                // The reply that a set point was waiting for may have come.
+                // The reply that a setpoint was waiting for may have come.
                 if self.connected && self.again {
                     self.pass_on_command(adapter);
                 }
@@ -463,13 +463,13 @@ impl Worker {
         self.health.answer_gripper(command.gripper_seq, result);
     }
 
-    /// Set points that the arm did not acknowledge must not reach it later: with two of them, or with one and no state,
+    /// Setpoints that the arm did not acknowledge must not reach it later: with two of them, or with one and no state,
     /// what is still on its way is discarded before anything new goes out.
     fn drop_what_is_pending(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let age = self.config.clock.now().since(self.state.stamp.max(self.last_read));
         let stale = age > self.config.state_timeout() && self.state.seq != 0;
         if self.connected && (self.in_flight > 0 || self.again) && stale {
-            self.trouble("set points are not acknowledged and no state arrives: what is pending is discarded");
+            self.trouble("setpoints are not acknowledged and no state arrives: what is pending is discarded");
             self.discard(adapter);
         }
     }
@@ -527,7 +527,7 @@ impl Worker {
             ControlMode::Velocity => adapter.write_joint_velocities(values),
             _ => adapter.write_joint_positions(values, 1.0),
         };
-        // A set point without an answer may have reached the arm: what comes next continues from it.
+        // A setpoint without an answer may have reached the arm: what comes next continues from it.
         if matches!(written, Ok(()) | Err(AdapterError::Timeout(_))) {
             self.guard.wrote(command, mode);
             self.state.written = command.seq;

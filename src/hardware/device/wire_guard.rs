@@ -1,4 +1,4 @@
-//! The last look at a set point before it is written. The tick keeps the limits between its commands; this keeps them
+//! The last look at a setpoint before it is written. The tick keeps the limits between its commands; this keeps them
 //! between what reaches the wire, where commands are skipped and time passes.
 
 use std::time::Duration;
@@ -9,7 +9,7 @@ use crate::joint::{ControlMode, JointLimits, Joints};
 
 /// Periods that one step may cover.
 const PERIODS: u32 = 2;
-/// Rounding of computed set points, as a part of a step and beyond it [rad, rad/s].
+/// Rounding of computed setpoints, as a part of a step and beyond it [rad, rad/s].
 const ROUNDING: (f64, f64) = (1e-6, 1e-6);
 
 /// What was written last.
@@ -34,7 +34,7 @@ pub struct WireGuard {
 }
 
 impl WireGuard {
-    /// For an arm of `dof` joints; `period` is the longer of the tick's and the arm's own for set points.
+    /// For an arm of `dof` joints; `period` is the longer of the tick's and the arm's own for setpoints.
     pub fn new(dof: usize, period: Duration, supervision: Supervision) -> Self {
         Self {
             last: None,
@@ -46,7 +46,7 @@ impl WireGuard {
         }
     }
 
-    /// The longer of the tick's and the arm's own period for set points.
+    /// The longer of the tick's and the arm's own period for setpoints.
     pub fn set_period(&mut self, period: Duration) {
         self.period = period;
     }
@@ -63,7 +63,7 @@ impl WireGuard {
         self.last = None;
     }
 
-    /// A set point was written, or may have been.
+    /// A setpoint was written, or may have been.
     pub fn wrote(&mut self, command: &ArmCommand, mode: ControlMode) {
         self.last = Some(Last { mode, values: command.values, at: command.at, start_seq: command.start_seq });
     }

@@ -157,7 +157,7 @@ impl SimArm {
         self
     }
 
-    /// The same arm without modes: it takes targets, set points and velocities at any time, as servos do.
+    /// The same arm without modes: it takes targets, setpoints and velocities at any time, as servos do.
     pub fn without_modes(mut self) -> Self {
         self.has_modes = false;
         self

@@ -63,7 +63,7 @@ impl SimArm {
         Ok(())
     }
 
-    /// Follows a set point [rad], in servo mode.
+    /// Follows a setpoint [rad], in servo mode.
     pub fn servo(&mut self, target: &[f64]) -> Result<(), Refusal> {
         self.may_move(ControlMode::ServoPosition)?;
         self.within(target)?;

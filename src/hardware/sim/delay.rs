@@ -1,20 +1,20 @@
-//! Dead time of emulated joints: set points take effect later than they arrive.
+//! Dead time of emulated joints: setpoints take effect later than they arrive.
 
 use std::collections::VecDeque;
 
 use crate::joint::{Joints, MAX_DOF};
 
-/// Set points that can be on their way at a time: those of 1 s at 500 Hz.
+/// Setpoints that can be on their way at a time: those of 1 s at 500 Hz.
 const CAPACITY: usize = 512;
 
-/// Set points on their way to the joints, in the order of their arrival. Allocates in [`DelayLine::new`] only.
+/// Setpoints on their way to the joints, in the order of their arrival. Allocates in [`DelayLine::new`] only.
 #[derive(Debug, Clone)]
 pub struct DelayLine {
     /// Dead time [s].
     delay: f64,
     /// Time that has passed [s].
     now: f64,
-    /// When each set point takes effect [s], and the set point [rad].
+    /// When each setpoint takes effect [s], and the setpoint [rad].
     pending: VecDeque<(f64, Joints)>,
 }
 
@@ -26,7 +26,7 @@ impl DelayLine {
         Self { delay, now: 0.0, pending: VecDeque::with_capacity(capacity) }
     }
 
-    /// Delays a set point [rad]. Returns what takes effect at once: this one without dead time, the oldest one where
+    /// Delays a setpoint [rad]. Returns what takes effect at once: this one without dead time, the oldest one where
     /// the line is full.
     pub fn push(&mut self, target: &[f64]) -> Option<Joints> {
         let mut joints = [f64::NAN; MAX_DOF];
@@ -39,7 +39,7 @@ impl DelayLine {
         oldest.map(|(_, joints)| joints)
     }
 
-    /// Lets up to `limit` [s] pass, until the next set point takes effect: returns the time that passed and this set
+    /// Lets up to `limit` [s] pass, until the next setpoint takes effect: returns the time that passed and this set
     /// point [rad]. `None`, and all of `limit` passes, when none does.
     pub fn pass(&mut self, limit: f64) -> Option<(f64, Joints)> {
         match self.pending.front().copied().filter(|(due, _)| *due <= self.now + limit) {
@@ -56,7 +56,7 @@ impl DelayLine {
         }
     }
 
-    /// Discards all set points that are on their way.
+    /// Discards all setpoints that are on their way.
     pub fn clear(&mut self) {
         self.pending.clear();
     }

@@ -20,7 +20,7 @@ const MAX_DROOP: f64 = 0.1;
 pub struct SimOptions {
     /// Joint positions at power-up [rad], one per joint; a pose of the arm's own when empty.
     pub initial_positions: Vec<f64>,
-    /// How far joints are behind their servo set points, 0 to 0.5 [s].
+    /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
     /// How far below their targets joints rest under load, 0 to 0.1 [rad].

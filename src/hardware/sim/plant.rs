@@ -13,17 +13,17 @@ const STEP: f64 = 0.0005;
 const SAG_SPEED: f64 = 0.25;
 /// Viscous friction [Nm·s/rad].
 const FRICTION: f64 = 0.5;
-/// How much more than the acceleration limit the drives can do when they follow set points: one that could do no more
+/// How much more than the acceleration limit the drives can do when they follow setpoints: one that could do no more
 /// than it is asked would never make up for starting late.
 const HEADROOM: f64 = 2.0;
 /// The part of a lag that is first-order at most [s]; the rest is dead time.
 const FIRST_ORDER: f64 = 0.02;
-/// How joints follow servo set points and velocities.
+/// How joints follow servo setpoints and velocities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Tracking {
     /// At once, as far as the velocity limit allows.
     Ideal,
-    /// First-order with this time constant [s]; set points within the acceleration limit, with some headroom.
+    /// First-order with this time constant [s]; setpoints within the acceleration limit, with some headroom.
     Lag(f64),
 }
 
@@ -36,7 +36,7 @@ pub enum Drive {
     Stop,
     /// On its own trapezoid to the target.
     Position,
-    /// Follows set points.
+    /// Follows setpoints.
     Servo,
     /// Keeps a velocity.
     Velocity,
@@ -49,7 +49,7 @@ pub struct Plant {
     dof: usize,
     drive: Drive,
     tracking: Tracking,
-    /// Servo set points that have not taken effect.
+    /// Servo setpoints that have not taken effect.
     delayed: DelayLine,
     /// How far below its target a joint rests, under load [rad].
     droop: f64,
@@ -59,7 +59,7 @@ pub struct Plant {
     fall: f64,
     /// How far the second joint still has to sink [rad].
     sag: f64,
-    /// Time since the last servo set point, and between the two before [s].
+    /// Time since the last servo setpoint, and between the two before [s].
     since_set_point: f64,
     interval: f64,
     /// How far the joints have been integrated beyond the present [s]: less than a step.
@@ -98,13 +98,13 @@ impl Plant {
         }
     }
 
-    /// Joints as those of [`Plant::new`] with brakes, which move `lag` [s] after their servo set points: 20 ms of it
+    /// Joints as those of [`Plant::new`] with brakes, which move `lag` [s] after their servo setpoints: 20 ms of it
     /// first-order, the rest dead time. First-order alone would be less than its time constant behind where the set
     /// points accelerate, and would not reach the ends of short motions.
     pub fn lagging(limits: &JointLimits, initial: &[f64], lag: f64) -> Self {
         let first_order = lag.min(FIRST_ORDER);
         let plant = Self::new(limits, initial, Tracking::Lag(first_order), 0.0);
-        // A set point is followed from the end of the present step on: half a step later, on average.
+        // A setpoint is followed from the end of the present step on: half a step later, on average.
         Self { delayed: DelayLine::new(lag - first_order - 0.5 * STEP), ..plant }
     }
 
@@ -185,7 +185,7 @@ impl Plant {
         self.drive_to(Drive::Position, target);
     }
 
-    /// Follows a set point [rad], after the dead time.
+    /// Follows a setpoint [rad], after the dead time.
     pub fn servo(&mut self, target: &[f64]) {
         if self.drive == Drive::Disabled {
             return;

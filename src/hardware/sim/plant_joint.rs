@@ -16,7 +16,7 @@ pub(super) struct Joint {
     pub on: bool,
     /// Target position [rad] or velocity [rad/s].
     pub target: f64,
-    /// How fast the set points move, by the last two of them [rad/s].
+    /// How fast the setpoints move, by the last two of them [rad/s].
     pub pace: f64,
     pub lower: f64,
     pub upper: f64,
@@ -67,7 +67,7 @@ impl Joint {
         self.accelerate(wanted.min(brake).min(top).copysign(error), acceleration, h);
     }
 
-    /// An ideal joint between set points: makes the rest of its way at top speed, then stands.
+    /// An ideal joint between setpoints: makes the rest of its way at top speed, then stands.
     pub fn follow(&mut self, pause: bool, h: f64) {
         let error = self.target - self.position;
         if error != 0.0 {

@@ -51,7 +51,7 @@ fn a_lagging_servo_follows_a_ramp_one_time_constant_behind() {
 
 #[test]
 fn a_lagging_servo_keeps_up_at_speed_and_stops_with_its_set_points() {
-    // 10 times the speed at which braking for each set point would still keep up.
+    // 10 times the speed at which braking for each setpoint would still keep up.
     let limits = JointLimits { acceleration_max: vec![10.0; 2], ..JointLimits::uniform(2, 9.0, 3.0) };
     let mut plant = Plant::new(&limits, &[0.0, 0.0], Tracking::Lag(0.02), 0.0);
     plant.enable(true);

@@ -28,9 +28,9 @@ pub struct Arm {
     pub row: Option<&'static AdapterSpec>,
     /// Two poses far apart: from one to the other some joint reaches its top speed [rad].
     pub ends: [[f64; 6]; 2],
-    /// What a set point is rounded to on the wire [rad].
+    /// What a setpoint is rounded to on the wire [rad].
     pub rounding: f64,
-    /// In velocity mode it stops by itself after this time without a set point [s]; `None`: it has no such mode.
+    /// In velocity mode it stops by itself after this time without a setpoint [s]; `None`: it has no such mode.
     pub time_limit: Option<f64>,
 }
 
@@ -42,7 +42,7 @@ pub const YOURARM: Arm = Arm {
     rounding: 1e-6,
     time_limit: Some(0.2),
 };
-/// UFACTORY's arm: set points without waiting for replies, reports on ports of their own.
+/// UFACTORY's arm: setpoints without waiting for replies, reports on ports of their own.
 pub const XARM: Arm = Arm {
     name: "xarm",
     row: None,
@@ -84,7 +84,7 @@ impl Arm {
         self.spec().stale_after.as_secs_f64()
     }
 
-    /// How far a joint may rest from its set point [rad].
+    /// How far a joint may rest from its setpoint [rad].
     pub fn accuracy(&self) -> f64 {
         self.spec().accuracy
     }

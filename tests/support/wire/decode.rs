@@ -165,7 +165,7 @@ pub fn template() -> NewDecoder {
     })
 }
 
-/// A Piper's CAN frames, put together to set points: 0x155 to 0x157 carry two joints each, big-endian in 0.001°.
+/// A Piper's CAN frames, put together to setpoints: 0x155 to 0x157 carry two joints each, big-endian in 0.001°.
 pub fn piper() -> impl FnMut(&CanFrame) -> Option<What> + Send {
     let mut joints = [None; 6];
     move |frame| {

@@ -4,7 +4,7 @@ use dimos::clock::Mono;
 
 use super::{Told, What};
 
-/// Limits of an arm, and how its set points come.
+/// Limits of an arm, and how its setpoints come.
 #[derive(Debug, Clone)]
 pub struct Bounds {
     /// Top speeds of the joints [rad/s].
@@ -13,13 +13,13 @@ pub struct Bounds {
     pub acceleration: Vec<f64>,
     /// The longer of the tick's and the arm's write period [s].
     pub period: f64,
-    /// What a set point is rounded to on the wire [rad].
+    /// What a setpoint is rounded to on the wire [rad].
     pub rounding: f64,
     /// Age limit of a state [s].
     pub stale_after: f64,
-    /// It is stopped by a set point this close to where it is [rad], whatever it was told before.
+    /// It is stopped by a setpoint this close to where it is [rad], whatever it was told before.
     pub stopped_within: Option<f64>,
-    /// In velocity mode the arm stands after this time without a set point [s].
+    /// In velocity mode the arm stands after this time without a setpoint [s].
     pub time_limit: Option<f64>,
 }
 
@@ -28,7 +28,7 @@ pub const WINDOW: f64 = 0.05;
 /// What is noted of times is this uncertain [s].
 const CLOCK: f64 = 1e-3;
 
-/// Set points of one kind that follow one another: neither a change of mode nor new torque stands between them.
+/// Setpoints of one kind that follow one another: neither a change of mode nor new torque stands between them.
 fn chains(told: &[Told], values: fn(&What) -> Option<&Vec<f64>>) -> Vec<Vec<(Mono, &Vec<f64>)>> {
     let (mut chains, mut mode) = (vec![Vec::new()], None);
     for one in told {
@@ -93,13 +93,13 @@ impl Worst {
 }
 
 impl Bounds {
-    /// The position set points that follow one another. One that stops the arm where it is begins anew.
+    /// The position setpoints that follow one another. One that stops the arm where it is begins anew.
     fn positions<'a>(&self, told: &'a [Told]) -> Vec<Vec<(Mono, &'a Vec<f64>)>> {
         let stops = |one: &Told| match (position(&one.what), &one.truth, self.stopped_within) {
             (Some(told), Some(truth), Some(most)) => told.iter().zip(truth).all(|(a, b)| (a - b).abs() <= most),
             _ => false,
         };
-        // Its stop at full speed may be measured by frames that waited in the stall: then the last set point of all goes
+        // Its stop at full speed may be measured by frames that waited in the stall: then the last setpoint of all goes
         // back towards the arm, and stays.
         let last = told.iter().rev().find_map(|one| position(&one.what));
         let stays = |one: &Told| {
@@ -120,7 +120,7 @@ impl Bounds {
         all
     }
 
-    /// Neighbouring set points: at most two periods at top speed apart; in velocity mode, at most acceleration.
+    /// Neighbouring setpoints: at most two periods at top speed apart; in velocity mode, at most acceleration.
     pub fn neighbours(&self, told: &[Told], since: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
         for chain in self.positions(told) {
@@ -131,7 +131,7 @@ impl Bounds {
                 }
             }
         }
-        worst.verdict("neighbouring set points", "rad", since)?;
+        worst.verdict("neighbouring setpoints", "rad", since)?;
         let mut worst = Worst::default();
         for chain in chains(told, velocity) {
             for pair in chain.windows(2) {
@@ -168,18 +168,18 @@ impl Bounds {
         worst.verdict("the way within 50 ms", "rad", since)
     }
 
-    /// How far an arm may still go after the last set point before a stall that it is held for [rad].
+    /// How far an arm may still go after the last setpoint before a stall that it is held for [rad].
     pub fn stopping(&self, joint: usize, delay: f64) -> f64 {
         let (v, a) = (self.velocity[joint], self.acceleration[joint]);
         v * (delay + 2.0 * self.period) + v * v / (2.0 * a)
     }
 
-    /// Where set points go after a stall that the arm is held for.
+    /// Where setpoints go after a stall that the arm is held for.
     pub fn travel(&self, delivered: &[Told], began: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
         let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| Some((t.at, position(&t.what)?)));
         let Some((at, last)) = last else { return Ok(()) };
-        // Counted from where the set points were when the stall began, after the last of them.
+        // Counted from where the setpoints were when the stall began, after the last of them.
         let delay = self.stale_after + began.seconds_since(at).min(self.period);
         for one in delivered.iter().filter(|t| t.at >= began) {
             for (j, (a, b)) in last.iter().zip(position(&one.what).unwrap_or(last)).enumerate() {
@@ -189,7 +189,7 @@ impl Bounds {
         worst.verdict("the way after a stall", "rad", began)
     }
 
-    /// How long after a moment set points still moved [s].
+    /// How long after a moment setpoints still moved [s].
     pub fn moved_for(&self, sent: &[Told], began: Mono) -> f64 {
         let points: Vec<(Mono, &Vec<f64>)> = sent.iter().filter_map(|t| Some((t.at, position(&t.what)?))).collect();
         let moves = |pair: &[(Mono, &Vec<f64>)]| pair[0].1.iter().zip(pair[1].1).any(|(a, b)| (a - b).abs() > 1e-4);
@@ -206,7 +206,7 @@ impl Bounds {
         worst.verdict("the way of the arm itself", "rad", since)
     }
 
-    /// Set points beside the pose at which the arm truly was when they reached it.
+    /// Setpoints beside the pose at which the arm truly was when they reached it.
     pub fn beside_the_truth(&self, delivered: &[Told], most: f64) -> Result<(), String> {
         let (mut worst, first) = (Worst::default(), delivered.first().map_or(Mono::ZERO, |t| t.at));
         for one in delivered {
@@ -214,6 +214,6 @@ impl Bounds {
                 told.iter().zip(truth).enumerate().for_each(|(j, (a, b))| worst.look(j, one.at, (a - b).abs(), most));
             }
         }
-        worst.verdict("a set point beside the true pose", "rad", first)
+        worst.verdict("a setpoint beside the true pose", "rad", first)
     }
 }

@@ -1,5 +1,5 @@
 //! A wire between a run and its arm that a test can cut, hold and slow down, and that remembers what went over it: every
-//! byte, and every set point in radians, when the run sent it and when it was delivered to the arm.
+//! byte, and every setpoint in radians, when the run sent it and when it was delivered to the arm.
 //!
 //! ```text
 //! run ──▶ [sent] ── gate: pass, hold, drop, trickle ── [delivered] ──▶ emulator
@@ -55,7 +55,7 @@ pub const TRICKLE: Duration = Duration::from_millis(2);
 /// A command of the run, as the arm's protocol sheet has it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum What {
-    /// A set point of a stream [rad].
+    /// A setpoint of a stream [rad].
     Position(Vec<f64>),
     /// Velocities [rad/s].
     Velocity(Vec<f64>),
@@ -199,7 +199,7 @@ impl Gate {
         lock(&self.log).bytes.clone()
     }
 
-    /// How fast the last two delivered set points move each joint [rad/s], at a set point every `period` [s]; in velocity
+    /// How fast the last two delivered setpoints move each joint [rad/s], at a setpoint every `period` [s]; in velocity
     /// mode the last velocities.
     pub fn speed(&self, period: f64) -> Vec<f64> {
         let log = lock(&self.log);

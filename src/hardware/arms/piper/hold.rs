@@ -72,7 +72,7 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 }
 
 impl Session {
-    /// Commands the arm to stay where it is. Where its feedback has paused while set points were streamed, that is the last
+    /// Commands the arm to stay where it is. Where its feedback has paused while setpoints were streamed, that is the last
     /// of them, which it is at or comes to: what was measured before the pause would pull it back.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
         let target = match self.written() {

@@ -116,10 +116,10 @@ impl GripperKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Follow {
-    /// The controller smooths the way to each set point.
+    /// The controller smooths the way to each setpoint.
     #[default]
     Smooth,
-    /// The controller hands each set point to the motors as it is: very stiff.
+    /// The controller hands each setpoint to the motors as it is: very stiff.
     Direct,
 }
 

@@ -44,7 +44,7 @@ pub struct Session {
     pub picture: Picture,
     /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
     pub written: Option<WireJoints>,
-    /// It is a set point of a stream: the arm is at most its lag behind it.
+    /// It is a setpoint of a stream: the arm is at most its lag behind it.
     pub streamed: bool,
     /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
     pub control: Option<(u8, Follow)>,
@@ -114,7 +114,7 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a set point. The control frame is left out where the arm reports that it is in the mode: another program that
+    /// Sends a setpoint. The control frame is left out where the arm reports that it is in the mode: another program that
     /// has just changed it would have that undone before it shows.
     pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         const SPEED: u8 = 100;
@@ -130,7 +130,7 @@ impl Session {
         Ok(())
     }
 
-    /// Whether another set point may wait for the bus.
+    /// Whether another setpoint may wait for the bus.
     pub fn has_room(&self) -> bool {
         self.wire.as_ref().is_some_and(Wire::has_room)
     }

@@ -213,7 +213,7 @@ fn f15_f16_an_estop_is_told_and_never_reset_from_here() {
     assert_eq!((emulator.power_drops(), arm.read_enabled()), (1, Ok(false)));
 }
 
-/// Lets the arm lose its power, and commands on until a set point is refused. Answers the commands that reached the arm
+/// Lets the arm lose its power, and commands on until a setpoint is refused. Answers the commands that reached the arm
 /// when its power was back.
 fn commanded_without_power(discard: bool) -> (PiperEmulator, PiperAdapter, usize) {
     let (emulator, mut arm) = connected();
@@ -245,7 +245,7 @@ fn commanded_without_power(discard: bool) -> (PiperEmulator, PiperAdapter, usize
 fn f16_what_waits_when_the_power_goes_moves_nothing_when_it_returns() {
     let (emulator, mut arm, stale) = commanded_without_power(false);
     assert_eq!(arm.read_enabled(), Ok(false));
-    assert!(stale <= 8, "{stale} frames waited"); // two set points, to an arm whose motors are off
+    assert!(stale <= 8, "{stale} frames waited"); // two setpoints, to an arm whose motors are off
     let lies = emulator.joints().0;
     arm.activate().unwrap_or_else(|e| panic!("{e}"));
     assert!(farthest(&emulator.joints().0, &lies) < 0.05, "it holds where it lies");

@@ -24,10 +24,10 @@ const FILTERS: &[CanFilter] = &[
     CanFilter { id: 0x470, mask: 0x7FC },
     CanFilter { id: 0x474, mask: 0x7FE },
 ];
-/// Frames that may wait for the bus: two set points of four frames. A healthy bus takes one in 1 ms, and what waits when
+/// Frames that may wait for the bus: two setpoints of four frames. A healthy bus takes one in 1 ms, and what waits when
 /// the arm loses its power reaches it when the power returns.
 const MAY_WAIT: usize = 2 * SET_POINT;
-/// Frames of a set point at most.
+/// Frames of a setpoint at most.
 const SET_POINT: usize = 4;
 /// Most events fetched in one go: a second's.
 const BATCH: usize = 4096;
@@ -71,7 +71,7 @@ impl Wire {
         if taken == frames.len() { Ok(()) } else { Err(self.no_room()) }
     }
 
-    /// Whether another set point may wait for the bus.
+    /// Whether another setpoint may wait for the bus.
     pub fn has_room(&self) -> bool {
         let waiting = self.port.waiting();
         if self.discarding { waiting == 0 } else { waiting + SET_POINT <= MAY_WAIT }

@@ -277,7 +277,7 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn set_point_period(&self) -> Option<Duration> {
-        // A set point waits for the answer to the one before, and the peer answers once a cycle.
+        // A setpoint waits for the answer to the one before, and the peer answers once a cycle.
         self.last.as_ref().map(|said| Duration::from_secs_f64(1.0 / said.native_rate.max(0.1)))
     }
 

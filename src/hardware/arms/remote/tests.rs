@@ -112,7 +112,7 @@ fn a_reply_wakes_and_brings_what_was_commanded() {
     let (_emulator, mut arm) = served(2);
     ready(&mut *arm, ControlMode::ServoPosition);
     let mut reading = JointReading::default();
-    until("the set point", || {
+    until("the setpoint", || {
         arm.write_joint_positions(&[0.01, -0.02], 1.0).unwrap();
         let mut fds = [rustix::event::PollFd::from_borrowed_fd(arm.state_fd().unwrap(), rustix::event::PollFlags::IN)];
         let wait = rustix::event::Timespec { tv_sec: 5, tv_nsec: 0 };

@@ -1,5 +1,5 @@
-//! The control connection. Requests go out without waiting for the responses to earlier ones: a set point must not
-//! wait for the answer to the set point before. Each response is matched to its request by number, whenever it comes.
+//! The control connection. Requests go out without waiting for the responses to earlier ones: a setpoint must not
+//! wait for the answer to the setpoint before. Each response is matched to its request by number, whenever it comes.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
@@ -12,7 +12,7 @@ use crate::hardware::transport::tcp::TcpLink;
 
 /// Most requests without response.
 const WINDOW: usize = 64;
-/// Most set points without response: what a stalled connection still delivers when it is back.
+/// Most setpoints without response: what a stalled connection still delivers when it is back.
 const IN_FLIGHT: usize = 2;
 /// A controller that answers nothing for so long, while it is asked what it answers quickly, is gone.
 const GONE: Duration = Duration::from_millis(1000);
@@ -123,7 +123,7 @@ impl Control {
         self.link.peer()
     }
 
-    /// Closes the connection and discards what has not left this computer. Set points that have left it may still arrive,
+    /// Closes the connection and discards what has not left this computer. Setpoints that have left it may still arrive,
     /// and velocities would drive the arm on once more: a stop goes right behind them.
     pub fn abort(mut self) {
         if self.in_flight() > 0 {
@@ -149,7 +149,7 @@ impl Control {
         self.pending.iter().flatten().any(Pending::is_slow)
     }
 
-    /// Set points on their way: without response, and nothing that was sent later has one. A connection that stands
+    /// Setpoints on their way: without response, and nothing that was sent later has one. A connection that stands
     /// still keeps this count, however long it does.
     fn in_flight(&self) -> usize {
         let on_their_way = |p: &&Pending| p.purpose == Purpose::Motion && p.sent > self.answered_up_to;

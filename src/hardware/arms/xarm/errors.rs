@@ -44,7 +44,7 @@ pub fn error_text(code: u8) -> &'static str {
         51 => "the mode of the force/torque sensor cannot be set",
         52 => "the zero of the force/torque sensor cannot be set",
         53 => "the force/torque sensor is overloaded or out of range",
-        60 => "set points move the tool faster than its limit; slow down the motion",
+        60 => "setpoints move the tool faster than its limit; slow down the motion",
         110 => "the base board of the arm does not answer",
         111 => "the device at the control box's RS485 does not answer",
         _ => "an error that the manual does not list",

@@ -1,5 +1,5 @@
 //! Frames and parts of reports computed from the vendor's pages with tools that are not ours (Python's `struct`); the
-//! set point is the one that the vendor's own client sends. Adapter and emulator are both tested against them, so that
+//! setpoint is the one that the vendor's own client sends. Adapter and emulator are both tested against them, so that
 //! a mistake which both sides share still shows.
 
 /// Bytes written as hexadecimal digits.
@@ -43,7 +43,7 @@ pub const SET_MODE: &str = "000300030003130100";
 pub const SET_MODE_OLD: &str = "0003000200021301";
 /// State 0.
 pub const READY: &str = "0004000300020c00";
-/// A set point.
+/// A setpoint.
 pub const SERVO: &str =
     "0005000300291dc2b8323ec2b8b2be920a06bfc2b8323ff3665f3f920a86bf00000000000000000000000000000000";
 /// A planned move at 0.5 rad/s, 8 rad/s².

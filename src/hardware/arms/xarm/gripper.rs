@@ -1,8 +1,8 @@
 //! The gripper, one telegram at a time: each costs 10 to 100 ms on the tool's bus, so no caller waits for one.
 //! Commands are kept until their turn; the position is read now and then and answered from memory.
 //!
-//! Telegrams go over the second control port. A box without one has them on the same connection as the set points, which
-//! would wait behind each telegram: there a gripper at rest is not asked while set points are streamed.
+//! Telegrams go over the second control port. A box without one has them on the same connection as the setpoints, which
+//! would wait behind each telegram: there a gripper at rest is not asked while setpoints are streamed.
 
 use std::time::Duration;
 
@@ -123,7 +123,7 @@ impl Gripper {
         !asked && self.pulses.is_some() && self.same >= RESTS_AFTER
     }
 
-    /// The next telegram, if one is due. `quiet`: a telegram would delay set points, so one that can wait does.
+    /// The next telegram, if one is due. `quiet`: a telegram would delay setpoints, so one that can wait does.
     pub fn due(&mut self, now: Mono, quiet: bool) -> Option<Rtu> {
         if self.kind == GripperKind::None || (quiet && (self.rests(now) || self.failures >= SILENT_AFTER)) {
             return None;

@@ -29,7 +29,7 @@ pub const SILENCE: Duration = Duration::from_millis(500);
 const ON_THE_WAY: Duration = Duration::from_millis(20);
 /// Which motors are on is told five times a second, and by nothing else: after so much silence that is not known.
 const CONDITION_SILENCE: Duration = Duration::from_millis(1000);
-/// Set points were streamed lately: a gripper that shares their connection is left alone as far as it can be.
+/// Setpoints were streamed lately: a gripper that shares their connection is left alone as far as it can be.
 const STREAMING: Duration = Duration::from_secs(2);
 /// Joint positions that jump further than the arm can move, and this much [rad], are believed only when the next
 /// report agrees.
@@ -96,9 +96,9 @@ pub struct Session {
     pub(super) ready: Option<Ready>,
     /// The mode that was ordered when another client changed the mode, the state or the motors.
     pub(super) foreign: Option<u8>,
-    /// When a set point was refused: no more are sent before a report tells why.
+    /// When a setpoint was refused: no more are sent before a report tells why.
     refused_at: Option<Mono>,
-    /// When the last set point was sent.
+    /// When the last setpoint was sent.
     streamed_at: Mono,
     /// A change of mode under way: it goes on with every report, whoever asks.
     pub(super) change: Option<ModeChange>,
@@ -208,7 +208,7 @@ impl Session {
             return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_SILENCE:?}", self.normal.peer())));
         }
         self.advance_change()?;
-        // What is asked behind something slow waits for it, and so would the next set point.
+        // What is asked behind something slow waits for it, and so would the next setpoint.
         if !self.control.waits()
             && let Some(question) = self.known.condition.due(now, self.control.last_sent())
         {
@@ -383,7 +383,7 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a command of a stream (a set point, velocities) and does not wait for its response. Not when the newest
+    /// Sends a command of a stream (a setpoint, velocities) and does not wait for its response. Not when the newest
     /// report or response says that the arm is not as it was ordered to be, and not while two are on their way (`Busy`).
     pub fn stream(&mut self, mode: u8, command: &Command) -> AdapterResult<()> {
         self.take_up()?;
@@ -397,11 +397,11 @@ impl Session {
         Ok(())
     }
 
-    /// Reports a set point that was refused. The response may say that the arm is not ready before the report does.
+    /// Reports a setpoint that was refused. The response may say that the arm is not ready before the report does.
     pub(super) fn heed_refusal(&mut self) -> AdapterResult<()> {
         let Some((status, sent)) = self.control.take_refusal() else { return Ok(()) };
         if self.ready.is_none_or(|ready| sent < ready.since) && self.foreign.is_none() {
-            return Ok(()); // of a set point before a stop or a change of mode that this run ordered
+            return Ok(()); // of a setpoint before a stop or a change of mode that this run ordered
         }
         self.refused_at = Some(MonotonicClock.now());
         Err(self.refused(status))

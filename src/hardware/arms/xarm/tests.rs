@@ -226,7 +226,7 @@ fn set_points_do_not_wait_for_their_responses_and_two_at_most_are_on_their_way()
     let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
     let start = six(&mut arm);
     emulator.record();
-    // The replies to set points take a minute: the second goes out before the first is answered, the third does not.
+    // The replies to setpoints take a minute: the second goes out before the first is answered, the third does not.
     emulator.slow_down(29, 60.0);
     arm.write_joint_positions(&start, 1.0).unwrap();
     arm.write_joint_positions(&start.map(|q| q + 1e-4), 1.0).unwrap();

@@ -65,7 +65,7 @@ fn an_arm_that_another_client_takes_over_is_left_to_it() {
                     std::thread::sleep(Duration::from_millis(2));
                 }
             });
-            until("set points", || sent(&emulator, 29).len() > 5);
+            until("setpoints", || sent(&emulator, 29).len() > 5);
             let pause = || std::thread::sleep(Duration::from_millis(spacing));
             other.send(19, &[0, 0]);
             pause();

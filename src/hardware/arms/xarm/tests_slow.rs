@@ -1,4 +1,4 @@
-//! Controllers that take their time, as real ones do: none of it delays set points or a stop.
+//! Controllers that take their time, as real ones do: none of it delays setpoints or a stop.
 
 use serde_json::json;
 
@@ -55,7 +55,7 @@ fn a_gripper_telegram_delays_neither_set_points_nor_a_stop() {
                 result => result.map(|()| true).unwrap(),
             }
         });
-        until("the set point at the controller", || sent(&emulator, 29).len() == i as usize);
+        until("the setpoint at the controller", || sent(&emulator, 29).len() == i as usize);
     }
     assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
     assert!(emulator.trace().iter().all(|request| request.second == (request.register == 124)));
@@ -85,7 +85,7 @@ fn without_port_503_a_gripper_at_rest_is_not_asked_while_set_points_are_streamed
     stream(2, &|_| false);
     emulator.record();
     stream(100, &|_| false);
-    // At most the one that was due before the first set point.
+    // At most the one that was due before the first setpoint.
     assert!(sent(&emulator, 124).len() <= 1 && sent(&emulator, 29).len() > 50);
     arm.write_gripper_position(0.03).unwrap();
     let mut stream = |cycles: u32, until: &dyn Fn(Option<f64>) -> bool| {

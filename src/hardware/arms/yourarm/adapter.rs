@@ -28,7 +28,7 @@ const CONNECT_TIMEOUT: Duration = Duration::from_millis(1500);
 const HELLO: Patience = Patience::once(Duration::from_millis(1000));
 /// Longest wait for the reply to an order. The controller answers within 1 ms; the rest is for a busy host.
 const REPLY: Patience = Patience::once(Duration::from_millis(100));
-/// Longest wait for measurements, and for the reply to a set point. One lost reply is asked for again, and both tries
+/// Longest wait for measurements, and for the reply to a setpoint. One lost reply is asked for again, and both tries
 /// together stay below `stale_after`: a single lost packet must not hold the arm.
 const CYCLE: Patience = Patience { each: Duration::from_millis(22), times: 2 };
 /// A packet answers further questions for one period of the controller.
@@ -89,7 +89,7 @@ impl YourArmAdapter {
         self.request(command, REPLY, |_| Some(()))
     }
 
-    /// A set point: it may be obeyed twice, so it may be sent twice.
+    /// A setpoint: it may be obeyed twice, so it may be sent twice.
     fn set_point(&mut self, command: &Command) -> AdapterResult<()> {
         self.state_at = Mono::ZERO;
         self.request(command, CYCLE, |_| Some(()))

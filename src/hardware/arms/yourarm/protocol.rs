@@ -37,7 +37,7 @@ pub enum Command {
         /// Target [deg].
         joints: WireJoints,
     },
-    /// Next set point [deg].
+    /// Next setpoint [deg].
     ServoJoints(WireJoints),
     /// Joint velocities [deg/s]; the arm stops when no other follows within 200 ms.
     VelocityJoints(WireJoints),
@@ -95,7 +95,7 @@ pub enum Mode {
     /// The controller plans the way.
     #[default]
     Position = 0,
-    /// Follows set points.
+    /// Follows setpoints.
     Servo = 1,
     /// Keeps velocities.
     Velocity = 2,

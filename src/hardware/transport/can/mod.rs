@@ -118,7 +118,7 @@ pub trait CanPort: Send {
 
 /// Opens a port on the bus at `address`. It hears what `filters` want of the frames that others send, everything
 /// without filters, and trouble always. On an interface of the system, frames that it sends itself are followed until they
-/// are transmitted if `filters` want them: name the identifiers of set points too. `device` names the arm in messages. Errors say what to do.
+/// are transmitted if `filters` want them: name the identifiers of setpoints too. `device` names the arm in messages. Errors say what to do.
 pub fn open(device: &str, address: &CanAddress, filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
     match address {
         CanAddress::Memory(number) => Ok(Box::new(bus::open(device, *number, filters)?)),

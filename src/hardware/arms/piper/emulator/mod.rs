@@ -63,7 +63,7 @@ pub struct SimOptions {
     pub feedback_hz: f64,
     /// Its firmware, as the arm says it.
     pub firmware: String,
-    /// How far joints are behind their servo set points, 0 to 0.5 [s].
+    /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
     /// How far below their targets joints rest under load, 0 to 0.1 [rad].

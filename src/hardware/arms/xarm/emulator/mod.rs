@@ -82,7 +82,7 @@ pub struct SimOptions {
     pub port_503: bool,
     /// Registers whose replies take time, as those of a real box do.
     pub slow_replies: Vec<SlowReply>,
-    /// How far joints are behind their servo set points, 0 to 0.5 [s].
+    /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
     /// How far below their targets joints rest under load, 0 to 0.1 [rad].

@@ -47,7 +47,7 @@ fn golden_requests_get_golden_responses() {
     assert_eq!(answer(&mut arm, &bytes(golden::SERVO), 0.0), bytes(golden::SERVO_REPLY));
     arm.advance(Mono(3_000_000_000));
     let off = arm.seven().iter().zip(DEGREES).map(|(q, d)| (q - d.to_radians()).abs()).fold(0.0, f64::max);
-    assert!(off < 1e-6, "it follows the set point");
+    assert!(off < 1e-6, "it follows the setpoint");
     ready(&mut arm, 0);
     assert_eq!(answer(&mut arm, &bytes(golden::MOVE_JOINTS), 3.0), bytes(golden::MOVE_REPLY));
     ready(&mut arm, 4);

@@ -13,7 +13,7 @@ const ALL_JOINTS: u8 = 8;
 /// The number of the tool flange among the devices behind the controller.
 const TOOL: u8 = 0x09;
 
-/// Reply timeouts. Set points and questions are answered within a few ms; what resets the controller or goes to a device
+/// Reply timeouts. Setpoints and questions are answered within a few ms; what resets the controller or goes to a device
 /// behind it takes longer (the vendor's client waits 2 s), and motors that are switched on longest (5 s).
 pub const QUICK: Duration = Duration::from_millis(200);
 /// See [`QUICK`].
@@ -71,7 +71,7 @@ pub enum Command {
         /// [rad/s²]
         acceleration: f64,
     },
-    /// Next set point [rad].
+    /// Next setpoint [rad].
     Servo(WireJoints),
     /// Joint velocities.
     Velocity {

@@ -34,7 +34,7 @@ pub enum Request {
     Stop,
     /// 0x10: speed [%], target [deg].
     MoveJoints(f32, [f32; 6]),
-    /// 0x11: set point [deg].
+    /// 0x11: setpoint [deg].
     ServoJoints([f32; 6]),
     /// 0x12: velocities [deg/s].
     VelocityJoints([f32; 6]),
