@@ -1,5 +1,5 @@
 //! Who gets which joint: the higher priority wins, at equal priority the blueprint's order; one mode per arm. A
-//! loser is told once per winner, and again only after that winner has let go.
+//! loser is notified once per winner, and again only after that winner has released the joint.
 
 use super::request::Motion;
 use super::task::Task;
@@ -19,7 +19,7 @@ pub struct Arbiter {
     before: Vec<Option<u16>>,
     /// By arm: how its joints are commanded, and the task that decided it.
     demands: Vec<(Demand, u16)>,
-    /// By loser and winner: whether the loser was told.
+    /// By loser and winner: whether the loser was notified.
     told: Vec<bool>,
 }
 
@@ -82,7 +82,7 @@ impl Arbiter {
         }
     }
 
-    /// The first claim of a task that a stronger one stands in the way of: that one, the joint, whether by mode.
+    /// Returns the first claim that a task loses to a stronger one: that task, the joint, whether by mode.
     fn lost(&self, task: u16, tasks: &[Task]) -> Option<(u16, u16, bool)> {
         let t = tasks.get(task as usize)?;
         t.claims.iter().find_map(|claim| {

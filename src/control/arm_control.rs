@@ -25,7 +25,7 @@ const MOVED: f64 = 0.02;
 const TRACKING_LIMIT: (f64, f64) = (0.1, 0.2);
 /// In velocity mode, how far the measured velocity may be from the setpoints [rad/s], and as a part of itself.
 const VELOCITY_TOLERANCE: (f64, f64) = (0.2, 0.2);
-/// A held joint that stands still further than this from its setpoints, besides its accuracy, has its setpoint drawn to
+/// A held joint at rest further than this from its setpoints, besides its accuracy, has its setpoint drawn to
 /// it [rad].
 const DRAW: f64 = 0.04;
 /// How long that takes at most, within the joint's top speed [s].
@@ -298,7 +298,7 @@ impl ArmControl {
         Freshness { fresh, age: Age { age_us: us(seen), limit_us: us(limit), own_us: us(own) } }
     }
 
-    /// Whether the arm moves in a way that nobody commanded: why it is to be held.
+    /// Returns why the arm must be held, if it moves without a command.
     fn strayed(&mut self, dt: f64) -> Option<Cause> {
         let measured = self.freshness.fresh && self.belief.refused() == 0;
         let supervised = measured && self.command.mode == Some(self.state.mode) && !self.set_points.is_empty();
@@ -337,7 +337,7 @@ impl ArmControl {
         if distance.abs() > tolerance { distance } else { 0.0 }
     }
 
-    /// The arm was enabled: starts the hold. An arm that is still being brought to rest goes on with that.
+    /// The arm was enabled: starts the hold. An arm that still decelerates continues to do so.
     pub fn seed(&mut self) {
         if self.command.mode.is_some() {
             return;
@@ -443,7 +443,7 @@ impl ArmControl {
         self.standing &= mode.is_position();
     }
 
-    /// An arm at speed that gets no setpoint comes to rest beyond the last one, by its own means, and then returns to it.
+    /// An arm at speed that gets no setpoint stops on its own beyond the last one, and then returns to it.
     fn begin_to_coast(&mut self, now: Mono) {
         let mut longest = 0.0f64;
         for (coast, limiter) in self.coast.0.iter_mut().zip(&self.limiters) {
@@ -479,7 +479,7 @@ impl ArmControl {
         let rest = self.command.mode.is_some_and(ControlMode::is_position);
         let last = self.written.last();
         for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
-            // Joints that follow positions have come to rest at the last one; velocities go on.
+            // Joints that follow positions are at rest at the last one; velocities continue.
             limiter.rewind(*q, if rest { 0.0 } else { *v });
         }
     }
@@ -487,7 +487,7 @@ impl ArmControl {
     /// Slows down by commands; when at rest, asks the arm to stop by its own means and leaves it alone.
     fn come_to_rest(&mut self, now: Mono, dt: f64) {
         if let Some(mode) = self.command.mode {
-            // A velocity that cannot be reduced, because nothing gets through, goes on: the stop replaces it. After a short
+            // A velocity that cannot be reduced, because nothing gets through, continues: the stop replaces it. After a short
             // gap the ramp continues.
             let silent = now.since(self.written.last().at) > self.config.supervision.stale_after;
             let stuck = self.gap_since.is_some() && silent && mode == ControlMode::Velocity;
@@ -619,7 +619,7 @@ impl ArmControl {
         Routed::Sent
     }
 
-    /// Nothing reaches the arm: it is asked for what it was given last. Requests go on, so that a jump in them shows.
+    /// Nothing reaches the arm: its last setpoint is repeated. Requests continue, so that a jump in them shows.
     fn wait_for_the_wire(&mut self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>, dt: f64) -> Routed {
         let mut refused = None;
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
@@ -690,7 +690,7 @@ impl ArmControl {
         }
     }
 
-    /// The cause of a latched hold that a refusal stands for.
+    /// Returns the cause of the latched hold for a refusal.
     pub fn cause_of(refusal: Refusal) -> Cause {
         match refusal {
             Refusal::NonFinite => Cause::NonFinite,

@@ -34,7 +34,7 @@ pub struct Belief {
     dof: usize,
     /// The joints' own top speeds [rad/s].
     speed: Joints,
-    /// Joints that may be reported a whole turn away: their range is at least one turn.
+    /// Joints whose measurement may be off by a whole turn: their range is at least one turn.
     turning: [bool; MAX_DOF],
     /// Shortest time between two readings [s].
     period: f64,

@@ -21,7 +21,7 @@ use crate::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, TaskStat
 const REQUESTS_PER_TICK: usize = 256;
 /// A tick this long after the one before makes all arms hold [s].
 const LOST_TIME: f64 = 0.1;
-/// So many overruns in a row are told as degraded.
+/// Consecutive overruns that are reported as degraded.
 const DEGRADED_AFTER: u32 = 10;
 
 /// The times of a tick.
@@ -99,7 +99,7 @@ impl Coordinator {
             })
             .collect();
         let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
-        // Each request has its outcome and may change a task; the rest tells of itself a few times at most.
+        // Each request has its outcome and may change a task; the rest reports a few times at most.
         let events = 2 * REQUESTS_PER_TICK + 4 * (arms.len() + tasks.len()) + arm_of.len();
         Self {
             period: 1.0 / config.rate,
@@ -143,7 +143,7 @@ impl Coordinator {
     ) -> &mut TickOutput {
         self.output.arms.clear();
         self.output.events.clear();
-        // Whoever runs the ticks has freed them elsewhere; what is left is only what it could not take.
+        // The caller has freed them elsewhere; only what it could not take is left.
         self.output.retired.clear();
         let late = Duration::from_nanos(time.woke_late_ns);
         self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % self.period_ns)), late);
@@ -274,7 +274,7 @@ impl Coordinator {
         self.output.tell(Event::Request(envelope.id, outcome));
     }
 
-    /// Does something to an arm and tells when that changed its phase.
+    /// Acts on an arm and reports a change of its phase.
     fn with_arm(&mut self, arm: u16, act: impl FnOnce(&mut ArmControl) -> Outcome) -> Outcome {
         let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
         let before = a.failsafe.phase();

@@ -6,7 +6,7 @@ use crate::joint::{Joints, MAX_DOF};
 
 /// Time constant of the filter [s].
 const TIME_CONSTANT: f64 = 0.02;
-/// After a longer gap between two states the estimate starts anew [s].
+/// After a longer gap between two states the estimate starts from scratch [s].
 const LONGEST_GAP: f64 = 0.1;
 
 /// Estimates one arm's joint velocities.

@@ -34,7 +34,7 @@ pub struct Freshness {
     pub age: Age,
 }
 
-/// What stands against an arm's motion.
+/// Returns what prevents an arm's motion.
 pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
     match state.link {
         _ if state.error != 0 => Some(Cause::Fault(state.error)),
@@ -78,8 +78,8 @@ impl Failsafe {
             Phase::Standby if !state.enabled && fresh.fresh => self.enter(Phase::Disabled, Cause::None, now),
             Phase::Standby => {
                 // A self-held arm is at rest already; `enable` takes it over again. One that is being enabled or
-                // disabled keeps its device thread busy, and its states wait: nobody moves it meanwhile, `ready`
-                // asks for a fresh one, and a connection that breaks is told as such.
+                // disabled keeps its device thread busy, and its states wait: no command moves it meanwhile, `ready`
+                // asks for a fresh one, and a connection that breaks is reported as such.
                 let passes = |cause: &Cause| matches!(cause, Cause::HeartbeatLost | Cause::Stale(_));
                 if let Some(cause) = trouble(state, fresh).filter(|cause| !passes(cause)) {
                     self.enter(Phase::Held, cause, now);
@@ -117,7 +117,7 @@ impl Failsafe {
         }
     }
 
-    /// Clears a latch, unless its reason still stands.
+    /// Clears a latch, unless its cause is still present.
     pub fn reset(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         if self.phase != Phase::Held {
             return Outcome::Accepted;

@@ -61,7 +61,7 @@ pub struct Limiter {
     position: f64,
     /// Last commanded velocity [rad/s].
     velocity: f64,
-    /// Last requested position, while the same task goes on requesting.
+    /// Last requested position, while the same task continues to request.
     request: Option<f64>,
     /// Filtered velocity of the requests [rad/s].
     request_velocity: f64,
@@ -93,7 +93,7 @@ impl Limiter {
         *self = Self { position, ..Self::new(self.bounds) };
     }
 
-    /// Goes back to what was written last: the commands after it did not reach the arm. What is requested goes on.
+    /// Goes back to what was written last: the commands after it did not reach the arm. Requests continue.
     pub fn rewind(&mut self, position: f64, velocity: f64) {
         (self.position, self.velocity) = (position, velocity);
     }
@@ -213,7 +213,7 @@ impl Limiter {
         Ok(Limited { value: self.velocity, by })
     }
 
-    /// Nobody asks anything: the position to command on the way to rest, then always the same.
+    /// Without a request: the position to command on the way to rest, then always the same.
     pub fn hold_position(&mut self, dt: f64) -> f64 {
         self.hand_over();
         self.slow_down(dt);
@@ -222,7 +222,7 @@ impl Limiter {
         self.position
     }
 
-    /// Nobody asks anything: the velocity to command on the way to zero, with the joint measured at `at` [rad].
+    /// Without a request: the velocity to command on the way to zero, with the joint measured at `at` [rad].
     pub fn hold_velocity(&mut self, at: f64, dt: f64) -> f64 {
         self.hand_over();
         self.slow_down(dt);
@@ -375,7 +375,7 @@ mod tests {
             }
         }
 
-        /// The same in velocity mode, with a joint that does exactly as it is told.
+        /// The same in velocity mode, with a joint that follows exactly.
         #[test]
         fn f09_velocities_stop_inside_the_range(targets in prop::collection::vec(-5.0f64..5.0, 1..400)) {
             let mut l = limiter();

@@ -52,7 +52,7 @@ impl PathClock {
         self.rate >= 1.0
     }
 
-    /// Begins at the start of a path, at full rate: a path starts from rest by itself.
+    /// Begins at the start of a path, at full rate: a path starts from rest anyway.
     pub fn start(&mut self) {
         *self = Self::default();
     }

@@ -1,10 +1,10 @@
-//! What the coordinator can be told. Requests arrive through a ring; nothing in them is freed by the tick: a
+//! Requests to the coordinator. They arrive through a ring; nothing in them is freed by the tick: a
 //! trajectory that is done goes back through [`TickOutput::retired`](super::coordinator::TickOutput).
 
 use crate::joint::Joints;
 use crate::trajectory::Spline;
 
-/// A request with its id. The outcome is told by `Event::Request` with the same id.
+/// A request with its id. `Event::Request` with the same id has the outcome.
 #[derive(Debug)]
 pub struct Envelope {
     /// Chosen by the sender; increases.
@@ -91,7 +91,7 @@ pub struct Motion {
     pub spline: Spline,
 }
 
-/// Where an end effector shall be, or how it shall move, as it is asked for.
+/// Requested pose or twist of an end effector.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Goal {
     /// A pose, in the frame that poses of the task are given in.

@@ -89,7 +89,7 @@ impl Task {
         }
         let (cx, body, _) = self.parts(now, dt, views);
         body.accept(&cx, target)?;
-        // A target while it decelerates after a cancel: it goes on from there.
+        // A target while it decelerates after a cancel: it continues from there.
         let begins = self.state != TaskState::Executing;
         self.state = TaskState::Executing;
         self.reason = Reason::None;
@@ -141,7 +141,7 @@ impl Task {
         }
     }
 
-    /// Nothing reached an arm since the tick of `at`: it goes on from what was commanded then, from rest.
+    /// Nothing reached an arm since the tick of `at`: it continues from what was commanded then, from rest.
     pub fn rewind(&mut self, at: Mono, now: Mono) {
         self.granted = false;
         self.body.rewind(at, now);

@@ -139,12 +139,12 @@ impl TargetKind {
     }
 }
 
-/// How a task goes on after a tick.
+/// How a task continues after a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Step {
-    /// It goes on.
+    /// It continues.
     Continue,
-    /// It goes on, and shows this reason from now on.
+    /// It continues, and shows this reason from now on.
     ContinueFor(Reason),
     /// It has ended. The coordinator brings its joints to rest.
     End(TaskState, Reason),
@@ -164,7 +164,7 @@ pub enum OnCancel {
 pub enum OnLoss {
     /// It ends.
     End,
-    /// It goes on with the other joints, and claims this one again with its next target at the earliest.
+    /// It continues with the other joints, and claims this one again with its next target at the earliest.
     Continue,
 }
 
@@ -190,7 +190,7 @@ pub trait TaskBody: std::fmt::Debug + Send {
         OnLoss::End
     }
 
-    /// Nothing reached an arm since the tick of `at`: goes on from what was commanded then, from rest. The next tick is
+    /// Nothing reached an arm since the tick of `at`: continues from what was commanded then, from rest. The next tick is
     /// not granted, so that a body which integrates from [`JointView::commanded`] then needs no more than that.
     fn rewind(&mut self, at: Mono, now: Mono) {
         let _ = (at, now);

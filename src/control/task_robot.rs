@@ -14,7 +14,7 @@ use crate::yaml::Text;
 pub struct RobotParams {
     /// The robot's `.urdf` or `.xacro` file, or `builtin:NAME`.
     pub model_path: Option<String>,
-    /// Folders that `package://NAME` stands for, by name.
+    /// Folders of `package://NAME`, by name.
     pub package_paths: BTreeMap<String, String>,
     /// Arguments of the xacro file.
     pub xacro_args: BTreeMap<String, Text>,

@@ -1,5 +1,5 @@
 //! The thread that runs the coordinator: sleeps until each absolute deadline, reads the state slots, ticks, fills
-//! the command slots, wakes the device threads, and only then tells about it. Nothing here allocates, locks, logs
+//! the command slots, wakes the device threads, and only then reports. Nothing here allocates, locks, logs
 //! or waits for anyone.
 
 use std::sync::Arc;
@@ -35,7 +35,7 @@ pub struct Pulse {
     pub fifo: AtomicBool,
     /// Whether no arm is being moved by commands.
     pub at_rest: AtomicBool,
-    /// Somebody listens to the joint state: wake whoever publishes it after every tick.
+    /// The joint state has subscribers: wake its publisher after every tick.
     pub streaming: AtomicBool,
     /// How many wait for what a tick brings: wake them after every tick.
     pub waiting: AtomicU32,
@@ -47,7 +47,7 @@ pub struct Pulse {
     pub overwritten: AtomicU32,
     /// Wake-up after the deadline.
     pub lateness: Histogram,
-    /// Wake-up to the last command handed over.
+    /// Wake-up to the last command passed on.
     pub compute: Histogram,
 }
 
@@ -61,11 +61,11 @@ pub struct TickPorts {
     pub wakes: Vec<Wake>,
     /// When the device threads mean to be awake, one per arm.
     pub dues: Vec<Arc<Due>>,
-    /// What it is told.
+    /// Requests to the coordinator.
     pub requests: rtrb::Consumer<Envelope>,
     /// What came of it: id and outcome.
     pub replies: rtrb::Producer<(u64, Outcome)>,
-    /// Wakes whoever waits for replies.
+    /// Wakes the thread that waits for replies.
     pub reply_wake: Wake,
     /// Motions that are done.
     pub retired: rtrb::Producer<Box<Motion>>,
@@ -88,7 +88,7 @@ pub fn missed_periods(deadline: Mono, woke: Mono, period: Duration) -> u32 {
     (woke.0.saturating_sub(deadline.0) / period).min(u32::MAX as u64) as u32
 }
 
-/// The first deadline of the grid that is still ahead, and how many were passed over: never two ticks less than
+/// The first deadline of the grid that is still ahead, and how many were skipped: never two ticks less than
 /// half a period apart, never a burst.
 pub fn next_deadline(deadline: Mono, woke: Mono, period: Duration) -> (Mono, u32) {
     let period = (period.as_nanos() as u64).max(1);
@@ -129,7 +129,7 @@ pub fn run(
             state.own_delay_ns = due.overdue(woke).as_nanos() as u64;
         }
         let requests = &mut ports.requests;
-        // What was skipped before this tick is told with the lateness that cost it.
+        // What was skipped before this tick is reported with the lateness that caused it.
         let worst = if skips_before > 0 { late_ns.max(late_before) } else { late_ns };
         let time = TickTime { now: deadline, next, skipped, late_ns: worst, woke_late_ns: late_ns };
         let output = coordinator.tick(time, &states, || requests.pop().ok());
@@ -168,7 +168,7 @@ pub fn run(
         for (slot, view) in ports.task_views.iter_mut().zip(&output.tasks) {
             slot.write(view);
         }
-        // After the views: whoever gets an outcome finds its effect there.
+        // After the views: a client that gets an outcome finds its effect there.
         let mut replied = false;
         for event in &output.events {
             if let Event::Request(id, outcome) = event {

@@ -8,7 +8,7 @@ use crate::telemetry::{Outcome, TaskState};
 
 pub const CHECKS: &[Check] = &[
     Check::new("comes_to_rest_on_cancel", "After a cancel the arm rests within 5 s, and the task has ended.", cancel),
-    Check::new("comes_to_rest_without_targets", "When no target comes any more, the arm rests within 5 s.", timeout),
+    Check::new("comes_to_rest_without_targets", "When targets stop coming, the arm rests within 5 s.", timeout),
     Check::new("ends_when_the_arm_is_held", "A stop ends it at once; after a reset only a target moves it.", held),
     Check::new(
         "gives_way_to_a_stronger_task",
@@ -62,7 +62,7 @@ fn held(bench: &mut Bench) -> Result<(), String> {
     bench.run(1.0);
     bench.enable()?;
     if bench.is_active() || !bench.rests(1.0) {
-        return Err("it went on after the reset, without a target".to_owned());
+        return Err("it continued after the reset, without a target".to_owned());
     }
     bench.stream(0.5)?;
     if bench.is_active() { Ok(()) } else { Err("it takes no target after the reset".to_owned()) }

@@ -1,5 +1,5 @@
 //! Takes an end effector to poses, or moves it with given velocities: a stream of either. When the stream stops, the
-//! end effector comes to rest and the joints are let go.
+//! end effector decelerates to rest and the joints are released.
 
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 

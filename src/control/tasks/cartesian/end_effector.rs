@@ -95,8 +95,8 @@ impl EndEffector {
         self.velocity == Velocity::default() && self.joints.velocity.iter().all(|v| *v == 0.0)
     }
 
-    /// Moves on by one tick towards a velocity and claims the joints. `way`: what is left to a goal, where it shall
-    /// stand still.
+    /// Moves on by one tick towards a velocity and claims the joints. `way`: what is left to a goal, where it must
+    /// stop.
     pub fn advance(&mut self, cx: &Context<'_>, wanted: &Velocity, way: Option<&Velocity>, claims: &mut Vec<Claim>) {
         let before = self.velocity;
         self.approach(wanted, cx.dt);
