@@ -129,7 +129,7 @@ class Client:
         return cls(live[run or next(iter(live))], timeout)
 
     def close(self) -> None:
-        """Ends the connection and what it leases. A motion that has begun goes on; a stream goes stale."""
+        """Ends the connection and what it leases. A motion that has begun continues; a stream goes stale."""
         self._socket.close()
 
     def __enter__(self) -> Client:
@@ -146,10 +146,10 @@ class Client:
         self._next_id += 1
         params = {key: value for key, value in params.items() if value is not None}
         try:
-            told = json.dumps({"id": self._next_id, "method": method, "params": params}, allow_nan=False)
+            request = json.dumps({"id": self._next_id, "method": method, "params": params}, allow_nan=False)
         except ValueError as error:
             raise Refused("INVALID_PARAMS", f"{method}: {error}", "all numbers must be finite") from None
-        if len(line := told.encode() + b"\n") > MAX_LINE:
+        if len(line := request.encode() + b"\n") > MAX_LINE:
             raise Refused("TOO_LARGE", f"the request has {len(line)} bytes, and may have {MAX_LINE}")
         try:
             self._socket.settimeout(self.timeout)

@@ -2,16 +2,16 @@
     python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock"""
 import argparse, contextlib, ctypes, enum, errno, importlib, itertools, json, math, os, pathlib, platform, select, signal
 import socket, struct, sys, time
-SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after so long without a request [s]; bytes of a line
+SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after this time without a request [s]; bytes of a line
 FEEDBACK, EXTRAS = ["read_joint_velocities", "read_joint_efforts"], ["modes", "gripper_range", "holds_when_disabled"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",
          "read_cartesian_position", "read_force_torque", *FEEDBACK]
 ACTS = ["activate", "deactivate", "write_enable", "set_control_mode", "write_stop", "write_clear_errors"]
 MOTIONS = ["write_gripper_position", "write_cartesian_position"]
 INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these
-DISABLED, MISSING = "it was stopped by itself or is not enabled: enable it first", (ModuleNotFoundError, AttributeError)
+DISABLED, MISSING = "it stopped on its own or is not enabled: enable it first", (ModuleNotFoundError, AttributeError)
 
-def control_modes():  # of dimos; where that is not installed, an object stands in for what adapters import from it
+def control_modes():  # of dimos; where that is not installed, an object replaces what adapters import from it
     name, bag = "dimos.hardware.manipulators", argparse.Namespace
     with contextlib.suppress(ImportError):
         return importlib.import_module(name + ".spec").ControlMode

@@ -2,7 +2,7 @@
 //!
 //! Wire: 0.001 deg, 0.001 deg/s. Here: rad, rad/s. Every conversion between the two is in this file.
 //!
-//! The arm sends its state by itself, and acknowledges nothing. So [`ManipulatorAdapter::state_fd`] tells when to read,
+//! The arm streams its state, and acknowledges nothing. So [`ManipulatorAdapter::state_fd`] shows when to read,
 //! every read first takes up what has arrived, and a command that must be sure waits until the state shows it.
 
 use std::os::fd::BorrowedFd;
@@ -26,9 +26,9 @@ const CONNECT_TIMEOUT: Duration = Duration::from_millis(1200);
 const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// Longest wait until the state shows what was commanded. YOUR ARM: how long its motors take to switch on, or its brakes.
 const CONFIRM_TIMEOUT: Duration = Duration::from_millis(500);
-/// A living arm is never silent for so long: reading fails. YOUR ARM: some 20 of its periods.
+/// A powered arm is never silent for this long: reading fails. YOUR ARM: some 20 of its periods.
 const STALE: Duration = Duration::from_millis(100);
-/// After this silence the arm counts as lost, and is connected to anew.
+/// After this silence the arm counts as lost, and is connected to again.
 const LOST: Duration = Duration::from_millis(500);
 /// How often is looked for what is waited for.
 const LOOK: Duration = Duration::from_millis(1);
@@ -142,7 +142,7 @@ impl AcmeAdapter {
             false => self.port()?.send(frames).inspect_err(|_| self.disconnect())?,
         };
         if sent < frames.len() {
-            let what = format!("the bus of acme at {} takes no more frames: nobody acknowledges them", self.address);
+            let what = format!("the bus of acme at {} takes no more frames: no node acknowledges them", self.address);
             return Err(AdapterError::Io(what));
         }
         Ok(())
@@ -352,7 +352,7 @@ impl ManipulatorAdapter for AcmeAdapter {
         self.send(&targets)
     }
 
-    // This arm has no velocity mode, so `write_joint_velocities` is left out. `dimos check` tells who asks for one.
+    // This arm has no velocity mode, so `write_joint_velocities` is left out. `dimos check` reports tasks that need one.
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.send(&[Control::Stop.encode()])?;

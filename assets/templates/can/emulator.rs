@@ -152,7 +152,7 @@ mod tests {
         }
         assert!(hear(&frame(golden::CLEAR), 50).2, "it moves");
         hear(&frame(golden::STOP), 60);
-        assert!(!hear(&frame(golden::IDENTIFY), 2000).2, "it stands");
+        assert!(!hear(&frame(golden::IDENTIFY), 2000).2, "it is at rest");
         assert_eq!(controller.targets[..], JOINTS.map(|(value, _)| value)[..DOF]);
         assert_eq!(answers, [identity(DOF as u8)]);
     }

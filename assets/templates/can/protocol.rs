@@ -4,7 +4,7 @@
 //! code below to match it.
 //!
 //! ```text
-//! The arm sends by itself, 200 times a second, in this order. All numbers are big-endian.
+//! The arm streams, 200 times a second, in this order. All numbers are big-endian.
 //! 2A0 + n   positions of joints 2n+1 and 2n+2, i32 [0.001 deg] each; a joint that is not there is 0
 //! 2B0 + n   velocities of the same, i32 [0.001 deg/s] each
 //! 2C0       flags u8 (1 motors on, 2 moving), mode u8, error u16, 0 0 0 0

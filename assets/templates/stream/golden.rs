@@ -22,7 +22,7 @@ pub const STOP: &str = "a506ff00 01aa";
 pub const HELLO_REPLY: &str = "5a01010a 00 0001 06 0201 0000002a 009a";
 /// Refusal of [`MODE`]: the arm is moving.
 pub const MOVING_REPLY: &str = "5a030301 05 0066";
-/// What stands before the joints in the reply to [`STATE`]: done, 123.456789 s, motors on, moving, setpoints, error 2.
+/// The part before the joints in the reply to [`STATE`]: done, 123.456789 s, motors on, moving, setpoints, error 2.
 pub const STATE_BEFORE_JOINTS: &str = "00 00000000075bcd15 03 01 0002";
 
 /// Values of the joints, and the same as floats of the wire.
@@ -51,7 +51,7 @@ pub fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len()).step_by(2).map(|i| u8::from_str_radix(&hex[i..i + 2], 16).unwrap()).collect()
 }
 
-/// A frame that carries, behind `before`, the values of all joints so many times.
+/// A frame that carries, behind `before`, the values of all joints that number of times.
 pub fn of_joints(header: &str, before: &str, times: usize) -> Vec<u8> {
     let joints = JOINTS.iter().take(DOF).map(|(_, float)| *float).collect::<String>().repeat(times);
     let payload = bytes(&format!("{before}{joints}"));
