@@ -1,7 +1,7 @@
 """Serves a Python arm adapter, one with the guide's methods, to dimos (`adapter_type: remote`; docs/remote-adapter.md):
     python3 dimos_shim.py yourmodule:YourArmAdapter --address 192.168.1.100 --at unix:/run/user/1000/arm.sock"""
-import argparse, contextlib, ctypes, enum, errno, importlib, itertools, json, math, os, pathlib, platform, select, signal
-import socket, struct, sys, time
+import argparse, contextlib, ctypes, enum, errno, importlib, itertools, json, math, os, pathlib, platform, select
+import signal, socket, struct, sys, time
 SILENCE, LONGEST = 0.5, 16384  # a commanded arm is stopped after this time without a request [s]; bytes of a line
 FEEDBACK, EXTRAS = ["read_joint_velocities", "read_joint_efforts"], ["modes", "gripper_range", "holds_when_disabled"]
 READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_gripper_position",

@@ -113,7 +113,9 @@ pub fn run(
     let (mut tick, mut skips_before, mut late_before, mut dropped) = (0u64, 0u32, 0u64, 0u32);
     pulse.beat.beat(clock.now());
     while !pulse.stop.load(Ordering::Relaxed) {
+        pulse.beat.sleep_until(deadline);
         host::sleep_until(deadline);
+        pulse.beat.awake();
         let woke = clock.now();
         if let Some(probe) = &mut probe {
             probe(tick);

@@ -3,21 +3,41 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use super::due::Due;
 use crate::clock::Mono;
 
-/// The time of the latest beat.
+/// The time of the latest beat, and the earliest time at which the next one is due.
 #[derive(Debug, Default)]
-pub struct Heartbeat(AtomicU64);
+pub struct Heartbeat {
+    last: AtomicU64,
+    due: Due,
+}
 
 impl Heartbeat {
     /// Records a beat.
     pub fn beat(&self, now: Mono) {
-        self.0.store(now.0, Ordering::Release);
+        self.last.store(now.0, Ordering::Release);
+    }
+
+    /// Notes that the thread sleeps until `at`.
+    pub fn sleep_until(&self, at: Mono) {
+        self.due.wait_until(at);
+    }
+
+    /// Notes that the thread is awake.
+    pub fn awake(&self) {
+        self.due.awake();
+    }
+
+    /// Returns for how long a sleeping thread has been overdue: it got no processor. Zero for a thread that is awake,
+    /// even if it does not beat.
+    pub fn overdue(&self, now: Mono) -> Duration {
+        self.due.overdue(now)
     }
 
     /// Returns the time of the latest beat; `None` before the first.
     pub fn last(&self) -> Option<Mono> {
-        match self.0.load(Ordering::Acquire) {
+        match self.last.load(Ordering::Acquire) {
             0 => None,
             last => Some(Mono(last)),
         }

@@ -115,6 +115,18 @@ fn a_stop_that_was_asked_for_while_the_link_was_down_is_sent_when_it_is_back() {
 }
 
 #[test]
+fn a_tick_that_gets_no_processor_holds_no_arm_for_less_than_a_tenth_of_a_second() {
+    let mut bench = bench(100.0);
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.03));
+    let began = MonotonicClock.now();
+    bench.beat.sleep_until(began.after(Duration::from_millis(10)));
+    bench.until("the hold", |b| b.states.read().self_held);
+    let held_after = MonotonicClock.now().since(began);
+    assert!(held_after >= Duration::from_millis(105), "it sleeps and was not woken: held after {held_after:?}");
+    bench.end();
+}
+
+#[test]
 fn a_slow_arm_is_held_too_when_the_tick_falls_silent() {
     // It is read once a second, and must be stopped long before the next time.
     let mut bench = bench(1.0);

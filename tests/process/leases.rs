@@ -52,7 +52,7 @@ fn one_commands_and_everyone_reads_cancels_and_stops() {
     one.call(target(0.1)).unwrap();
     let holder = commander(&mut two).expect("the first target took the lease");
     assert_eq!(holder.pid, Some(std::process::id() as i32));
-    assert!(holder.program.starts_with("leases"), "{holder:?}");
+    assert!(holder.program.starts_with("process"), "{holder:?}");
 
     let named = format!("arm is commanded by {} (pid {}), since ", holder.program, std::process::id());
     for verb in ["move arm 0 0 0 0 0 0", "arm gripper arm 0.02", "arm disable arm", "arm enable arm", "arm reset arm"] {

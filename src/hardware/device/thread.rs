@@ -592,9 +592,12 @@ impl Worker {
 
     /// How long the tick may still be silent, where its silence would matter.
     fn until_silent(&self, now: Mono) -> Duration {
-        let silence = self.config.beat.silence(now).filter(|_| self.moving());
-        let limit = self.config.beat_timeout() + self.delay.1;
-        silence.map_or(Duration::MAX, |silence| limit.saturating_sub(silence))
+        let Some(silence) = self.config.beat.silence(now).filter(|_| self.moving()) else { return Duration::MAX };
+        let timeout = self.config.beat_timeout();
+        let left = (timeout + self.delay.1).saturating_sub(silence);
+        // A tick that sleeps and was not woken does not hang, it got no processor: not for long enough to hold the arm.
+        let overdue = self.config.beat.overdue(now);
+        if overdue.is_zero() { left } else { left.max(LONGEST_DELAY.saturating_sub(overdue)) }
     }
 
     /// This thread woke late: it could not have seen the tick meanwhile, and the tick could hardly have run.
