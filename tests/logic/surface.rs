@@ -53,7 +53,7 @@ fn a_change_is_shown_as_lines() {
 #[test]
 #[cfg(feature = "can")]
 fn blueprint_keys() {
-    let schema = dimos::blueprint::json_schema((&Registry::builtin()).into());
+    let schema = dimos::blueprint::json_schema(&Registry::builtin());
     unchanged("blueprint", &schema::lines(&schema, &schema, ""));
 }
 
