@@ -4,9 +4,6 @@
 #[path = "../support/mod.rs"]
 mod support;
 
-/// Whether programs that tests start may schedule in real time.
-const REALTIME: bool = false;
-
 #[global_allocator]
 static ALLOCATOR: support::counting::Counting = support::counting::Counting;
 

@@ -3,9 +3,6 @@
 #[path = "../support/mod.rs"]
 mod support;
 
-/// Whether programs that tests start may schedule in real time.
-const REALTIME: bool = true;
-
 mod can_kernel;
 mod piper_kernel;
 mod piper_sdk;

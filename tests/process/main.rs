@@ -3,9 +3,6 @@
 #[path = "../support/mod.rs"]
 mod support;
 
-/// Whether programs that tests start may schedule in real time.
-const REALTIME: bool = true;
-
 mod adapter_emulate;
 mod adapter_new;
 mod adapter_test;

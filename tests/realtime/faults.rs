@@ -256,7 +256,7 @@ fn f10_a_stream_that_ends_ends_the_motion() {
     let still = || arm.joints().1.iter().all(|v| v.abs() < 0.01);
     // Timeout, deceleration from 0.5 rad/s, two ticks; and the emulator's own lag.
     for (task, timeout) in [("velocity", 0.2), ("servo", 0.5)] {
-        // To and fro, so that no joint comes to the end of its range.
+        // The direction alternates, so that no joint reaches its position limit.
         let mut way = -1.0;
         within(&format!("F10 {task} still"), (timeout + 0.5 / ACCELERATION + 2.0 * PERIOD) * 1e3 + 100.0, || {
             let mut client = home.client();

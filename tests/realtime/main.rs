@@ -3,9 +3,6 @@
 #[path = "../support/mod.rs"]
 mod support;
 
-/// Whether programs that tests start may schedule in real time.
-const REALTIME: bool = true;
-
 #[allow(dead_code, reason = "a library's public parts")]
 #[path = "../../assets/templates/serial/mod.rs"]
 mod serial;

@@ -1,7 +1,7 @@
 //! The real binary as a user runs it: in folders of its own, and always ended, whatever a test does.
 
 use std::io::Read;
-use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Output, Stdio};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,20 +11,12 @@ use std::time::{Duration, Instant};
 use dimos::rpc::client::Client;
 use dimos::rpc::place::RunFolder;
 use rustix::process::{Pid, Signal, kill_process};
-use rustix::thread::CapabilitySet;
 use serde_json::Value;
 
 /// Nothing here takes longer; a test that waits this long has failed.
 pub const PATIENCE: Duration = Duration::from_secs(30);
 /// The last line of the banner: the run is up.
 pub const UP: &str = "Press Ctrl-C for a controlled stop.";
-
-/// What runs has no right to schedule in real time from here on, even as root. A user who may not even give rights up has
-/// none.
-fn give_up_real_time() -> std::io::Result<()> {
-    let _ = rustix::thread::remove_capability_from_bounding_set(CapabilitySet::SYS_NICE);
-    Ok(())
-}
 
 /// A user's folders: sockets, logs, settings. Only what runs in them is seen.
 pub struct Home(tempfile::TempDir);
@@ -40,7 +32,7 @@ impl Home {
         self.0.path()
     }
 
-    /// Gives a command this user's folders, and in most binaries no right to schedule in real time.
+    /// Gives a command this user's folders.
     pub fn settle<'c>(&self, command: &'c mut Command) -> &'c mut Command {
         command
             .env("HOME", self.path())
@@ -50,12 +42,7 @@ impl Home {
             .env("XDG_CONFIG_HOME", self.path().join("config"))
             .env_remove("DIMOS_BLUEPRINT_PATH")
             .env_remove("DIMOS_LOG")
-            .current_dir(self.path());
-        if !crate::REALTIME {
-            // SAFETY: one system call, which allocates nothing.
-            unsafe { command.pre_exec(give_up_real_time) };
-        }
-        command
+            .current_dir(self.path())
     }
 
     pub fn command(&self, arguments: &str) -> Command {

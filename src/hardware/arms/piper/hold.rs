@@ -72,8 +72,8 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 }
 
 impl Session {
-    /// Commands the arm to stay where it is. Where its feedback has paused while setpoints were streamed, that is the last
-    /// of them, which it is at or comes to: what was measured before the pause would pull it back.
+    /// Commands the arm to stay where it is. When its feedback pauses during a stream, the target is the last setpoint:
+    /// positions measured before the pause would pull the arm back.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
         let target = match self.written() {
             Some(written) if self.streamed && !self.picture.is_live() => written,

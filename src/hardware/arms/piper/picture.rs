@@ -19,7 +19,7 @@ const FAR: u32 = 360_000;
 /// Positions come every 5 ms. After a longer pause than this those that waited on their way arrive first, all at once.
 const PAUSE: Duration = Duration::from_millis(20);
 /// For how long after a pause positions may be such.
-pub const WAITED: Duration = Duration::from_millis(10);
+const WAITED: Duration = Duration::from_millis(10);
 /// A set of zeros is not believed of an arm that was farther away than this at the last one [0.001°].
 const NOT_ZERO: u32 = 5_000;
 /// After this time an arm at exactly zero is taken to be there.
