@@ -187,7 +187,10 @@ mod tests {
         all[1].pin(true);
         all[2].begin();
         let reserved = seats.take().unwrap();
-        assert!(reserved.is_reserved() && all.iter().all(|seat| !left(seat)), "a stop needs no place of another connection");
+        assert!(
+            reserved.is_reserved() && all.iter().all(|seat| !left(seat)),
+            "a stop needs no place of another connection"
+        );
         reserved.promote().unwrap();
         let gone: Vec<usize> = (0..all.len()).filter(|i| left(&all[*i])).collect();
         assert_eq!(gone, [3]);

@@ -9,10 +9,10 @@ use crate::clock::{Clock, MonotonicClock, WallOffset};
 use crate::control::config::CoordinatorConfig;
 use crate::hardware::device;
 use crate::message::Message;
-use crate::recording::{disk_space, files};
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::Notes;
 use crate::recording::recorder::Note;
+use crate::recording::{disk_space, files};
 use crate::telemetry::describe::{Names, Severity};
 
 /// The log of a run, where it has one; refused where there is no room for it.

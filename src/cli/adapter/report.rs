@@ -157,7 +157,8 @@ impl Report {
     }
 
     fn facts(&self) -> Vec<(&'static str, String)> {
-        let (arm, said) = (&self.arm, |text: &Option<String>| text.clone().unwrap_or_else(|| "not reported".to_owned()));
+        let (arm, said) =
+            (&self.arm, |text: &Option<String>| text.clone().unwrap_or_else(|| "not reported".to_owned()));
         vec![
             ("arm", format!("{} {}, {} joints", arm.vendor, arm.model, arm.dof)),
             ("firmware", said(&arm.firmware)),

@@ -2,8 +2,8 @@
 //! `dimos adapter emulate` does; whoever writes neither waits for a terminal nor makes the diary grow without bound.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::faults::FaultKind;
 use crate::clock::{Clock, Mono, MonotonicClock};
