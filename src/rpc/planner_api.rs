@@ -188,7 +188,7 @@ pub struct PlanSummary {
 /// A pair that does not keep the padding, near the start or the goal, where it is closer itself.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PaddingGivenUp {
-    /// `start`, `goal`, or `everywhere`: the two are closer in every pose.
+    /// `start`, `goal`, or `everywhere`: the two are closer in every configuration.
     pub near: String,
     /// The link.
     pub link: String,
@@ -277,7 +277,7 @@ pub struct PlannerReport {
     /// Number of the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
-    /// Link pairs that touch in every pose and are therefore not checked, by robot.
+    /// Link pairs that touch in every configuration and are therefore not checked, by robot.
     pub always_touching: BTreeMap<String, Vec<[String; 2]>>,
 }
 

@@ -197,7 +197,7 @@ fn motion(view: &View<'_>) -> Vec<Line> {
     // The task's limit has priority over a joint's.
     let held_back = task.and_then(|task| task.bound.clone());
     let bound = match held_back.or_else(|| view.seen.bound.as_ref().map(|(text, _)| text.clone())) {
-        Some(text) => Line::default().with(format!("bounded: {text}"), Look::Warning),
+        Some(text) => Line::default().with(format!("limited: {text}"), Look::Warning),
         None => Line::default(),
     };
     vec![first, line, bound]
