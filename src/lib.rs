@@ -1,7 +1,7 @@
 //! dimos runs robot arms: a real-time control coordinator, recording and replay, from a YAML blueprint, for any arm.
 //!
 //! ```text
-//!  blueprint.yaml ─▶ blueprint (schema → resolve) ─▶ runtime: builds everything below, starts threads, stops them in order
+//!  blueprint.yaml ─▶ blueprint (schema → resolve) ─▶ runtime: builds everything below, starts and stops threads
 //!
 //!  CLI ──rpc──▶ runtime::service ──requests──▶ coordinator (real-time thread)
 //!                     └─▶ planning: robot model, obstacles (collision) ▶ a verified trajectory ──▲

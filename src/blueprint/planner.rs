@@ -23,14 +23,15 @@ pub struct PlannerConfig {
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub planning_timeout: f64,
-    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Reduced near a start or goal
-    /// that is closer itself; every such plan reports it.
+    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Reduced near a start or
+    /// goal that is closer itself; every such plan reports it.
     #[serde(deserialize_with = "non_negative")]
     #[schemars(range(min = 0.0))]
     pub padding: f64,
     /// The robots that are planned for.
     pub robots: Vec<Located<RobotConfig>>,
-    /// Obstacles that are there from the start, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0, 0]}}`.
+    /// Obstacles that are there from the start, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0,
+    /// 0]}}`.
     pub world: Keyed<Located<ObjectEntry>>,
     /// The same as the section `view`; only one of the two may be given.
     pub visualization: Option<Located<ViewConfig>>,
@@ -85,8 +86,8 @@ pub struct RobotConfig {
     /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
     #[serde(default)]
     pub joint_name_mapping: Keyed<Located<String>>,
-    /// The joint of the model that the arm's gripper moves: `{joint: finger, closed: 0, open: 0.04}`. Without it a gripper is
-    /// planned for at its widest opening.
+    /// The joint of the model that the arm's gripper moves: `{joint: finger, closed: 0, open: 0.04}`. Without it a
+    /// gripper is planned for at its widest opening.
     #[serde(default)]
     pub gripper_joint: Option<Located<GripperJointEntry>>,
     /// The trajectory task that executes the robot's motions.
@@ -95,11 +96,13 @@ pub struct RobotConfig {
     /// Pairs of links that may touch: `[[finger_left, finger_right]]`.
     #[serde(default)]
     pub collision_exclusion_pairs: Vec<(String, String)>,
-    /// How the collision meshes of links are checked, by the link's name: `{left_finger: decomposition}`. `hull` (default)
-    /// fills what is hollow, `decomposition` takes several convex parts, `triangles` the mesh as it is, slowly.
+    /// How the collision meshes of links are checked, by the link's name: `{left_finger: decomposition}`. `hull`
+    /// (default) fills what is hollow, `decomposition` takes several convex parts, `triangles` the mesh as it is,
+    /// slowly.
     #[serde(default)]
     pub collision_shapes: Keyed<Located<MeshMode>>,
-    /// Whether collision meshes may be Collada files, which are converted to triangles. STL and OBJ are read as they are.
+    /// Whether collision meshes may be Collada files, which are converted to triangles. STL and OBJ are read as they
+    /// are.
     #[serde(default = "yes")]
     pub auto_convert_meshes: bool,
     /// Highest joint speed, on top of the model's own limits [rad/s].

@@ -92,8 +92,8 @@ fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> Ob
     ObjectConfig { name: name.to_owned(), shape, pose: pose(&entry.pose), padding: entry.padding }
 }
 
-/// Returns a path into an asset, or a path relative to the file that names it; relative to the working directory if that
-/// file is built-in.
+/// Returns a path into an asset, or a path relative to the file that names it; relative to the working directory if
+/// that file is built-in.
 pub(super) fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
     if path.starts_with(crate::robot::builtin::PREFIX) {
         return path.into();

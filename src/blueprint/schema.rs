@@ -91,13 +91,13 @@ pub struct HardwareEntry {
     #[serde(default, deserialize_with = "range::maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub accuracy: Option<f64>,
-    /// Time from a setpoint to the measured motion that follows it [s]; `dimos adapter test --lag` measures it. Default:
-    /// the adapter's.
+    /// Time from a setpoint to the measured motion that follows it [s]; `dimos adapter test --lag` measures it.
+    /// Default: the adapter's.
     #[serde(default, deserialize_with = "range::maybe_lag")]
     #[schemars(extend("minimum" = 0, "maximum" = 1))]
     pub lag: Option<f64>,
-    /// Age limit of a state [s]: an arm without a newer one is held. At least three of the device's periods are granted.
-    /// Default: the adapter's.
+    /// Age limit of a state [s]: an arm without a newer one is held. At least three of the device's periods are
+    /// granted. Default: the adapter's.
     #[serde(default, deserialize_with = "range::maybe_age")]
     #[schemars(extend("minimum" = 0.02, "maximum" = 2))]
     pub stale_after: Option<f64>,

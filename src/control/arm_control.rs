@@ -358,8 +358,8 @@ impl ArmControl {
     }
 
     /// Where the arm has been under power since the last position was written, and is at it within its accuracy, that
-    /// position stays: starting from the measured pose would sink a little at every start. Otherwise it starts from where
-    /// it is measured.
+    /// position stays: starting from the measured pose would sink a little at every start. Otherwise it starts from
+    /// where it is measured.
     fn seed_limiters(&mut self) {
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
             let q = self.state.position.get(j).copied().unwrap_or_default();
@@ -487,8 +487,8 @@ impl ArmControl {
     /// Slows down by commands; when at rest, asks the arm to stop by its own means and leaves it alone.
     fn come_to_rest(&mut self, now: Mono, dt: f64) {
         if let Some(mode) = self.command.mode {
-            // A velocity that cannot be reduced, because nothing gets through, continues: the stop replaces it. After a short
-            // gap the ramp continues.
+            // A velocity that cannot be reduced, because nothing gets through, continues: the stop replaces it. After a
+            // short gap the ramp continues.
             let silent = now.since(self.written.last().at) > self.config.supervision.stale_after;
             let stuck = self.gap_since.is_some() && silent && mode == ControlMode::Velocity;
             let drawn = mode.is_position() && self.draw(dt);
@@ -639,8 +639,8 @@ impl ArmControl {
         }
     }
 
-    /// Where each joint may be by the time a velocity command takes effect [rad], lowest and highest: the measurement is
-    /// old, and the joint still follows what was commanded since.
+    /// Where each joint may be by the time a velocity command takes effect [rad], lowest and highest: the measurement
+    /// is old, and the joint still follows what was commanded since.
     fn ahead(&self, dt: f64) -> Option<[(f64, f64); MAX_DOF]> {
         let range = self.set_points.range(self.window_start())?;
         let age = f64::from(self.freshness.age.age_us + self.freshness.age.own_us) * 1e-6;

@@ -1,5 +1,5 @@
-//! Time along a path. It runs at rate 1, slows down for a cancel, and after a gap starts again from rest where the arm is
-//! on the path: the path stays the same, only the time along it is scaled, within acceleration and jerk.
+//! Time along a path. It runs at rate 1, slows down for a cancel, and after a gap starts again from rest where the arm
+//! is on the path: the path stays the same, only the time along it is scaled, within acceleration and jerk.
 
 use crate::clock::Mono;
 

@@ -1,5 +1,5 @@
-//! The setpoints of the last moments, and how far an arm is from them. A joint that follows with a delay is somewhere in
-//! the range of the setpoints of its `lag`; one that is outside is blocked, or moved from outside.
+//! The setpoints of the last moments, and how far an arm is from them. A joint that follows with a delay is somewhere
+//! in the range of the setpoints of its `lag`; one that is outside is blocked, or moved from outside.
 
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};

@@ -190,8 +190,8 @@ pub trait TaskBody: std::fmt::Debug + Send {
         OnLoss::End
     }
 
-    /// Nothing reached an arm since the tick of `at`: continues from what was commanded then, from rest. The next tick is
-    /// not granted, so that a body which integrates from [`JointView::commanded`] then needs no more than that.
+    /// Nothing reached an arm since the tick of `at`: continues from what was commanded then, from rest. The next tick
+    /// is not granted, so that a body which integrates from [`JointView::commanded`] then needs no more than that.
     fn rewind(&mut self, at: Mono, now: Mono) {
         let _ = (at, now);
     }

@@ -1,6 +1,6 @@
-//! What reached the wire. The device thread reports the newest command that it wrote; with the commands of the last ticks
-//! that is the setpoint the arm has. When nothing was written for more than two periods there is a gap: commands stay at
-//! what was written last, and motion continues from there.
+//! What reached the wire. The device thread reports the newest command that it wrote; with the commands of the last
+//! ticks that is the setpoint the arm has. When nothing was written for more than two periods there is a gap: commands
+//! stay at what was written last, and motion continues from there.
 
 use std::time::Duration;
 

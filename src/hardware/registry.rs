@@ -224,7 +224,8 @@ pub fn available() -> Vec<&'static str> {
 }
 
 /// Makes a built-in adapter by name, the way a run does; it is not connected yet. The address is in the adapter's own
-/// form (`dimos list-adapters` shows it). An error names the adapters that there are, or what is wrong with the address.
+/// form (`dimos list-adapters` shows it). An error names the adapters that there are, or what is wrong with the
+/// address.
 ///
 /// ```
 /// use dimos::hardware::registry;

@@ -149,8 +149,8 @@ pub trait ManipulatorAdapter: Send {
     fn get_control_mode(&self) -> ControlMode;
 
     /// What another client of the device, or a person at its panel, changed since the last `activate` or
-    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: nothing, or the device itself is the cause
-    /// (`read_error`). An adapter never undoes such a change by itself. Must not allocate.
+    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: nothing, or the device itself is the
+    /// cause (`read_error`). An adapter never undoes such a change by itself. Must not allocate.
     fn foreign_change(&self) -> Option<&'static str> {
         None
     }
@@ -214,14 +214,15 @@ pub trait ManipulatorAdapter: Send {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
     /// Clears the device's error state. Moves nothing, enables nothing.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
-    /// Longest regular time between two setpoints that the device takes, known once it is connected. `None`: it takes one
-    /// in every tick, or in every period of its states where that is longer.
+    /// Longest regular time between two setpoints that the device takes, known once it is connected. `None`: it takes
+    /// one in every tick, or in every period of its states where that is longer.
     fn set_point_period(&self) -> Option<Duration> {
         None
     }
     /// Discards setpoints that have not left this computer. Called when the arm stopped answering, before anything else
-    /// is sent: a setpoint that waits in a queue must not reach the arm later. By default the connection is dropped, and
-    /// the device thread connects again; a TCP connection is reset, not closed, so that its send buffer is discarded.
+    /// is sent: a setpoint that waits in a queue must not reach the arm later. By default the connection is dropped,
+    /// and the device thread connects again; a TCP connection is reset, not closed, so that its send buffer is
+    /// discarded.
     fn discard_pending(&mut self) {
         self.disconnect();
     }

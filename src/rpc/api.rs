@@ -40,7 +40,8 @@ pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
 /// What the server serves: the run itself.
 pub trait Backend: Send + Sync + 'static {
     /// Answers one request. Called from the server's threads, several at once; it may wait but must not block, or a
-    /// stop would wait for it. When it takes longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is dropped.
+    /// stop would wait for it. When it takes longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is
+    /// dropped.
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
     /// The arms that `subject` is about, by `hardware_id`; none where it names something that is not there. Who
     /// moves an arm needs its lease.

@@ -82,8 +82,8 @@ pub struct PlannerRequest {
 pub struct Moment {
     /// The number of the plan that begins now.
     pub plan: u64,
-    /// Where joints are [rad]: where they are commanded to be, where positions are commanded. Without those whose arm has
-    /// not been heard of for 1 s.
+    /// Where joints are [rad]: where they are commanded to be, where positions are commanded. Without those whose arm
+    /// has not been heard of for 1 s.
     pub positions: BTreeMap<String, f64>,
     /// How far the grippers of arms are open, 0–1, by each of their arm's joints.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]

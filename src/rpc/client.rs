@@ -143,7 +143,8 @@ impl Client {
         &self.run
     }
 
-    /// Asks, and waits for the answer. Stream messages that come meanwhile are kept for [`next_message`](Self::next_message).
+    /// Asks, and waits for the answer. Stream messages that come meanwhile are kept for
+    /// [`next_message`](Self::next_message).
     pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
         let id = self.next;
         self.next += 1;

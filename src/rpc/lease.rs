@@ -1,8 +1,8 @@
 //! One commander at a time: who may move an arm just now.
 //!
-//! A connection takes the lease of an arm with its first request that is taken on and moves it, or with `lease`, and has it until
-//! `release` or its own end. The rest of the program knows nothing of it: a stream of targets that ends with its
-//! commander goes stale like any other, and a trajectory that has begun continues.
+//! A connection takes the lease of an arm with its first request that is taken on and moves it, or with `lease`, and
+//! has it until `release` or its own end. The rest of the program knows nothing of it: a stream of targets that ends
+//! with its commander goes stale like any other, and a trajectory that has begun continues.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};

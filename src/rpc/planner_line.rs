@@ -124,8 +124,8 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// The planner's process has ended. A run that never had one refuses without `data`: who relied on a planner must not be
-/// moved without one because it crashed.
+/// The planner's process has ended. A run that never had one refuses without `data`: who relied on a planner must not
+/// be moved without one because it crashed.
 pub fn gone() -> RpcError {
     RpcError::new(Code::NoPlanner, "the planner that was attached to this run has gone")
         .hint("start it again: `dimos run` its blueprint beside this run; `dimos move … --direct` needs none")

@@ -1,6 +1,6 @@
 //! The requests that always get through: `stop`, `cancel`, `status`, `shutdown`. The thread that takes connections
-//! answers them itself as long as a connection asks nothing else; so they never wait for another client's JSON, and need
-//! no place among the other connections.
+//! answers them itself as long as a connection asks nothing else; so they never wait for another client's JSON, and
+//! need no place among the other connections.
 
 use std::sync::Arc;
 use std::sync::mpsc::Sender;

@@ -106,8 +106,8 @@ fn set_other() {
 /// The slice of processor time that ordinary timed threads ask for [ns], the shortest that Linux grants.
 const SLICE: u64 = 100_000;
 
-/// Lets an ordinary thread wait less for a processor: since Linux 6.12 a thread that asks for short slices is run the sooner
-/// after it wakes. Needs no right; older kernels ignore it.
+/// Lets an ordinary thread wait less for a processor: since Linux 6.12 a thread that asks for short slices is run the
+/// sooner after it wakes. Needs no right; older kernels ignore it.
 fn ask_for_short_slices() {
     const SIZE: libc::c_uint = size_of::<libc::sched_attr>() as libc::c_uint;
     // SAFETY: sched_attr is plain data, zero is a valid value for it.
@@ -123,8 +123,8 @@ fn ask_for_short_slices() {
 }
 
 /// Prepares the calling thread for timed work: FIFO if permitted, otherwise short slices and the shortest timer slack;
-/// touches its stack and locks it as far as the limit allows, so that it causes no page faults later. Returns whether it
-/// runs under FIFO.
+/// touches its stack and locks it as far as the limit allows, so that it causes no page faults later. Returns whether
+/// it runs under FIFO.
 pub fn enter_realtime(priority: i32) -> bool {
     let fifo = set_fifo(priority).is_ok();
     if !fifo {

@@ -126,8 +126,8 @@ impl Service {
         self.refusal(&outcome).map_or_else(|| Err(internal()), Err)
     }
 
-    /// Makes the arms ready that a start has enabled, and waits until they are and the others are seen; not for ever: the
-    /// banner and `status` say how far each came.
+    /// Makes the arms ready that a start has enabled, and waits until they are and the others are seen; not for ever:
+    /// the banner and `status` say how far each came.
     pub async fn first_ready(&self) {
         let arms = || self.parts.blueprint.arms.iter().map(|arm| arm.auto_enable).enumerate();
         let settled = |(arm, enabled): (usize, bool)| match self.phase(arm) {

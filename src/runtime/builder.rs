@@ -135,8 +135,8 @@ impl Builder {
         Ok(())
     }
 
-    /// Starts the run; assets that it needs are fetched first, its arms are up then. When this fails nothing has moved, and all that was connected is
-    /// disconnected again.
+    /// Starts the run; assets that it needs are fetched first, its arms are up then. When this fails nothing has moved,
+    /// and all that was connected is disconnected again.
     pub fn start(self) -> Result<Run, StartError> {
         self.fetch()?;
         let loaded = self.check();

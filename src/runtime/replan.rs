@@ -1,6 +1,6 @@
-//! Around what got in the way: a planned motion that had to end before an obstacle is planned again from where it rests,
-//! to the goal that was asked for, and continues as another motion. It runs on its own thread: it waits for the arm and
-//! for the planner.
+//! Around what got in the way: a planned motion that had to end before an obstacle is planned again from where it
+//! rests, to the goal that was asked for, and continues as another motion. It runs on its own thread: it waits for the
+//! arm and for the planner.
 
 use std::time::{Duration, Instant};
 

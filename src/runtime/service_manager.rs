@@ -1,5 +1,5 @@
-//! The service manager (systemd), where there is one: informed when the run is up and when it ends; its watchdog is fed only
-//! while the tick beats.
+//! The service manager (systemd), where there is one: informed when the run is up and when it ends; its watchdog is fed
+//! only while the tick beats.
 //!
 //! It receives datagrams on the socket that `NOTIFY_SOCKET` names: `READY=1`, `WATCHDOG=1` and the like.
 

@@ -243,7 +243,9 @@ fn wrong_model(what: String) -> StartError {
 pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError> {
     let setup = PlanningScene::load(config).map_err(wrong_model)?;
     for (robot, [a, b]) in &setup.always_touching {
-        tracing::warn!("robot {robot}: {a} and {b} touch in every configuration: they are not checked against each other");
+        tracing::warn!(
+            "robot {robot}: {a} and {b} touch in every configuration: they are not checked against each other"
+        );
     }
     Ok(setup)
 }

@@ -45,8 +45,8 @@ impl Watchdog {
                 std::thread::park_timeout(LOOK_EVERY);
                 let now = MonotonicClock.now();
                 let beat = beat.last();
-                // A process that was stopped and continued finds its tick silent, but the tick has had no chance to beat:
-                // only time counts in which this thread could look.
+                // A process that was stopped and continued finds its tick silent, but the tick has had no chance to
+                // beat: only time counts in which this thread could look.
                 let passed = now.since(looked).min(2 * LOOK_EVERY);
                 silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };
                 if beat != last {

@@ -1,5 +1,5 @@
-//! The planner's world, over rpc: objects that come, go, move, are held. [`PlannerPort::objects`] has them as given, the planner
-//! thread's world as shapes; the two change together.
+//! The planner's world, over rpc: objects that come, go, move, are held. [`PlannerPort::objects`] has them as given,
+//! the planner thread's world as shapes; the two change together.
 
 use std::path::PathBuf;
 

@@ -1,7 +1,7 @@
 //! Faults that the coordinator must withstand, on a virtual clock, each with the number that it must keep. Named
 //! after the numbers of the project's table of faults. The rig checks every command of every test as well: finite,
-//! within position, velocity and acceleration limits, no motion without power, modes changed at standstill. One table of
-//! faults, hence the length.
+//! within position, velocity and acceleration limits, no motion without power, modes changed at standstill. One table
+//! of faults, hence the length.
 
 use std::time::Duration;
 

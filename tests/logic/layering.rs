@@ -282,6 +282,24 @@ fn no_file_is_too_long_and_no_test_is_skipped_for_good() {
     fail_on(&found, "no file over 800 lines, no ignored test");
 }
 
+/// rustfmt leaves comments as they are.
+#[test]
+fn no_comment_is_wider_than_the_code() {
+    let mut found = Vec::new();
+    for source in ["src", "tests", "benches"].into_iter().flat_map(sources) {
+        for (i, line) in source.text.lines().enumerate() {
+            let width = line.chars().count();
+            let comment = line.trim_start().strip_prefix("//");
+            // A table, or an address that cannot be broken.
+            let fixed = |text: &str| text.trim_start_matches(['/', '!', ' ']).starts_with('|') || text.contains("://");
+            if width > 120 && comment.is_some_and(|text| !fixed(text)) {
+                found.push(format!("{}:{}: {width} columns", source.path, i + 1));
+            }
+        }
+    }
+    fail_on(&found, "comments of at most 120 columns");
+}
+
 #[test]
 fn nothing_panics_on_purpose_where_hardware_runs() {
     let mut found = Vec::new();

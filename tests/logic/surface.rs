@@ -1,5 +1,6 @@
-//! All that users touch, written down: blueprint keys, rpc, command line, logs, exit codes, the Python client, the trait of an
-//! adapter. Scripts, cells and adapters of users depend on every line, so a line changes on purpose or not at all.
+//! All that users touch, written down: blueprint keys, rpc, command line, logs, exit codes, the Python client, the
+//! trait of an adapter. Scripts, cells and adapters of users depend on every line, so a line changes on purpose or not
+//! at all.
 
 mod schema;
 mod source;

@@ -122,8 +122,8 @@ fn an_interface_may_go_down_and_come_back() {
     });
 }
 
-/// The interface sends nothing for a while: at most two setpoints wait, and after `discard_pending` nothing new goes out
-/// before they are transmitted.
+/// The interface sends nothing for a while: at most two setpoints wait, and after `discard_pending` nothing new goes
+/// out before they are transmitted.
 #[test]
 fn at_most_two_set_points_wait_in_the_kernel() {
     in_guest(module_path!(), "at_most_two_set_points_wait_in_the_kernel", &Guest::with(uml::VXCAN), || {
@@ -190,8 +190,8 @@ fn stream_until_changed(arm: &mut PiperAdapter, reading: &mut JointReading) {
     });
 }
 
-/// The vendor's SDK beside the adapter on one interface: the adapter does not hear it, and sees in the arm's feedback what
-/// its calls change. They are not undone.
+/// The vendor's SDK beside the adapter on one interface: the adapter does not hear it, and sees in the arm's feedback
+/// what its calls change. They are not undone.
 fn interfere(test: &str, kinds: &[&str], pauses: &[u32], feedback_hz: f64) {
     if !has_sdk() {
         return;

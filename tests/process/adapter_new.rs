@@ -131,8 +131,8 @@ fn the_table_conforms() {
 }
 "#;
 
-/// A checkout of dimos as far as a new arm sees it: the table of arms, and around it what the sources name as `crate::…`,
-/// borrowed from the real one. So new arms are compiled and tested without building the tree again.
+/// A checkout of dimos as far as a new arm sees it: the table of arms, and around it what the sources name as
+/// `crate::…`, borrowed from the real one. So new arms are compiled and tested without building the tree again.
 fn checkout(at: &Path) {
     for (path, text) in [
         (

@@ -2,9 +2,9 @@
 //!
 //! Blocks and what becomes of them: `console`: the lines after `$ ` are run by a shell, what stands below each is what
 //! they must say, loosely (`…`: anything). `console up=TERMINAL`: the same, and the last command goes on in that
-//! terminal until the next such block. `rust in=FILE`, `xml in=FILE`: these lines stand in FILE. `diff in=FILE`: the change
-//! is made there. `yaml file=NAME`, `python …`, `xml …`: the file is written. `checkout=NAME`: a copy of this checkout.
-//! `needs=ARM`: only where the table has that arm.
+//! terminal until the next such block. `rust in=FILE`, `xml in=FILE`: these lines stand in FILE. `diff in=FILE`: the
+//! change is made there. `yaml file=NAME`, `python …`, `xml …`: the file is written. `checkout=NAME`: a copy of this
+//! checkout. `needs=ARM`: only where the table has that arm.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};

@@ -1,4 +1,5 @@
-//! Every order has its own answer, from the arm's device thread or the tick; none is guessed from what happens beside it.
+//! Every order has its own answer, from the arm's device thread or the tick; none is guessed from what happens beside
+//! it.
 
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};

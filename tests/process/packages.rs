@@ -1,4 +1,5 @@
-//! What is shipped, made from the program under test: the tarball, and the Debian package installed in a root of its own.
+//! What is shipped, made from the program under test: the tarball, and the Debian package installed in a root of its
+//! own.
 
 use std::ffi::OsStr;
 use std::fs;

@@ -1,5 +1,5 @@
-//! A planner that attaches to a running coordinator, with the real binary in two processes: every verb goes on addressing
-//! one run, whoever of the two goes away is told of by the other, and the coordinator never waits.
+//! A planner that attaches to a running coordinator, with the real binary in two processes: every verb goes on
+//! addressing one run, whoever of the two goes away is told of by the other, and the coordinator never waits.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;

@@ -1,5 +1,5 @@
-//! What goes wrong while a motion is planned or carried out, in whole runs: it costs one request, or one motion, and the
-//! coordinator does not notice.
+//! What goes wrong while a motion is planned or carried out, in whole runs: it costs one request, or one motion, and
+//! the coordinator does not notice.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -57,8 +57,8 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
     };
     let run = Run::from_yaml("f23", BLUEPRINT).record(Record::Off).folder(RunFolder::at(folder.path()));
     let run = run.solver(Arc::new(solver)).start().unwrap();
-    // A motion that takes as long as all of this does, and is not disturbed by any of it. Other programs may hold a busy
-    // machine up: one undisturbed time of three shows that the planner does not.
+    // A motion that takes as long as all of this does, and is not disturbed by any of it. Other programs may hold a
+    // busy machine up: one undisturbed time of three shows that the planner does not.
     let undisturbed = (0..TRIES).any(|try_| {
         let goal = if try_ % 2 == 0 { 2.5 } else { 0.0 };
         let motion = run.move_arm("arm", &[goal, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).unwrap();

@@ -448,8 +448,8 @@ fn several_arms_are_sent_together_from_the_command_line() {
     assert_eq!(preview["trajectory"]["joint_names"].as_array().unwrap().len(), 12);
     let done = home.dimos("execute").with(0);
     assert!(done.out.contains("left_joint1") && done.out.contains("right_joint6"), "{}", done.out);
-    // One straight line in the space of both: each has done the same part of its way at every moment. A busy machine may
-    // hold an arm up; then it begins again.
+    // One straight line in the space of both: each has done the same part of its way at every moment. A busy machine
+    // may hold an arm up; then it begins again.
     let (there, home_pose) =
         ("left=0.8,-0.3,0.6,0,0.8,0 --goal right=-0.4,-0.3,0.6,0,0.8,0", "left=named:home --goal right=named:home");
     let arrived = (0..5).any(|_| {

@@ -1,5 +1,5 @@
-//! Whole runs with an xArm, judged by what its emulator received: another client takes the arm over, stops it; a box that
-//! takes its time; an arm at zero.
+//! Whole runs with an xArm, judged by what its emulator received: another client takes the arm over, stops it; a box
+//! that takes its time; an arm at zero.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;

@@ -1,6 +1,6 @@
 //! The faults of the fault table that need a process, a wire or a real clock. The number in a test's name is the
-//! fault's. Each prints what it measured. Those of pure logic are in `faults_virtual.rs`. One table of faults, hence the
-//! length.
+//! fault's. Each prints what it measured. Those of pure logic are in `faults_virtual.rs`. One table of faults, hence
+//! the length.
 
 use std::io::{BufRead, Write};
 use std::process::{Command, Stdio};
@@ -27,7 +27,8 @@ const TOP_SPEED: [f64; 6] = [180.0, 180.0, 180.0, 360.0, 360.0, 360.0];
 const ACCELERATION: f64 = 10.0;
 /// What an angle is rounded to on the wire [deg]: half a step of an f32 near 270.
 const ROUNDING: f64 = 1.6e-5;
-/// How often a reaction time is measured. Its median is judged: one try alone says more about the machine than about the run.
+/// How often a reaction time is measured. Its median is judged: one try alone says more about the machine than about
+/// the run.
 const TRIES: usize = 5;
 
 fn now() -> Mono {

@@ -1,5 +1,6 @@
-//! This computer's stalls are not the arm's fault: a run at full speed that is stopped and continued, with its emulator or
-//! beside it, goes on; what it tells the arm is judged on the wire between the two. `DIMOS_STALLS=200` stops them so often.
+//! This computer's stalls are not the arm's fault: a run at full speed that is stopped and continued, with its emulator
+//! or beside it, goes on; what it tells the arm is judged on the wire between the two. `DIMOS_STALLS=200` stops them so
+//! often.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -1,5 +1,6 @@
-//! `make soak`: runs with simulated arms, idle and moving at the same time, beside busy processes, with and without real-time rights: no
-//! arm is held. `DIMOS_SOAK` is for how long each is watched [s] (10; when it is given, a computer that stands still for
+//! `make soak`: runs with simulated arms, idle and moving at the same time, beside busy processes, with and without
+//! real-time rights: no arm is held. `DIMOS_SOAK` is for how long each is watched [s] (10; when it is given, a computer
+//! that stands still for
 //! 0.1 s is no excuse), `DIMOS_SOAK_BUSY` how many processes are busy (8),
 //! `DIMOS_SOAK_ALL=1` takes every shipped blueprint.
 
@@ -108,7 +109,8 @@ impl Soaked {
 fn started(mut command: Command, realtime: bool) -> Started {
     let thread = std::thread::spawn(move || {
         if !realtime {
-            // What a thread cannot have, its children cannot have either. A user who may not even give rights up has none.
+            // What a thread cannot have, its children cannot have either. A user who may not even give rights up has
+            // none.
             let _ = rustix::thread::remove_capability_from_bounding_set(CapabilitySet::SYS_NICE);
         }
         Started::of(&mut command)
@@ -128,8 +130,8 @@ fn blueprints() -> Vec<String> {
 /// How long one request moves an arm [s].
 const LONGEST_MOTION: f64 = 120.0;
 
-/// A computer that does not run a program for so long is too busy to judge anything on it: the cycle of a shim in Python
-/// is several such waits, one after the other.
+/// A computer that does not run a program for so long is too busy to judge anything on it: the cycle of a shim in
+/// Python is several such waits, one after the other.
 const STANDSTILL: Duration = Duration::from_millis(20);
 
 /// Watches runs once, of each blueprint one idle and one moving: how long this computer stood still meanwhile for a

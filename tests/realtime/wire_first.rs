@@ -1,5 +1,5 @@
-//! The first setpoints an arm gets, and those after something went wrong with it, beside where it truly is: judged on the
-//! wire of every arm whose emulator can play the fault.
+//! The first setpoints an arm gets, and those after something went wrong with it, beside where it truly is: judged on
+//! the wire of every arm whose emulator can play the fault.
 
 use std::time::{Duration, Instant};
 

@@ -1,7 +1,7 @@
-//! What an arm is told when the wire to it stalls at full speed, judged on the wire: five arms, every kind of stall, from
-//! 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and every
-//! length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and tells what went over the wire
-//! where something is wrong.
+//! What an arm is told when the wire to it stalls at full speed, judged on the wire: five arms, every kind of stall,
+//! from 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and
+//! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and tells what went over the wire where
+//! something is wrong.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -188,7 +188,8 @@ fn velocity_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
             verdicts.push(bed.bounds.neighbours(&delivered, began).map_err(|e| format!("delivered: {e}")));
         }
         if held {
-            // What was on its way may come late: it counts from then, and sets an arm that has stopped in motion once more.
+            // What was on its way may come late: it counts from then, and sets an arm that has stopped in motion once
+            // more.
             let (limit, stall) = (bed.arm.time_limit.unwrap_or_default(), time.as_secs_f64());
             let again = if stall > limit { bed.bounds.stopping(0, limit) } else { 0.0 };
             let delay = limit + bed.arm.stale_after().max(stall.min(limit));

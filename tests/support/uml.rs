@@ -1,9 +1,9 @@
 //! Runs parts of tests inside a guest Linux that has CAN, whatever the kernel here has.
 //!
 //! User-mode Linux is a Linux kernel that runs as an ordinary process; Debian's package brings CAN as modules. The
-//! guest boots in 2 to 3 seconds, with the files of this computer as its own, a network stack of its own, one processor,
-//! and process 1 as root. It cannot withhold acknowledgements as a real bus can; `sch_plug` holds frames back in the
-//! queue of an interface, which looks the same to the sender.
+//! guest boots in 2 to 3 seconds, with the files of this computer as its own, a network stack of its own, one
+//! processor, and process 1 as root. It cannot withhold acknowledgements as a real bus can; `sch_plug` holds frames
+//! back in the queue of an interface, which looks the same to the sender.
 //!
 //! All of the guest runs on one processor of the host: its kernel traces its programs, and a system call that has to
 //! wake another processor, twice, takes ten times as long (on a virtual machine 190 µs instead of 20), too long for the
@@ -86,8 +86,8 @@ pub struct Ran {
     pub output: String,
 }
 
-/// Runs `body` in a guest: here, it starts the guest with the same test; in the guest, it runs the body. `module` is the
-/// test's `module_path!()`, `name` the name of its function.
+/// Runs `body` in a guest: here, it starts the guest with the same test; in the guest, it runs the body. `module` is
+/// the test's `module_path!()`, `name` the name of its function.
 pub fn in_guest(module: &str, name: &str, guest: &Guest, body: impl FnOnce()) {
     if std::env::var_os(INSIDE).is_some() {
         return body();

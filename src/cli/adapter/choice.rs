@@ -19,7 +19,8 @@ pub struct Choice {
     /// The same as --option model=MODEL
     #[arg(long)]
     pub model: Option<String>,
-    /// An option of the adapter, as under `options` in a blueprint: speed_scale=0.5, sim.initial_positions=[…] (repeatable)
+    /// An option of the adapter, as under `options` in a blueprint: speed_scale=0.5, sim.initial_positions=[…]
+    /// (repeatable)
     #[arg(long = "option", value_name = "KEY=VALUE", value_parser = super::super::arguments::setting)]
     pub options: Vec<(String, String)>,
 }

@@ -1,4 +1,5 @@
-//! `dimos adapter emulate NAME`: an arm's emulator in its own process, so that any client of the arm can be tried against it.
+//! `dimos adapter emulate NAME`: an arm's emulator in its own process, so that any client of the arm can be tried
+//! against it.
 
 use std::io::{self, IsTerminal};
 use std::net::IpAddr;

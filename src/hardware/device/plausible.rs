@@ -1,5 +1,6 @@
-//! Whether an arm's pose may be trusted enough to switch its motors on: stable for a while, confirmed by the device where it
-//! can, and not simply zero everywhere, which is what many controllers report before they have read their encoders.
+//! Whether an arm's pose may be trusted enough to switch its motors on: stable for a while, confirmed by the device
+//! where it can, and not simply zero everywhere, which is what many controllers report before they have read their
+//! encoders.
 
 use std::time::Duration;
 

@@ -23,13 +23,13 @@ use crate::rt::wake::Wake;
 const MAX_FAILURES: u32 = 3;
 /// Unacknowledged setpoints before the connection is dropped.
 const MAX_IN_FLIGHT: u32 = 2;
-/// Consecutive readings that show a change that this run did not order, before it is one: a report may be older than the
-/// order.
+/// Consecutive readings that show a change that this run did not order, before it is one: a report may be older than
+/// the order.
 const INTERFERENCE_READINGS: u32 = 2;
 /// The longest delay of this thread that does not count for the tick's silence.
 const LONGEST_DELAY: Duration = Duration::from_millis(100);
-/// Cycles in which everything is read once, where each read costs a round trip; in which of them the error code is read,
-/// and the motors' state.
+/// Cycles in which everything is read once, where each read costs a round trip; in which of them the error code is
+/// read, and the motors' state.
 const TURNS: u8 = 6;
 const ERROR_TURN: u8 = 0;
 const ENABLED_TURN: u8 = 1;

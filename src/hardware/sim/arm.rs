@@ -1,5 +1,5 @@
-//! The arm behind an emulated controller, whatever its wire: joints with motors, one mode at a time, an error, an E-stop
-//! line, and a script of faults. Everything is in SI units, and time is passed in.
+//! The arm behind an emulated controller, whatever its wire: joints with motors, one mode at a time, an error, an
+//! E-stop line, and a script of faults. Everything is in SI units, and time is passed in.
 
 use std::time::Duration;
 

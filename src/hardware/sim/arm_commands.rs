@@ -29,7 +29,8 @@ impl SimArm {
         Ok(())
     }
 
-    /// Switches the motor of one joint (index from 0), also in error. A sagging arm sinks when the last of them comes on.
+    /// Switches the motor of one joint (index from 0), also in error. A sagging arm sinks when the last of them comes
+    /// on.
     pub fn enable_joint(&mut self, joint: usize, on: bool) {
         let before = self.plant.enabled();
         self.plant.enable_joint(joint, on);
@@ -84,9 +85,9 @@ impl SimArm {
         Ok(())
     }
 
-    /// Takes a goal [rad] as servos do, whose controllers know no modes: goals that come close together are a stream and
-    /// followed, others are moves at a fraction of the top speed. `direct`: every goal is followed. A goal that comes while
-    /// the motors are off is kept, for [`SimArm::resume_goal`].
+    /// Takes a goal [rad] as servos do, whose controllers know no modes: goals that come close together are a stream
+    /// and followed, others are moves at a fraction of the top speed. `direct`: every goal is followed. A goal that
+    /// comes while the motors are off is kept, for [`SimArm::resume_goal`].
     pub fn take_goal(&mut self, goal: &[f64], speed: f64, direct: bool) {
         let mut joints = [0.0; crate::joint::MAX_DOF];
         joints.iter_mut().zip(goal).for_each(|(joint, value)| *joint = *value);
@@ -103,8 +104,8 @@ impl SimArm {
         }
     }
 
-    /// Goes to the goal that it was given last, at top speed, if it was given one since power-up: what careless servos do
-    /// when their motors come on.
+    /// Goes to the goal that it was given last, at top speed, if it was given one since power-up: what careless servos
+    /// do when their motors come on.
     pub fn resume_goal(&mut self) {
         if let Some((goal, _)) = self.goal {
             self.plant.move_to(&goal, 1.0);

@@ -1,5 +1,5 @@
-//! An emulated arm on a CAN bus: it takes commands, and sends its state in a rhythm of its own, whether anything listens
-//! or not.
+//! An emulated arm on a CAN bus: it takes commands, and sends its state in a rhythm of its own, whether anything
+//! listens or not.
 
 use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};

@@ -16,10 +16,10 @@
 //! | [`diary`] | clients and faults, as `dimos adapter emulate` shows them |
 //!
 //! A device model implements [`HasArm`](arm::HasArm) and either [`stream::Controller`] or
-//! [`CanController`](can_server::CanController); the server then is the [`Emulator`](super::registry::Emulator). Time is
-//! passed in: a device model never asks a clock, and sleeps nowhere. `dimos adapter new` writes a complete one; those of
-//! the xArm (several ports), the Piper (CAN, a motor command per joint, no modes, falls) and `remote` (JSON lines) are
-//! larger examples.
+//! [`CanController`](can_server::CanController); the server then is the [`Emulator`](super::registry::Emulator). Time
+//! is passed in: a device model never asks a clock, and sleeps nowhere. `dimos adapter new` writes a complete one;
+//! those of the xArm (several ports), the Piper (CAN, a motor command per joint, no modes, falls) and `remote` (JSON
+//! lines) are larger examples.
 
 pub mod arm;
 mod can_seat;

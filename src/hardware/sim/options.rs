@@ -45,8 +45,8 @@ impl SimOptions {
         self
     }
 
-    /// Refuses a pose outside `limits`, figures that no emulator has, and faults that are not among `playable`. `name` is
-    /// the arm's.
+    /// Refuses a pose outside `limits`, figures that no emulator has, and faults that are not among `playable`. `name`
+    /// is the arm's.
     pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), Misfit> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))

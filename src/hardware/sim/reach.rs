@@ -33,8 +33,8 @@ pub trait Chain {
         links.fold(Isometry3::identity(), |pose, link| pose * link) * self.end()
     }
 
-    /// Joint positions [rad] near `start` that bring the end to `goal`, by damped least squares; `None` when that does not
-    /// lead there. Knows no joint limits.
+    /// Joint positions [rad] near `start` that bring the end to `goal`, by damped least squares; `None` when that does
+    /// not lead there. Knows no joint limits.
     fn inverse<const N: usize>(&self, goal: &Isometry3<f64>, start: &[f64; N]) -> Option<[f64; N]> {
         let mut joints = *start;
         for _ in 0..STEPS {

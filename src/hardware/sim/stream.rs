@@ -40,8 +40,8 @@ pub trait Controller: Send + 'static {
         self.serve(bytes, now, answer)
     }
 
-    /// Puts what the controller sends by itself over a connection to `port` into `packet` (which is empty), once a period;
-    /// `None` ends the connection.
+    /// Puts what the controller sends by itself over a connection to `port` into `packet` (which is empty), once a
+    /// period; `None` ends the connection.
     fn report(&mut self, _port: usize, _now: Mono, _packet: &mut Vec<u8>) -> Option<Delivery> {
         None
     }

@@ -65,8 +65,8 @@ pub(super) struct Inner<C> {
 type Client = (u64, TcpStream);
 
 impl<C: Controller> TcpServer<C> {
-    /// Listens at `address`, which should be a loopback address, and serves one client at a time. `name` is the arm's, for
-    /// messages.
+    /// Listens at `address`, which should be a loopback address, and serves one client at a time. `name` is the arm's,
+    /// for messages.
     pub fn start(name: &str, controller: C, address: SocketAddr) -> AdapterResult<Self> {
         let failed = |e| cannot_listen(&format!("{name} emulator"), address, &e);
         let listener = TcpListener::bind(address).map_err(failed)?;

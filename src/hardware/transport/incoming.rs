@@ -74,8 +74,8 @@ impl Incoming {
         Ok(n)
     }
 
-    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the time it is given; 0 when none
-    /// have come.
+    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the time it is given; 0 when
+    /// none have come.
     pub(super) fn receive<T>(
         &mut self,
         peer: &str,

@@ -139,8 +139,8 @@ impl TcpLink {
         let _ = rustix::net::send(&self.stream, bytes, flags);
     }
 
-    /// Closes the connection and discards what has not left this computer yet (linger 0: the peer sees a reset). A plain
-    /// drop would let the kernel go on sending it for as long as the peer takes it. Never blocks.
+    /// Closes the connection and discards what has not left this computer yet (linger 0: the peer sees a reset). A
+    /// plain drop would let the kernel go on sending it for as long as the peer takes it. Never blocks.
     pub fn abort(self) {
         // Where the option is refused the connection is broken already, and nothing more is sent either.
         let _ = rustix::net::sockopt::set_socket_linger(&self.stream, Some(Duration::ZERO));

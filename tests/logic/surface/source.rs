@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
-/// The public classes, functions, constants and fields of a Python file, in its order. The form is that of our own files:
-/// four spaces, one statement per line, brackets that may continue on the next.
+/// The public classes, functions, constants and fields of a Python file, in its order. The form is that of our own
+/// files: four spaces, one statement per line, brackets that may continue on the next.
 pub fn python(text: &str) -> Vec<String> {
     let mut out = Vec::new();
     // Whether what is indented belongs to a public class.

@@ -27,9 +27,9 @@ pub struct CanProxy {
 impl CanProxy {
     /// In front of the arm on the bus at `upstream`.
     ///
-    /// In a stall on the way to the arm nobody acknowledges what the run sends, as where the arm's plug is out: it waits in
-    /// the queue of the computer's own controller, and nothing comes back. In the other stalls frames wait behind the bus,
-    /// as in a gateway.
+    /// In a stall on the way to the arm nobody acknowledges what the run sends, as where the arm's plug is out: it
+    /// waits in the queue of the computer's own controller, and nothing comes back. In the other stalls frames wait
+    /// behind the bus, as in a gateway.
     pub fn start(upstream: &str, gate: &Gate) -> Self {
         let address = CanAddress::parse(upstream).unwrap();
         // A run locks its arm by the bus's number, and buses of other tests have numbers, too.

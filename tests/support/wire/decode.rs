@@ -88,8 +88,8 @@ fn crc16(bytes: &[u8]) -> u16 {
     })
 }
 
-/// xArm's control port: a big-endian header, registers, little-endian floats in radians. Seven joints always go over the
-/// wire; `dof` of them count.
+/// xArm's control port: a big-endian header, registers, little-endian floats in radians. Seven joints always go over
+/// the wire; `dof` of them count.
 pub fn xarm(dof: usize) -> NewDecoder {
     by(move |bytes| {
         let Some(header) = bytes.first_chunk::<6>() else { return Front::More };
@@ -136,8 +136,8 @@ pub fn remote() -> NewDecoder {
     })
 }
 
-/// The template of an arm on a stream of bytes (the sheet in `assets/templates/stream/protocol.rs`): big-endian floats in
-/// degrees, a sum at the end.
+/// The template of an arm on a stream of bytes (the sheet in `assets/templates/stream/protocol.rs`): big-endian floats
+/// in degrees, a sum at the end.
 pub fn template() -> NewDecoder {
     by(|bytes| {
         let Some([start, opcode, _, length]) = bytes.first_chunk::<4>() else {

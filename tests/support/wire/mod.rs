@@ -1,5 +1,5 @@
-//! A wire between a run and its arm that a test can cut, hold and slow down, and that remembers what went over it: every
-//! byte, and every setpoint in radians, when the run sent it and when it was delivered to the arm.
+//! A wire between a run and its arm that a test can cut, hold and slow down, and that remembers what went over it:
+//! every byte, and every setpoint in radians, when the run sent it and when it was delivered to the arm.
 //!
 //! ```text
 //! run ──▶ [sent] ── gate: pass, hold, drop, trickle ── [delivered] ──▶ emulator

@@ -1,7 +1,8 @@
-//! The first description of a new arm: a made-up arm with any number of joints, for a planner to work with from the start.
+//! The first description of a new arm: a made-up arm with any number of joints, for a planner to work with from the
+//! start.
 //!
-//! It points straight up when all joints are at zero. Its joints roll about z and pitch about y by turns, its shapes are
-//! primitives, and it is about a metre long whatever the number of joints.
+//! It points straight up when all joints are at zero. Its joints roll about z and pitch about y by turns, its shapes
+//! are primitives, and it is about a metre long whatever the number of joints.
 
 use std::fmt::Write;
 use std::iter;

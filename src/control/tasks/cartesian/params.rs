@@ -47,7 +47,8 @@ pub struct CartesianParams {
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_angular_acceleration: f64,
-    /// A joint that is measured further than this from where it is commanded to be ends the motion: the arm holds [rad].
+    /// A joint that is measured further than this from where it is commanded to be ends the motion: the arm holds
+    /// [rad].
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_tracking_error: f64,

@@ -1,7 +1,7 @@
 //! The Piper adapter: the adapter protocol on one side, the arm's CAN frames on the other.
 //!
-//! Wire: 0.001°, 0.001 mm, 0.001 rad/s, mA. Here: rad, m, rad/s, Nm. The conversions are in this file, those of angles in
-//! `protocol.rs`.
+//! Wire: 0.001°, 0.001 mm, 0.001 rad/s, mA. Here: rad, m, rad/s, Nm. The conversions are in this file, those of angles
+//! in `protocol.rs`.
 //!
 //! The arm sends its state by itself, 200 times a second; nothing is asked for after `connect`. It takes joint targets
 //! without a word: what it does shows in its feedback, and so enabling, clearing and stopping are confirmed by that.
@@ -89,8 +89,8 @@ impl PiperAdapter {
         known.then(|| joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI)))
     }
 
-    /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which says
-    /// how to read the currents.
+    /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which
+    /// says how to read the currents.
     fn efforts(&self) -> Option<Joints> {
         if !self.arm.measures() {
             return None;
@@ -257,12 +257,13 @@ impl ManipulatorAdapter for PiperAdapter {
         }
     }
 
-    /// Holds the arm: at what was last written, 0.02 rad from where it is at most. Confirmed when its feedback shows that
-    /// every joint gets slower or stands.
+    /// Holds the arm: at what was last written, 0.02 rad from where it is at most. Confirmed when its feedback shows
+    /// that every joint gets slower or stands.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
         if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
-            // Where the arm is now: not where it was before a pause of its feedback. One that stays silent is held there.
+            // Where the arm is now: not where it was before a pause of its feedback. One that stays silent is held
+            // there.
             self.arm.watch(LIVE_TIMEOUT, Picture::is_live)?;
             self.arm.settle()?;
         }
@@ -323,8 +324,8 @@ impl ManipulatorAdapter for PiperAdapter {
         Err(AdapterError::Fault { code, text })
     }
 
-    /// Set points that wait for the bus are taken back, where the bus lets them be; otherwise nothing new is sent before
-    /// they are out.
+    /// Set points that wait for the bus are taken back, where the bus lets them be; otherwise nothing new is sent
+    /// before they are out.
     fn discard_pending(&mut self) {
         self.arm.discard();
     }

@@ -53,7 +53,8 @@ impl Change {
 /// Compares what the arm reports with what this run has ordered.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Guard {
-    /// Control, move mode and teaching as ordered, and from when on reports count; `None`: not under this run's control.
+    /// Control, move mode and teaching as ordered, and from when on reports count; `None`: not under this run's
+    /// control.
     ordered: Option<((u8, u8, u8), Mono)>,
     /// The first change that was not ordered.
     pub change: Option<Change>,

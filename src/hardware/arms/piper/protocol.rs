@@ -68,8 +68,8 @@ pub fn gripper_target(stroke: i32, torque: u16) -> CanFrame {
     frame(0x159, [a, b, c, d, e, f, 1, 0])
 }
 
-/// Clears the gripper's errors and leaves it on or off, as it was; its target is this stroke [0.001 mm], with a torque of
-/// at most so much [mNm].
+/// Clears the gripper's errors and leaves it on or off, as it was; its target is this stroke [0.001 mm], with a torque
+/// of at most so much [mNm].
 pub fn clear_gripper(stroke: i32, torque: u16, on: bool) -> CanFrame {
     let [a, b, c, d, e, f, ..] = gripper_target(stroke, torque).data;
     frame(0x159, [a, b, c, d, e, f, if on { 3 } else { 2 }, 0])

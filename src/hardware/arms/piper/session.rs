@@ -114,8 +114,8 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a setpoint. The control frame is left out where the arm reports that it is in the mode: another program that
-    /// has just changed it would have that undone before it shows.
+    /// Sends a setpoint. The control frame is left out where the arm reports that it is in the mode: another program
+    /// that has just changed it would have that undone before it shows.
     pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         const SPEED: u8 = 100;
         let Status { control, mode, .. } = self.picture.status;
@@ -253,9 +253,9 @@ impl Session {
         ))
     }
 
-    /// Whether the measured positions can be relied on: `Some(true)` where the motors' drivers answer the controller, and
-    /// the positions are not all exactly zero, which it says before it has measured; `Some(false)` where a joint does not
-    /// answer it, or none of the drivers has said anything about itself.
+    /// Whether the measured positions can be relied on: `Some(true)` where the motors' drivers answer the controller,
+    /// and the positions are not all exactly zero, which it says before it has measured; `Some(false)` where a joint
+    /// does not answer it, or none of the drivers has said anything about itself.
     pub fn valid(&self) -> Option<bool> {
         let silent =
             |driver: &Driver| (driver.voltage, driver.driver_temperature, driver.motor_temperature) == (0, 0, 0);

@@ -1,5 +1,5 @@
-//! Somebody else changes the arm's mode or power: it is left alone, and that shows. Two calls of the vendor's SDK, as its
-//! frames, with pauses between them; from a program that this computer hears, and from one that it does not.
+//! Somebody else changes the arm's mode or power: it is left alone, and that shows. Two calls of the vendor's SDK, as
+//! its frames, with pauses between them; from a program that this computer hears, and from one that it does not.
 
 use std::time::{Duration, Instant};
 
@@ -74,7 +74,8 @@ fn interfere(calls: Calls, pause: Duration, heard: bool) {
     });
     assert!(changed || calls == POWER, "the mode shows it");
     let what = format!("{calls:?} {pause:?} heard: {heard}");
-    // It is not undone: no frame that takes the mode back, nor one that switches motors, and nothing is written any more.
+    // It is not undone: no frame that takes the mode back, nor one that switches motors, and nothing is written any
+    // more.
     let others: Vec<CanFrame> = calls.0.iter().chain(calls.1).map(|text| frame(text)).collect();
     let ours = || emulator.trace().iter().map(|(_, f)| *f).filter(|f| !others.contains(f)).collect::<Vec<_>>();
     assert!(ours().iter().all(|f| (0x155..=0x157).contains(&f.id)), "{what}: {:x?}", ours());

@@ -214,8 +214,8 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a command; `Busy` while the peer has not answered the last cycle. Answers why an earlier one was not taken,
-    /// where that is so.
+    /// Sends a command; `Busy` while the peer has not answered the last cycle. Answers why an earlier one was not
+    /// taken, where that is so.
     pub fn command(&mut self, command: Command<'_>) -> AdapterResult<()> {
         self.commanded = MonotonicClock.now();
         self.take_up()?;

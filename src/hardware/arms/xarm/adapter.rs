@@ -1,7 +1,7 @@
 //! The xArm adapter: the adapter protocol on one side, a [`Session`] with the controller on the other.
 //!
-//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. The conversions between the two are in this file, those of the
-//! gripper's pulses in `protocol/gripper.rs`.
+//! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. The conversions between the two are in this file, those of
+//! the gripper's pulses in `protocol/gripper.rs`.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;

@@ -123,8 +123,8 @@ impl Control {
         self.link.peer()
     }
 
-    /// Closes the connection and discards what has not left this computer. Setpoints that have left it may still arrive,
-    /// and velocities would drive the arm on once more: a stop goes right behind them.
+    /// Closes the connection and discards what has not left this computer. Setpoints that have left it may still
+    /// arrive, and velocities would drive the arm on once more: a stop goes right behind them.
     pub fn abort(mut self) {
         if self.in_flight() > 0 {
             let mut frame = [0; MAX_REQUEST];

@@ -86,8 +86,8 @@ pub const SPEC: AdapterSpec = AdapterSpec {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Options {
-    /// Which arm it is: `xarm5`, `xarm6`, `xarm7`, `lite6` or `xarm850`. By default the xArm with that number of joints. An
-    /// arm that is another model is refused.
+    /// Which arm it is: `xarm5`, `xarm6`, `xarm7`, `lite6` or `xarm850`. By default the xArm with that number of
+    /// joints. An arm that is another model is refused.
     pub model: Option<Model>,
     /// The gripper at the tool flange: `xarm`, `xarm_g2`, or `none`.
     pub gripper: GripperKind,

@@ -134,8 +134,8 @@ impl Model {
         }
     }
 
-    /// Joint limits of the usual arm of this model: the narrower ones where series differ. Arms of another kind, such as
-    /// a mirrored one, have others: [`Identity::limits`].
+    /// Joint limits of the usual arm of this model: the narrower ones where series differ. Arms of another kind, such
+    /// as a mirrored one, have others: [`Identity::limits`].
     pub fn limits(self) -> JointLimits {
         limits_of(match self {
             Self::Xarm5 => &XARM5_1305,

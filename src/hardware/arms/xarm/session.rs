@@ -193,7 +193,8 @@ impl Session {
         self.bus.into_iter().for_each(Control::abort);
     }
 
-    /// Takes up all that has arrived, without waiting, and asks what is due. Does nothing within `age` of the last time.
+    /// Takes up all that has arrived, without waiting, and asks what is due. Does nothing within `age` of the last
+    /// time.
     pub fn update(&mut self, age: Duration) -> AdapterResult<()> {
         let now = MonotonicClock.now();
         if now.since(self.updated) < age {
@@ -384,7 +385,8 @@ impl Session {
     }
 
     /// Sends a command of a stream (a setpoint, velocities) and does not wait for its response. Not when the newest
-    /// report or response says that the arm is not as it was ordered to be, and not while two are on their way (`Busy`).
+    /// report or response says that the arm is not as it was ordered to be, and not while two are on their way
+    /// (`Busy`).
     pub fn stream(&mut self, mode: u8, command: &Command) -> AdapterResult<()> {
         self.take_up()?;
         self.heed_refusal()?;

@@ -1,6 +1,6 @@
 //! YourArm, a made-up 6-joint arm: the template for an arm of your own. Copy this folder, then change, in this
-//! order: `frame.rs` and `protocol.rs` (the bytes), `adapter.rs` (the units and the lifecycle), `emulator/` (the other side of the
-//! wire), the numbers below, and add the row to the table in `arms/mod.rs`.
+//! order: `frame.rs` and `protocol.rs` (the bytes), `adapter.rs` (the units and the lifecycle), `emulator/` (the other
+//! side of the wire), the numbers below, and add the row to the table in `arms/mod.rs`.
 
 pub mod adapter;
 pub mod emulator;

@@ -1,7 +1,7 @@
 //! Frames that were handed over and are not known to have been transmitted.
 //!
-//! A confirmation (the echo of a frame from the kernel) takes its frame off the list. Controllers with several mailboxes
-//! send a frame with a lower identifier first, so confirmations may overtake each other a little.
+//! A confirmation (the echo of a frame from the kernel) takes its frame off the list. Controllers with several
+//! mailboxes send a frame with a lower identifier first, so confirmations may overtake each other a little.
 
 use std::collections::VecDeque;
 

@@ -103,9 +103,9 @@ pub trait CanPort: Send {
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>>;
     /// Readable when something has arrived. Fetch until there is nothing before waiting for it.
     fn fd(&self) -> BorrowedFd<'_>;
-    /// About how many frames of this port still wait for the bus, where that can be known; what was transmitted since the
-    /// last [`CanPort::receive`] may be among them. A number that stays above 0 says that no node acknowledges: those
-    /// frames go out later, when one does.
+    /// About how many frames of this port still wait for the bus, where that can be known; what was transmitted since
+    /// the last [`CanPort::receive`] may be among them. A number that stays above 0 says that no node acknowledges:
+    /// those frames go out later, when one does.
     fn waiting(&self) -> usize {
         0
     }
@@ -117,8 +117,9 @@ pub trait CanPort: Send {
 }
 
 /// Opens a port on the bus at `address`. It hears what `filters` want of the frames that others send, everything
-/// without filters, and trouble always. On an interface of the system, frames that it sends itself are followed until they
-/// are transmitted if `filters` want them: name the identifiers of setpoints too. `device` names the arm in messages. Errors say what to do.
+/// without filters, and trouble always. On an interface of the system, frames that it sends itself are followed until
+/// they are transmitted if `filters` want them: name the identifiers of setpoints too. `device` names the arm in
+/// messages. Errors say what to do.
 pub fn open(device: &str, address: &CanAddress, filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
     match address {
         CanAddress::Memory(number) => Ok(Box::new(bus::open(device, *number, filters)?)),

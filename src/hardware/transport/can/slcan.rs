@@ -2,8 +2,8 @@
 //! identifier, the number of bytes and the bytes in hexadecimal digits, ended by a carriage return.
 //!
 //! Such an adapter tells of no trouble on the bus: that nobody acknowledges shows only in that nobody answers. What it
-//! replies to commands (a carriage return, or a bell for "no") is not read, since many models do not reply; the `z` that
-//! some reply to a frame is counted, and bounds what waits.
+//! replies to commands (a carriage return, or a bell for "no") is not read, since many models do not reply; the `z`
+//! that some reply to a frame is counted, and bounds what waits.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
@@ -101,7 +101,8 @@ impl CanPort for SlcanPort {
         self.line.fd.as_fd()
     }
 
-    /// Frames without a reply, of an adapter that replies. Of another one: the kernel says when some 256 bytes wait for it.
+    /// Frames without a reply, of an adapter that replies. Of another one: the kernel says when some 256 bytes wait for
+    /// it.
     fn waiting(&self) -> usize {
         let room = || wait(&self.line.fd, PollFlags::OUT, Duration::ZERO).unwrap_or(false);
         if self.replies {

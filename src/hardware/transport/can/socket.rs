@@ -3,13 +3,15 @@
 //! Two things bound what can go wrong while no node acknowledges (the arm has lost its power): the socket may have
 //! [`SEND_QUEUE`] frames in the kernel's queues at a time, and [`CanPort::waiting`] tells how many have not been
 //! transmitted. Closing the socket does not take them back: the kernel sends them when a node acknowledges again. What
-//! takes them back is the interface going down (`ip link set can0 down`, a privilege), or a controller in one-shot mode.
+//! takes them back is the interface going down (`ip link set can0 down`, a privilege), or a controller in one-shot
+//! mode.
 //!
-//! The memory that the kernel charges the socket for a frame shows only what waits in the interface's queue: since Linux
+//! The memory that the kernel charges the socket for a frame shows only what waits in the interface's queue: since
+//! Linux
 //! 5.10 it is released when the driver takes the frame, and drivers have room for 10 and more. So the socket also hears
 //! its own frames (`CAN_RAW_RECV_OWN_MSGS`, marked `MSG_CONFIRM`): drivers of real controllers echo a frame when it was
-//! transmitted. Interfaces without such a driver (vcan, vxcan, serial lines) echo it at once, and there the memory shows
-//! what waits.
+//! transmitted. Interfaces without such a driver (vcan, vxcan, serial lines) echo it at once, and there the memory
+//! shows what waits.
 
 use std::io::{Error, ErrorKind, IoSliceMut};
 use std::os::fd::{AsFd, BorrowedFd};

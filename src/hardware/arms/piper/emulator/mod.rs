@@ -1,5 +1,5 @@
-//! The emulator: plays a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface or
-//! a serial line.
+//! The emulator: plays a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface
+//! or a serial line.
 //!
 //! Like the arm it sends its state by itself, at the arm's rates (3 040 frames/s in all), whether somebody listens or
 //! not, and takes commands from every node on its bus. The bus and the joints are those of the simulation kit
@@ -54,8 +54,8 @@ const ANYWHERE: usize = PLAYABLE.len() - 3;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an arm may rest that
-    /// nobody holds; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
+    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an arm may rest
+    /// that nobody holds; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
     pub initial_positions: Vec<f64>,
     /// How often it sends its state, 20 to 200 [Hz]: an arm's 200, or less for a client that cannot keep up.
     #[serde(deserialize_with = "rate")]

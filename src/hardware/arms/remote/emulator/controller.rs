@@ -39,7 +39,8 @@ pub struct Controller {
 }
 
 impl Controller {
-    /// An arm with these position and velocity limits that was just switched on; at zero where the options give no pose.
+    /// An arm with these position and velocity limits that was just switched on; at zero where the options give no
+    /// pose.
     pub fn new(limits: &JointLimits, options: &SimOptions, now: Mono) -> AdapterResult<Self> {
         let dof = limits.position_lower.len();
         let limits =

@@ -1,5 +1,5 @@
-//! The protocol as the server sees it: requests in, replies out. Written from the sheet a second time, on purpose without
-//! `protocol.rs`: an emulator that shared the adapter's encoders would share its mistakes.
+//! The protocol as the server sees it: requests in, replies out. Written from the sheet a second time, on purpose
+//! without `protocol.rs`: an emulator that shared the adapter's encoders would share its mistakes.
 
 use serde_json::{Map, Value, json};
 

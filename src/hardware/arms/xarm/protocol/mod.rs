@@ -1,5 +1,5 @@
-//! The wire format of the controller: pure encoding and decoding, no I/O, no units but the wire's own (rad, mm, Nm). Only
-//! the gripper's pulses are made of metres here, and back.
+//! The wire format of the controller: pure encoding and decoding, no I/O, no units but the wire's own (rad, mm, Nm).
+//! Only the gripper's pulses are made of metres here, and back.
 //!
 //! Encoders write into the caller's buffer. Decoders answer `None` or skip for whatever bytes come; none allocates on
 //! the way of a cycle, none panics.

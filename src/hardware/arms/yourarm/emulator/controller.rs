@@ -1,5 +1,5 @@
-//! The emulated controller: what it does with a request. The arm behind it is a [`SimArm`]; the gripper and the pose are
-//! its own. Time is passed in and nothing here knows of sockets.
+//! The emulated controller: what it does with a request. The arm behind it is a [`SimArm`]; the gripper and the pose
+//! are its own. Time is passed in and nothing here knows of sockets.
 
 use super::super::{GRIPPER_MAX, limits, protocol::DOF};
 use super::kinematics::Links;
