@@ -4,7 +4,9 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::arm::Pose;
-use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
+use crate::hardware::spec::{
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
 use crate::joint::{ControlMode, JointLimits};
 use crate::sync::lock;
 
@@ -166,7 +168,7 @@ impl MockAdapter {
         self
     }
 
-    /// Answers of `read_cartesian_position`.
+    /// Gives it kinematics, which answer with this pose.
     pub fn pose(self, pose: Pose) -> Self {
         self.lock().pose = Some(pose);
         self
@@ -178,7 +180,7 @@ impl MockAdapter {
         self
     }
 
-    /// Answers of `read_force_torque` [N, N, N, Nm, Nm, Nm].
+    /// Gives it a force/torque sensor, which answers with this [N, N, N, Nm, Nm, Nm].
     pub fn force_torque(self, wrench: [f64; 6]) -> Self {
         self.lock().wrench = Some(wrench);
         self
@@ -187,10 +189,10 @@ impl MockAdapter {
     /// Makes the next call of a method fail; several failures of one method happen in order.
     ///
     /// # Panics
-    /// When the trait has no fallible method of that name.
+    /// When an adapter has no fallible method of that name.
     pub fn fail(&self, method: &str, error: AdapterError) {
         let known = METHODS.iter().find(|known| **known == method);
-        assert!(known.is_some(), "no method {method:?} of ManipulatorAdapter can fail");
+        assert!(known.is_some(), "no method {method:?} of an adapter can fail");
         self.lock().failures.extend(known.map(|name| (*name, error)));
     }
 
@@ -336,25 +338,41 @@ impl ManipulatorAdapter for MockAdapter {
         Ok(())
     }
 
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        Ok(self.asked("read_cartesian_position")?.pose)
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.lock().gripper.is_some() { Some(self) } else { None }
     }
 
-    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
-        let shared = self.called(Call::WriteCartesianPosition(*pose, velocity))?;
-        if shared.pose.is_some() { Ok(()) } else { Err(AdapterError::Unsupported) }
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        if self.lock().wrench.is_some() { Some(self) } else { None }
     }
 
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        if self.lock().pose.is_some() { Some(self) } else { None }
+    }
+}
+
+impl Gripper for MockAdapter {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         Ok(self.asked("read_gripper_position")?.gripper)
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        let shared = self.called(Call::WriteGripperPosition(position))?;
-        if shared.gripper.is_some() { Ok(()) } else { Err(AdapterError::Unsupported) }
+        self.called(Call::WriteGripperPosition(position)).map(|_| ())
     }
+}
 
+impl ForceTorque for MockAdapter {
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
         Ok(self.asked("read_force_torque")?.wrench)
+    }
+}
+
+impl Cartesian for MockAdapter {
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
+        Ok(self.asked("read_cartesian_position")?.pose)
+    }
+
+    fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
+        self.called(Call::WriteCartesianPosition(*pose, velocity)).map(|_| ())
     }
 }

@@ -3,9 +3,10 @@
 use std::os::fd::BorrowedFd;
 use std::sync::{Arc, Mutex};
 
-use dimos::arm::Pose;
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::hardware::spec::{AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
+use dimos::hardware::spec::{
+    AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
 use dimos::joint::{ControlMode, JointLimits};
 
 /// Returns a time stamp as a joint position: microseconds of the current second, a nanoradian each.
@@ -101,14 +102,14 @@ impl ManipulatorAdapter for Timed {
     fn read_enabled(&mut self) -> AdapterResult<bool> {
         self.inner.read_enabled()
     }
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        self.inner.read_cartesian_position()
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        self.inner.gripper()
     }
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        self.inner.read_gripper_position()
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        self.inner.force_torque()
     }
-    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        self.inner.read_force_torque()
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        self.inner.cartesian()
     }
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.inner.write_stop()

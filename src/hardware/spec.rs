@@ -2,7 +2,8 @@
 //!
 //! Everything that crosses it is in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a
 //! default body and those of the rest that its device can do; the defaults say "no" in the agreed way, so the
-//! absence of a feature is never an error.
+//! absence of a feature is never an error. What only some arms have is a small trait of its own: [`Gripper`],
+//! [`ForceTorque`], [`Cartesian`].
 //!
 //! A device either answers when it is asked, or sends its state by itself. For the second kind
 //! [`ManipulatorAdapter::state_fd`] names the descriptor on which the state arrives: the device thread then reads when
@@ -227,31 +228,74 @@ pub trait ManipulatorAdapter: Send {
         self.disconnect();
     }
 
-    // --- Optional parts ---
+    // --- Optional parts: an adapter writes only those that its arm has ---
 
-    /// End-effector pose; `None` when the device has none.
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
-        Ok(None)
-    }
-    /// Commands an end-effector pose; the device plans the way. `velocity` as above.
-    fn write_cartesian_position(&mut self, _pose: &Pose, _velocity: f64) -> AdapterResult<()> {
-        Err(AdapterError::Unsupported)
-    }
-    /// Gripper opening [m]; `None` when there is no gripper.
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        Ok(None)
-    }
-    /// How far the gripper closes and opens [m], as the data sheet says: what `open` and `close` mean. `None` when
-    /// there is no gripper, or nobody knows.
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    /// The arm's gripper; `None` if there is none. Does not change while the arm is connected.
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
         None
     }
-    /// Commands the gripper opening [m].
-    fn write_gripper_position(&mut self, _position: f64) -> AdapterResult<()> {
-        Err(AdapterError::Unsupported)
+    /// The force/torque sensor at the flange; `None` if there is none. Does not change while the arm is connected.
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        None
     }
-    /// Force and torque [N, N, N, Nm, Nm, Nm]; `None` when there is no sensor.
-    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        Ok(None)
+    /// The device's own kinematics; `None` if it has none. Does not change while the arm is connected.
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        None
+    }
+}
+
+/// A gripper whose fingers move along one axis. The adapter usually implements it itself, and
+/// [`ManipulatorAdapter::gripper`] returns `Some(self)`.
+///
+/// ```
+/// use dimos::hardware::spec::{AdapterError, AdapterResult, Gripper};
+///
+/// struct Fingers {
+///     opening: f64,
+/// }
+///
+/// impl Gripper for Fingers {
+///     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+///         Ok(Some(self.opening))
+///     }
+///     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+///         if !(0.0..=0.08).contains(&position) {
+///             return Err(AdapterError::Rejected(format!("the gripper opens 0 to 0.08 m, not {position} m")));
+///         }
+///         self.opening = position;
+///         Ok(())
+///     }
+/// }
+///
+/// let mut fingers = Fingers { opening: 0.0 };
+/// fingers.write_gripper_position(0.05).unwrap();
+/// assert_eq!(fingers.read_gripper_position(), Ok(Some(0.05)));
+/// assert!(fingers.write_gripper_position(0.09).is_err());
+/// ```
+pub trait Gripper {
+    /// Opening [m]; `None` while it is unknown. Must not allocate.
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>>;
+    /// Commands the opening [m].
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()>;
+    /// How far the gripper closes and opens [m] by its data sheet: what `open` and `close` mean. `None`: unknown.
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        None
+    }
+}
+
+/// A force/torque sensor.
+pub trait ForceTorque {
+    /// Force and torque [N, N, N, Nm, Nm, Nm]; `None` while the sensor is not ready. Must not allocate.
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>>;
+}
+
+/// The device's own kinematics.
+pub trait Cartesian {
+    /// End-effector pose; `None` while it is unknown. Must not allocate.
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>>;
+    /// Commands an end-effector pose; the device plans the way. `velocity` as in
+    /// [`ManipulatorAdapter::write_joint_positions`].
+    fn write_cartesian_position(&mut self, _pose: &Pose, _velocity: f64) -> AdapterResult<()> {
+        Err(AdapterError::Unsupported)
     }
 }

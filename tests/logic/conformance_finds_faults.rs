@@ -225,7 +225,8 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             // The arm's own stop holds the gripper too; this one does not.
             GRIPPER_GOES_ON | STOP_LOCKS_GRIPPER => {
                 let stop = self.inner.write_stop()?;
-                self.inner.write_gripper_position(self.gripper).map(|()| stop)
+                let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
+                gripper.write_gripper_position(self.gripper).map(|()| stop)
             }
             _ => self.inner.write_stop(),
         }
@@ -236,11 +237,20 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.inner.write_clear_errors()
     }
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        self.inner.read_gripper_position()
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.inner.gripper().is_some() { Some(self) } else { None }
     }
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
-        self.inner.get_gripper_range()
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        if MISTAKE == FAILS_WITHOUT_SENSOR { Some(self) } else { None }
+    }
+}
+
+impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())
+    }
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        self.inner.gripper().and_then(|gripper| gripper.get_gripper_range())
     }
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         match MISTAKE {
@@ -248,10 +258,13 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
             _ => self.gripper = position,
         }
-        self.inner.write_gripper_position(position)
+        self.inner.gripper().ok_or(AdapterError::Unsupported)?.write_gripper_position(position)
     }
+}
+
+impl<const MISTAKE: u8> ForceTorque for Wrong<MISTAKE> {
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        if MISTAKE == FAILS_WITHOUT_SENSOR { Err(AdapterError::Unsupported) } else { Ok(None) }
+        Err(AdapterError::Unsupported)
     }
 }
 

@@ -280,23 +280,20 @@ impl ManipulatorAdapter for Watched {
     fn read_enabled(&mut self) -> AdapterResult<bool> {
         self.inner.read_enabled()
     }
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        self.inner.read_gripper_position()
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        self.inner.gripper()
     }
-    fn read_cartesian_position(&mut self) -> AdapterResult<Option<dimos::arm::Pose>> {
-        self.inner.read_cartesian_position()
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        self.inner.force_torque()
     }
-    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        self.inner.read_force_torque()
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        self.inner.cartesian()
     }
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         self.inner.write_joint_positions(positions, velocity)
     }
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         self.inner.write_joint_velocities(velocities)
-    }
-    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        self.inner.write_gripper_position(position)
     }
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.inner.write_stop()

@@ -5,7 +5,7 @@ use std::time::Duration;
 use dimos::hardware::arms::mock;
 use dimos::hardware::fit::Fit;
 use dimos::hardware::registry::{AdapterSpec, AddressForm};
-use dimos::hardware::spec::{AdapterResult, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
+use dimos::hardware::spec::{AdapterResult, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use dimos::joint::{ControlMode, JointLimits};
 use dimos::testing::MockAdapter;
 
@@ -93,6 +93,12 @@ impl ManipulatorAdapter for Wrapped {
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.mock.write_clear_errors()
     }
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        Some(self)
+    }
+}
+
+impl Gripper for Wrapped {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         self.mock.read_gripper_position()
     }

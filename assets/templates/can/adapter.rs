@@ -382,6 +382,6 @@ impl ManipulatorAdapter for AcmeAdapter {
         }
     }
 
-    // --- Optional parts. YOUR ARM: `read_cartesian_position`, `write_gripper_position`, `read_force_torque` … are in
-    // the trait `ManipulatorAdapter`; what is not written here says "not supported" ---
+    // --- Optional parts. YOUR ARM: for a gripper, a force/torque sensor or poses add `gripper`, `force_torque` or
+    // `cartesian`, which return `Some(self)`, and implement `Gripper`, `ForceTorque` or `Cartesian` ---
 }

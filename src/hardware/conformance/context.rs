@@ -233,7 +233,15 @@ impl Context {
     /// The gripper's opening [m], as the device says after this call; `None` without gripper.
     pub fn gripper(&mut self) -> Result<Option<f64>, String> {
         self.joints()?;
-        self.adapter.read_gripper_position().map_err(|e| format!("read_gripper_position: {e}"))
+        let opening = self.adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position());
+        opening.map_err(|e| format!("read_gripper_position: {e}"))
+    }
+
+    /// Commands the gripper's opening [m].
+    pub fn command_gripper(&mut self, opening: f64) -> Result<(), String> {
+        let gripper = self.adapter.gripper().ok_or(AdapterError::Unsupported);
+        let result = gripper.and_then(|gripper| gripper.write_gripper_position(opening));
+        result.map_err(|e| format!("write_gripper_position: {e}"))
     }
 
     /// Joint positions at nine tenths of the way from the lower to the upper limits [rad]: a long way from anywhere

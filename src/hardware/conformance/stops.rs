@@ -136,7 +136,7 @@ fn stop_holds_gripper(context: &mut Context) -> Result<(), String> {
     if context.gripper()?.is_none() {
         return context.skip("it has no gripper");
     }
-    let Some((closed, open)) = context.adapter.get_gripper_range() else {
+    let Some((closed, open)) = context.adapter.gripper().and_then(|gripper| gripper.get_gripper_range()) else {
         return context.skip("nobody knows how far its gripper goes");
     };
     // A busy machine may look away until it has arrived: then it is sent back, and stopped again.
@@ -151,7 +151,7 @@ fn stop_holds_gripper(context: &mut Context) -> Result<(), String> {
 /// Sends the gripper somewhere and stops it. Where it came to rest; `None` when it was there already.
 fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<f64>, String> {
     let left = |opening: Option<f64>| opening.map_or(0.0, |opening| (target - opening).abs());
-    context.adapter.write_gripper_position(target).map_err(|e| format!("write_gripper_position: {e}"))?;
+    context.command_gripper(target)?;
     let way = left(context.gripper()?);
     context.until("the gripper's motion", |context| Ok(left(context.gripper()?) < 0.95 * way.max(0.01)))?;
     if left(context.gripper()?) < GRIPPER_ROOM {
@@ -166,7 +166,7 @@ fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<
     context.until("the gripper's rest", |context| {
         let (opening, now) = (context.gripper()?, MonotonicClock.now());
         if let Some(here) = opening.and_then(|opening| stop.look(opening, now)) {
-            context.adapter.write_gripper_position(here).map_err(|e| format!("holding the gripper: {e}"))?;
+            context.command_gripper(here).map_err(|e| format!("holding the gripper: {e}"))?;
         }
         if left(opening) != left(rest.0) {
             rest = (opening, now);

@@ -283,7 +283,8 @@ impl Worker {
         let write_period = self.config.write_period(adapter.set_point_period());
         self.guard.set_period(write_period);
         let read_period = self.config.read_period();
-        Ok(Connected { info, limits, gripper_range: adapter.get_gripper_range(), read_period, write_period })
+        let gripper_range = adapter.gripper().and_then(|gripper| gripper.get_gripper_range());
+        Ok(Connected { info, limits, gripper_range, read_period, write_period })
     }
 
     fn set_limits(&mut self, limits: &JointLimits) {
@@ -445,7 +446,8 @@ impl Worker {
             Err(AdapterError::Rejected("the arm is held; `arm enable` makes it ready again".to_owned()))
         } else {
             self.gripper_stop.end();
-            adapter.write_gripper_position(command.gripper)
+            let gripper = adapter.gripper().ok_or(AdapterError::Unsupported);
+            gripper.and_then(|gripper| gripper.write_gripper_position(command.gripper))
         };
         match &result {
             Ok(()) => {}
@@ -572,8 +574,9 @@ impl Worker {
     fn hold_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let now = self.config.clock.now();
         let Some(here) = self.state.gripper.and_then(|opening| self.gripper_stop.look(opening, now)) else { return };
-        let (closed, open) = adapter.get_gripper_range().unwrap_or((0.0, f64::MAX));
-        if let Err(error) = adapter.write_gripper_position(here.max(closed).min(open)) {
+        let Some(gripper) = adapter.gripper() else { return };
+        let (closed, open) = gripper.get_gripper_range().unwrap_or((0.0, f64::MAX));
+        if let Err(error) = gripper.write_gripper_position(here.max(closed).min(open)) {
             self.trouble(&format!("the gripper did not take the stop: {error}"));
         }
     }
@@ -674,14 +677,14 @@ impl Worker {
             self.state.enabled = adapter.read_enabled()?;
         }
         if all || turn == 2 {
-            self.state.gripper = adapter.read_gripper_position()?;
+            self.state.gripper = adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())?;
             self.hold_gripper(adapter);
         }
         if all || turn == 3 {
-            self.state.wrench = adapter.read_force_torque()?;
+            self.state.wrench = adapter.force_torque().map_or(Ok(None), |sensor| sensor.read_force_torque())?;
         }
         if all || turn == 4 {
-            self.state.pose = adapter.read_cartesian_position()?;
+            self.state.pose = adapter.cartesian().map_or(Ok(None), |poses| poses.read_cartesian_position())?;
         }
         if all || turn == 5 {
             self.read_codes(adapter)?;

@@ -9,7 +9,8 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::spec::{
-    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+    AdapterError, AdapterResult, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
+    Stop,
 };
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
@@ -204,19 +205,26 @@ impl ManipulatorAdapter for MockArm {
         self.device.arm.clear_error().map_err(|refusal| self.device.refused(refusal))
     }
 
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        self.device.answer()?;
-        Ok(self.options.gripper.then_some(self.device.gripper.position))
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.options.gripper { Some(self) } else { None }
     }
 
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
-        self.options.gripper.then_some((0.0, GRIPPER_MAX))
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        if self.options.force_torque { Some(self) } else { None }
+    }
+}
+
+impl Gripper for MockArm {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.device.answer()?;
+        Ok(Some(self.device.gripper.position))
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        Some((0.0, GRIPPER_MAX))
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        if !self.options.gripper {
-            return Err(AdapterError::Unsupported);
-        }
         self.device.write_motion()?;
         if !(0.0..=GRIPPER_MAX).contains(&position) {
             return Err(AdapterError::Rejected(format!(
@@ -227,9 +235,11 @@ impl ManipulatorAdapter for MockArm {
         self.device.gripper.move_to(position);
         Ok(())
     }
+}
 
+impl ForceTorque for MockArm {
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
         self.device.answer()?;
-        Ok(self.options.force_torque.then_some([0.0; 6]))
+        Ok(Some([0.0; 6]))
     }
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 use super::MockArm;
 use crate::clock::{Mono, VirtualClock};
 use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::spec::{AdapterError, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
 fn arm(options: serde_json::Value) -> (MockArm, VirtualClock) {
@@ -135,12 +135,10 @@ fn gripper_and_optional_parts() {
     clock.advance(ms(100));
     assert!((arm.read_gripper_position().unwrap().unwrap() - 0.05).abs() < 1e-12, "0.1 m/s from half open");
     assert!(matches!(arm.write_gripper_position(0.1), Err(AdapterError::Rejected(_))));
-    assert_eq!(arm.read_cartesian_position(), Ok(None));
-    assert_eq!(arm.read_force_torque(), Ok(None));
+    assert!(arm.cartesian().is_none() && arm.force_torque().is_none());
     let (mut bare, _) = ready(serde_json::json!({"gripper": false, "force_torque": true}), ControlMode::Position);
-    assert_eq!(bare.read_gripper_position(), Ok(None));
-    assert_eq!(bare.write_gripper_position(0.01), Err(AdapterError::Unsupported));
-    assert_eq!(bare.read_force_torque(), Ok(Some([0.0; 6])));
+    assert!(bare.gripper().is_none());
+    assert_eq!(bare.force_torque().unwrap().read_force_torque(), Ok(Some([0.0; 6])));
 }
 
 #[test]

@@ -22,7 +22,8 @@ use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
-    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+    AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
+    Stop,
 };
 use crate::hardware::transport::can::CanAddress;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
@@ -332,6 +333,35 @@ impl ManipulatorAdapter for PiperAdapter {
 
     // --- Optional parts ---
 
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.options.gripper.stroke().is_some() { Some(self) } else { None }
+    }
+
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        Some(self)
+    }
+}
+
+impl Gripper for PiperAdapter {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(self.arm.known()?.gripper.map(|gripper| f64::from(gripper.stroke) * MICRO))
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        self.options.gripper.stroke().map(|stroke| (0.0, stroke))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        let stroke = self.options.gripper.stroke().ok_or(AdapterError::Unsupported)?;
+        if !(0.0..=stroke).contains(&position) {
+            return Err(self.arm.refuse(format!("gripper opening {position} m is not within 0 to {stroke} m")));
+        }
+        self.arm.may_move()?;
+        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque())])
+    }
+}
+
+impl Cartesian for PiperAdapter {
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
         Ok(self.arm.known()?.pose.map(|[x, y, z, roll, pitch, yaw]| Pose {
             xyz: [x, y, z].map(|v| f64::from(v) * MICRO),
@@ -351,24 +381,5 @@ impl ManipulatorAdapter for PiperAdapter {
         (self.arm.written, self.arm.control) = (None, None);
         self.arm.picture.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
         self.arm.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
-    }
-
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        let used = self.options.gripper.stroke().is_some();
-        let gripper = self.arm.known()?.gripper.filter(|_| used);
-        Ok(gripper.map(|gripper| f64::from(gripper.stroke) * MICRO))
-    }
-
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
-        self.options.gripper.stroke().map(|stroke| (0.0, stroke))
-    }
-
-    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        let stroke = self.options.gripper.stroke().ok_or(AdapterError::Unsupported)?;
-        if !(0.0..=stroke).contains(&position) {
-            return Err(self.arm.refuse(format!("gripper opening {position} m is not within 0 to {stroke} m")));
-        }
-        self.arm.may_move()?;
-        self.arm.send(&[protocol::gripper_target((position / MICRO).round() as i32, self.gripper_torque())])
     }
 }

@@ -10,7 +10,7 @@ use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::registry::{AdapterConfig, Emulator, Place};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::spec::{AdapterError, Cartesian, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::ControlMode;
 
@@ -173,8 +173,7 @@ fn the_gripper_counts_in_metres_and_knows_its_size() {
     }
     let (_emulator, mut arm) = pair(serde_json::json!({ "gripper": "none" }));
     arm.connect().unwrap();
-    assert_eq!((arm.read_gripper_position(), arm.get_gripper_range()), (Ok(None), None));
-    assert_eq!(arm.write_gripper_position(0.01), Err(AdapterError::Unsupported));
+    assert!(arm.gripper().is_none());
 }
 
 #[test]

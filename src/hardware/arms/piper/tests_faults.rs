@@ -11,7 +11,7 @@ use super::tests::{START, activate, config, connected, farthest, ids, pair, read
 use crate::clock::Mono;
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, ManipulatorAdapter, Stop};
+use crate::hardware::spec::{AdapterError, Cartesian, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::transport::can::{self, CanAddress, CanFrame, CanPort};
 use crate::joint::ControlMode;
 

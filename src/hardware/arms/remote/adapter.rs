@@ -13,7 +13,8 @@ use super::{MODES, NATIVE_RATE, fit, limits, same_modes};
 use crate::arm::Pose;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
-    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
+    RobotState, Stop,
 };
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
@@ -71,8 +72,9 @@ impl RemoteAdapter {
         self.with(|session| session.recent().map(|state| state.map(of)))?
     }
 
+    /// Whether the peer of this or of the last connection said that its arm has a part.
     fn has_part(&self, name: &str) -> bool {
-        self.session.as_ref().is_some_and(|session| session.description.parts.iter().any(|part| part == name))
+        self.last.as_ref().is_some_and(|said| said.parts.iter().any(|part| part == name))
     }
 
     /// Refuses what the arm would refuse, and sends the rest.
@@ -289,41 +291,54 @@ impl ManipulatorAdapter for RemoteAdapter {
 
     // --- Optional parts ---
 
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.has_part("read_gripper_position") { Some(self) } else { None }
+    }
+
+    // A sensor may be switched on while the arm runs; `parts` lists what answered when the connection began.
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        Some(self)
+    }
+
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        if self.has_part("read_cartesian_position") { Some(self) } else { None }
+    }
+}
+
+impl Gripper for RemoteAdapter {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        self.recent(|state| state.gripper)
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        self.last.as_ref()?.gripper_range
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        let patience = self.late()?;
+        if !position.is_finite() {
+            return Err(AdapterError::Rejected(format!("a gripper opening of {position} m")));
+        }
+        self.act(&Act::Gripper(position), patience)
+    }
+}
+
+impl ForceTorque for RemoteAdapter {
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        self.recent(|state| state.wrench)
+    }
+}
+
+impl Cartesian for RemoteAdapter {
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
         self.recent(|state| state.pose.map(WirePose::pose))
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
         let patience = self.late()?;
-        if !self.has_part("read_cartesian_position") {
-            return Err(AdapterError::Unsupported);
-        }
         if !pose.xyz.iter().chain(&pose.rpy).all(|value| value.is_finite()) {
             return Err(AdapterError::Rejected("the pose is not finite".into()));
         }
         self.act(&Act::Cartesian(WirePose::of(pose), velocity), patience)
-    }
-
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        self.recent(|state| state.gripper)
-    }
-
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
-        self.last.as_ref()?.gripper_range
-    }
-
-    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        let patience = self.late()?;
-        if !self.has_part("read_gripper_position") {
-            return Err(AdapterError::Unsupported);
-        }
-        if !position.is_finite() {
-            return Err(AdapterError::Rejected(format!("a gripper opening of {position} m")));
-        }
-        self.act(&Act::Gripper(position), patience)
-    }
-
-    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        self.recent(|state| state.wrench)
     }
 }

@@ -12,12 +12,14 @@ pub use super::control::Counts;
 use super::measured::measured;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
+use super::protocol::gripper::GripperKind;
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, fit, model_of};
 use crate::arm::Pose;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
-    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
+    RobotState, Stop,
 };
 use crate::joint::{ControlMode, JointLimits, joints_of};
 
@@ -326,6 +328,40 @@ impl ManipulatorAdapter for XArmAdapter {
 
     // --- Optional parts ---
 
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.options.gripper == GripperKind::None { None } else { Some(self) }
+    }
+
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        if self.options.force_torque { Some(self) } else { None }
+    }
+
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        Some(self)
+    }
+}
+
+impl Gripper for XArmAdapter {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        Ok(self.recent()?.gripper().opening())
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        self.options.gripper.widest().map(|widest| (0.0, widest))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        self.with(|session| session.gripper().go_to(position))
+    }
+}
+
+impl ForceTorque for XArmAdapter {
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
+        Ok(self.recent()?.wrench())
+    }
+}
+
+impl Cartesian for XArmAdapter {
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
         let [x, y, z, roll, pitch, yaw] = self.recent()?.motion().0.pose;
         Ok(Some(Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw] }))
@@ -340,21 +376,5 @@ impl ManipulatorAdapter for XArmAdapter {
         let speed = self.speed(velocity, self.model.line_speed(), SLOWEST.1);
         self.target = None;
         self.with(|session| session.plan(&Command::MoveLine { pose, speed, acceleration: LINE_ACCELERATION }))
-    }
-
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        Ok(self.recent()?.gripper().opening())
-    }
-
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
-        self.options.gripper.widest().map(|widest| (0.0, widest))
-    }
-
-    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        self.with(|session| session.gripper().go_to(position))
-    }
-
-    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
-        Ok(self.recent()?.wrench())
     }
 }

@@ -16,7 +16,8 @@ use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::kit::{fault, fill, finite};
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::spec::{
-    AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+    AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
+    Stop,
 };
 use crate::hardware::transport::device_time::DeviceTime;
 use crate::hardware::transport::dialogue::{Dialogue, Patience};
@@ -321,6 +322,35 @@ impl ManipulatorAdapter for YourArmAdapter {
 
     // --- Optional parts: leave out what your arm does not have ---
 
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        if self.options.gripper { Some(self) } else { None }
+    }
+
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        Some(self)
+    }
+}
+
+impl Gripper for YourArmAdapter {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        let state = self.recent()?;
+        Ok(state.gripper_fitted.then_some(state.gripper / MM_PER_M))
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        Some((0.0, super::GRIPPER_MAX))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        if !(0.0..=super::GRIPPER_MAX).contains(&position) {
+            let max = super::GRIPPER_MAX;
+            return Err(AdapterError::Rejected(format!("gripper opening {position} m is not within 0 to {max} m")));
+        }
+        self.command(&Command::Gripper(position * MM_PER_M))
+    }
+}
+
+impl Cartesian for YourArmAdapter {
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
         let [x, y, z, roll, pitch, yaw] = self.recent()?.pose;
         Ok(Some(Pose { xyz: [x, y, z].map(|v| v / MM_PER_M), rpy: [roll, pitch, yaw].map(f64::to_radians) }))
@@ -333,26 +363,5 @@ impl ManipulatorAdapter for YourArmAdapter {
             return Err(AdapterError::Rejected("the pose is not finite".into()));
         }
         self.command(&Command::MoveCartesian { speed: self.percent(velocity), pose })
-    }
-
-    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
-        let used = self.options.gripper;
-        let state = self.recent()?;
-        Ok((used && state.gripper_fitted).then_some(state.gripper / MM_PER_M))
-    }
-
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
-        self.options.gripper.then_some((0.0, super::GRIPPER_MAX))
-    }
-
-    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        if !self.options.gripper {
-            return Err(AdapterError::Unsupported);
-        }
-        if !(0.0..=super::GRIPPER_MAX).contains(&position) {
-            let max = super::GRIPPER_MAX;
-            return Err(AdapterError::Rejected(format!("gripper opening {position} m is not within 0 to {max} m")));
-        }
-        self.command(&Command::Gripper(position * MM_PER_M))
     }
 }
