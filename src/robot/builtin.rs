@@ -6,7 +6,7 @@ use std::sync::OnceLock;
 pub const PREFIX: &str = "builtin:";
 
 macro_rules! robots {
-    ($($name:literal),*) => {
+    ($($name:literal),* $(,)?) => {
         /// Names of the robots shipped with this crate.
         pub const NAMES: &[&str] = &[$($name),*];
 
@@ -33,7 +33,7 @@ robots!(
     "xarm850",
     "xarm850_gripper",
     "yourarm",
-    "yourarm_gripper"
+    "yourarm_gripper",
 );
 
 /// Robots added by a program that embeds this crate.

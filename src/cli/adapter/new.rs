@@ -2,7 +2,6 @@
 
 mod description;
 mod name;
-mod table;
 mod templates;
 mod write;
 
@@ -17,7 +16,7 @@ use crate::hardware::registry::Registry;
 use crate::joint::MAX_DOF;
 use name::Name;
 use templates::Arm;
-use write::{Change, Plan};
+use write::Plan;
 
 /// Paths of the table of adapters and of that of robot descriptions in a checkout.
 const TABLE: &str = "src/hardware/arms/mod.rs";
@@ -38,8 +37,8 @@ suite, runs and plans at once, with a made-up wire format and a made-up shape: s
   dimos adapter new acme --dof 6 --transport tcp
   cd acme && cargo test && cargo run -- run coordinator-acme
 
-With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, assets/robots,
-blueprints, and a line in the table of each.
+With --in-tree the same goes into a checkout of dimos: src/hardware/arms/NAME, assets/robots and
+blueprints. It prints the lines that you add to the tables of arms and of robots.
 
 docs/adding-an-arm.md goes through it step by step.")]
 pub struct Args {
@@ -84,20 +83,29 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         return Err(Failure::usage(what).hint("`dimos list-adapters` shows them; choose another name"));
     }
     let arm = Arm { name, dof: args.dof, transport: args.transport };
-    let (plan, next) = if args.in_tree { in_tree(args, &arm)? } else { own_crate(args, &arm)? };
+    let (plan, lines, next) = if args.in_tree { in_tree(args, &arm)? } else { own_crate(args, &arm)? };
     if let Some(path) = plan.obstacle() {
         let what = format!("{} is there already: nothing was written", path.display());
         return Err(Failure::usage(what).hint("choose another name or --path, or move it away"));
     }
     plan.write().map_err(|e| Failure::new(Exit::Failed, format!("{e}: nothing was written")))?;
-    report(args, &arm, &plan, &next);
+    report(args, &arm, &plan, &lines, &next);
     Ok(Exit::Ok)
 }
 
 /// The next commands, and the purpose of each.
 type Next = [(String, &'static str); 4];
 
-fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
+/// A line to add to a source file by hand.
+#[derive(Debug, serde::Serialize)]
+struct Line {
+    file: PathBuf,
+    /// The list in the file that takes the line; empty: the file's own level.
+    list: &'static str,
+    line: String,
+}
+
+fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     if !args.path.is_dir() {
         return Err(Failure::usage(format!("--path: there is no folder {}", args.path.display())));
     }
@@ -113,22 +121,23 @@ fn own_crate(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
         ),
         ("grep -rn 'YOUR ARM' src robots".to_owned(), "what to change"),
     ];
-    Ok((Plan { new, folders: vec![folder], changes: Vec::new() }, next))
+    Ok((Plan { new, folders: vec![folder] }, Vec::new(), next))
 }
 
-fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
+fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     let root = &args.path;
     if !is_checkout(root) {
         let what = format!("--in-tree: {} is no checkout of dimos", root.display());
         return Err(Failure::usage(what).hint("give the one to write into: --path DIR"));
     }
     let name = &arm.name.snake;
-    let changes = vec![
-        Change::of(root.join(TABLE), |text| table::with_row(text, name)).map_err(Failure::usage)?,
-        Change::of(root.join(ROBOTS), |text| table::with_robot(text, name)).map_err(Failure::usage)?,
+    let lines = vec![
+        Line { file: root.join(TABLE), list: "", line: format!("pub mod {name};") },
+        Line { file: root.join(TABLE), list: "TABLE", line: format!("{name}::SPEC,") },
+        Line { file: root.join(ROBOTS), list: "robots!", line: format!("{name:?},") },
     ];
     let new = arm.in_tree().into_iter().map(|(path, text)| (root.join(path), text)).collect();
-    let folder = root.join("src/hardware/arms").join(&arm.name.snake);
+    let folder = root.join("src/hardware/arms").join(name);
     let next = [
         ("DIMOS_REGENERATE=1 cargo test --lib blueprint".to_owned(), "brings the generated pages up to date"),
         ("cargo test --test logic conformance::".to_owned(), "every arm of the table, this one too"),
@@ -138,7 +147,7 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Next)> {
             "the same with a planner: `cargo run -- plan arm --named home`",
         ),
     ];
-    Ok((Plan { new, folders: vec![folder], changes }, next))
+    Ok((Plan { new, folders: vec![folder] }, lines, next))
 }
 
 /// Where a crate finds dimos, as its manifest writes it.
@@ -173,23 +182,25 @@ fn shown(path: &Path) -> String {
     if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', r"'\''")) }
 }
 
-fn report(args: &Args, arm: &Arm, plan: &Plan, next: &Next) {
+fn report(args: &Args, arm: &Arm, plan: &Plan, lines: &[Line], next: &Next) {
     let name = |path: &Path| path.strip_prefix(".").unwrap_or(path).display().to_string();
     let written: Vec<String> = plan.new.iter().map(|(path, _)| name(path)).collect();
-    let changed = plan.changes.iter().map(|change| name(&change.path));
     if args.json {
         output::json(&json!({
             "adapter": arm.name.snake,
             "blueprint": arm.blueprint(),
             "planner": arm.planner(),
             "written": written,
-            "changed": changed.collect::<Vec<_>>(),
+            "add": lines,
             "next": next.iter().map(|(command, _)| command).collect::<Vec<_>>(),
         }));
         return;
     }
     written.iter().for_each(|path| output::line(format_args!("wrote   {path}")));
-    changed.for_each(|path| output::line(format_args!("changed {path}")));
+    for Line { file, list, line } in lines {
+        let list = if list.is_empty() { String::new() } else { format!(", in {list}") };
+        output::line(format_args!("add to  {}{list}: {line}", name(file)));
+    }
     output::line("");
     output::line("next:");
     let width = next.iter().map(|(command, _)| command.len()).max().unwrap_or_default();

@@ -4,26 +4,13 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// Files that are to be made, and some that are to be changed.
+/// Files to create.
 #[derive(Debug, Default)]
 pub struct Plan {
     /// Paths and texts of new files.
     pub new: Vec<(PathBuf, String)>,
     /// Folders that must not be there yet.
     pub folders: Vec<PathBuf>,
-    /// Files that are to be changed.
-    pub changes: Vec<Change>,
-}
-
-/// A change of a file.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Change {
-    /// Its path.
-    pub path: PathBuf,
-    /// What it was read as.
-    pub before: String,
-    /// What it becomes.
-    pub after: String,
 }
 
 impl Plan {
@@ -51,40 +38,7 @@ impl Plan {
             made.0.push(path.clone());
             file.write_all(text.as_bytes()).map_err(|e| at(path, &e))?;
         }
-        // The changes come last, each at once: a reader sees a file from before or from after.
-        let mut ready = Vec::new();
-        for change in &self.changes {
-            let beside = change.path.with_extension("rs.new");
-            let mut file = fs::File::create_new(&beside).map_err(|e| at(&beside, &e))?;
-            made.0.push(beside.clone());
-            file.write_all(change.after.as_bytes()).map_err(|e| at(&beside, &e))?;
-            change.still_as_read()?;
-            ready.push((beside, change));
-        }
-        for (done, (beside, change)) in ready.iter().enumerate() {
-            if let Err(error) = fs::rename(beside, &change.path) {
-                let back = |(_, change): &(PathBuf, &Change)| drop(fs::write(&change.path, &change.before));
-                ready.iter().take(done).for_each(back);
-                return Err(at(&change.path, &error));
-            }
-        }
         Ok(())
-    }
-}
-
-impl Change {
-    /// What a function makes of a file; what is wrong with the file where it cannot.
-    pub fn of(path: PathBuf, make: impl FnOnce(&str) -> Result<String, String>) -> Result<Self, String> {
-        let before = fs::read_to_string(&path).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
-        let after = make(&before).map_err(|e| format!("{}: {e}: nothing was written", path.display()))?;
-        Ok(Self { path, before, after })
-    }
-
-    fn still_as_read(&self) -> io::Result<()> {
-        if fs::read_to_string(&self.path).map_err(|e| at(&self.path, &e))? == self.before {
-            return Ok(());
-        }
-        Err(io::Error::other(format!("{} was changed meanwhile", self.path.display())))
     }
 }
 
@@ -123,26 +77,20 @@ mod tests {
     fn a_failure_leaves_nothing_behind() {
         let dir = tempfile::tempdir().unwrap();
         let at = |path: &str| dir.path().join(path);
-        let change = |file: &str, before: &str| Change { path: at(file), before: before.into(), after: "new".into() };
-        fs::write(at("table"), "old").unwrap();
-        fs::write(at("robots"), "few").unwrap();
+        fs::write(at("file"), "old").unwrap();
         let plan = |last: &str| Plan {
             new: [("a/b/c", "1"), ("a/d", "2"), (last, "3")].map(|(path, text)| (at(path), text.to_owned())).to_vec(),
             folders: vec![at("a")],
-            changes: vec![change("table", "old"), change("robots", "few")],
         };
-        assert!(plan("table/x").write().is_err(), "a file is no folder");
-        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 2, "only what was there is there");
-        let changes = vec![change("table", "old"), change("robots", "other")];
-        assert!(Plan { changes, ..plan("a/e") }.write().is_err());
-        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 2);
-        assert_eq!(fs::read_to_string(at("table")).unwrap(), "old");
-        assert_eq!(fs::read_to_string(at("robots")).unwrap(), "few");
+        assert!(plan("file/x").write().is_err(), "a file is no folder");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "only the file from before is left");
+
+        assert!(plan("file").write().is_err(), "the file exists");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+        assert_eq!(fs::read_to_string(at("file")).unwrap(), "old");
 
         assert_eq!(plan("a/e").obstacle(), None);
         plan("a/e").write().unwrap();
-        assert_eq!(fs::read_to_string(at("table")).unwrap(), "new");
-        assert_eq!(fs::read_to_string(at("robots")).unwrap(), "new");
         assert_eq!(fs::read_to_string(at("a/b/c")).unwrap(), "1");
         assert_eq!(plan("a/f").obstacle(), Some(at("a").as_path()));
     }
