@@ -235,6 +235,22 @@ fn mistakes_stand_where_they_were_written_with_the_way_there() {
 }
 
 #[test]
+fn functions_that_are_left_out_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    for (expression, what) in [
+        ("cosh(1)", "the function cosh() of Python is not supported"),
+        ("python.enumerate([1])", "python.enumerate is not supported; the functions of python are list, dict,"),
+        ("math.gcd(4, 6)", "math.gcd is not supported; the functions of math are acos, asin,"),
+        ("xacro.nope()", "xacro.nope is not supported; the functions of xacro are load_yaml,"),
+        ("'a'.capitalize()", "'str' object has no attribute 'capitalize' that is supported"),
+        ("python.set([1]).add(2)", "'set' object has no attribute 'add' that is supported"),
+    ] {
+        let found = mistakes(&write(folder.path(), "t.xacro", &format!("<a b=\"${{{expression}}}\"/>")));
+        assert!(found.contains(what), "{expression}:\n{found}");
+    }
+}
+
+#[test]
 fn work_is_bounded() {
     let folder = tempfile::tempdir().unwrap();
     let doubling: String =
@@ -253,6 +269,7 @@ fn work_is_bounded() {
         ("<a b='${[0]*10**9}'/>".to_owned(), "too long"),
         ("<a b='${len(list(range(10**12)))}'/>".to_owned(), "too long"),
         ("<a b='${2**10**10}'/>".to_owned(), "too large"),
+        ("<a b='${len(python.set(list(range(10**6))))}'/>".to_owned(), "too many steps"),
         ("<a b='${len([1 for a in range(10000) for b in range(10000)])}'/>".to_owned(), "too"),
         (format!("<a b='${{{}1{}}}'/>", "(".repeat(500), ")".repeat(500)), "nested too deeply"),
         (format!("<a b='${{1{}}}'/>", "+1".repeat(5000)), "more than"),

@@ -57,6 +57,7 @@ impl Interpreter<'_> {
             }
             Expr::Binary(sign, left, right) => {
                 let (left, right) = (self.value(left)?, self.value(right)?);
+                self.host.charge(set_work(&left, &right))?;
                 let value = binary(sign, &left, &right)?;
                 self.host.charge(length(&value))?;
                 Ok(value)
@@ -110,7 +111,7 @@ impl Interpreter<'_> {
         if let Some((_, value)) = self.locals.iter().rev().find(|(local, _)| local == name) {
             return Ok(value.clone());
         }
-        self.host.name(name)?.ok_or_else(|| format!("name '{name}' is not defined"))
+        self.host.name(name)?.ok_or_else(|| functions::undefined(name))
     }
 
     fn attribute(&mut self, object: &Value, name: &str) -> Evaluated {
@@ -121,7 +122,7 @@ impl Interpreter<'_> {
             }
             Value::Module(module) => {
                 let value = functions::in_module(module, name);
-                value.ok_or_else(|| format!("name '{name}' is not defined in {module}"))
+                value.ok_or_else(|| functions::undefined_in(module, name))
             }
             Value::Namespace(scope) => {
                 let value = self.host.member(*scope, name)?;
@@ -191,6 +192,7 @@ impl Interpreter<'_> {
         let mut left = self.value(first)?;
         for (sign, right) in steps {
             let right = self.value(right)?;
+            self.host.charge(set_work(&left, &right))?;
             if !compared(sign, &left, &right)? {
                 return Ok(Value::Bool(false));
             }
@@ -205,6 +207,7 @@ impl Interpreter<'_> {
             let object = self.value(object)?;
             if !matches!(object, Value::Module(_) | Value::Namespace(_)) {
                 let (values, named) = (self.values(values)?, self.named(named)?);
+                self.host.charge(values.first().map_or(0, |value| set_work(&object, value)))?;
                 let value = methods::call(&object, name, &values, &named)?;
                 self.host.charge(length(&value))?;
                 return Ok(value);
@@ -270,7 +273,7 @@ impl Interpreter<'_> {
 /// Returns the elements that a loop visits: items, characters, keys.
 pub(super) fn items(value: &Value) -> Evaluated<Vec<Value>> {
     match value {
-        Value::List(items) | Value::Tuple(items) => Ok(items.to_vec()),
+        Value::List(items) | Value::Tuple(items) | Value::Set(items) => Ok(items.to_vec()),
         Value::Str(text) => Ok(text.chars().map(|c| String::from(c).into()).collect()),
         Value::Dict(dict) => Ok(dict.entries.iter().map(|(key, _)| key.clone()).collect()),
         other => Err(format!("'{}' object is not iterable", other.type_name())),
@@ -280,7 +283,7 @@ pub(super) fn items(value: &Value) -> Evaluated<Vec<Value>> {
 /// Returns the value if it is hashable.
 pub(super) fn hashable(value: Value) -> Evaluated {
     match value {
-        Value::List(_) | Value::Dict(_) => Err(format!("unhashable type: '{}'", value.type_name())),
+        Value::List(_) | Value::Dict(_) | Value::Set(_) => Err(format!("unhashable type: '{}'", value.type_name())),
         value => Ok(value),
     }
 }
@@ -289,9 +292,20 @@ pub(super) fn hashable(value: Value) -> Evaluated {
 fn length(value: &Value) -> usize {
     match value {
         Value::Str(text) => text.len() / 16,
-        Value::List(items) | Value::Tuple(items) => items.len(),
+        Value::List(items) | Value::Tuple(items) | Value::Set(items) => items.len(),
         _ => 0,
     }
+}
+
+/// Returns the work of comparing each of one list with each of another.
+pub(super) fn pair_work(a: usize, b: usize) -> usize {
+    a.saturating_mul(b) / 16
+}
+
+/// Returns the work of an operation between a set and something else.
+fn set_work(left: &Value, right: &Value) -> usize {
+    let sets = matches!(left, Value::Set(_)) || matches!(right, Value::Set(_));
+    if sets { pair_work(length(left).max(1), length(right).max(1)) } else { 0 }
 }
 
 fn negative(value: &Value) -> Evaluated {
@@ -357,7 +371,9 @@ fn contains(container: &Value, item: &Value) -> Evaluated<bool> {
             Err(format!("'in <string>' requires string as left operand, not {}", other.type_name()))
         }
         (Value::Dict(dict), key) => Ok(dict.get(key).is_some()),
-        (Value::List(items) | Value::Tuple(items), item) => Ok(items.iter().any(|i| i.equals(item))),
+        (Value::List(items) | Value::Tuple(items) | Value::Set(items), item) => {
+            Ok(items.iter().any(|i| i.equals(item)))
+        }
         (other, _) => Err(format!("argument of type '{}' is not iterable", other.type_name())),
     }
 }
@@ -370,6 +386,7 @@ fn binary(sign: &str, left: &Value, right: &Value) -> Evaluated {
         ("+", Value::Tuple(a), Value::Tuple(b)) => {
             limited(a.len() + b.len(), || Value::Tuple(Rc::new([&a[..], &b[..]].concat())))
         }
+        ("-", Value::Set(a), Value::Set(b)) => methods::selected(a, b, false),
         ("*", Value::Str(text), n) | ("*", n, Value::Str(text)) if n.as_int().is_some() => {
             let n = repeats(n);
             limited(text.len().saturating_mul(n), || text.repeat(n).into())

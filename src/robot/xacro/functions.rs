@@ -3,7 +3,7 @@
 use std::f64::consts;
 use std::rc::Rc;
 
-use super::evaluate::{Evaluated, Interpreter, MAX_LENGTH, hashable, items};
+use super::evaluate::{Evaluated, Interpreter, MAX_LENGTH, hashable, items, pair_work};
 use super::value::{Dict, Value, integer};
 
 /// Names available to every expression, and in the module `python`.
@@ -19,64 +19,22 @@ const PYTHON: &[&str] = &[
     "min",
     "max",
     "round",
+    "set",
     "sorted",
     "range",
     "abs",
     "all",
     "any",
     "divmod",
-    "enumerate",
-    "filter",
     "isinstance",
-    "ord",
-    "repr",
     "reversed",
     "sum",
     "tuple",
     "zip",
 ];
 const MATH: &[&str] = &[
-    "acos",
-    "acosh",
-    "asin",
-    "asinh",
-    "atan",
-    "atan2",
-    "atanh",
-    "cbrt",
-    "ceil",
-    "copysign",
-    "cos",
-    "cosh",
-    "degrees",
-    "exp",
-    "exp2",
-    "expm1",
-    "fabs",
-    "factorial",
-    "floor",
-    "fmod",
-    "fsum",
-    "gcd",
-    "hypot",
-    "isclose",
-    "isfinite",
-    "isinf",
-    "isnan",
-    "log",
-    "log10",
-    "log1p",
-    "log2",
-    "pow",
-    "prod",
-    "radians",
-    "remainder",
-    "sin",
-    "sinh",
-    "sqrt",
-    "tan",
-    "tanh",
-    "trunc",
+    "acos", "asin", "atan", "atan2", "ceil", "copysign", "cos", "degrees", "exp", "fabs", "floor", "fmod", "hypot",
+    "isnan", "log", "log10", "pow", "radians", "sin", "sqrt", "tan", "trunc",
 ];
 /// Functions of the module `xacro`; the host implements all but `dotify` and `tokenize`.
 const XACRO: &[&str] = &[
@@ -93,6 +51,29 @@ const XACRO: &[&str] = &[
 ];
 /// Functions of `xacro` that old files call without the module name.
 const BARE: &[&str] = &["load_yaml", "abs_filename", "dotify"];
+
+/// Functions of Python that the original has too, and no known description uses.
+const OMITTED: &str = "acosh asinh atanh cbrt comb complex cosh dist enumerate erf erfc exp2 expm1 factorial filter \
+    frexp frozenset fsum gamma gcd hash isclose isfinite isinf issubclass isqrt lcm ldexp lgamma log1p log2 modf \
+    nextafter ord perm prod remainder repr sinh slice tanh type ulp vars";
+
+/// Says that a global name is unknown, or of a function that is left out.
+pub(super) fn undefined(name: &str) -> String {
+    match OMITTED.split_whitespace().any(|omitted| omitted == name) {
+        true => format!("the function {name}() of Python is not supported"),
+        false => format!("name '{name}' is not defined"),
+    }
+}
+
+/// Says that a module has no such name, and which it has.
+pub(super) fn undefined_in(module: &str, name: &str) -> String {
+    let names = match module {
+        "python" => PYTHON,
+        "xacro" => XACRO,
+        _ => MATH,
+    };
+    format!("{module}.{name} is not supported; the functions of {module} are {}", names.join(", "))
+}
 
 /// Returns a global name.
 pub(super) fn global(name: &str) -> Option<Value> {
@@ -133,7 +114,7 @@ pub(super) fn call(
 ) -> Evaluated {
     let option = |key: &str| named.iter().find(|(n, _)| n == key).map(|(_, v)| v);
     if MATH.contains(&name) {
-        return math(name, values, named);
+        return math(name, values);
     }
     let one = || values.first().ok_or_else(|| format!("{name}() takes an argument"));
     match (name, values) {
@@ -142,12 +123,16 @@ pub(super) fn call(
         ("tuple", []) => Ok(Value::Tuple(Rc::default())),
         ("tuple", _) => Ok(Value::Tuple(Rc::new(items(one()?)?))),
         ("dict", _) => dict(values, named),
+        ("set", _) => {
+            let list = values.first().map(items).transpose()?.unwrap_or_default();
+            interpreter.host.charge(pair_work(list.len(), list.len()))?;
+            Value::set(list)
+        }
         ("dotify", _) => dotify(one()?),
         ("tokenize", _) => tokenize(one()?, values.get(1).or(option("sep")), values.get(2).or(option("skip_empty"))),
         ("len", _) => Ok(Value::Int(items(one()?)?.len() as i64)),
         ("str", []) => Ok("".into()),
         ("str", _) => Ok(one()?.text().into()),
-        ("repr", _) => Ok(one()?.repr().into()),
         ("float", []) => Ok(Value::Float(0.0)),
         ("float", _) => float(one()?),
         ("int", []) => Ok(Value::Int(0)),
@@ -170,28 +155,12 @@ pub(super) fn call(
         ("reversed", _) => Ok(Value::list(items(one()?)?.into_iter().rev().collect())),
         ("range", _) => range(values),
         ("zip", _) => zip(values),
-        ("enumerate", _) => {
-            let start = values.get(1).or(option("start")).and_then(Value::as_int).unwrap_or(0);
-            let pair = |(i, v)| Value::Tuple(Rc::new(vec![Value::Int(start.saturating_add(i as i64)), v]));
-            Ok(Value::list(items(one()?)?.into_iter().enumerate().map(pair).collect()))
-        }
         ("map", [function, lists @ ..]) => {
             let columns: Vec<Vec<Value>> = lists.iter().map(items).collect::<Evaluated<_>>()?;
             let rows = columns.iter().map(Vec::len).min().unwrap_or(0);
             let row = |i: usize| columns.iter().filter_map(|c| c.get(i).cloned()).collect();
             let mapped = (0..rows).map(|i| interpreter.apply(function, row(i), Vec::new()));
             Ok(Value::list(mapped.collect::<Evaluated<_>>()?))
-        }
-        ("filter", [function, list]) => {
-            let mut kept = Vec::new();
-            for item in items(list)? {
-                let keep = match function {
-                    Value::None => item.truth(),
-                    function => interpreter.apply(function, vec![item.clone()], Vec::new())?.truth(),
-                };
-                kept.extend(keep.then_some(item));
-            }
-            Ok(Value::list(kept))
         }
         ("isinstance", [value, kind]) => {
             let kinds = if let Value::Tuple(kinds) = kind { kinds.to_vec() } else { vec![kind.clone()] };
@@ -209,9 +178,6 @@ pub(super) fn call(
             }
             _ => Err("divmod() takes two integers, the second not zero".to_owned()),
         },
-        ("ord", [Value::Str(text)]) if text.chars().count() == 1 => {
-            Ok(Value::Int(text.chars().next().map_or(0, |c| i64::from(c as u32))))
-        }
         _ => Err(format!("{name}() cannot be called with these {} arguments", values.len())),
     }
 }
@@ -379,21 +345,10 @@ fn zip(values: &[Value]) -> Evaluated {
     Ok(Value::list((0..rows).map(row).collect()))
 }
 
-fn math(name: &str, values: &[Value], named: &[(String, Value)]) -> Evaluated {
-    if matches!(name, "fsum" | "prod") {
-        let list = values.first().map(items).transpose()?.unwrap_or_default();
-        let start = Value::Int(if name == "prod" { 1 } else { 0 });
-        let product = |a: Value, b: &Value| match (a.as_int(), b.as_int(), a.as_float(), b.as_float()) {
-            (Some(x), Some(y), ..) => x.checked_mul(y).map(Value::Int),
-            (_, _, Some(x), Some(y)) => Some(Value::Float(x * y)),
-            _ => None,
-        };
-        return list.iter().try_fold(start, |a, b| {
-            if name == "prod" { product(a, b).ok_or_else(|| wrong(name, b)) } else { add(&a, b) }
-        });
-    }
-    if let Some(value) = integers(name, values) {
-        return value;
+fn math(name: &str, values: &[Value]) -> Evaluated {
+    // Of an integer they are the integer.
+    if let ("floor" | "ceil" | "trunc", Some(whole)) = (name, values.first().and_then(Value::as_int)) {
+        return Ok(Value::Int(whole));
     }
     let numbers: Vec<f64> = values
         .iter()
@@ -401,13 +356,6 @@ fn math(name: &str, values: &[Value], named: &[(String, Value)]) -> Evaluated {
         .collect::<Evaluated<_>>()?;
     let domain = |valid: bool, value: f64| if valid { Ok(value) } else { Err("math domain error".to_owned()) };
     let value = match (name, numbers.as_slice()) {
-        ("isclose", [a, b]) => {
-            let tolerance = |key: &str| named.iter().find(|(n, _)| n == key).and_then(|(_, v)| v.as_float());
-            let (relative, absolute) = (tolerance("rel_tol").unwrap_or(1e-9), tolerance("abs_tol").unwrap_or(0.0));
-            return Ok(Value::Bool((a - b).abs() <= (relative * a.abs().max(b.abs())).max(absolute)));
-        }
-        ("isfinite", [x]) => return Ok(Value::Bool(x.is_finite())),
-        ("isinf", [x]) => return Ok(Value::Bool(x.is_infinite())),
         ("isnan", [x]) => return Ok(Value::Bool(x.is_nan())),
         ("floor", [x]) => return int(&Value::Float(x.floor()), None),
         ("ceil", [x]) => return int(&Value::Float(x.ceil()), None),
@@ -416,55 +364,23 @@ fn math(name: &str, values: &[Value], named: &[(String, Value)]) -> Evaluated {
         ("asin", [x]) => domain(x.abs() <= 1.0, x.asin())?,
         ("atan", [x]) => x.atan(),
         ("atan2", [y, x]) => y.atan2(*x),
-        ("acosh", [x]) => domain(*x >= 1.0, x.acosh())?,
-        ("asinh", [x]) => x.asinh(),
-        ("atanh", [x]) => domain(x.abs() < 1.0, x.atanh())?,
-        ("cbrt", [x]) => x.cbrt(),
         ("copysign", [x, y]) => x.copysign(*y),
         ("cos", [x]) => domain(x.is_finite(), x.cos())?,
         ("sin", [x]) => domain(x.is_finite(), x.sin())?,
         ("tan", [x]) => domain(x.is_finite(), x.tan())?,
-        ("cosh", [x]) => x.cosh(),
-        ("sinh", [x]) => x.sinh(),
-        ("tanh", [x]) => x.tanh(),
         ("degrees", [x]) => x * (180.0 / consts::PI),
         ("radians", [x]) => x * (consts::PI / 180.0),
         ("exp", [x]) => x.exp(),
-        ("exp2", [x]) => x.exp2(),
-        ("expm1", [x]) => x.exp_m1(),
         ("fabs", [x]) => x.abs(),
         ("fmod", [x, y]) => domain(*y != 0.0, x % y)?,
-        ("remainder", [x, y]) => domain(*y != 0.0, x - y * (x / y).round_ties_even())?,
         ("hypot", [x, y]) => x.hypot(*y),
         ("hypot", many) => many.iter().map(|x| x * x).sum::<f64>().sqrt(),
         ("log", [x]) => domain(*x > 0.0, x.ln())?,
         ("log", [x, base]) => domain(*x > 0.0 && *base > 0.0 && *base != 1.0, x.ln() / base.ln())?,
         ("log10", [x]) => domain(*x > 0.0, x.log10())?,
-        ("log1p", [x]) => domain(*x > -1.0, x.ln_1p())?,
-        ("log2", [x]) => domain(*x > 0.0, x.log2())?,
         ("pow", [x, y]) => domain(!(*x < 0.0 && y.fract() != 0.0 || *x == 0.0 && *y < 0.0), x.powf(*y))?,
         ("sqrt", [x]) => domain(*x >= 0.0, x.sqrt())?,
         _ => return Err(format!("{name}() cannot be called with {} arguments", values.len())),
     };
     Ok(Value::Float(value))
-}
-
-/// Functions of integers that give integers.
-fn integers(name: &str, values: &[Value]) -> Option<Evaluated> {
-    let whole = |value: Option<i64>| Some(value.map(Value::Int).ok_or_else(|| "an integer is too large".to_owned()));
-    match (name, values) {
-        ("floor" | "ceil" | "trunc", [x]) => x.as_int().map(|i| Ok(Value::Int(i))),
-        ("factorial", [x]) => match x.as_int() {
-            Some(n @ 0..=20) => Some(Ok(Value::Int((1..=n).product()))),
-            _ => Some(Err("factorial() takes an integer from 0 to 20 here".to_owned())),
-        },
-        ("gcd", [a, b]) => {
-            let (mut a, mut b) = (a.as_int()?.checked_abs()?, b.as_int()?.checked_abs()?);
-            while b != 0 {
-                (a, b) = (b, a % b);
-            }
-            whole(Some(a))
-        }
-        _ => None,
-    }
 }

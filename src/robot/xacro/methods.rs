@@ -7,10 +7,10 @@ use super::value::{Dict, Value};
 
 /// Calls a method.
 pub(super) fn call(object: &Value, name: &str, values: &[Value], named: &[(String, Value)]) -> Evaluated {
-    let missing = || format!("'{}' object has no attribute '{name}'", object.type_name());
+    let missing = || format!("'{}' object has no attribute '{name}' that is supported", object.type_name());
     match object {
         Value::Str(text) => of_text(text, name, values, named).unwrap_or_else(|| Err(missing())),
-        Value::List(list) | Value::Tuple(list) => of_list(list, name, values).unwrap_or_else(|| Err(missing())),
+        Value::Set(set) => of_set(set, name, values).unwrap_or_else(|| Err(missing())),
         Value::Dict(dict) => of_dict(dict, name, values).unwrap_or_else(|| Err(missing())),
         _ => Err(missing()),
     }
@@ -24,22 +24,7 @@ fn text_at<'v>(values: &'v [Value], at: usize, name: &str) -> Evaluated<&'v str>
     }
 }
 
-/// Removes the characters that a `strip` names.
-fn stripped<'t>(text: &'t str, name: &str, values: &[Value]) -> Evaluated<&'t str> {
-    let wanted: Option<Vec<char>> = match values.first() {
-        Some(Value::Str(chars)) => Some(chars.chars().collect()),
-        _ => None,
-    };
-    let goes = |c: char| wanted.as_ref().map_or(c.is_whitespace(), |w| w.contains(&c));
-    Ok(match name {
-        "lstrip" => text.trim_start_matches(goes),
-        "rstrip" => text.trim_end_matches(goes),
-        _ => text.trim_matches(goes),
-    })
-}
-
 fn of_text(text: &str, name: &str, values: &[Value], named: &[(String, Value)]) -> Option<Evaluated> {
-    let text_value = |text: &str| Ok(Value::from(text));
     let chars = |byte: usize| text[..byte].chars().count() as i64;
     // `startswith` and `endswith` accept a tuple.
     let any = |test: &dyn Fn(&str) -> bool| match values.first() {
@@ -58,27 +43,15 @@ fn of_text(text: &str, name: &str, values: &[Value], named: &[(String, Value)]) 
             });
             Ok(cased.collect::<String>().into())
         }
-        "capitalize" => {
-            let mut rest = text.chars();
-            let first = rest.next().map(|c| c.to_uppercase().collect::<String>()).unwrap_or_default();
-            Ok((first + &rest.as_str().to_lowercase()).into())
+        "strip" => Ok(match values.first() {
+            Some(Value::Str(chars)) => text.trim_matches(|c| chars.contains(c)),
+            _ => text.trim(),
         }
-        "strip" | "lstrip" | "rstrip" => stripped(text, name, values).and_then(text_value),
+        .into()),
         "startswith" => any(&|end| text.starts_with(end)),
         "endswith" => any(&|end| text.ends_with(end)),
-        "removeprefix" => text_at(values, 0, name).and_then(|p| text_value(text.strip_prefix(p).unwrap_or(text))),
-        "removesuffix" => text_at(values, 0, name).and_then(|p| text_value(text.strip_suffix(p).unwrap_or(text))),
         "find" => text_at(values, 0, name).map(|part| Value::Int(text.find(part).map_or(-1, chars))),
-        "rfind" => text_at(values, 0, name).map(|part| Value::Int(text.rfind(part).map_or(-1, chars))),
-        "index" => text_at(values, 0, name).and_then(|part| {
-            text.find(part).map(|at| Value::Int(chars(at))).ok_or_else(|| "substring not found".to_owned())
-        }),
-        "count" => text_at(values, 0, name).map(|part| Value::Int(text.matches(part).count() as i64)),
-        "isdigit" | "isnumeric" | "isdecimal" => {
-            Ok(Value::Bool(!text.is_empty() && text.chars().all(|c| c.is_ascii_digit())))
-        }
         "isalpha" => Ok(Value::Bool(!text.is_empty() && text.chars().all(char::is_alphabetic))),
-        "isalnum" => Ok(Value::Bool(!text.is_empty() && text.chars().all(char::is_alphanumeric))),
         "zfill" => {
             let width = values.first().and_then(Value::as_int).unwrap_or(0).clamp(0, 1000) as usize;
             let sign = usize::from(text.starts_with(['-', '+']));
@@ -89,7 +62,6 @@ fn of_text(text: &str, name: &str, values: &[Value], named: &[(String, Value)]) 
         "replace" => replaced(text, values),
         "join" => values.first().ok_or_else(|| "join() takes a list".to_owned()).and_then(|list| joined(text, list)),
         "split" | "rsplit" => split(text, name, values, named),
-        "splitlines" => Ok(Value::list(text.lines().map(Value::from).collect())),
         "partition" => text_at(values, 0, name).map(|sign| {
             let (a, s, b) = text.split_once(sign).map_or((text, "", ""), |(a, b)| (a, sign, b));
             Value::Tuple(Rc::new(vec![a.into(), s.into(), b.into()]))
@@ -159,19 +131,6 @@ fn split(text: &str, name: &str, values: &[Value], named: &[(String, Value)]) ->
     Ok(Value::list(parts.into_iter().map(Value::from).collect()))
 }
 
-fn of_list(list: &[Value], name: &str, values: &[Value]) -> Option<Evaluated> {
-    let item = || values.first().ok_or_else(|| format!("{name}() takes a value"));
-    Some(match name {
-        "index" => item().and_then(|item| {
-            let at = list.iter().position(|i| i.equals(item));
-            at.map(|at| Value::Int(at as i64)).ok_or_else(|| format!("{} is not in list", item.repr()))
-        }),
-        "count" => item().map(|item| Value::Int(list.iter().filter(|i| i.equals(item)).count() as i64)),
-        "copy" => Ok(Value::list(list.to_vec())),
-        _ => return None,
-    })
-}
-
 fn of_dict(dict: &Dict, name: &str, values: &[Value]) -> Option<Evaluated> {
     let entries = || dict.entries.iter().cloned();
     Some(match name {
@@ -182,7 +141,23 @@ fn of_dict(dict: &Dict, name: &str, values: &[Value]) -> Option<Evaluated> {
             Some(key) => Ok(dict.get(key).or(values.get(1)).cloned().unwrap_or(Value::None)),
             None => Err("get() takes a key".to_owned()),
         },
-        "copy" => Ok(Value::Dict(Rc::new(dict.clone()))),
         _ => return None,
     })
+}
+
+fn of_set(set: &[Value], name: &str, values: &[Value]) -> Option<Evaluated> {
+    let other = || Ok::<_, String>(values.first().map(items).transpose()?.unwrap_or_default());
+    Some(match name {
+        "union" => other().and_then(|other| Value::set([set, &other[..]].concat())),
+        "intersection" => other().and_then(|other| selected(set, &other, true)),
+        "difference" => other().and_then(|other| selected(set, &other, false)),
+        "issubset" => other().map(|other| Value::Bool(set.iter().all(|item| other.iter().any(|o| o.equals(item))))),
+        _ => return None,
+    })
+}
+
+/// The elements of a set that are in another one, or are not.
+pub(super) fn selected(set: &[Value], other: &[Value], inside: bool) -> Evaluated {
+    let wanted = |item: &&Value| other.iter().any(|o| o.equals(item)) == inside;
+    Value::set(set.iter().filter(wanted).cloned().collect())
 }

@@ -14,6 +14,8 @@ pub(super) enum Value {
     Str(Rc<str>),
     List(Rc<Vec<Value>>),
     Tuple(Rc<Vec<Value>>),
+    /// Different values, in order of insertion.
+    Set(Rc<Vec<Value>>),
     Dict(Rc<Dict>),
     /// A built-in function.
     Function(&'static str),
@@ -61,6 +63,18 @@ impl Value {
         Self::List(Rc::new(items))
     }
 
+    /// A set of the different ones among these; fails if one is not hashable.
+    pub(super) fn set(items: Vec<Self>) -> Result<Self, String> {
+        let mut set: Vec<Self> = Vec::new();
+        for item in items {
+            let item = super::evaluate::hashable(item)?;
+            if !set.iter().any(|known| known.equals(&item)) {
+                set.push(item);
+            }
+        }
+        Ok(Self::Set(Rc::new(set)))
+    }
+
     /// Returns Python's name of its type.
     pub(super) fn type_name(&self) -> &'static str {
         match self {
@@ -71,6 +85,7 @@ impl Value {
             Self::Str(_) => "str",
             Self::List(_) => "list",
             Self::Tuple(_) => "tuple",
+            Self::Set(_) => "set",
             Self::Dict(_) => "dict",
             Self::Function(_) => "builtin_function_or_method",
             Self::Module(_) | Self::Namespace(_) => "namespace",
@@ -85,7 +100,7 @@ impl Value {
             Self::Int(i) => *i != 0,
             Self::Float(f) => *f != 0.0,
             Self::Str(s) => !s.is_empty(),
-            Self::List(v) | Self::Tuple(v) => !v.is_empty(),
+            Self::List(v) | Self::Tuple(v) | Self::Set(v) => !v.is_empty(),
             Self::Dict(d) => !d.entries.is_empty(),
             Self::Function(_) | Self::Module(_) | Self::Namespace(_) => true,
         }
@@ -115,6 +130,7 @@ impl Value {
             (Self::None, Self::None) => true,
             (Self::Str(a), Self::Str(b)) => a == b,
             (Self::List(a), Self::List(b)) | (Self::Tuple(a), Self::Tuple(b)) => all(a, b),
+            (Self::Set(a), Self::Set(b)) => a.len() == b.len() && a.iter().all(|x| b.iter().any(|y| x.equals(y))),
             (Self::Dict(a), Self::Dict(b)) => {
                 let same = |(k, v): &(Self, Self)| b.get(k).is_some_and(|w| v.equals(w));
                 a.entries.len() == b.entries.len() && a.entries.iter().all(same)
@@ -185,6 +201,12 @@ impl Value {
                 out.push('(');
                 items(v, out);
                 out.push_str(if v.len() == 1 { ",)" } else { ")" });
+            }
+            Self::Set(v) if v.is_empty() => out.push_str("set()"),
+            Self::Set(v) => {
+                out.push('{');
+                items(v, out);
+                out.push('}');
             }
             Self::Dict(d) => {
                 out.push('{');
