@@ -104,7 +104,8 @@ impl Process {
             let end = PlannerEnd::register(&self.socket, &self.registration).await.map_err(refused)?;
             let limits = &end.registered.limits;
             let port = PlannerPort::start(&self.config, setup, limits, None).map_err(|what| {
-                let hint = "the model's limits and the run's must have room in common: is it the model of this arm?";
+                let hint =
+                    "the limits of the model and of the run must overlap; check that the model belongs to this arm";
                 StartError::other(what, hint)
             })?;
             Ok((end, Arc::new(port)))

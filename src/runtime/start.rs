@@ -110,7 +110,7 @@ impl<'a> Prepared<'a> {
         let planner = self.blueprint.planner.as_ref().zip(self.robots.take()).map(|(planner, setup)| {
             let limits = command_limits(&self.names, &config);
             PlannerPort::start(planner, setup, &limits, self.options.solver.take()).map_err(|what| {
-                let hint = "the model's limits, the arm's, and `limits` in the blueprint must have room in common";
+                let hint = "the model's limits, the arm's, and `limits` in the blueprint must overlap";
                 StartError::other(what, hint)
             })
         });

@@ -243,7 +243,7 @@ fn mistakes_in_a_trajectory_file_are_located() {
         ("a.csv", "", "a.csv:1:1: the file is empty"),
         ("a.csv", "t,j\n0,0\n1,1\n", "a.csv:1:1: the first column must be `time`"),
         ("a.csv", "time,j,j\n0,0,0\n1,1,1\n", "a.csv:1:8: "),
-        ("a.csv", "time\n0\n1\n", "a.csv:1:1: there is no joint"),
+        ("a.csv", "time\n0\n1\n", "a.csv:1:1: no joint columns"),
         ("a.csv", "time,a,b,a_vel\n0,0,0,0\n", "a.csv:1:1: velocities of 1 of 2 joints"),
         ("a.csv", "time,j\n0,0\n1,  x\n", "a.csv:3:5: \"x\" is not a finite number"),
         ("a.csv", "time,j\n0,0\n1,inf\n", "a.csv:3:3: \"inf\""),

@@ -114,7 +114,7 @@ fn every_verb_goes_on_addressing_one_run() {
 
     // It ends, and the run goes on; a move that relied on it is not made without it.
     home.dimos("down lab").with(0).says(&["planner lab ended"]);
-    planner.wait().with(143).says(&["planner lab ended; run cell goes on without it"]);
+    planner.wait().with(143).says(&["planner lab ended; run cell continues without it"]);
     for verb in ["plan arm --named home", "preview", "execute", "world list", "move arm 0 0 0 0 0 0"] {
         home.dimos(verb).with(1).says(&["NO_PLANNER", "the planner that was attached to this run has gone", "hint: "]);
     }
@@ -292,8 +292,8 @@ tasks: [{name: traj_b, type: trajectory, joint_names: {hardware: b}}]
     let _run = home.run("cell.yaml --no-record");
     home.dimos("run lab.yaml")
         .with(1)
-        .says(&["arm_joint1 goes from -2.967 to 2.967 rad in the model", "nothing is in both"]);
-    home.dimos("run lab.yaml --standalone --name x").with(1).says(&["nothing is in both"]);
+        .says(&["arm_joint1 ranges from -2.967 to 2.967 rad in the model", "the ranges do not overlap"]);
+    home.dimos("run lab.yaml --standalone --name x").with(1).says(&["the ranges do not overlap"]);
 }
 
 #[test]
