@@ -19,8 +19,8 @@ STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
 # Builds the program and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
-	@[ -e $(TARGET)/release/dimos ] || echo "building dimos: a few minutes the first time, seconds from then on" >&2
-	cargo run --release --locked -- run coordinator-yourarm
+	@[ -e $(TARGET)/quick/dimos ] || echo "building dimos: about 4 minutes the first time" >&2
+	cargo run --profile quick --locked -- run coordinator-yourarm
 
 # Installs program, man pages, completions and blueprints below PREFIX; below /usr/local also the systemd unit.
 install: shipped
