@@ -6,9 +6,9 @@ use std::time::Duration;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::de::DeserializeOwned;
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::sim::faults::Fault;
-use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::joint::{ControlMode, Joints};
 use crate::named::named;
 use crate::yaml;
@@ -80,7 +80,7 @@ pub trait Emulator: Send {
 
 /// Where an emulator listens, as far as the arm's transport has a choice.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub enum Place {
+pub enum EmulatorAddress {
     /// Where only this program finds it, and no privilege is needed: free loopback ports, a bus in memory.
     #[default]
     InProcess,
@@ -92,7 +92,7 @@ pub enum Place {
     Pty,
 }
 
-impl Place {
+impl EmulatorAddress {
     /// Where an emulator on TCP listens whose arm has its server at `port`; an error where that cannot be.
     pub fn tcp(&self, port: u16) -> AdapterResult<SocketAddr> {
         match self {
@@ -109,7 +109,7 @@ impl Place {
 }
 
 /// Starts an emulator for an arm's configuration; `Rejected` for a place that the arm's transport does not have.
-pub type Emulate = fn(&AdapterConfig, &Place) -> AdapterResult<Box<dyn Emulator>>;
+pub type Emulate = fn(&AdapterConfig, &EmulatorAddress) -> AdapterResult<Box<dyn Emulator>>;
 
 /// One row of the table.
 #[derive(Debug, Clone, Copy)]
@@ -145,7 +145,7 @@ pub struct AdapterSpec {
     /// The adapter's own options.
     pub options: OptionsSpec,
     /// Whether number of joints and options go together, and what follows from them. Never asks the device.
-    pub fit: fn(&AdapterConfig) -> Result<Fit, Misfit>,
+    pub check: fn(&AdapterConfig) -> Result<Checked, ConfigError>,
     /// Makes an adapter. Does not connect.
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
@@ -234,7 +234,7 @@ pub fn available() -> Vec<&'static str> {
 /// assert_eq!(adapter.get_dof(), 6);
 /// assert!(!adapter.is_connected());
 /// assert!(registry::create("yuorarm", "192.168.1.100", 6).is_err());
-/// # Ok::<(), dimos::hardware::spec::AdapterError>(())
+/// # Ok::<(), dimos::hardware::adapter::AdapterError>(())
 /// ```
 pub fn create(name: &str, address: &str, dof: usize) -> AdapterResult<Box<dyn ManipulatorAdapter>> {
     (builtin(name)?.create)(&plain(name, address, dof))
@@ -253,11 +253,11 @@ pub fn create(name: &str, address: &str, dof: usize) -> AdapterResult<Box<dyn Ma
 /// let mut positions = [0.0; 6]; // [rad]
 /// adapter.read_joint_positions(&mut positions)?;
 /// adapter.disconnect();
-/// # Ok::<(), dimos::hardware::spec::AdapterError>(())
+/// # Ok::<(), dimos::hardware::adapter::AdapterError>(())
 /// ```
 pub fn emulate(name: &str, dof: usize) -> AdapterResult<Box<dyn Emulator>> {
     let start = builtin(name)?.emulate.ok_or(AdapterError::Unsupported)?;
-    start(&plain(name, SIM, dof), &Place::InProcess)
+    start(&plain(name, SIM, dof), &EmulatorAddress::InProcess)
 }
 
 fn builtin(name: &str) -> AdapterResult<&'static AdapterSpec> {

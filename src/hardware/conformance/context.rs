@@ -4,9 +4,9 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
+use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::Fault;
-use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
 
 /// Longest wait for something that must happen.
@@ -81,7 +81,7 @@ impl Context {
     pub(super) fn new(subject: &Subject) -> Result<Self, String> {
         let (row, mut config) = (subject.row, subject.config.clone());
         let emulator = match row.emulate.filter(|_| !subject.real) {
-            Some(start) => Some(start(&config, &Place::InProcess).map_err(|e| e.to_string())?),
+            Some(start) => Some(start(&config, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?),
             None => None,
         };
         if let Some(emulator) = &emulator {
@@ -135,7 +135,7 @@ impl Context {
     }
 
     /// Lets the next prepared fault happen, now or soon.
-    pub fn strike(&mut self) -> Result<(), String> {
+    pub fn trigger_faults(&mut self) -> Result<(), String> {
         match (&self.emulator, self.faults.pop_front()) {
             (Some(emulator), Some(fault)) => emulator.inject(fault),
             _ => Ok(()),

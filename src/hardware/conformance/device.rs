@@ -3,8 +3,8 @@
 use super::Check;
 use super::Needs::{Motion, Nothing};
 use super::context::{Context, farthest, require};
-use super::pushed;
-use crate::hardware::spec::{AdapterError, JointReading};
+use super::streamed_state;
+use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::joint::ControlMode;
 
 /// The checks of this file.
@@ -82,7 +82,7 @@ fn no_allocation(context: &mut Context) -> Result<(), String> {
         // What an arm sends by itself must come before a cycle has anything to take up.
         let pushed = context.adapter.state_fd().is_some();
         if pushed {
-            pushed::await_news(context)?;
+            streamed_state::await_news(context)?;
         }
         let before = allocations();
         let adapter = &mut context.adapter;

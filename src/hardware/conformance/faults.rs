@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading};
 
 /// The error code that is injected.
 const CODE: u16 = 2;
@@ -30,7 +30,7 @@ fn errors(context: &mut Context) -> Result<(), String> {
     context.ready(context.first_mode())?;
     let healthy = context.error()?;
     require(healthy == (0, String::new()), || format!("without error it says {healthy:?}"))?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (code, text) = context.error()?;
     require(code == i32::from(CODE) && !text.is_empty(), || format!("error {code}, text {text:?}"))?;
@@ -49,7 +49,7 @@ fn estop(context: &mut Context) -> Result<(), String> {
     }
     context.ready(context.first_mode())?;
     let mut start = context.positions()?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the E-stop", |context| Ok(context.error()?.0 != 0))?;
     require(context.adapter.write_enable(true).is_err(), || "enabling in E-stop is accepted".into())?;
     context.until("the release", |context| Ok(context.adapter.write_clear_errors().is_ok()))?;
@@ -80,7 +80,7 @@ fn survives(context: &mut Context, kind: FaultKind) -> Result<(), String> {
     context.connect()?;
     let start = context.positions()?;
     let struck = MonotonicClock.now();
-    context.strike()?;
+    context.trigger_faults()?;
     // What is damaged may come with the next reading, or with one of those that the arm sends by itself.
     let mut failures = 0;
     let mut reading = JointReading::default();

@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde::Serialize;
 
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
+use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::rt::histogram::Histogram;
 use crate::rt::host::sleep_until;
 use crate::rt::wake::Wake;

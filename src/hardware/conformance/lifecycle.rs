@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::{Faults, Motion, Nothing};
 use super::context::{Context, farthest, require};
+use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading};
 
 /// The longest that `connect` may take on an address that does not answer.
 const UNREACHABLE: Duration = Duration::from_secs(3);
@@ -110,7 +110,7 @@ fn silence_is_clear(context: &mut Context) -> Result<(), String> {
     if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::Silent).lasting(60.0)) {
         return context.skip("its double cannot be silent");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     fails_clearly(context, Instant::now())
 }
 
@@ -127,7 +127,7 @@ fn wrong_arm_is_refused(context: &mut Context) -> Result<(), String> {
     if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::WrongDof)) {
         return context.skip("its double cannot be another arm");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     let result = context.adapter.connect();
     let text = result.as_ref().err().map_or(String::new(), |e| e.to_string());
     let numbers = [context.config.dof, context.config.dof + 1].map(|n| n.to_string());
@@ -140,7 +140,7 @@ fn wrong_model_is_refused(context: &mut Context) -> Result<(), String> {
     if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::WrongModel)) {
         return context.skip("its double cannot be another model");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     let result = context.adapter.connect();
     let text = result.as_ref().err().map_or(String::new(), |e| e.to_string());
     require(matches!(result, Err(AdapterError::Rejected(_))), || format!("connect answers {result:?}"))?;

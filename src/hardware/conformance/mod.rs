@@ -4,18 +4,18 @@
 //! Each check is a function in one of the lists below and starts with an adapter of its own that is not connected.
 
 mod context;
-mod cuts;
 mod device;
+mod disconnects;
 mod faults;
 pub mod figures;
-pub mod gently;
+pub mod first_motion;
 mod identity;
 pub mod lag;
 mod lifecycle;
 mod motion;
-mod pushed;
 mod stale;
 mod stops;
+mod streamed_state;
 
 pub use context::{Context, Subject};
 
@@ -77,12 +77,12 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
         identity::CHECKS,
         lifecycle::CHECKS,
         device::CHECKS,
-        pushed::CHECKS,
+        streamed_state::CHECKS,
         motion::CHECKS,
         stops::CHECKS,
         faults::CHECKS,
         stale::CHECKS,
-        cuts::CHECKS,
+        disconnects::CHECKS,
     ]
     .into_iter()
     .flatten()

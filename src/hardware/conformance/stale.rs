@@ -9,8 +9,8 @@ use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, require};
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::adapter::JointReading;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::JointReading;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
@@ -65,7 +65,7 @@ fn silence(context: &mut Context) -> Result<(), String> {
     }
     context.connect()?;
     context.positions()?;
-    context.strike()?;
+    context.trigger_faults()?;
     let old = settle(context)?;
     context.until("an error", |context| {
         let now = look(context)?;
@@ -89,7 +89,7 @@ fn frozen(context: &mut Context) -> Result<(), String> {
     if context.joints()?.stamp.is_none() {
         return context.skip("it gives no time");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     let Some(old) = settle(context)? else {
         return Ok(()); // it is an error to this adapter, which is as good
     };

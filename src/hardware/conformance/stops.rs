@@ -6,9 +6,9 @@ use super::Check;
 use super::Needs::{Faults, Motion};
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::device::gripper::GripperStop;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::AdapterError;
 use crate::joint::ControlMode;
 
 /// The checks of this file.
@@ -189,7 +189,7 @@ fn stop_in_error(context: &mut Context) -> Result<(), String> {
         return context.skip("its double cannot be in error");
     }
     context.ready(context.first_mode())?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (start, error) = (context.standstill()?, context.error()?);
     for _ in 0..3 {

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult, RobotState};
+use crate::hardware::adapter::{AdapterError, AdapterResult, RobotState};
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 

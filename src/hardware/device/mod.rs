@@ -21,7 +21,7 @@ pub use health::{Episode, Health, Note};
 
 use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Clock;
-use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
+use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::JointLimits;
 use crate::rt::due::Due;
 use crate::rt::heartbeat::Heartbeat;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::arm::{ArmState, Supervision};
 use crate::clock::Mono;
-use crate::hardware::spec::JointReading;
+use crate::hardware::adapter::JointReading;
 
 /// How long a pose must have been stable.
 const STABLE_FOR: Duration = Duration::from_millis(100);

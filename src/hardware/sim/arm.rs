@@ -6,9 +6,9 @@ use std::time::Duration;
 pub use super::delivery::Delivery;
 pub use super::options::{SimOptions, check_pose};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::faults::{FaultKind, FaultScript};
 use crate::hardware::sim::plant::{Drive, Plant};
-use crate::hardware::spec::AdapterResult;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
 /// Positions this close to a limit count as inside: numbers on the wire are rounded [rad].

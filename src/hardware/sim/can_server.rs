@@ -8,12 +8,12 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use super::arm::{Delivery, HasArm};
-use super::can_seat::Seat;
-use super::diary::{self, Happening};
+use super::can_connection::CanConnection;
+use super::events::{self, SimEvent};
 use super::faults::{Fault, FaultKind};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::{Emulator, Place};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::registry::{Emulator, EmulatorAddress};
 use crate::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame};
 use crate::joint::Joints;
 use crate::rt::host;
@@ -44,7 +44,7 @@ pub const PLAYABLE: &[FaultKind] = &[
 /// The arm's side of a bus.
 pub trait CanController: Send + 'static {
     /// Takes a frame. What the arm answers at once goes into `answers`.
-    fn hear(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>);
+    fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>);
 
     /// A period has passed: puts what the arm sends by itself into `frames`, and says how it is delivered.
     fn tick(&mut self, now: Mono, frames: &mut Vec<CanFrame>) -> Delivery;
@@ -88,9 +88,9 @@ impl<C> Shared<C> {
 
 impl<C: CanController> CanServer<C> {
     /// An arm at `place` that sends every `period`. `name` is the arm's, for messages.
-    pub fn start(name: &str, controller: C, place: &Place, period: Duration) -> AdapterResult<Self> {
+    pub fn start(name: &str, controller: C, place: &EmulatorAddress, period: Duration) -> AdapterResult<Self> {
         let failed = |e: io::Error| AdapterError::Io(format!("{name} emulator: {e}"));
-        let (seat, address) = Seat::take(name, place, controller.filters())?;
+        let (connection, address) = CanConnection::take(name, place, controller.filters())?;
         let shared = Arc::new(Shared {
             controller: Mutex::new(controller),
             closing: AtomicBool::new(false),
@@ -100,7 +100,7 @@ impl<C: CanController> CanServer<C> {
         });
         let mut arm = Arm {
             shared: shared.clone(),
-            seat,
+            connection,
             period,
             frames: Vec::with_capacity(64),
             stalled: Mono::ZERO,
@@ -162,7 +162,7 @@ impl<C: CanController> Drop for CanServer<C> {
 /// What the arm's thread works with.
 struct Arm<C> {
     shared: Arc<Shared<C>>,
-    seat: Seat,
+    connection: CanConnection,
     period: Duration,
     frames: Vec<CanFrame>,
     /// It does nothing until then; what arrives waits.
@@ -191,7 +191,7 @@ impl<C: CanController> Arm<C> {
                 self.listen(now);
             }
             let left = next.since(MonotonicClock.now());
-            match self.seat.fd().filter(|_| now >= self.stalled) {
+            match self.connection.fd().filter(|_| now >= self.stalled) {
                 Some(fd) => self.shared.wake.wait_or_readable(fd, left),
                 None => self.shared.wake.wait(left),
             };
@@ -200,7 +200,7 @@ impl<C: CanController> Arm<C> {
 
     /// Once per period: faults begin and end, and the state is sent.
     fn tick(&mut self, now: Mono) {
-        self.seat.mend(now);
+        self.connection.mend(now);
         if now < self.stalled || now < self.deaf {
             return;
         }
@@ -209,7 +209,7 @@ impl<C: CanController> Arm<C> {
         let mut controller = shared.controller();
         let delivery = controller.tick(now, &mut self.frames);
         self.silent = delivery == Delivery::Silent;
-        self.seat.refuse(delivery);
+        self.connection.refuse(delivery);
         match delivery {
             Delivery::Garbage => {
                 let noise = controller.noise().iter().map(|(id, bytes)| CanFrame::new(*id, bytes));
@@ -224,10 +224,10 @@ impl<C: CanController> Arm<C> {
             Delivery::Stall(time) => self.stalled = now.after(time),
             Delivery::PowerLoss(time) => {
                 self.deaf = now.after(time.max(controller.start_time()));
-                self.seat.lose_power(self.deaf);
+                self.connection.lose_power(self.deaf);
             }
             Delivery::Disconnect(time) => self.disconnect(now, time),
-            Delivery::BusOff => self.seat.bus_off(),
+            Delivery::BusOff => self.connection.bus_off(),
             _ => {}
         }
         drop(controller);
@@ -238,7 +238,7 @@ impl<C: CanController> Arm<C> {
 
     /// The interface goes down; where it cannot, the arm neither hears nor sends.
     fn disconnect(&mut self, now: Mono, time: Duration) {
-        if !self.seat.go_down(now, time) {
+        if !self.connection.go_down(now, time) {
             self.deaf = now.after(time.max(CUT));
         }
     }
@@ -246,15 +246,15 @@ impl<C: CanController> Arm<C> {
     /// Does what has arrived.
     fn listen(&mut self, now: Mono) {
         self.frames.clear();
-        self.seat.open(now);
-        while let Some(event) = self.seat.receive(now) {
+        self.connection.open(now);
+        while let Some(event) = self.connection.receive(now) {
             if let CanEvent::Frame(frame) = event
                 && now >= self.deaf
             {
                 if !std::mem::replace(&mut self.heard, true) {
-                    diary::note(Happening::Came);
+                    events::note(SimEvent::Connected);
                 }
-                self.shared.controller().hear(&frame, now, &mut self.frames);
+                self.shared.controller().on_frame(&frame, now, &mut self.frames);
             }
         }
         self.send();
@@ -265,7 +265,7 @@ impl<C: CanController> Arm<C> {
         if self.silent {
             self.frames.clear();
         }
-        let sent = self.seat.send(&self.frames);
+        let sent = self.connection.send(&self.frames);
         self.shared.sent.fetch_add(sent as u64, Relaxed);
         self.shared.not_taken.fetch_add((self.frames.len() - sent) as u64, Relaxed);
         self.frames.clear();

@@ -6,8 +6,8 @@ use std::time::Duration;
 use schemars::{JsonSchema, SchemaGenerator};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use super::diary::{self, Happening};
-use crate::hardware::fit::Misfit;
+use super::events::{self, SimEvent};
+use crate::hardware::check::ConfigError;
 
 /// What goes wrong. Not every simulated arm can play every kind; each names those it can.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -195,20 +195,20 @@ pub struct FaultScript {
 #[derive(Debug, Clone)]
 struct Entry {
     fault: Fault,
-    struck: u32,
-    /// Whether the diary has it.
+    played: u32,
+    /// Whether its event was recorded.
     noted: Cell<bool>,
 }
 
 impl Entry {
     fn new(fault: Fault) -> Self {
-        Self { fault, struck: 0, noted: Cell::new(false) }
+        Self { fault, played: 0, noted: Cell::new(false) }
     }
 
     fn over(&self, now: f64) -> bool {
         let fault = &self.fault;
         let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
-        (limit > 0 && self.struck >= limit) || fault.over(now)
+        (limit > 0 && self.played >= limit) || fault.over(now)
     }
 
     fn is(&self, kind: FaultKind, now: f64) -> bool {
@@ -217,7 +217,7 @@ impl Entry {
 
     fn note(&self) {
         if !self.noted.replace(true) {
-            diary::note(Happening::Struck(self.fault.kind));
+            events::note(SimEvent::Fault(self.fault.kind));
         }
     }
 }
@@ -243,7 +243,7 @@ impl FaultScript {
     /// The same, for a fault that `wanted` accepts; others stay.
     pub fn take_if(&mut self, kind: FaultKind, now: f64, wanted: impl Fn(&Fault) -> bool) -> Option<Fault> {
         let entry = self.entries.iter_mut().find(|entry| entry.is(kind, now) && wanted(&entry.fault))?;
-        entry.struck += 1;
+        entry.played += 1;
         entry.note();
         Some(entry.fault)
     }
@@ -259,17 +259,17 @@ impl FaultScript {
 }
 
 /// Refuses a script with kinds that the simulated arm `name` cannot play. The option is that of `faults`.
-pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), Misfit> {
+pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), ConfigError> {
     let unknown = faults.iter().enumerate().find(|(_, fault)| !playable.contains(&fault.kind));
     let Some((index, fault)) = unknown else { return Ok(()) };
     let known: Vec<String> = playable.iter().map(|kind| format!("{:?}", kind.name())).collect();
     let what = format!("{name} cannot play the fault {:?}; it can play {}", fault.kind.name(), known.join(", "));
-    Err(Misfit::new(format!("faults.{index}.kind"), what))
+    Err(ConfigError::new(format!("faults.{index}.kind"), what))
 }
 
 /// Refuses a fault that the simulated arm `name` cannot play.
 pub fn check_kind(name: &str, fault: &Fault, playable: &[FaultKind]) -> Result<(), String> {
-    check_script(name, std::slice::from_ref(fault), playable).map_err(|misfit| misfit.what)
+    check_script(name, std::slice::from_ref(fault), playable).map_err(|error| error.what)
 }
 
 #[cfg(test)]
@@ -277,7 +277,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fault_without_count_or_duration_strikes_once() {
+    fn a_fault_without_count_or_duration_is_played_once() {
         let mut script = FaultScript::new(&[Fault::new(FaultKind::ReadError).at(1.0)]);
         assert_eq!(script.take(FaultKind::ReadError, 0.9), None);
         assert_eq!(script.take(FaultKind::WriteError, 1.0), None);
@@ -292,7 +292,7 @@ mod tests {
         assert!(script.take(FaultKind::Nan, 1.0).is_some());
         assert!(!script.lasts(FaultKind::Nan, 0.9) && script.lasts(FaultKind::Nan, 1.0));
         assert!(script.take(FaultKind::Nan, 2.0).is_some());
-        assert!(script.take(FaultKind::Nan, 2.5).is_none(), "struck twice already");
+        assert!(script.take(FaultKind::Nan, 2.5).is_none(), "played twice already");
         assert!((0..100).all(|_| script.take(FaultKind::Silent, 0.4).is_some()), "no count: any number of times");
         assert!(script.take(FaultKind::Silent, 0.5).is_none(), "its duration is over");
     }

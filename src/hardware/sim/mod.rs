@@ -13,7 +13,7 @@
 //! | [`serial_server`] | a pseudo-terminal; requests as over TCP ([`stream`]) |
 //! | [`can_server`] | a bus in memory, a CAN interface, or a serial CAN adapter; the arm sends by itself |
 //! | [`trace`] | what came over the wire, for tests |
-//! | [`diary`] | clients and faults, as `dimos adapter emulate` shows them |
+//! | [`events`] | clients and faults, as `dimos adapter emulate` shows them |
 //!
 //! A device model implements [`HasArm`](arm::HasArm) and either [`stream::Controller`] or
 //! [`CanController`](can_server::CanController); the server then is the [`Emulator`](super::registry::Emulator). Time
@@ -22,11 +22,11 @@
 //! lines) are larger examples.
 
 pub mod arm;
-mod can_seat;
+mod can_connection;
 pub mod can_server;
 pub mod delay;
 pub mod delivery;
-pub mod diary;
+pub mod events;
 pub mod faults;
 pub mod gripper;
 pub mod options;
@@ -35,6 +35,6 @@ mod plant_joint;
 pub mod reach;
 pub mod serial_server;
 pub mod stream;
-mod tcp_listen;
+mod tcp_listener;
 pub mod tcp_server;
 pub mod trace;

@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::faults::{Fault, FaultKind, check_script};
-use crate::hardware::fit::Misfit;
+use crate::hardware::check::ConfigError;
 use crate::joint::JointLimits;
 
 /// Default of [`SimOptions::lag`] [s].
@@ -47,7 +47,7 @@ impl SimOptions {
 
     /// Refuses a pose outside `limits`, figures that no emulator has, and faults that are not among `playable`. `name`
     /// is the arm's.
-    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), Misfit> {
+    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), ConfigError> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))
             .and_then(|()| within("lag", self.lag, MAX_LAG, "s"))
@@ -57,26 +57,26 @@ impl SimOptions {
 }
 
 /// Refuses `initial_positions` [rad] that are neither empty nor a pose within `limits`.
-pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), Misfit> {
+pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), ConfigError> {
     let (dof, given) = (limits.position_lower.len(), positions.len());
     let needed = format!("initial_positions must be {dof} angles [rad] within the joint limits");
     if given != 0 && given != dof {
-        return Err(Misfit::new("initial_positions", format!("{needed}, not {given}")));
+        return Err(ConfigError::new("initial_positions", format!("{needed}, not {given}")));
     }
     let mut range = limits.position_lower.iter().zip(&limits.position_upper).zip(positions).enumerate();
     match range.find(|(_, ((lower, upper), value))| !(**lower..=**upper).contains(value)) {
         None => Ok(()),
         Some((joint, ((lower, upper), value))) => {
             let what = format!("{needed}: joint {} goes from {lower:.4} to {upper:.4}, not to {value}", joint + 1);
-            Err(Misfit::new(format!("initial_positions.{joint}"), what))
+            Err(ConfigError::new(format!("initial_positions.{joint}"), what))
         }
     }
 }
 
-fn within(name: &str, value: f64, most: f64, unit: &str) -> Result<(), Misfit> {
+fn within(name: &str, value: f64, most: f64, unit: &str) -> Result<(), ConfigError> {
     if (0.0..=most).contains(&value) {
         Ok(())
     } else {
-        Err(Misfit::new(name, format!("{name} must be 0 to {most} {unit}, not {value} {unit}")))
+        Err(ConfigError::new(name, format!("{name} must be 0 to {most} {unit}, not {value} {unit}")))
     }
 }

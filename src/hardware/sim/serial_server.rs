@@ -6,12 +6,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::arm::HasArm;
-use super::diary::{self, Happening};
+use super::events::{self, SimEvent};
 use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared};
 use crate::clock::Mono;
-use crate::hardware::registry::{Emulator, Place};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::registry::{Emulator, EmulatorAddress};
 use crate::hardware::transport::serial::Pty;
 use crate::joint::Joints;
 use crate::rt::host;
@@ -31,8 +31,8 @@ pub struct SerialServer<C: Controller> {
 
 impl<C: Controller> SerialServer<C> {
     /// A controller at `place`. `name` is the arm's, for messages.
-    pub fn start(name: &str, controller: C, place: &Place) -> AdapterResult<Self> {
-        if !matches!(place, Place::InProcess | Place::Pty) {
+    pub fn start(name: &str, controller: C, place: &EmulatorAddress) -> AdapterResult<Self> {
+        if !matches!(place, EmulatorAddress::InProcess | EmulatorAddress::Pty) {
             let what = format!("{name} has a serial line: its emulator is on a pseudo-terminal (--pty)");
             return Err(AdapterError::Rejected(what));
         }
@@ -115,7 +115,7 @@ impl<C: Controller> Read for Line<'_, C> {
                 Ok(0) => {}
                 Ok(n) => {
                     if !std::mem::replace(&mut self.heard, true) {
-                        diary::note(Happening::Came);
+                        events::note(SimEvent::Connected);
                     }
                     return Ok(n);
                 }

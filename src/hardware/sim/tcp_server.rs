@@ -16,13 +16,13 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::arm::HasArm;
-use super::diary::{self, Happening};
+use super::events::{self, SimEvent};
 use super::faults::Fault;
 use super::stream::{Controller, Ending, Line, Shared};
-use super::tcp_listen::Floor;
+use super::tcp_listener::Floor;
 use crate::clock::Mono;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::Emulator;
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
@@ -154,12 +154,12 @@ impl<C: Controller> Inner<C> {
         self.shared.wait(|line| line.stalled_until);
         let Some(number) = self.take_seat(&stream) else {
             self.refused.fetch_add(1, Ordering::Relaxed);
-            diary::note(Happening::TurnedAway);
+            events::note(SimEvent::Rejected);
             return self.turn_away(stream);
         };
-        diary::note(Happening::Came);
+        events::note(SimEvent::Connected);
         let ending = self.shared.serve(port, &mut stream);
-        diary::note(Happening::Gone);
+        events::note(SimEvent::Disconnected);
         if let Ending::Cut(dark) = ending {
             self.cut(dark);
         }

@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// Most bytes that may wait for the rest of their frame.
 pub(super) const BUFFER: usize = 4096;

@@ -2,9 +2,9 @@
 
 pub mod can;
 pub mod device_time;
-pub mod dialogue;
 mod incoming;
 pub mod pty;
+pub mod request_reply;
 pub mod serial;
 pub mod tcp;
 

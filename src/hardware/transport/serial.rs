@@ -17,7 +17,7 @@ use rustix::termios::{
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
 pub use super::pty::Pty;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// How far the hardware may be off the wanted rate [%]; a character of 10 bits bears about twice that.
 const RATE_TOLERANCE: u32 = 2;

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// A peer that acknowledges nothing for this long is gone [ms].
 const USER_TIMEOUT_MS: u32 = 1000;

@@ -12,18 +12,18 @@
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
+use super::feedback::{Counts, Feedback, STANDSTILL};
 use super::hold;
-use super::picture::{Counts, Picture, STANDSTILL};
 use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
-use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit};
+use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::can::CanAddress;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
@@ -54,7 +54,7 @@ impl PiperAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let options: Options = config.options()?;
         let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
@@ -63,7 +63,7 @@ impl PiperAdapter {
 
     /// What was counted since the connection was made: frames of the arm, and of the bus.
     pub fn counts(&self) -> (Counts, WireCounts) {
-        (self.arm.picture.counts, self.arm.wire.as_ref().map(|wire| wire.counts).unwrap_or_default())
+        (self.arm.feedback.counts, self.arm.wire.as_ref().map(|wire| wire.counts).unwrap_or_default())
     }
 
     /// Speed of a planned move [%] from a fraction of the top speed.
@@ -86,7 +86,7 @@ impl PiperAdapter {
     /// Velocities [rad/s]; `None` when a motor has not told its own lately.
     fn velocities(&self) -> Option<Joints> {
         let known = self.arm.measures();
-        known.then(|| joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI)))
+        known.then(|| joints_of(&self.arm.feedback.motors.map(|motor| f64::from(motor.speed) * MILLI)))
     }
 
     /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which
@@ -95,9 +95,9 @@ impl PiperAdapter {
         if !self.arm.measures() {
             return None;
         }
-        let quarter = self.arm.picture.firmware()? <= QUARTER_CURRENT;
+        let quarter = self.arm.feedback.firmware()? <= QUARTER_CURRENT;
         let mut efforts = [0.0; DOF];
-        let motors = self.arm.picture.motors.iter().zip(TORQUE).enumerate();
+        let motors = self.arm.feedback.motors.iter().zip(TORQUE).enumerate();
         for (effort, (joint, (motor, torque))) in efforts.iter_mut().zip(motors) {
             let scale = if quarter && joint < 3 { 4.0 } else { 1.0 };
             *effort = f64::from(motor.current) * MILLI * torque * scale;
@@ -137,7 +137,7 @@ impl ManipulatorAdapter for PiperAdapter {
             vendor: "AgileX".into(),
             model: "Piper".into(),
             dof: DOF,
-            firmware_version: self.arm.picture.firmware().map(|(a, b, c)| format!("S-V{a}.{b}-{c}")),
+            firmware_version: self.arm.feedback.firmware().map(|(a, b, c)| format!("S-V{a}.{b}-{c}")),
             serial_number: None,
             native_rate: NATIVE_RATE,
             modes: MODES,
@@ -172,7 +172,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     /// The ordered mode, or another one when somebody else has changed it.
     fn get_control_mode(&self) -> ControlMode {
-        self.arm.picture.guard.change.map_or(self.mode, |change| change.mode(self.mode))
+        self.arm.feedback.guard.change.map_or(self.mode, |change| change.mode(self.mode))
     }
 
     // --- State ---
@@ -183,7 +183,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
         self.arm.whole()?;
-        fill(positions, &self.arm.picture.joints.map(radians));
+        fill(positions, &self.arm.feedback.joints.map(radians));
         Ok(())
     }
 
@@ -204,8 +204,8 @@ impl ManipulatorAdapter for PiperAdapter {
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         self.arm.whole()?;
         *reading = JointReading {
-            stamp: Some(self.arm.picture.joints_at),
-            position: joints_of(&self.arm.picture.joints.map(radians)),
+            stamp: Some(self.arm.feedback.joints_at),
+            position: joints_of(&self.arm.feedback.joints.map(radians)),
             velocity: self.velocities(),
             effort: self.efforts(),
             valid: self.arm.valid(),
@@ -220,13 +220,13 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
-        let picture = self.arm.known()?;
-        Ok((picture.error_code(), picture.error_text())) // an empty text allocates nothing
+        let feedback = self.arm.known()?;
+        Ok((feedback.error_code(), feedback.error_text())) // an empty text allocates nothing
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
-        let picture = self.arm.known()?;
-        Ok(picture.enabled() && !picture.guard.just_off(MonotonicClock.now()))
+        let feedback = self.arm.known()?;
+        Ok(feedback.enabled() && !feedback.guard.just_off(MonotonicClock.now()))
     }
 
     // --- Motion ---
@@ -247,7 +247,7 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(AdapterError::Busy);
         }
         let mut joints: WireJoints = positions.map(millidegrees);
-        let here = self.arm.picture.joints.iter().zip(&self.arm.ranges);
+        let here = self.arm.feedback.joints.iter().zip(&self.arm.ranges);
         for (target, (here, range)) in joints.iter_mut().zip(here) {
             *target = hold::within(*target, *here, *range, self.arm.strict);
         }
@@ -261,20 +261,20 @@ impl ManipulatorAdapter for PiperAdapter {
     /// that every joint gets slower or stands.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
-        if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
+        if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
             // Where the arm is now: not where it was before a pause of its feedback. One that stays silent is held
             // there.
-            self.arm.watch(LIVE_TIMEOUT, Picture::is_live)?;
+            self.arm.watch(LIVE_TIMEOUT, Feedback::is_live)?;
             self.arm.settle()?;
         }
-        let before = self.arm.picture.motors.map(|motor| i32::from(motor.speed).abs());
-        if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
+        let before = self.arm.feedback.motors.map(|motor| i32::from(motor.speed).abs());
+        if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
             self.arm.hold(self.follow())?;
         }
         let sent = MonotonicClock.now();
-        let slower = |picture: &Picture| {
-            let speeds = picture.motors.iter().map(|motor| i32::from(motor.speed).abs());
-            picture.motors_heard(sent)
+        let slower = |feedback: &Feedback| {
+            let speeds = feedback.motors.iter().map(|motor| i32::from(motor.speed).abs());
+            feedback.motors_heard(sent)
                 && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
         };
         Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
@@ -290,7 +290,7 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.refresh()?;
         self.arm.in_order()?;
         self.arm.plausible()?;
-        let were_on = self.arm.picture.enabled();
+        let were_on = self.arm.feedback.enabled();
         self.arm.release();
         self.arm.written = self.arm.written.filter(|_| were_on);
         self.arm.take_up_hold(self.follow())?;
@@ -303,24 +303,25 @@ impl ManipulatorAdapter for PiperAdapter {
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.arm.refresh()?;
-        if self.arm.picture.status.arm == ESTOP {
+        if self.arm.feedback.status.arm == ESTOP {
             return self.arm.in_order();
         }
         self.arm.learn();
         self.arm.send(&[protocol::clear_errors()])?;
-        if let Some(gripper) = self.arm.picture.gripper.filter(|_| self.arm.picture.gripper_errors().next().is_some()) {
+        if let Some(gripper) = self.arm.feedback.gripper.filter(|_| self.arm.feedback.gripper_errors().next().is_some())
+        {
             let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
             self.arm.send(&[frame])?;
         }
         let asked = MonotonicClock.now();
-        let cleared = |p: &Picture| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
+        let cleared = |p: &Feedback| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
         if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
-            if matches!(self.arm.picture.status.control, 0 | 1) {
+            if matches!(self.arm.feedback.status.control, 0 | 1) {
                 self.arm.release();
             }
             return Ok(());
         }
-        let (code, text) = (self.arm.picture.error_code(), self.arm.picture.error_text());
+        let (code, text) = (self.arm.feedback.error_code(), self.arm.feedback.error_text());
         Err(AdapterError::Fault { code, text })
     }
 
@@ -349,7 +350,7 @@ impl ManipulatorAdapter for PiperAdapter {
         let ([x, y, z], [roll, pitch, yaw]) =
             (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
         (self.arm.written, self.arm.control) = (None, None);
-        self.arm.picture.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
+        self.arm.feedback.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
         self.arm.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
     }
 

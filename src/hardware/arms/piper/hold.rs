@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::protocol::{self, DOF, Follow, MoveMode, Status, WireJoints, millidegrees};
 use super::session::Session;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 
 /// Farthest that a hold may be from the measured position [rad].
 const WINDOW: f64 = 0.02;
@@ -76,8 +76,8 @@ impl Session {
     /// positions measured before the pause would pull the arm back.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
         let target = match self.written() {
-            Some(written) if self.streamed && !self.picture.is_live() => written,
-            written => target(&self.picture.joints, written.as_ref(), &self.ranges, self.strict),
+            Some(written) if self.streamed && !self.feedback.is_live() => written,
+            written => target(&self.feedback.joints, written.as_ref(), &self.ranges, self.strict),
         };
         self.write(100, follow, target)
     }
@@ -85,36 +85,36 @@ impl Session {
     /// Waits until no measured positions contradict the believed ones, where that decides what is held: not where the
     /// arm is close to what was written. `false`: they do not agree.
     pub fn settle(&mut self) -> AdapterResult<bool> {
-        let (believed, written) = (&self.picture.joints, self.written());
+        let (believed, written) = (&self.feedback.joints, self.written());
         let near = |(here, written): (&i32, &i32)| (written - here).abs() <= millidegrees(WINDOW);
         if written.is_some_and(|written| believed.iter().zip(&written).all(near)) {
             return Ok(true);
         }
-        self.watch(SETTLE_TIMEOUT, |picture| !picture.disputed(MonotonicClock.now()))
+        self.watch(SETTLE_TIMEOUT, |feedback| !feedback.disputed(MonotonicClock.now()))
     }
 
     /// The hold before the motors come on. Where the arm lies a little outside its limits, that is the target, if the
     /// controller takes it; otherwise the limit is.
     pub fn take_up_hold(&mut self, follow: Follow) -> AdapterResult<()> {
         loop {
-            if let (true, Some((joint, by))) = (self.strict, too_far_outside(&self.picture.joints, &self.ranges)) {
+            if let (true, Some((joint, by))) = (self.strict, too_far_outside(&self.feedback.joints, &self.ranges)) {
                 return Err(self.refuse(format!(
                     "joint {joint} lies {by:.3} rad outside its limits, and the controller takes no target there: not \
                      enabled\nhint: move it back by hand"
                 )));
             }
             self.hold(follow)?;
-            if self.strict || !outside(&self.picture.joints, &self.ranges) {
+            if self.strict || !outside(&self.feedback.joints, &self.ranges) {
                 return Ok(());
             }
             let sent = MonotonicClock.now();
-            if !self.watch(REFUSAL_TIMEOUT, |picture| picture.status_at > sent && picture.status.arm == BEYOND)? {
+            if !self.watch(REFUSAL_TIMEOUT, |feedback| feedback.status_at > sent && feedback.status.arm == BEYOND)? {
                 return Ok(());
             }
             self.strict = true;
             let asked = MonotonicClock.now();
             self.send(&[protocol::clear_errors()])?;
-            self.watch(CLEAR_TIMEOUT, |picture| picture.status_at > asked && picture.status.arm == 0)?;
+            self.watch(CLEAR_TIMEOUT, |feedback| feedback.status_at > asked && feedback.status.arm == 0)?;
             self.in_order()?;
         }
     }
@@ -123,16 +123,16 @@ impl Session {
     pub fn take_control(&mut self) -> AdapterResult<()> {
         let sent = MonotonicClock.now();
         let ours = |status: &Status| (status.control, status.mode, status.teaching) == (1, MoveMode::Joint as u8, 0);
-        self.watch(CONTROL_TIMEOUT, |picture| picture.status_at > sent && ours(&picture.status))?;
+        self.watch(CONTROL_TIMEOUT, |feedback| feedback.status_at > sent && ours(&feedback.status))?;
         self.in_order()?;
-        let status = self.picture.status;
-        self.picture.guard.begin(&status, MonotonicClock.now());
+        let status = self.feedback.status;
+        self.feedback.guard.begin(&status, MonotonicClock.now());
         Ok(())
     }
 
     /// Remembers what an error before its clearing says of the controller.
     pub fn learn(&mut self) {
-        let beyond = self.picture.status.arm == BEYOND;
+        let beyond = self.feedback.status.arm == BEYOND;
         self.strict |= beyond && self.written.is_some_and(|written| outside(&written, &self.ranges));
     }
 }

@@ -95,7 +95,7 @@ pub fn ask_firmware() -> CanFrame {
     frame(0x4AF, [1, 0, 0, 0, 0, 0, 0, 0])
 }
 
-// --- Feedback ---
+// --- FeedbackFrame ---
 
 /// What the controller says of itself (0x2A1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -172,7 +172,7 @@ pub struct MotorLimits {
 
 /// What a frame says. Indices of joints and parts count from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Feedback {
+pub enum FeedbackFrame {
     /// 0x2A1
     Status(Status),
     /// 0x2A2–4, a third of the pose: x y, z roll, pitch yaw [0.001 mm, 0.001°].
@@ -199,31 +199,36 @@ pub enum Feedback {
     Other,
 }
 
-/// What a frame means. Never fails: see [`Feedback::Damaged`] and [`Feedback::Other`].
-pub fn decode(frame: &CanFrame) -> Feedback {
+/// What a frame means. Never fails: see [`FeedbackFrame::Damaged`] and [`FeedbackFrame::Other`].
+pub fn decode(frame: &CanFrame) -> FeedbackFrame {
     let id = frame.id;
     if let 0x151 | 0x155..=0x157 | 0x159 | 0x3A0..=0x3AF = id {
-        return Feedback::Leader;
+        return FeedbackFrame::Leader;
     }
     if let 0x150 | 0x152..=0x154 | 0x158 | 0x15A..=0x15F | 0x470 | 0x471 | 0x474 | 0x475 = id {
-        return Feedback::Command;
+        return FeedbackFrame::Command;
     }
     if id == 0x4AF {
-        return Feedback::Firmware(frame.data, usize::from(frame.len.min(8)));
+        return FeedbackFrame::Firmware(frame.data, usize::from(frame.len.min(8)));
     }
     let [a, b, c, d, e, f, g, h] = frame.data;
     let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
     let from = |first: u16| usize::from(id.wrapping_sub(first));
     let feedback = match id {
-        0x2A1 => {
-            Feedback::Status(Status { control: a, arm: b, mode: c, teaching: d, limits: g & 0x3F, silent: h & 0x3F })
-        }
-        0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
-        0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
-        0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], status: g }),
+        0x2A1 => FeedbackFrame::Status(Status {
+            control: a,
+            arm: b,
+            mode: c,
+            teaching: d,
+            limits: g & 0x3F,
+            silent: h & 0x3F,
+        }),
+        0x2A2..=0x2A4 => FeedbackFrame::Pose(from(0x2A2), two),
+        0x2A5..=0x2A7 => FeedbackFrame::Joints(from(0x2A5), two),
+        0x2A8 => FeedbackFrame::Gripper(Gripper { stroke: two[0], status: g }),
         0x251..=0x256 => {
             let motor = Motor { speed: i16::from_be_bytes([a, b]), current: i16::from_be_bytes([c, d]) };
-            Feedback::Motor(from(0x251), motor)
+            FeedbackFrame::Motor(from(0x251), motor)
         }
         0x261..=0x266 => {
             let driver = Driver {
@@ -232,7 +237,7 @@ pub fn decode(frame: &CanFrame) -> Feedback {
                 motor_temperature: i8::from_be_bytes([e]),
                 status: f,
             };
-            Feedback::Driver(from(0x261), driver)
+            FeedbackFrame::Driver(from(0x261), driver)
         }
         0x473 if (1..=6).contains(&a) => {
             let limits = MotorLimits {
@@ -240,12 +245,12 @@ pub fn decode(frame: &CanFrame) -> Feedback {
                 lower: i16::from_be_bytes([d, e]),
                 speed: u16::from_be_bytes([f, g]),
             };
-            Feedback::Limits(usize::from(a) - 1, limits)
+            FeedbackFrame::Limits(usize::from(a) - 1, limits)
         }
-        0x473 => Feedback::Damaged,
-        _ => return Feedback::Other,
+        0x473 => FeedbackFrame::Damaged,
+        _ => return FeedbackFrame::Other,
     };
-    if frame.len == 8 { feedback } else { Feedback::Damaged }
+    if frame.len == 8 { feedback } else { FeedbackFrame::Damaged }
 }
 
 // --- Angles ---

@@ -3,14 +3,14 @@
 
 use std::time::Duration;
 
+use super::controller_limits;
+use super::feedback::Feedback;
 use super::hold::{self, WireRanges};
 use super::limits;
-use super::own_limits;
-use super::picture::Picture;
 use super::protocol::{self, DOF, Driver, Follow, MoveMode, Status, WireJoints, radians};
 use super::wire::Wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::{CanAddress, CanFrame};
 use crate::joint::JointLimits;
 
@@ -41,7 +41,7 @@ pub struct Session {
     /// The open port, while connected.
     pub wire: Option<Wire>,
     /// What is known of the arm.
-    pub picture: Picture,
+    pub feedback: Feedback,
     /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
     pub written: Option<WireJoints>,
     /// It is a setpoint of a stream: the arm is at most its lag behind it.
@@ -59,13 +59,13 @@ pub struct Session {
 impl Session {
     /// A session with the arm on the bus at `address`. Does not connect.
     pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
-        let picture = Picture::of_arm(gripper_used);
+        let feedback = Feedback::of_arm(gripper_used);
         let ranges = [(0, 0); DOF];
         Self {
             hardware_id,
             address,
             wire: None,
-            picture,
+            feedback,
             written: None,
             streamed: false,
             control: None,
@@ -77,7 +77,7 @@ impl Session {
 
     /// Opens the port and waits for a whole state. Only asks.
     pub fn connect(&mut self) -> AdapterResult<()> {
-        self.picture = Picture::of_arm(self.picture.gripper_used);
+        self.feedback = Feedback::of_arm(self.feedback.gripper_used);
         (self.written, self.control, self.strict) = (None, None, false);
         self.wire = Some(Wire::open(&self.address)?);
         let introduced = self.introduce();
@@ -93,7 +93,7 @@ impl Session {
     pub fn drain(&mut self) -> AdapterResult<()> {
         let wire = self.wire.as_mut().ok_or(AdapterError::NotConnected)?;
         self.drained_at = MonotonicClock.now();
-        let result = wire.drain(&mut self.picture);
+        let result = wire.drain(&mut self.feedback);
         if result.is_err() {
             self.wire = None;
         }
@@ -108,7 +108,7 @@ impl Session {
     /// Sends a joint target, with its control frame, and remembers it.
     pub fn write(&mut self, speed: u8, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         let frames = protocol::joint_targets(speed, follow, target);
-        self.picture.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
+        self.feedback.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
         self.send(&frames)?;
         (self.written, self.control, self.streamed) = (Some(target), Some((speed, follow)), false);
         Ok(())
@@ -118,7 +118,7 @@ impl Session {
     /// that has just changed it would have that undone before it shows.
     pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         const SPEED: u8 = 100;
-        let Status { control, mode, .. } = self.picture.status;
+        let Status { control, mode, .. } = self.feedback.status;
         if self.control != Some((SPEED, follow)) || (control, mode) != (1, MoveMode::Joint as u8) {
             self.write(SPEED, follow, target)?;
             self.streamed = true;
@@ -144,13 +144,13 @@ impl Session {
     }
 
     /// Takes up feedback until `done` says so; `false` when the time is over.
-    pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Picture) -> bool) -> AdapterResult<bool> {
+    pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Feedback) -> bool) -> AdapterResult<bool> {
         let end = MonotonicClock.now().after(timeout);
         loop {
             self.drain()?;
             let left = end.since(MonotonicClock.now());
-            if done(&self.picture) || left.is_zero() {
-                return Ok(done(&self.picture));
+            if done(&self.feedback) || left.is_zero() {
+                return Ok(done(&self.feedback));
             }
             if let Some(wire) = &self.wire {
                 wire.wait(left);
@@ -161,7 +161,7 @@ impl Session {
     /// Takes up what has arrived; an error when the newest positions are too old to act on.
     pub fn refresh(&mut self) -> AdapterResult<()> {
         self.drain()?;
-        let age = MonotonicClock.now().since(self.picture.joints_at);
+        let age = MonotonicClock.now().since(self.feedback.joints_at);
         if age <= SILENCE {
             return Ok(());
         }
@@ -180,10 +180,10 @@ impl Session {
     pub fn whole(&mut self) -> AdapterResult<()> {
         self.refresh()?;
         let earliest = MonotonicClock.now().before(DRIVERS_SILENCE);
-        if self.picture.drivers_heard(earliest) {
+        if self.feedback.drivers_heard(earliest) {
             return Ok(());
         }
-        let (address, silent) = (&self.address, self.picture.silent_drivers(earliest));
+        let (address, silent) = (&self.address, self.feedback.silent_drivers(earliest));
         Err(AdapterError::Timeout(format!(
             "piper at {address}: the drivers of joints {silent} have said nothing for {} ms",
             DRIVERS_SILENCE.as_millis()
@@ -192,18 +192,18 @@ impl Session {
 
     /// Whether what is known of the motors' speeds and currents is new enough to be told.
     pub fn measures(&self) -> bool {
-        self.picture.motors_heard(MonotonicClock.now().before(SILENCE))
+        self.feedback.motors_heard(MonotonicClock.now().before(SILENCE))
     }
 
-    /// The picture, for reads that mostly follow one of the joints and then answer from memory.
-    pub fn known(&mut self) -> AdapterResult<&Picture> {
+    /// The feedback, for reads that mostly follow one of the joints and then answer from memory.
+    pub fn known(&mut self) -> AdapterResult<&Feedback> {
         if self.wire.is_none() {
             return Err(AdapterError::NotConnected);
         }
         if MonotonicClock.now().since(self.drained_at) > RECENT {
             self.drain()?;
         }
-        Ok(&self.picture)
+        Ok(&self.feedback)
     }
 
     /// Waits for a whole state, then for what was asked.
@@ -211,10 +211,10 @@ impl Session {
         let mut questions = [protocol::ask_firmware(); DOF + 1];
         questions.iter_mut().zip(1..).take(DOF).for_each(|(frame, joint)| *frame = protocol::ask_limits(joint));
         self.send(&questions)?;
-        if !self.watch(CONNECT_TIMEOUT, Picture::complete)? {
+        if !self.watch(CONNECT_TIMEOUT, Feedback::complete)? {
             return Err(self.why_not());
         }
-        let answered = |p: &Picture| p.firmware().is_some() && p.limits.iter().all(Option::is_some);
+        let answered = |p: &Feedback| p.firmware().is_some() && p.limits.iter().all(Option::is_some);
         if !self.watch(ANSWER_TIMEOUT / 2, answered)? {
             self.send(&questions)?;
             self.watch(ANSWER_TIMEOUT / 2, answered)?; // what stays unanswered is known from the data sheet
@@ -226,13 +226,13 @@ impl Session {
 
     /// The data sheet's limits, narrowed by those that the controller has been given; and what of these is odd.
     pub fn limits(&self) -> (JointLimits, Vec<String>) {
-        own_limits::narrowed(&self.picture.limits)
+        controller_limits::narrowed(&self.feedback.limits)
     }
 
     /// Why there is no whole state.
     fn why_not(&self) -> AdapterError {
-        let (address, counts) = (&self.address, self.picture.counts);
-        if self.picture.joints_at != Mono::ZERO {
+        let (address, counts) = (&self.address, self.feedback.counts);
+        if self.feedback.joints_at != Mono::ZERO {
             return AdapterError::Timeout(format!("piper at {address}: some of its motors send no state"));
         }
         if counts.leader > 0 {
@@ -259,10 +259,10 @@ impl Session {
     pub fn valid(&self) -> Option<bool> {
         let silent =
             |driver: &Driver| (driver.voltage, driver.driver_temperature, driver.motor_temperature) == (0, 0, 0);
-        if self.picture.status.silent != 0 || self.picture.drivers.iter().all(silent) {
+        if self.feedback.status.silent != 0 || self.feedback.drivers.iter().all(silent) {
             return Some(false);
         }
-        (self.picture.joints != [0; DOF]).then_some(true)
+        (self.feedback.joints != [0; DOF]).then_some(true)
     }
 
     // --- What may be done ---
@@ -279,10 +279,10 @@ impl Session {
 
     /// An error unless the arm is in order and listens to nobody but us.
     pub fn in_order(&self) -> AdapterResult<()> {
-        let code = self.picture.error_code();
+        let code = self.feedback.error_code();
         if code != 0 {
-            let mut text = self.picture.error_text();
-            if self.picture.status.arm == ESTOP {
+            let mut text = self.feedback.error_text();
+            if self.feedback.status.arm == ESTOP {
                 text.push_str(
                     "\nhint: the arm leaves its E-stop only by a reset that takes the power from its motors: hold it, \
                      then switch it off and on",
@@ -290,13 +290,13 @@ impl Session {
             }
             return Err(AdapterError::Fault { code, text });
         }
-        if MonotonicClock.now().since(self.picture.commanded_at) < SILENCE {
+        if MonotonicClock.now().since(self.feedback.commanded_at) < SILENCE {
             return Err(self.refuse(
                 "somebody else commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
                     .into(),
             ));
         }
-        match self.picture.status.control {
+        match self.feedback.status.control {
             0 | 1 => Ok(()),
             other => Err(self.refuse(format!(
                 "the arm is controlled by {}\nhint: end that at the arm; where it does not let go, hold it and switch \
@@ -308,7 +308,7 @@ impl Session {
 
     /// An error when somebody else has changed the arm's mode or power, which is left as it is.
     pub fn ours(&self) -> AdapterResult<()> {
-        let what = match (self.picture.guard.change, self.picture.guard.lost_power()) {
+        let what = match (self.feedback.guard.change, self.feedback.guard.lost_power()) {
             (Some(change), _) => change.text(),
             (None, true) => "its motors were switched off".to_owned(),
             (None, false) => return Ok(()),
@@ -322,7 +322,7 @@ impl Session {
     pub fn release(&mut self) {
         self.written = self.written();
         self.control = None;
-        self.picture.guard.release();
+        self.feedback.guard.release();
     }
 
     /// What was written, if the arm has followed it since.
@@ -335,7 +335,7 @@ impl Session {
         self.whole()?;
         self.in_order()?;
         self.ours()?;
-        if self.picture.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
+        if self.feedback.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
     }
 
     /// An error when the measured pose cannot be true: holding there would be a jump.
@@ -347,7 +347,7 @@ impl Session {
                     .into(),
             ));
         }
-        if self.picture.only_zeros(MonotonicClock.now()) {
+        if self.feedback.only_zeros(MonotonicClock.now()) {
             return Err(self.refuse(
                 "every joint reads exactly 0, as from a controller that has not measured yet: not enabled\nhint: if \
                  the arm truly lies there, move a joint a little by hand"
@@ -356,7 +356,7 @@ impl Session {
         }
         let limits = limits();
         let range = limits.position_lower.iter().zip(&limits.position_upper);
-        for (i, (wire, (lower, upper))) in self.picture.joints.iter().zip(range).enumerate() {
+        for (i, (wire, (lower, upper))) in self.feedback.joints.iter().zip(range).enumerate() {
             let value = radians(*wire);
             if !(lower - PLAUSIBLE..=upper + PLAUSIBLE).contains(&value) {
                 let joint = i + 1;
@@ -373,7 +373,7 @@ impl Session {
     pub fn switch_motors(&mut self, on: bool) -> AdapterResult<()> {
         let began = MonotonicClock.now();
         let end = began.after(ENABLE_TIMEOUT);
-        let switched = |p: &Picture| p.drivers_heard(began) && if on { p.enabled() } else { p.disabled() };
+        let switched = |p: &Feedback| p.drivers_heard(began) && if on { p.enabled() } else { p.disabled() };
         let mut sent = Ok(());
         while MonotonicClock.now() < end {
             sent = self.send(&[protocol::enable(on)]);
@@ -383,14 +383,14 @@ impl Session {
         }
         sent?;
         let (name, within) = (&self.hardware_id, ENABLE_TIMEOUT.as_millis());
-        let silent = self.picture.silent_drivers(began);
+        let silent = self.feedback.silent_drivers(began);
         if !silent.is_empty() {
             let what = format!("{name}: the drivers of joints {silent} have said nothing for {within} ms");
             return Err(AdapterError::Timeout(what));
         }
         let wrong = |(_, driver): &(usize, &protocol::Driver)| driver.enabled() != on;
         let joints: Vec<String> =
-            (1..).zip(&self.picture.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
+            (1..).zip(&self.feedback.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
         let (joints, word) = (joints.join(", "), if on { "on" } else { "off" });
         Err(AdapterError::Timeout(format!("{name}: the motors of joints {joints} do not go {word} within {within} ms")))
     }

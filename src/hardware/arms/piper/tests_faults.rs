@@ -4,14 +4,14 @@ use std::time::{Duration, Instant};
 
 use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
+use super::feedback::Feedback;
 use super::golden;
-use super::picture::Picture;
 use super::protocol::{DOF, decode};
 use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
 use crate::clock::Mono;
+use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, Stop};
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, ManipulatorAdapter, Stop};
 use crate::hardware::transport::can::{self, CanAddress, CanFrame, CanPort};
 use crate::joint::ControlMode;
 
@@ -364,15 +364,15 @@ fn f18_noise_and_short_frames_cost_nothing_but_readings() {
         });
     }
     // Random frames at the arm's rate: nothing panics, and neither joints nor a pose are made of them.
-    let mut picture = Picture::default();
+    let mut feedback = Feedback::default();
     let mut seed = 0x2545_F491_4F6C_DD1D_u64;
     let mut take = |n: u64, id: Option<u16>| {
         seed ^= seed << 13;
         seed ^= seed >> 7;
         seed ^= seed << 17;
         let (id, len) = id.map_or(((seed >> 48) as u16 & 0x7FF, seed as u8 % 10), |id| (id, 8));
-        picture.take(decode(&CanFrame { id, len, data: seed.to_le_bytes() }), Mono(330_000 * (n + 1)));
-        (picture.joints_at, picture.counts.sets, picture.pose, picture.counts.damaged)
+        feedback.take(decode(&CanFrame { id, len, data: seed.to_le_bytes() }), Mono(330_000 * (n + 1)));
+        (feedback.joints_at, feedback.counts.sets, feedback.pose, feedback.counts.damaged)
     };
     let random = (0..200_000).fold(Default::default(), |_, n| take(n, None));
     assert_eq!((random.0, random.1, random.2), (Mono::ZERO, 0, None));

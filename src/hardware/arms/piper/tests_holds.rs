@@ -8,8 +8,8 @@ use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::protocol::DOF;
 use super::tests::{START, activate, connected, farthest, pair, two, until};
+use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::registry::Emulator;
-use crate::hardware::spec::ManipulatorAdapter;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
 
 /// Farthest that a hold may be from where the arm is [rad].

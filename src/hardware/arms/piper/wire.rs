@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::picture::Picture;
+use super::feedback::Feedback;
 use super::protocol::decode;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
 
 /// What the arm sends, and what it would send if it led other arms (0x15x, 0x3Ax).
@@ -92,19 +92,19 @@ impl Wire {
         ))
     }
 
-    /// Adds all that has arrived to the picture, without waiting.
-    pub fn drain(&mut self, picture: &mut Picture) -> AdapterResult<()> {
+    /// Adds all that has arrived to the feedback, without waiting.
+    pub fn drain(&mut self, feedback: &mut Feedback) -> AdapterResult<()> {
         for _ in 0..BATCH {
             match self.port.receive()? {
                 None => break,
-                Some(CanEvent::Frame(frame)) => picture.take(decode(&frame), MonotonicClock.now()),
-                Some(CanEvent::Trouble(trouble)) => self.suffer(trouble)?,
+                Some(CanEvent::Frame(frame)) => feedback.take(decode(&frame), MonotonicClock.now()),
+                Some(CanEvent::Trouble(trouble)) => self.apply_trouble(trouble)?,
             }
         }
         Ok(())
     }
 
-    fn suffer(&mut self, trouble: CanTrouble) -> AdapterResult<()> {
+    fn apply_trouble(&mut self, trouble: CanTrouble) -> AdapterResult<()> {
         let (what, hint) = match trouble {
             CanTrouble::BusOff => (
                 "the CAN controller has left the bus after too many errors",

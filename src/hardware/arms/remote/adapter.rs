@@ -9,12 +9,12 @@ use std::time::Duration;
 use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
-use super::{MODES, NATIVE_RATE, fit, limits, same_modes};
+use super::{MODES, NATIVE_RATE, check, limits, same_modes};
 use crate::arm::Pose;
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
 /// Longest wait for the motors: a vendor's SDK may take its time.
@@ -37,7 +37,7 @@ impl RemoteAdapter {
     /// An adapter for the peer at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let (mode, assumed_enabled) = (ControlMode::Position, false);
         Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })

@@ -14,7 +14,7 @@ use rustix::net::{
 
 use super::address::Address;
 use super::protocol::MAX_LINE;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// Room for a line and the beginning of the next.
 const BUFFER: usize = 2 * MAX_LINE;

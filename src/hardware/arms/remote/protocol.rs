@@ -9,7 +9,7 @@ use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::arm::Pose;
-use crate::hardware::spec::AdapterError;
+use crate::hardware::adapter::AdapterError;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
 /// The version of the protocol.

@@ -11,7 +11,7 @@ use super::link::Link;
 
 use super::protocol::{self, Act, Command, Description, Measured, Reply};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
 
 /// Longest waits for the connection and for the description: together below 3 s.

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use super::SPEC;
 use super::emulator::wire;
 use super::protocol::{self, Act, Command, Description, Reply, WirePose};
+use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{self, AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::transport::Scan;
 use crate::joint::ControlMode;
 

@@ -9,16 +9,16 @@ use std::time::Duration;
 use super::address::Address;
 use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
-use super::measured::measured;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
+use super::report_validity::measured;
 use super::session::Session;
-use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, fit, model_of};
+use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
 use crate::arm::Pose;
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, joints_of};
 
 /// The controller's modes that the adapter uses.
@@ -54,7 +54,7 @@ impl XArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let options: Options = config.options()?;
         let model = model_of(&options, config.dof)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;

@@ -17,7 +17,7 @@ use super::protocol::report::{Health, Kind, Motion};
 use super::session::{Device, Session};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
 /// Longest time for all of it.

@@ -7,7 +7,7 @@ use std::time::Duration;
 use super::protocol::commands::{Command, QUICK, STOP};
 use super::protocol::frame::{self, Arrived, MAX_REQUEST, PRIVATE, Response, Status};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
 /// Most requests without response.

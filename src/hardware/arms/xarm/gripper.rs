@@ -10,7 +10,7 @@ use super::errors::gripper_text;
 use super::protocol::frame::Response;
 use super::protocol::gripper::{GripperKind, Rtu, decode_error, decode_position};
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// How often the position is asked for, and how often when the gripper does not answer.
 const POLL: Duration = Duration::from_millis(100);

@@ -14,21 +14,21 @@ mod connect;
 mod control;
 pub mod emulator;
 pub mod errors;
-mod foreign;
 #[cfg(test)]
 mod golden;
 mod gripper;
-mod measured;
 mod mode;
 pub mod model;
-mod orders;
+mod other_clients;
 pub mod protocol;
+mod report_validity;
 mod session;
+mod state_commands;
 mod stream;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
-mod tests_foreign;
+mod tests_other_clients;
 #[cfg(test)]
 mod tests_slow;
 
@@ -37,7 +37,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::joint::ControlMode;
 use address::Address;
@@ -77,7 +77,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(adapter::XArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::XArmEmulator::start(config, place)?))),
 };
@@ -114,20 +114,20 @@ impl Default for Options {
 }
 
 /// The model says how many joints there are, and what their limits are.
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options: Options = config.options()?;
     let limits = model_of(&options, config.dof)?.limits();
     options.sim.check(&limits)?;
-    Ok(Fit { limits })
+    Ok(Checked { limits })
 }
 
 /// The model that options and number of joints say; or why they do not go together.
-fn model_of(options: &Options, dof: usize) -> Result<Model, Misfit> {
+fn model_of(options: &Options, dof: usize) -> Result<Model, ConfigError> {
     let model = options.model.or(Model::of_dof(dof));
-    let model = model.ok_or_else(|| Misfit::new("", format!("no xArm has {dof} joints")))?;
+    let model = model.ok_or_else(|| ConfigError::new("", format!("no xArm has {dof} joints")))?;
     match model.axes() {
         axes if axes == dof => Ok(model),
-        axes => Err(Misfit::new("model", format!("{} has {axes} joints, not {dof}", model.name()))
+        axes => Err(ConfigError::new("model", format!("{} has {axes} joints, not {dof}", model.name()))
             .hint(format!("give the arm {axes} joints, or leave `model` out for the xArm with {dof}"))),
     }
 }

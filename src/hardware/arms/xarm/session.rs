@@ -18,7 +18,7 @@ use super::protocol::identity::Firmware;
 use super::protocol::report::{Health, Motion};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
 use crate::joint::JointLimits;
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::address::Address;
 use super::protocol::report::{Kind, scan};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::transport::tcp::TcpLink;
 
 /// A connection on which the controller reports by itself.

@@ -10,10 +10,10 @@ use super::adapter::XArmAdapter;
 use super::emulator::{Withhold, XArmEmulator};
 use super::{MODES_WITHOUT_VELOCITY, SPEC};
 use crate::arm::Pose;
+use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::conformance::{Outcome, Subject, checks, run_on};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
 fn config(address: &str, dof: usize, options: Value) -> AdapterConfig {
@@ -21,7 +21,7 @@ fn config(address: &str, dof: usize, options: Value) -> AdapterConfig {
 }
 
 pub(super) fn pair(dof: usize, options: Value) -> (XArmEmulator, XArmAdapter) {
-    let emulator = XArmEmulator::start(&config("", dof, options.clone()), &Place::InProcess).unwrap();
+    let emulator = XArmEmulator::start(&config("", dof, options.clone()), &EmulatorAddress::InProcess).unwrap();
     let adapter = XArmAdapter::new(&config(&emulator.address(), dof, options)).unwrap();
     (emulator, adapter)
 }

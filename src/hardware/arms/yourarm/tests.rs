@@ -7,9 +7,9 @@ use super::emulator::{SimOptions, YourArmEmulator};
 use super::{SPEC, protocol::DOF};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
 const START: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
@@ -295,5 +295,5 @@ fn wrong_configurations_are_refused() {
         assert!(error.contains(part), "{error}");
     }
     let sim = serde_json::json!({"sim": {"initial_positions": [0, 0, 0, 0, 0, 9]}});
-    assert!(YourArmEmulator::start(&config("sim", 6, sim), &Place::InProcess).is_err());
+    assert!(YourArmEmulator::start(&config("sim", 6, sim), &EmulatorAddress::InProcess).is_err());
 }

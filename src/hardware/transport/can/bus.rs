@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 use super::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 

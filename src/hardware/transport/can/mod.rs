@@ -15,7 +15,7 @@ pub mod socket;
 
 use std::os::fd::BorrowedFd;
 
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 pub use address::CanAddress;
 pub use bus::Bus;
 pub use slcan_pty::SlcanPty;
@@ -149,7 +149,7 @@ fn open_interface(device: &str, name: &str, filters: &[CanFilter]) -> AdapterRes
 
 #[cfg(not(all(feature = "can", target_os = "linux")))]
 fn open_interface(device: &str, name: &str, _filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
-    Err(crate::hardware::spec::AdapterError::Io(format!(
+    Err(crate::hardware::adapter::AdapterError::Io(format!(
         "cannot open CAN interface {name} for {device}: this build has no CAN\nhint: build with --features can, on Linux"
     )))
 }

@@ -14,7 +14,7 @@ use rustix::termios::{QueueSelector, tcflush};
 
 use super::address::SLCAN_RATES;
 use super::{CanEvent, CanFilter, CanFrame, CanPort};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::incoming::{Incoming, Scan};
 use crate::hardware::transport::serial::{broken, open_line, read_line, wait};
 

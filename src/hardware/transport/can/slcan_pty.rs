@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use super::slcan::{Lines, decode};
 use super::{CanAddress, CanEvent, CanFrame, CanPort};
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::transport::pty::Pty;
 
 /// The adapter, and at once the port of the arm behind it: what clients send is received here.
@@ -50,7 +50,7 @@ impl SlcanPty {
     }
 
     /// Does as the client says; `false` where it cannot be done.
-    fn obey(&mut self, command: u8, argument: Option<u8>) -> bool {
+    fn execute(&mut self, command: u8, argument: Option<u8>) -> bool {
         match (command, argument) {
             (b'C', None) => self.channel_open = false,
             // A rate is set on a closed channel only.
@@ -82,7 +82,7 @@ impl CanPort for SlcanPty {
                     self.line.put(b"z\r")?;
                     return Ok(Some(CanEvent::Frame(frame)));
                 }
-                Said::Command(command, argument) if self.obey(command, argument) => b"\r",
+                Said::Command(command, argument) if self.execute(command, argument) => b"\r",
                 _ => b"\x07",
             };
             self.line.put(reply)?;

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::super::slcan::{encode, open};
 use super::*;
-use crate::hardware::spec::AdapterError;
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::transport::can::CanFilter;
 
 const WAIT: Duration = Duration::from_secs(10);

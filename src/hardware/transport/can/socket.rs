@@ -22,7 +22,7 @@ use socketcan::{CanDataFrame, CanSocket, EmbeddedFrame, Socket, SocketOptions, S
 
 use super::in_flight::InFlight;
 use super::{CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// About how many frames of one socket may wait in the kernel to be sent.
 pub const SEND_QUEUE: usize = 16;

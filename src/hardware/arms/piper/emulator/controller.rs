@@ -12,13 +12,13 @@ use super::kinematics::Links;
 use super::wire::{self, Request};
 use super::{SimOptions, stops};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
 use crate::hardware::sim::can_server::CanController;
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::reach::{self, Chain};
 use crate::hardware::sim::trace::Trace;
-use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::{CanFilter, CanFrame};
 use crate::joint::Joints;
 
@@ -259,7 +259,7 @@ impl Controller {
 }
 
 impl CanController for Controller {
-    fn hear(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
+    fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
         self.advance(now);
         self.arm.client_came();
         self.trace.push(|| (now, *frame));

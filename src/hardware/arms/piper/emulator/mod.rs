@@ -19,12 +19,12 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::{GripperKind, NATIVE_RATE, Options, limits};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::fit::Misfit;
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::AdapterResult;
+use crate::hardware::check::ConfigError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm::{self, HasArm};
 use crate::hardware::sim::can_server::{CanController, CanServer};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
@@ -88,11 +88,11 @@ impl Default for SimOptions {
 
 impl SimOptions {
     /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
-    pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), Misfit> {
+    pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), ConfigError> {
         self.common().check("piper", &stops(), playable)?;
         match self.firmware.len() {
             8 => Ok(()),
-            _ => Err(Misfit::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
+            _ => Err(ConfigError::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
         }
     }
 
@@ -128,14 +128,15 @@ pub struct PiperEmulator {
 
 impl PiperEmulator {
     /// Starts an emulator at `place`, with the adapter's options.
-    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+    pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         let options = config.options::<Options>()?;
         Self::with(&options.sim, options.gripper, place)
     }
 
     /// Starts an emulator at `place`.
-    pub fn with(options: &SimOptions, gripper: GripperKind, place: &Place) -> AdapterResult<Self> {
-        let playable = if *place == Place::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
+    pub fn with(options: &SimOptions, gripper: GripperKind, place: &EmulatorAddress) -> AdapterResult<Self> {
+        let playable =
+            if *place == EmulatorAddress::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
         options.check(playable)?;
         let controller = Controller::new(options, gripper, playable, MonotonicClock.now())?;
         let period = Duration::from_secs_f64(1.0 / options.feedback_hz);
@@ -159,8 +160,8 @@ impl PiperEmulator {
 
     /// Does as a frame says that a program sends which other programs on this computer do not hear, as the vendor's SDK
     /// does (it switches local loopback off).
-    pub fn obey_unheard(&self, frame: &CanFrame) {
-        self.server.with(|controller, now| controller.hear(frame, now, &mut Vec::new()));
+    pub fn execute_unheard(&self, frame: &CanFrame) {
+        self.server.with(|controller, now| controller.on_frame(frame, now, &mut Vec::new()));
     }
 
     /// How often a client has let the motors lose their power by a reset (0x150).

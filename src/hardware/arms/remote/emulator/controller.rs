@@ -5,11 +5,11 @@ use serde_json::{Map, Value, json};
 use super::wire::{self, Command, Request};
 use super::{PLAYABLE, SILENCE_TIMEOUT};
 use crate::clock::Mono;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::sim::arm::{Delivery, ESTOP, HasArm, Measured, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::stream;
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, JointLimits, Joints};
 

@@ -12,10 +12,10 @@ use super::kinematics::Links;
 use super::tool::Tool;
 use super::{PLAYABLE, SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{HasArm, SimArm};
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::trace::Trace;
-use crate::hardware::spec::AdapterResult;
 use crate::joint::Joints;
 
 /// Acceleration of the emulated joints [rad/s²]: a real arm does less than its limit.

@@ -9,7 +9,7 @@ use super::mode::{ModeChange, Next};
 use super::protocol::commands::{Command, STOP};
 use super::session::{Ready, Session};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult, Stop};
+use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
 
 /// How long one call may work on a change of mode. It goes on with the next call.
 const MODE_SLICE: Duration = Duration::from_millis(15);

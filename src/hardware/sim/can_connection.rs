@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use super::arm::Delivery;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::Place;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::registry::EmulatorAddress;
 use crate::hardware::transport::can::bus::{Bus, SEND_QUEUE};
 use crate::hardware::transport::can::slcan_pty::SlcanPty;
 use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
@@ -24,7 +24,7 @@ const COMMAND: usize = 4;
 const REOPEN: Duration = Duration::from_millis(50);
 
 /// The arm's connection to its bus.
-pub(super) struct Seat {
+pub(super) struct CanConnection {
     kind: Kind,
     port: Option<Box<dyn CanPort>>,
     /// The other nodes have no power until then; the interface is down until then, or not opened before.
@@ -43,27 +43,31 @@ enum Kind {
     Serial,
 }
 
-impl Seat {
+impl CanConnection {
     /// Connects the arm `name` at `place`, and says where adapters find the bus.
-    pub fn take(name: &str, place: &Place, filters: &'static [CanFilter]) -> AdapterResult<(Self, CanAddress)> {
+    pub fn take(
+        name: &str,
+        place: &EmulatorAddress,
+        filters: &'static [CanFilter],
+    ) -> AdapterResult<(Self, CanAddress)> {
         let (kind, port, address): (_, Box<dyn CanPort>, _) = match place {
-            Place::InProcess => {
+            EmulatorAddress::InProcess => {
                 let bus = Bus::new();
                 let (port, address) = (bus.attach()?, bus.address());
                 (Kind::Memory(bus), Box::new(port), address)
             }
-            Place::Can(interface) => {
+            EmulatorAddress::Can(interface) => {
                 let address = CanAddress::parse(interface).map_err(AdapterError::Rejected)?;
                 let device = format!("the {name} emulator");
                 let port = can::open(&device, &address, filters)?;
                 (Kind::Interface { device, address: address.clone(), filters }, port, address)
             }
-            Place::Pty => {
+            EmulatorAddress::Pty => {
                 let pty = SlcanPty::open()?;
                 let address = pty.address();
                 (Kind::Serial, Box::new(pty), address)
             }
-            Place::Bind(_) => {
+            EmulatorAddress::Bind(_) => {
                 let what = "is on a CAN bus: its emulator has an interface or a pseudo-terminal, no IP address";
                 return Err(AdapterError::Rejected(format!("{name} {what}")));
             }

@@ -20,7 +20,7 @@ const DISPUTE: f64 = 0.1;
 
 /// The believed joint positions and what speaks against them.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Belief {
+pub struct JumpFilter {
     /// The believed positions [0.001°].
     pub joints: WireJoints,
     /// When they arrived; `Mono::ZERO`: there are none.
@@ -33,7 +33,7 @@ pub struct Belief {
     undisputed: u32,
 }
 
-impl Belief {
+impl JumpFilter {
     /// Takes a set that arrived at `now`. `true`: it is believed.
     pub fn take(&mut self, joints: WireJoints, now: Mono) -> bool {
         if self.at == Mono::ZERO || reachable(&joints, &self.joints, now.seconds_since(self.at)) {
@@ -76,7 +76,7 @@ mod tests {
 
     #[test]
     fn what_the_arm_cannot_have_reached_is_not_believed() {
-        let mut belief = Belief::default();
+        let mut belief = JumpFilter::default();
         assert!(belief.take([10_000; 6], ms(0)) && belief.take([12_000; 6], ms(5)), "0.035 rad in 5 ms");
         assert!(!belief.disputed(ms(5)));
         assert!(!belief.take([15_000; 6], ms(10)), "0.052 rad in 5 ms");
@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn three_in_a_row_that_agree_are_believed() {
-        let mut belief = Belief::default();
+        let mut belief = JumpFilter::default();
         belief.take([0; 6], ms(0));
         let far = [90_000; 6];
         let took = [far, far, [0; 6], far, [-90_000; 6], far, far, far].map(|joints| belief.take(joints, ms(5)));

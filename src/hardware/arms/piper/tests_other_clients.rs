@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use super::adapter::PiperAdapter;
 use super::golden::frame;
 use super::tests::{START, activate, connected, farthest, read, until};
+use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::registry::Emulator;
-use crate::hardware::spec::ManipulatorAdapter;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
 use crate::joint::ControlMode;
 
@@ -63,7 +63,7 @@ fn interfere(calls: Calls, pause: Duration, heard: bool) {
                 let frames: Vec<CanFrame> = part.iter().map(|text| frame(text)).collect();
                 match heard {
                     true => drop(port.send(&frames).unwrap()),
-                    false => frames.iter().for_each(|frame| emulator.obey_unheard(frame)),
+                    false => frames.iter().for_each(|frame| emulator.execute_unheard(frame)),
                 }
                 if i == 0 {
                     std::thread::sleep(pause);

@@ -1,26 +1,26 @@
 //! Whether an arm's number of joints and its options go together, and what follows from them: all that can be known
-//! without the device. A row answers it with [`AdapterSpec::fit`](super::registry::AdapterSpec); `dimos check` shows a
-//! misfit at its place in the blueprint, and nothing is made of a configuration that does not fit.
+//! without the device. A row answers it with [`AdapterSpec::check`](super::registry::AdapterSpec); `dimos check` shows a
+//! error at its place in the blueprint, and nothing is made of a configuration that does not fit.
 
 use std::fmt;
 
 use serde::de::DeserializeOwned;
 
+use super::adapter::{AdapterError, AdapterResult};
 use super::registry::AdapterConfig;
-use super::spec::{AdapterError, AdapterResult};
 use crate::joint::JointLimits;
 use crate::message::Message;
 
 /// What follows from a configuration that fits.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Fit {
+pub struct Checked {
     /// Nominal joint limits. An arm that is connected may narrow them.
     pub limits: JointLimits,
 }
 
 /// What does not fit, and where. As text it is a sentence without full stop; the hint is not part of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Misfit {
+pub struct ConfigError {
     /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty: the number of joints, or all options.
     pub option: String,
     /// What is wrong with it.
@@ -29,7 +29,7 @@ pub struct Misfit {
     pub hint: Option<String>,
 }
 
-impl Misfit {
+impl ConfigError {
     /// Something that does not fit, at an option.
     pub fn new(option: impl Into<String>, what: impl Into<String>) -> Self {
         Self { option: option.into(), what: what.into(), hint: None }
@@ -48,36 +48,37 @@ impl Misfit {
     }
 }
 
-impl fmt::Display for Misfit {
+impl fmt::Display for ConfigError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.what)
     }
 }
 
-impl From<Misfit> for AdapterError {
-    fn from(misfit: Misfit) -> Self {
-        Self::Rejected(Message { what: misfit.what, hint: misfit.hint }.to_string())
+impl From<ConfigError> for AdapterError {
+    fn from(error: ConfigError) -> Self {
+        Self::Rejected(Message { what: error.what, hint: error.hint }.to_string())
     }
 }
 
 impl AdapterConfig {
     /// The options as the adapter's own type.
-    pub fn options<T: DeserializeOwned>(&self) -> Result<T, Misfit> {
+    pub fn options<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
         let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
-        serde_json::from_value(given).map_err(|e| Misfit::new("", format!("options: {e}")))
+        serde_json::from_value(given).map_err(|e| ConfigError::new("", format!("options: {e}")))
     }
 
     /// Refuses a number of joints that the adapter `name` cannot have.
-    pub fn check_dof(&self, name: &str, (fewest, most): (usize, usize)) -> Result<(), Misfit> {
+    pub fn check_dof(&self, name: &str, (fewest, most): (usize, usize)) -> Result<(), ConfigError> {
         match self.dof {
             dof if (fewest..=most).contains(&dof) => Ok(()),
-            dof if fewest == most => Err(Misfit::new("", format!("{name} has {most} joints, not {dof}"))),
-            dof => Err(Misfit::new("", format!("{name} has {fewest} to {most} joints, not {dof}"))),
+            dof if fewest == most => Err(ConfigError::new("", format!("{name} has {most} joints, not {dof}"))),
+            dof => Err(ConfigError::new("", format!("{name} has {fewest} to {most} joints, not {dof}"))),
         }
     }
 
-    /// Asks whether it fits; a misfit becomes a refusal that names the arm.
-    pub fn fit(&self, fit: fn(&Self) -> Result<Fit, Misfit>) -> AdapterResult<Fit> {
-        fit(self).map_err(|misfit| Misfit { what: format!("{}: {}", self.hardware_id, misfit.what), ..misfit }.into())
+    /// Asks whether it fits; a error becomes a refusal that names the arm.
+    pub fn check(&self, check: fn(&Self) -> Result<Checked, ConfigError>) -> AdapterResult<Checked> {
+        check(self)
+            .map_err(|error| ConfigError { what: format!("{}: {}", self.hardware_id, error.what), ..error }.into())
     }
 }

@@ -9,7 +9,7 @@ use super::Check;
 use super::Needs::Nothing;
 use super::context::{Context, require};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::JointReading;
+use crate::hardware::adapter::JointReading;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[

@@ -1,7 +1,7 @@
 //! What adapters of all kinds need, so that an adapter's own files say only what is its own.
 
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{AdapterError, AdapterResult};
 
 /// Copies the first values; `out` has length dof.
 pub fn fill(out: &mut [f64], values: &[f64]) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::Scan;
 use super::serial::SerialLink;
 use super::tcp::TcpLink;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// So many replies in a row that do not come end the connection. One lost reply is not a lost arm.
 const LOST_AFTER: u32 = 3;
@@ -54,14 +54,14 @@ impl ByteLink for SerialLink {
 
 /// How long a reply is waited for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Patience {
+pub struct Retry {
     /// The longest wait after each time that the command is sent.
     pub each: Duration,
     /// How often it is sent: more than once only where being obeyed twice does no harm.
     pub times: u32,
 }
 
-impl Patience {
+impl Retry {
     /// The command is sent once.
     pub const fn once(each: Duration) -> Self {
         Self { each, times: 1 }
@@ -70,19 +70,19 @@ impl Patience {
 
 /// The connection to a controller that answers each command, or none.
 #[derive(Debug)]
-pub struct Dialogue<L> {
+pub struct RequestReply<L> {
     link: Option<L>,
     /// Replies in a row that did not come.
     lost: u32,
 }
 
-impl<L> Default for Dialogue<L> {
+impl<L> Default for RequestReply<L> {
     fn default() -> Self {
         Self { link: None, lost: 0 }
     }
 }
 
-impl<L: ByteLink> Dialogue<L> {
+impl<L: ByteLink> RequestReply<L> {
     /// Takes a new connection.
     pub fn open(&mut self, link: L) {
         *self = Self { link: Some(link), lost: 0 };
@@ -111,7 +111,7 @@ impl<L: ByteLink> Dialogue<L> {
     pub fn request<T>(
         &mut self,
         command: &[u8],
-        patience: Patience,
+        patience: Retry,
         mut scan: impl FnMut(&[u8]) -> Scan<T>,
     ) -> AdapterResult<T> {
         let link = self.link.as_mut().ok_or(AdapterError::NotConnected)?;
@@ -160,8 +160,8 @@ mod tests {
 
     #[test]
     fn only_replies_missing_in_a_row_end_it() {
-        let mut line = Dialogue::default();
-        let once = Patience::once(Duration::ZERO);
+        let mut line = RequestReply::default();
+        let once = Retry::once(Duration::ZERO);
         assert_eq!(line.request(b"?", once, scan), Err(AdapterError::NotConnected));
         line.open(Script(vec![None, None, Some(7), None, None, None], 0));
         let answers: Vec<_> = (0..6).map(|_| (line.request(b"?", once, scan).ok(), line.is_open())).collect();
@@ -173,8 +173,8 @@ mod tests {
 
     #[test]
     fn a_patient_request_is_sent_again_and_counts_once() {
-        let mut line = Dialogue::default();
-        let patient = Patience { each: Duration::ZERO, times: 3 };
+        let mut line = RequestReply::default();
+        let patient = Retry { each: Duration::ZERO, times: 3 };
         line.open(Script(vec![None, None, Some(9), None, None, None], 0));
         assert_eq!(line.request(b"?", patient, scan), Ok(9));
         assert_eq!(line.link.as_ref().map(|script| script.1), Some(3));

@@ -1,5 +1,5 @@
 //! What happens to an emulator: clients that come and go, faults that strike. Nobody reads it unless it was opened, as
-//! `dimos adapter emulate` does; whoever writes neither waits for a terminal nor makes the diary grow without bound.
+//! `dimos adapter emulate` does; whoever writes neither waits for a terminal nor makes the events grow without bound.
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
@@ -10,42 +10,42 @@ use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::sync::lock;
 
 /// So many entries wait for a reader; newer ones are then lost.
-const LONGEST: usize = 256;
+const CAPACITY: usize = 256;
 
 /// Something that happened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Happening {
+pub enum SimEvent {
     /// A client connected; on a bus: the first frame came.
-    Came,
+    Connected,
     /// A client has gone, or was cut off.
-    Gone,
+    Disconnected,
     /// Another client was turned away.
-    TurnedAway,
+    Rejected,
     /// A fault of the script struck, for the first time.
-    Struck(FaultKind),
+    Fault(FaultKind),
 }
 
 static OPEN: AtomicBool = AtomicBool::new(false);
-static ENTRIES: Mutex<VecDeque<(Mono, Happening)>> = Mutex::new(VecDeque::new());
+static ENTRIES: Mutex<VecDeque<(Mono, SimEvent)>> = Mutex::new(VecDeque::new());
 
 /// From now on everything is noted that happens to emulators of this program.
 pub fn open() {
-    lock(&ENTRIES).reserve(LONGEST);
+    lock(&ENTRIES).reserve(CAPACITY);
     OPEN.store(true, Ordering::Relaxed);
 }
 
-/// Notes something, where the diary is open.
-pub fn note(what: Happening) {
+/// Notes something, where the events is open.
+pub fn note(what: SimEvent) {
     if !OPEN.load(Ordering::Relaxed) {
         return;
     }
     let mut entries = lock(&ENTRIES);
-    if entries.len() < LONGEST {
+    if entries.len() < CAPACITY {
         entries.push_back((MonotonicClock.now(), what));
     }
 }
 
 /// Takes out the oldest entry.
-pub fn take() -> Option<(Mono, Happening)> {
+pub fn take() -> Option<(Mono, SimEvent)> {
     lock(&ENTRIES).pop_front()
 }

@@ -9,8 +9,8 @@ use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, Stop};
 use crate::joint::ControlMode;
 
 /// The checks of this file.
@@ -32,7 +32,7 @@ const DARK: f64 = 0.5;
 
 /// Lets the prepared cut happen and waits until the adapter has noticed.
 fn cut(context: &mut Context) -> Result<(), String> {
-    context.strike()?;
+    context.trigger_faults()?;
     let mut reading = JointReading::default();
     context.until("the cut", |context| Ok(context.adapter.read_joints(&mut reading).is_err()))?;
     context.until("is_connected to be false", |context| {
@@ -144,7 +144,7 @@ fn in_error(context: &mut Context) -> Result<(), String> {
         return context.skip("its double cannot be in error, or cannot cut the wire");
     }
     context.ready(context.first_mode())?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (error, start) = (context.error()?, context.standstill()?);
     cut(context)?;
@@ -172,7 +172,7 @@ fn stop_into_the_void(context: &mut Context) -> Result<(), String> {
         return context.skip(NO_CUT);
     }
     context.ready(context.first_mode())?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("a stop that is not taken", |context| {
         let began = Instant::now();
         let result = context.adapter.write_stop();

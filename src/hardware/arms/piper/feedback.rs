@@ -5,10 +5,10 @@
 
 use std::time::Duration;
 
-use super::belief::Belief;
 use super::guard::Guard;
+use super::jump_filter::JumpFilter;
 use super::protocol::{
-    DOF, Driver, Feedback, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
+    DOF, Driver, FeedbackFrame, Gripper, Motor, MotorLimits, Status, WireJoints, arm_text, driver_text, gripper_text,
 };
 use crate::clock::{Clock, Mono, MonotonicClock};
 
@@ -70,7 +70,7 @@ pub struct Counts {
 
 /// The arm's newest feedback. `Mono::ZERO` stands for never.
 #[derive(Debug, Clone)]
-pub struct Picture {
+pub struct Feedback {
     /// The newest believed joint positions [0.001°].
     pub joints: WireJoints,
     /// When `joints` was completed.
@@ -103,7 +103,7 @@ pub struct Picture {
     pub guard: Guard,
     /// What was counted.
     pub counts: Counts,
-    belief: Belief,
+    jump_filter: JumpFilter,
     /// Since when every joint has read exactly zero.
     zeros_since: Option<Mono>,
     joint_parts: Triple,
@@ -112,7 +112,7 @@ pub struct Picture {
     text_length: usize,
 }
 
-impl Default for Picture {
+impl Default for Feedback {
     fn default() -> Self {
         Self {
             joints: [0; DOF],
@@ -131,7 +131,7 @@ impl Default for Picture {
             commanded_at: Mono::ZERO,
             guard: Guard::default(),
             counts: Counts::default(),
-            belief: Belief::default(),
+            jump_filter: JumpFilter::default(),
             zeros_since: None,
             joint_parts: Triple::default(),
             pose_parts: Triple::default(),
@@ -141,42 +141,42 @@ impl Default for Picture {
     }
 }
 
-impl Picture {
+impl Feedback {
     /// Nothing known yet, of an arm whose gripper is used or not.
     pub fn of_arm(gripper_used: bool) -> Self {
         Self { gripper_used, ..Self::default() }
     }
 
     /// Adds what a frame says that arrived at `now`.
-    pub fn take(&mut self, feedback: Feedback, now: Mono) {
+    pub fn take(&mut self, feedback: FeedbackFrame, now: Mono) {
         match feedback {
-            Feedback::Other => return self.counts.other += 1,
-            Feedback::Damaged => return self.counts.damaged += 1,
-            Feedback::Leader | Feedback::Command => {
+            FeedbackFrame::Other => return self.counts.other += 1,
+            FeedbackFrame::Damaged => return self.counts.damaged += 1,
+            FeedbackFrame::Leader | FeedbackFrame::Command => {
                 self.commanded_at = now;
                 self.guard.commanded();
-                return self.counts.leader += u64::from(feedback == Feedback::Leader);
+                return self.counts.leader += u64::from(feedback == FeedbackFrame::Leader);
             }
             _ => self.counts.decoded += 1,
         }
         match feedback {
-            Feedback::Joints(part, pair) => {
+            FeedbackFrame::Joints(part, pair) => {
                 if let Some(joints) = self.joint_parts.take(part, pair, now) {
                     self.take_joints(joints, now);
                 }
             }
-            Feedback::Pose(part, pair) => self.pose = self.pose_parts.take(part, pair, now).or(self.pose),
-            Feedback::Status(status) => {
+            FeedbackFrame::Pose(part, pair) => self.pose = self.pose_parts.take(part, pair, now).or(self.pose),
+            FeedbackFrame::Status(status) => {
                 (self.status, self.status_at) = (status, now);
                 self.guard.status(&status, now);
             }
-            Feedback::Gripper(gripper) => self.gripper = Some(gripper),
-            Feedback::Motor(joint, motor) => {
+            FeedbackFrame::Gripper(gripper) => self.gripper = Some(gripper),
+            FeedbackFrame::Motor(joint, motor) => {
                 if let (Some(to), Some(at)) = (self.motors.get_mut(joint), self.motors_at.get_mut(joint)) {
                     (*to, *at) = (motor, now);
                 }
             }
-            Feedback::Driver(joint, driver) => {
+            FeedbackFrame::Driver(joint, driver) => {
                 if let (Some(to), Some(at)) = (self.drivers.get_mut(joint), self.drivers_at.get_mut(joint)) {
                     (*to, *at) = (driver, now);
                     if !driver.enabled() {
@@ -184,16 +184,16 @@ impl Picture {
                     }
                 }
             }
-            Feedback::Limits(joint, limits) => {
+            FeedbackFrame::Limits(joint, limits) => {
                 self.limits.get_mut(joint).into_iter().for_each(|to| *to = Some(limits));
             }
-            Feedback::Firmware(piece, length) => {
+            FeedbackFrame::Firmware(piece, length) => {
                 let room = self.text.get_mut(self.text_length..).unwrap_or_default();
                 let count = length.min(room.len());
                 room.iter_mut().zip(piece.iter().take(count)).for_each(|(to, from)| *to = *from);
                 self.text_length += count;
             }
-            Feedback::Other | Feedback::Damaged | Feedback::Leader | Feedback::Command => {}
+            FeedbackFrame::Other | FeedbackFrame::Damaged | FeedbackFrame::Leader | FeedbackFrame::Command => {}
         }
     }
 
@@ -201,7 +201,7 @@ impl Picture {
         let far = joints.iter().any(|value| value.unsigned_abs() > FAR);
         // A controller that has just started says zero before it has asked its joints.
         let elsewhere = self.joints_at != Mono::ZERO && self.joints.iter().any(|value| value.unsigned_abs() > NOT_ZERO);
-        if far || (elsewhere && joints == [0; DOF]) || !self.belief.take(joints, now) {
+        if far || (elsewhere && joints == [0; DOF]) || !self.jump_filter.take(joints, now) {
             return self.counts.damaged += 1;
         }
         self.zeros_since = (joints == [0; DOF]).then(|| self.zeros_since.unwrap_or(now));
@@ -225,7 +225,7 @@ impl Picture {
 
     /// Whether joint positions were refused lately, so that the believed ones may be the wrong ones.
     pub fn disputed(&self, now: Mono) -> bool {
-        self.belief.disputed(now)
+        self.jump_filter.disputed(now)
     }
 
     /// Whether all motors say that they stand.
@@ -348,41 +348,41 @@ mod tests {
         Mono(1_000_000_000 + n * 1_000_000)
     }
 
-    fn joints(picture: &mut Picture, part: usize, value: i32, at: Mono) {
-        picture.take(Feedback::Joints(part, [value, value]), at);
+    fn joints(feedback: &mut Feedback, part: usize, value: i32, at: Mono) {
+        feedback.take(FeedbackFrame::Joints(part, [value, value]), at);
     }
 
     #[test]
     fn a_set_is_three_frames_of_one_burst_in_order() {
-        let mut picture = Picture::default();
-        (0..3).for_each(|part| joints(&mut picture, part, 1, ms(part as u64)));
-        assert_eq!((picture.joints, picture.joints_at), ([1; 6], ms(2)));
+        let mut feedback = Feedback::default();
+        (0..3).for_each(|part| joints(&mut feedback, part, 1, ms(part as u64)));
+        assert_eq!((feedback.joints, feedback.joints_at), ([1; 6], ms(2)));
         // Each of the three lost in turn: no set.
         for lost in 0..3 {
-            (0..3).filter(|part| *part != lost).for_each(|part| joints(&mut picture, part, 7, ms(10)));
+            (0..3).filter(|part| *part != lost).for_each(|part| joints(&mut feedback, part, 7, ms(10)));
         }
-        assert_eq!(picture.joints, [1; 6]);
+        assert_eq!(feedback.joints, [1; 6]);
         // The end of one burst and that of the next.
-        joints(&mut picture, 0, 8, ms(20));
-        joints(&mut picture, 1, 8, ms(20));
-        joints(&mut picture, 2, 9, ms(25));
-        assert_eq!((picture.joints, picture.counts.sets), ([1; 6], 1));
-        (0..3).for_each(|part| joints(&mut picture, part, -5, ms(30)));
-        assert_eq!((picture.joints, picture.joints_at), ([-5; 6], ms(30)));
+        joints(&mut feedback, 0, 8, ms(20));
+        joints(&mut feedback, 1, 8, ms(20));
+        joints(&mut feedback, 2, 9, ms(25));
+        assert_eq!((feedback.joints, feedback.counts.sets), ([1; 6], 1));
+        (0..3).for_each(|part| joints(&mut feedback, part, -5, ms(30)));
+        assert_eq!((feedback.joints, feedback.joints_at), ([-5; 6], ms(30)));
         // What no arm can have reached in that time.
-        (0..3).for_each(|part| joints(&mut picture, part, 60_000, ms(35)));
-        assert_eq!((picture.joints, picture.counts.damaged), ([-5; 6], 1));
-        assert!(picture.disputed(ms(35)));
+        (0..3).for_each(|part| joints(&mut feedback, part, 60_000, ms(35)));
+        assert_eq!((feedback.joints, feedback.counts.damaged), ([-5; 6], 1));
+        assert!(feedback.disputed(ms(35)));
     }
 
     #[test]
     fn sudden_zeros_and_impossible_angles_are_not_believed() {
-        let mut picture = Picture::default();
+        let mut feedback = Feedback::default();
         let mut at = 1;
         let mut set = |value: i32| {
             at += 200;
-            (0..3).for_each(|part| joints(&mut picture, part, value, ms(at)));
-            picture.joints[0]
+            (0..3).for_each(|part| joints(&mut feedback, part, value, ms(at)));
+            feedback.joints[0]
         };
         assert_eq!(set(0), 0, "the first may be zero: activation looks again");
         assert_eq!(set(40_000), 40_000);
@@ -390,57 +390,57 @@ mod tests {
         assert_eq!(set(400_000), 40_000);
         assert_eq!(set(4_000), 4_000);
         assert_eq!(set(0), 0, "close to zero, zero is plausible");
-        assert_eq!(picture.counts.damaged, 2);
+        assert_eq!(feedback.counts.damaged, 2);
     }
 
     #[test]
     fn errors_have_a_code_and_all_their_words() {
-        let mut picture = Picture::default();
-        assert_eq!((picture.error_code(), picture.error_text()), (0, String::new()));
+        let mut feedback = Feedback::default();
+        assert_eq!((feedback.error_code(), feedback.error_text()), (0, String::new()));
         let hot = Driver { motor_temperature: 84, status: 0x40 | 0b10, ..Driver::default() };
-        picture.take(Feedback::Driver(2, hot), ms(0));
-        assert_eq!((picture.error_code(), picture.error_text()), (331, "joint 3: motor too hot (84 °C)".into()));
-        picture.take(Feedback::Status(Status { limits: 0b10, silent: 0b100000, ..Status::default() }), ms(0));
-        assert_eq!(picture.error_code(), 206);
-        picture.take(Feedback::Status(Status { arm: 9, limits: 0b10, ..Status::default() }), ms(0));
+        feedback.take(FeedbackFrame::Driver(2, hot), ms(0));
+        assert_eq!((feedback.error_code(), feedback.error_text()), (331, "joint 3: motor too hot (84 °C)".into()));
+        feedback.take(FeedbackFrame::Status(Status { limits: 0b10, silent: 0b100000, ..Status::default() }), ms(0));
+        assert_eq!(feedback.error_code(), 206);
+        feedback.take(FeedbackFrame::Status(Status { arm: 9, limits: 0b10, ..Status::default() }), ms(0));
         let text = "a joint is in error; joint 2 beyond its limits; joint 3: motor too hot (84 °C)";
-        assert_eq!((picture.error_code(), picture.error_text()), (9, text.into()));
-        picture.take(Feedback::Status(Status { arm: 12, ..Status::default() }), ms(0));
-        assert_eq!(picture.error_code(), 331, "being taught is no error");
+        assert_eq!((feedback.error_code(), feedback.error_text()), (9, text.into()));
+        feedback.take(FeedbackFrame::Status(Status { arm: 12, ..Status::default() }), ms(0));
+        assert_eq!(feedback.error_code(), 331, "being taught is no error");
         let closed_too_hard = Gripper { status: 0xC0 | 0b100100, ..Gripper::default() };
-        let mut picture = Picture::default();
-        picture.take(Feedback::Gripper(closed_too_hard), ms(0));
-        assert_eq!((picture.error_code(), picture.error_text()), (0, String::new()), "of no interest");
-        picture.gripper_used = true;
+        let mut feedback = Feedback::default();
+        feedback.take(FeedbackFrame::Gripper(closed_too_hard), ms(0));
+        assert_eq!((feedback.error_code(), feedback.error_text()), (0, String::new()), "of no interest");
+        feedback.gripper_used = true;
         let text = "gripper: overcurrent; gripper: driver error";
-        assert_eq!((picture.error_code(), picture.error_text()), (402, text.into()));
-        picture.take(Feedback::Driver(2, hot), ms(0));
+        assert_eq!((feedback.error_code(), feedback.error_text()), (402, text.into()));
+        feedback.take(FeedbackFrame::Driver(2, hot), ms(0));
         let text = "joint 3: motor too hot (84 °C); gripper: overcurrent; gripper: driver error";
-        assert_eq!((picture.error_code(), picture.error_text()), (331, text.into()));
+        assert_eq!((feedback.error_code(), feedback.error_text()), (331, text.into()));
     }
 
     #[test]
     fn the_firmware_is_found_in_its_pieces() {
-        let mut picture = Picture::default();
+        let mut feedback = Feedback::default();
         for (piece, length) in [(b"\0H-V1.2-", 8), (b"1 S-V1.6", 8), (b"-3\0\0\0\0\0\0", 2)] {
-            assert_eq!(picture.firmware(), None);
-            picture.take(Feedback::Firmware(*piece, length), ms(0));
+            assert_eq!(feedback.firmware(), None);
+            feedback.take(FeedbackFrame::Firmware(*piece, length), ms(0));
         }
-        assert_eq!(picture.firmware(), Some((1, 6, 3)));
-        (0..1000).for_each(|_| picture.take(Feedback::Firmware([b'x'; 8], 8), ms(0)));
-        assert_eq!(picture.firmware(), Some((1, 6, 3)));
+        assert_eq!(feedback.firmware(), Some((1, 6, 3)));
+        (0..1000).for_each(|_| feedback.take(FeedbackFrame::Firmware([b'x'; 8], 8), ms(0)));
+        assert_eq!(feedback.firmware(), Some((1, 6, 3)));
     }
 
     #[test]
     fn it_is_complete_when_every_part_was_heard() {
-        let mut picture = Picture::default();
-        (0..3).for_each(|part| joints(&mut picture, part, 1, ms(0)));
-        picture.take(Feedback::Status(Status::default()), ms(0));
+        let mut feedback = Feedback::default();
+        (0..3).for_each(|part| joints(&mut feedback, part, 1, ms(0)));
+        feedback.take(FeedbackFrame::Status(Status::default()), ms(0));
         for joint in 0..DOF {
-            assert!(!picture.complete());
-            picture.take(Feedback::Motor(joint, Motor::default()), ms(0));
-            picture.take(Feedback::Driver(joint, Driver { status: 0x40, ..Driver::default() }), ms(0));
+            assert!(!feedback.complete());
+            feedback.take(FeedbackFrame::Motor(joint, Motor::default()), ms(0));
+            feedback.take(FeedbackFrame::Driver(joint, Driver { status: 0x40, ..Driver::default() }), ms(0));
         }
-        assert!(picture.complete() && picture.enabled() && !picture.disabled());
+        assert!(feedback.complete() && feedback.enabled() && !feedback.disabled());
     }
 }
