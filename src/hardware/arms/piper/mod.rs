@@ -14,6 +14,8 @@ mod session;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
+mod tests_bus;
+#[cfg(test)]
 mod tests_faults;
 #[cfg(test)]
 mod tests_holds;

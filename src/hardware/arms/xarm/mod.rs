@@ -1,10 +1,10 @@
 //! UFACTORY's arms behind a control box on TCP: xArm 5, 6 and 7, Lite 6, 850. `docs/arms/xarm.md` is for users.
 //!
 //! ```text
-//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched whenever they come; port 503: the gripper
+//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched by number; port 503: the gripper
 //!   (SI)       (state)  ◀── stream    ports 30000 or 30003: joints; 30001: motors, error
-//!                 ├── orders: motors, mode, stop; foreign: what other clients change
-//!                 └── mode, condition, gripper: small machines that never wait
+//!                 ├── motion_commands, state_commands (motors, mode, stop), other_clients
+//!                 └── mode, condition, gripper: state machines that never wait
 //! ```
 
 pub mod adapter;
@@ -19,6 +19,7 @@ mod golden;
 mod gripper;
 mod mode;
 pub mod model;
+mod motion_commands;
 mod other_clients;
 pub mod protocol;
 mod report_validity;
@@ -27,6 +28,8 @@ mod state_commands;
 mod stream;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_models;
 #[cfg(test)]
 mod tests_other_clients;
 #[cfg(test)]

@@ -92,7 +92,7 @@ impl Session {
         if self.change.is_none() {
             // A change that came to nothing between two calls has stopped the arm: first why, then that.
             self.reached()?;
-            let _ = self.heed_refusal(); // of a setpoint; but it may tell that the arm was stopped
+            let _ = self.check_refusal(); // of a setpoint; but it may tell that the arm was stopped
             self.may_be_commanded()?;
         }
         if self.change.is_none_or(|change| change.target != mode) {
