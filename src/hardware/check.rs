@@ -1,6 +1,6 @@
-//! Whether an arm's number of joints and its options go together, and what follows from them: all that can be known
-//! without the device. A row answers it with [`AdapterSpec::check`](super::registry::AdapterSpec); `dimos check` shows a
-//! error at its place in the blueprint, and nothing is made of a configuration that does not fit.
+//! Checks whether an arm's number of joints and options are consistent, and derives its limits, without the device.
+//! Each row provides this as [`AdapterSpec::check`](super::registry::AdapterSpec); `dimos check` reports an error at
+//! its position in the blueprint, and no adapter or emulator is created from such a configuration.
 
 use std::fmt;
 
@@ -11,17 +11,18 @@ use super::registry::AdapterConfig;
 use crate::joint::JointLimits;
 use crate::message::Message;
 
-/// What follows from a configuration that fits.
+/// What a valid configuration implies.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Checked {
-    /// Nominal joint limits. An arm that is connected may narrow them.
+    /// Nominal joint limits. A connected arm may narrow them.
     pub limits: JointLimits,
 }
 
-/// What does not fit, and where. As text it is a sentence without full stop; the hint is not part of it.
+/// An invalid configuration, and where. As text it is a sentence without full stop, without the hint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConfigError {
-    /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty: the number of joints, or all options.
+    /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty for the number
+    /// of joints, or for all options.
     pub option: String,
     /// What is wrong with it.
     pub what: String,
@@ -30,18 +31,18 @@ pub struct ConfigError {
 }
 
 impl ConfigError {
-    /// Something that does not fit, at an option.
+    /// Creates an error at an option.
     pub fn new(option: impl Into<String>, what: impl Into<String>) -> Self {
         Self { option: option.into(), what: what.into(), hint: None }
     }
 
-    /// The same, with what to do.
+    /// Adds a hint.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
     }
 
-    /// The same, as an option of the group `group`: `faults.0` of `sim` is `sim.faults.0`.
+    /// Puts the option into the group `group`: `faults.0` of `sim` becomes `sim.faults.0`.
     pub fn within(mut self, group: &str) -> Self {
         self.option = format!("{group}.{}", self.option);
         self
@@ -61,7 +62,7 @@ impl From<ConfigError> for AdapterError {
 }
 
 impl AdapterConfig {
-    /// The options as the adapter's own type.
+    /// Returns the options as the adapter's own type.
     pub fn options<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
         let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
         serde_json::from_value(given).map_err(|e| ConfigError::new("", format!("options: {e}")))
@@ -76,7 +77,7 @@ impl AdapterConfig {
         }
     }
 
-    /// Asks whether it fits; a error becomes a refusal that names the arm.
+    /// Runs `check`; the error names the arm.
     pub fn check(&self, check: fn(&Self) -> Result<Checked, ConfigError>) -> AdapterResult<Checked> {
         check(self)
             .map_err(|error| ConfigError { what: format!("{}: {}", self.hardware_id, error.what), ..error }.into())

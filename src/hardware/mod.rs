@@ -1,4 +1,4 @@
-//! Everything that talks to an arm: the adapter protocol, the table of adapters, the arms, one device thread each.
+//! Everything that talks to arms: the adapter trait, the adapter registry, the arms, and one device thread per arm.
 
 pub mod adapter;
 pub mod adapter_util;

@@ -65,14 +65,14 @@ impl AcmeAdapter {
     fn request<T>(
         &mut self,
         command: &Command,
-        patience: Retry,
+        timeout: Retry,
         decode: impl Fn(&[u8]) -> Option<T>,
     ) -> AdapterResult<T> {
         self.number = self.number.wrapping_add(1);
         let (number, (opcode, name)) = (self.number, command.sheet());
         let mut frame = [0; MAX_COMMAND];
         let frame = protocol::encode(command, number, &mut frame);
-        let reply = self.line.request(frame, patience, |bytes| {
+        let reply = self.line.request(frame, timeout, |bytes| {
             protocol::scan(bytes, opcode, number).map(|reply| match reply.status {
                 0 => Ok(decode(reply.data)),
                 status => Err(status),

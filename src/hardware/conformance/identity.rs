@@ -1,4 +1,4 @@
-//! What an adapter says of itself.
+//! Identity: table row, info, limits, address, options, number of joints.
 
 use super::Check;
 use super::Needs::Nothing;
@@ -56,7 +56,7 @@ fn limits_are_usable(context: &mut Context) -> Result<(), String> {
         require(finite, || format!("{source}: a limit is not finite"))?;
         let ordered = limits.position_lower.iter().zip(&limits.position_upper).all(|(lower, upper)| lower < upper);
         require(ordered, || format!("{source}: a lower limit is not below its upper limit"))?;
-        // 100 rad or 100 rad/s is no arm: these are degrees.
+        // Limits of 100 rad or 100 rad/s are in degrees.
         let radians = limits.position_lower.iter().chain(&limits.position_upper).chain(&limits.velocity_max);
         require(radians.into_iter().all(|v| v.abs() < 100.0), || format!("{source}: these limits are not in rad"))?;
         require(limits.velocity_max.iter().all(|v| *v > 0.0), || format!("{source}: a velocity limit is not above 0"))?;
@@ -68,7 +68,7 @@ fn addresses_are_checked(context: &mut Context) -> Result<(), String> {
     let address = context.row.address;
     require(!address.form.is_empty(), || "the form of the address is not stated".into())?;
     if !address.required {
-        return context.skip("it needs no address");
+        return context.skip("this adapter needs no address");
     }
     require((address.check)("").is_err(), || "an empty address is accepted".into())?;
     let own = (address.check)(&context.config.address);

@@ -1,5 +1,5 @@
-//! What happens to an emulator: clients that come and go, faults that strike. Nobody reads it unless it was opened, as
-//! `dimos adapter emulate` does; whoever writes neither waits for a terminal nor makes the events grow without bound.
+//! Events of emulators: clients that connect and disconnect, faults that begin. Recorded only after [`open`], as in
+//! `dimos adapter emulate`. Recording never blocks, and the number of entries is bounded.
 
 use std::collections::VecDeque;
 use std::sync::Mutex;
@@ -9,32 +9,32 @@ use super::faults::FaultKind;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::sync::lock;
 
-/// So many entries wait for a reader; newer ones are then lost.
+/// Maximum number of unread entries; newer ones are dropped.
 const CAPACITY: usize = 256;
 
-/// Something that happened.
+/// An event of an emulator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SimEvent {
-    /// A client connected; on a bus: the first frame came.
+    /// A client connected; on a bus: the first frame arrived.
     Connected,
-    /// A client has gone, or was cut off.
+    /// A client disconnected, or was disconnected.
     Disconnected,
-    /// Another client was turned away.
+    /// Another client was rejected.
     Rejected,
-    /// A fault of the script struck, for the first time.
+    /// A fault of the script began.
     Fault(FaultKind),
 }
 
 static OPEN: AtomicBool = AtomicBool::new(false);
 static ENTRIES: Mutex<VecDeque<(Mono, SimEvent)>> = Mutex::new(VecDeque::new());
 
-/// From now on everything is noted that happens to emulators of this program.
+/// Starts to record the events of all emulators of this program.
 pub fn open() {
     lock(&ENTRIES).reserve(CAPACITY);
     OPEN.store(true, Ordering::Relaxed);
 }
 
-/// Notes something, where the events is open.
+/// Records an event, if recording was started.
 pub fn note(what: SimEvent) {
     if !OPEN.load(Ordering::Relaxed) {
         return;
@@ -45,7 +45,7 @@ pub fn note(what: SimEvent) {
     }
 }
 
-/// Takes out the oldest entry.
+/// Removes and returns the oldest entry.
 pub fn take() -> Option<(Mono, SimEvent)> {
     lock(&ENTRIES).pop_front()
 }

@@ -1,4 +1,4 @@
-//! What a blueprint may set of every emulated arm: the `sim` part of its options.
+//! Options of every emulated arm: the `sim` part of its options.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -14,19 +14,19 @@ const MAX_LAG: f64 = 0.5;
 /// Largest droop that an emulator can have [rad].
 const MAX_DROOP: f64 = 0.1;
 
-/// What an emulator does: the `sim` part of an arm's options. An arm with options of its own there has these too.
+/// Settings of an emulator: the `sim` part of an arm's options. Arms with more settings there have these too.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint; a pose of the arm's own when empty.
+    /// Joint positions at power-up [rad], one per joint; empty for the arm's default pose.
     pub initial_positions: Vec<f64>,
-    /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
+    /// Lag of the joints behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// How far below their targets joints rest under load, 0 to 0.1 [rad].
+    /// Droop of the joints below their targets at rest under load, 0 to 0.1 [rad].
     #[schemars(range(min = 0, max = 0.1))]
     pub droop: f64,
-    /// What goes wrong, and when (seconds after the first connection).
+    /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
 
@@ -37,7 +37,7 @@ impl Default for SimOptions {
 }
 
 impl SimOptions {
-    /// The same, with this pose [rad] at power-up where the options give none.
+    /// Uses this pose [rad] at power-up if the options give none.
     pub fn starting_at(mut self, pose: &[f64]) -> Self {
         if self.initial_positions.is_empty() {
             self.initial_positions = pose.to_vec();
@@ -45,8 +45,8 @@ impl SimOptions {
         self
     }
 
-    /// Refuses a pose outside `limits`, figures that no emulator has, and faults that are not among `playable`. `name`
-    /// is the arm's.
+    /// Refuses a pose outside `limits`, values out of range, and faults that are not in `playable`. `name` is the name
+    /// of the adapter.
     pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), ConfigError> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))
@@ -59,7 +59,7 @@ impl SimOptions {
 /// Refuses `initial_positions` [rad] that are neither empty nor a pose within `limits`.
 pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), ConfigError> {
     let (dof, given) = (limits.position_lower.len(), positions.len());
-    let needed = format!("initial_positions must be {dof} angles [rad] within the joint limits");
+    let needed = format!("initial_positions must be {dof} positions [rad] within the joint limits");
     if given != 0 && given != dof {
         return Err(ConfigError::new("initial_positions", format!("{needed}, not {given}")));
     }

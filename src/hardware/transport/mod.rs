@@ -1,4 +1,4 @@
-//! Ways to reach a device, shared by the arms.
+//! Transports to devices, shared by the arms.
 
 pub mod can;
 pub mod device_time;

@@ -44,7 +44,7 @@ impl MockArm {
         if values.len() == self.dof && values.iter().all(|value| value.is_finite()) {
             Ok(())
         } else {
-            Err(AdapterError::Rejected(format!("{} finite values are needed, one per joint", self.dof)))
+            Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)))
         }
     }
 }

@@ -3,11 +3,11 @@
 //! Wire: 0.001°, 0.001 mm, 0.001 rad/s, mA. Here: rad, m, rad/s, Nm. The conversions are in this file, those of angles
 //! in `protocol.rs`.
 //!
-//! The arm sends its state by itself, 200 times a second; nothing is asked for after `connect`. It takes joint targets
-//! without a word: what it does shows in its feedback, and so enabling, clearing and stopping are confirmed by that.
+//! The arm streams its state, 200 times per second; after `connect` nothing is polled. It does not acknowledge joint
+//! targets, so enabling, clearing and stopping are confirmed by its feedback.
 //!
-//! Nothing here takes the power from the motors but `write_enable(false)`: the arm has no brakes. So a stop is a hold
-//! where the arm is; the arm's own E-stop command can only be left by a reset that lets it fall, and is never sent.
+//! Only `write_enable(false)` disables the motors: the arm has no brakes. A stop is a hold at the current position. The
+//! arm's own E-stop command is never sent: it can only be left by a reset that lets the arm fall.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -83,14 +83,14 @@ impl PiperAdapter {
         (self.options.gripper_torque / MILLI).round() as u16
     }
 
-    /// Velocities [rad/s]; `None` when a motor has not told its own lately.
+    /// Velocities [rad/s]; `None` if a motor has not reported its own recently.
     fn velocities(&self) -> Option<Joints> {
         let known = self.arm.measures();
         known.then(|| joints_of(&self.arm.feedback.motors.map(|motor| f64::from(motor.speed) * MILLI)))
     }
 
-    /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which
-    /// says how to read the currents.
+    /// Torques [Nm]; `None` if a motor has not reported its current recently, or if the firmware, which determines the
+    /// unit of the currents, is unknown.
     fn efforts(&self) -> Option<Joints> {
         if !self.arm.measures() {
             return None;
@@ -159,7 +159,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     // --- Mode ---
 
-    /// Both modes are MOVE J and differ in what stands before each target, so that nothing is sent here.
+    /// Both modes are MOVE J and differ only in the frame before each target, so nothing is sent here.
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
         if !MODES.contains(&mode) {
             return Err(AdapterError::Unsupported);
@@ -213,7 +213,7 @@ impl ManipulatorAdapter for PiperAdapter {
         Ok(())
     }
 
-    /// State: the arm's own (0 = in order, 1 = E-stop …); mode: who controls it (0 nobody, 1 CAN, 2 teaching …).
+    /// State: the arm's own (0 = normal, 1 = E-stop …); mode: who controls it (0 = none, 1 = CAN, 2 = teaching …).
     fn read_state(&mut self) -> AdapterResult<RobotState> {
         let status = self.arm.known()?.status;
         Ok(RobotState { state: status.arm.into(), mode: status.control.into() })
@@ -257,8 +257,8 @@ impl ManipulatorAdapter for PiperAdapter {
         }
     }
 
-    /// Holds the arm: at what was last written, 0.02 rad from where it is at most. Confirmed when its feedback shows
-    /// that every joint gets slower or stands.
+    /// Holds the arm at the last written target, at most 0.02 rad from its position. Confirmed when the feedback shows
+    /// that every joint decelerates or is at rest.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
         if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
@@ -325,8 +325,8 @@ impl ManipulatorAdapter for PiperAdapter {
         Err(AdapterError::Fault { code, text })
     }
 
-    /// Set points that wait for the bus are taken back, where the bus lets them be; otherwise nothing new is sent
-    /// before they are out.
+    /// Takes back setpoints that wait for the bus, if the bus allows it; otherwise nothing new is sent until they are
+    /// out.
     fn discard_pending(&mut self) {
         self.arm.discard();
     }

@@ -68,7 +68,7 @@ impl Guard {
         *self = Self { ordered: Some((key(status), now)), ..Self::default() };
     }
 
-    /// The arm is not under this run's control any more, or is to be taken under it again.
+    /// This run loses or takes control of the arm.
     pub fn release(&mut self) {
         *self = Self::default();
     }

@@ -1,4 +1,4 @@
-//! Where the arm is told to stay.
+//! Computes and sends the pose at which the arm holds.
 
 use std::time::Duration;
 
@@ -22,9 +22,9 @@ pub const BEYOND: u8 = 4;
 /// Lowest and highest target of each joint [0.001°].
 pub type WireRanges = [(i32, i32); DOF];
 
-/// The pose to hold [0.001°]: the targets that were last written, since another one would move an arm that stands; but
-/// no farther from the measured positions than 0.02 rad. It is inside the limits, or where the arm lies outside, no
-/// farther outside than it lies. `strict`: the controller refuses targets outside.
+/// Returns the pose to hold [0.001°]: the last written targets, since others would move an arm at rest, but at most
+/// 0.02 rad from the measured positions. It is inside the limits; for a joint outside, at most as far outside as
+/// measured. `strict`: the controller refuses targets outside.
 pub fn target(measured: &WireJoints, written: Option<&WireJoints>, ranges: &WireRanges, strict: bool) -> WireJoints {
     let window = (WINDOW.to_degrees() * 1000.0) as i32;
     let mut target = *measured;

@@ -50,7 +50,7 @@ fn motion_control(mode: MoveMode, speed: u8, follow: Follow) -> CanFrame {
     frame(0x151, [1, mode as u8, speed.min(100), follow as u8, 0, 0, 0, 0])
 }
 
-/// Joint targets [0.001°] at a speed [%]: 0x151 stands before every burst, so that a lost frame costs one burst only.
+/// Joint targets [0.001°] at a speed [%]. 0x151 precedes every burst, so that a lost frame affects one burst only.
 pub fn joint_targets(speed: u8, follow: Follow, [j1, j2, j3, j4, j5, j6]: WireJoints) -> [CanFrame; 4] {
     let mode = motion_control(MoveMode::Joint, speed, follow);
     [mode, pair(0x155, j1, j2), pair(0x156, j3, j4), pair(0x157, j5, j6)]
@@ -100,7 +100,7 @@ pub fn ask_firmware() -> CanFrame {
 /// What the controller says of itself (0x2A1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Status {
-    /// Who controls the arm: 0 nobody, 1 CAN, 2 teaching …
+    /// Who controls the arm: 0 none, 1 CAN, 2 teaching …
     pub control: u8,
     /// The arm's state; 0 = in order.
     pub arm: u8,
@@ -293,7 +293,7 @@ pub fn arm_text(code: u8) -> &'static str {
 /// Who controls the arm (0x2A1, byte 0).
 pub fn control_text(control: u8) -> &'static str {
     match control {
-        0 => "nobody",
+        0 => "no client",
         1 => "CAN",
         2 => "its teach button",
         3 => "Ethernet",

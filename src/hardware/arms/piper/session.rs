@@ -25,7 +25,7 @@ const SILENCE: Duration = Duration::from_millis(150);
 const DRIVERS_SILENCE: Duration = Duration::from_millis(300);
 /// After this long without a state the connection is given up: the arm has lost its power.
 const LOST: Duration = Duration::from_millis(400);
-/// Enabling and disabling are asked for again and again, as the vendor does, and for so long.
+/// Period of the repeated commands for enabling and disabling, as in the vendor's SDK.
 const REPEAT: Duration = Duration::from_millis(10);
 const ENABLE_TIMEOUT: Duration = Duration::from_millis(1000);
 /// The E-stop among the arm's states.
@@ -165,7 +165,7 @@ impl Session {
         if age <= SILENCE {
             return Ok(());
         }
-        // The same words each time, so that they are told once.
+        // The same text each time, so that it is logged once.
         if age > LOST {
             self.wire = None;
             let text =
@@ -175,8 +175,8 @@ impl Session {
         Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, SILENCE.as_millis())))
     }
 
-    /// Takes up what has arrived; an error when the state is too old to be told, or the drivers do not say any more
-    /// whether the motors are on.
+    /// Processes what has arrived; an error if the state is stale, or if the drivers no longer report whether the
+    /// motors are on.
     pub fn whole(&mut self) -> AdapterResult<()> {
         self.refresh()?;
         let earliest = MonotonicClock.now().before(DRIVERS_SILENCE);
@@ -190,7 +190,7 @@ impl Session {
         )))
     }
 
-    /// Whether what is known of the motors' speeds and currents is new enough to be told.
+    /// Returns whether the motors' speeds and currents are recent.
     pub fn measures(&self) -> bool {
         self.feedback.motors_heard(MonotonicClock.now().before(SILENCE))
     }
@@ -277,7 +277,7 @@ impl Session {
         AdapterError::Rejected(format!("{}: {why}", self.hardware_id))
     }
 
-    /// An error unless the arm is in order and listens to nobody but us.
+    /// Checks that the arm has no error and that only this run controls it.
     pub fn in_order(&self) -> AdapterResult<()> {
         let code = self.feedback.error_code();
         if code != 0 {
@@ -314,7 +314,7 @@ impl Session {
             (None, false) => return Ok(()),
         };
         Err(self.refuse(format!(
-            "{what}, which this run did not order: the arm is left alone\nhint: end that, then enable the arm again"
+            "{what}, which this run did not order: the arm is not commanded\nhint: end that, then enable the arm again"
         )))
     }
 
@@ -330,7 +330,7 @@ impl Session {
         self.written.filter(|_| self.ours().is_ok())
     }
 
-    /// An error unless the arm may be told to move.
+    /// Checks that the arm may be moved.
     pub fn may_move(&mut self) -> AdapterResult<()> {
         self.whole()?;
         self.in_order()?;

@@ -237,7 +237,7 @@ fn disabling_is_verified_and_the_arm_falls() {
     assert_eq!(refused, AdapterError::Rejected("arm: the motors are disabled".into()));
     until("the fall", || emulator.joints().0[1] < 0.5);
     assert!(!SPEC.holds_when_disabled && !arm.get_info().holds_when_disabled);
-    // Where it has fallen to is where it holds: not where it was told to be before.
+    // It holds where it has fallen to, not at its earlier target.
     until("the end of the fall", || emulator.joints().1.iter().all(|v| *v == 0.0));
     let (lies, _) = emulator.joints();
     until("the last of it", || farthest(&read(&mut arm).unwrap().position, &lies) < 1e-4);

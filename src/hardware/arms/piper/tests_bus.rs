@@ -97,7 +97,7 @@ fn f17_a_set_point_that_the_bus_does_not_take_is_told() {
     assert!(arm.counts().1.not_taken >= 4);
 }
 
-/// The bus has no room for the next so many commands, from now on.
+/// Leaves the bus without room for this number of commands.
 fn no_room(emulator: &PiperEmulator, commands: usize) {
     emulator.inject(Fault::new(FaultKind::NoBuffers)).unwrap();
     let mut other = other(emulator);

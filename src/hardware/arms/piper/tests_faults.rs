@@ -59,7 +59,7 @@ fn f05_speeds_that_are_old_are_not_told() {
     let mut values = [7.0; DOF];
     assert_eq!((arm.read_joint_velocities(&mut values), values), (Ok(false), [7.0; DOF]));
     assert_eq!((arm.read_joint_efforts(&mut values), values), (Ok(false), [7.0; DOF]));
-    assert_eq!(arm.write_stop(), Ok(Stop::Sent), "nothing shows that motor 2 stands");
+    assert_eq!(arm.write_stop(), Ok(Stop::Sent), "nothing shows that motor 2 is at rest");
     emulator.mute(None);
     until("news of it", || read(&mut arm).unwrap().velocity.is_some());
     assert_eq!(arm.write_stop(), Ok(Stop::Confirmed));
@@ -254,7 +254,7 @@ fn f19_faults_of_the_gripper_are_told_and_cleared_where_it_is_used() {
     let end = Instant::now() + Duration::from_millis(200);
     while Instant::now() < end {
         read(&mut arm).unwrap();
-        assert_eq!(arm.read_error(), Ok((0, String::new())), "nobody uses it");
+        assert_eq!(arm.read_error(), Ok((0, String::new())), "the gripper is not used");
     }
 }
 

@@ -86,7 +86,7 @@ impl Wire {
 
     fn no_room(&self) -> AdapterError {
         AdapterError::Io(format!(
-            "{}: its bus takes no frames: the queue is full\nhint: nobody acknowledges: is the arm powered, plugged \
+            "{}: its bus takes no frames: the queue is full\nhint: no node acknowledges: is the arm powered, plugged \
              in, and the bus at 1 Mbit/s?",
             self.peer
         ))
@@ -111,7 +111,7 @@ impl Wire {
                 "check cable, termination and bit rate (1 Mbit/s); then set the interface down and up",
             ),
             CanTrouble::NoAcknowledge => {
-                ("nobody acknowledges on its bus", "is the arm powered, plugged in, and the bus at 1 Mbit/s?")
+                ("no node acknowledges on its bus", "is the arm powered, plugged in, and the bus at 1 Mbit/s?")
             }
             CanTrouble::Overflow => {
                 self.counts.overflows += 1;
@@ -125,7 +125,7 @@ impl Wire {
         Err(AdapterError::Io(format!("the connection to {} broke: {what}\nhint: {hint}", self.peer)))
     }
 
-    /// Waits until something has arrived, so long at most.
+    /// Waits until something has arrived, at most `timeout`.
     pub fn wait(&self, timeout: Duration) {
         let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
         let _ = poll(&mut [PollFd::from_borrowed_fd(self.port.fd(), PollFlags::IN)], Some(&timeout));

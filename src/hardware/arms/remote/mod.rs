@@ -48,7 +48,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         required: true,
         check: |address| Address::parse(address).map(|address| address.to_string()),
     },
-    // Nobody knows before the peer is asked, and then a blueprint's default must be the careful one.
+    // Unknown before the connection; the default must be the safe one.
     holds_when_disabled: false,
     gripper: true,
     options: OptionsSpec::of::<Options>(),

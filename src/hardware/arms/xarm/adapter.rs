@@ -26,14 +26,14 @@ const PLANNED: u8 = 0;
 const SERVO: u8 = 1;
 const JOINT_VELOCITY: u8 = 4;
 
-/// What is known answers further questions for so long.
+/// Maximum age of the state that answers further reads of a cycle.
 const RECENT: Duration = Duration::from_millis(2);
 /// Accelerations of planned moves: the vendor's own defaults [rad/s², mm/s²].
 const JOINT_ACCELERATION: f64 = 8.726_646;
 const LINE_ACCELERATION: f64 = 2000.0;
 /// Slowest planned moves that the controller takes [rad/s, mm/s].
 const SLOWEST: (f64, f64) = (1e-4, 0.1);
-/// The arm stops by itself when no velocity follows for so long [s].
+/// The arm stops when no velocity follows within this time [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
 /// Targets of planned moves closer than this are the same [rad].
 const SAME: f64 = 1e-6;
@@ -91,7 +91,7 @@ impl XArmAdapter {
     fn joints(&self, values: &[f64]) -> AdapterResult<WireJoints> {
         let dof = self.model.axes();
         if values.len() != dof || !values.iter().all(|value| value.is_finite()) {
-            return Err(AdapterError::Rejected(format!("{dof} finite values are needed, one per joint")));
+            return Err(AdapterError::Rejected(format!("expected {dof} finite values, one per joint")));
         }
         let mut joints = [0.0; 7];
         joints.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
@@ -198,8 +198,8 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     fn get_control_mode(&self) -> ControlMode {
-        // A mode that the adapter does not use has the nearest name that `set_control_mode` does not know, so that
-        // nobody takes it for one that does.
+        // A mode that the adapter does not use is reported as the most similar one that `set_control_mode` refuses, so
+        // that it never counts as a used one.
         match self.session.as_ref().map_or(PLANNED, |session| session.motion().0.mode) {
             PLANNED => ControlMode::Position,
             SERVO => ControlMode::ServoPosition,

@@ -34,7 +34,7 @@ impl Address {
         Endpoint { host: self.control.host.clone(), port: self.control.port.saturating_add(1) }
     }
 
-    /// The report port so many after the first.
+    /// Returns the report port at this offset from the first.
     pub fn report(&self, offset: u16) -> Endpoint {
         Endpoint { host: self.control.host.clone(), port: self.reports.saturating_add(offset) }
     }

@@ -1,5 +1,5 @@
-//! How the controller is: error, warning, motors. Register 15 alone says what the error is; everything else that hints
-//! at a change (the state byte of any response, a report, a stop that nobody asked for) only makes us ask it.
+//! Condition of the controller: error, warning, motors. Only register 15 says what the error is. Anything that hints at
+//! a change (the state byte of a response, a report, a stop that this run did not order) triggers a request for it.
 
 use std::time::Duration;
 
@@ -52,12 +52,12 @@ impl Condition {
         u16::from(self.enabled) & ((1 << axes) - 1) == 0
     }
 
-    /// Looks at the state byte of a response.
+    /// Checks the state byte of a response.
     pub fn hint(&mut self, status: Status) {
         self.changed |= status.error() != (self.error != 0);
     }
 
-    /// Looks at a report.
+    /// Checks a report.
     pub fn report(&mut self, health: Health) {
         (self.enabled, self.tool) = (health.enabled, health.tool);
         self.changed |= health.error != self.error || health.warning != self.warning;

@@ -182,8 +182,8 @@ pub fn takes_detection(firmware: Firmware) -> bool {
     firmware.at_least(1, 10, 0)
 }
 
-/// Whether joint velocities have a time after which the controller ends them. Without it a velocity lasts until the
-/// next command, also when no command can come any more: such an arm has no velocity mode here.
+/// Returns whether the controller ends joint velocities after a time. Without this, a velocity lasts until the next
+/// command, even after a loss of the connection; such an arm has no velocity mode here.
 pub fn ends_velocities(firmware: Firmware) -> bool {
     firmware.at_least(1, 8, 0)
 }

@@ -14,8 +14,8 @@ use crate::hardware::transport::tcp::TcpLink;
 const WINDOW: usize = 64;
 /// Most setpoints without response: what a stalled connection still delivers when it is back.
 const IN_FLIGHT: usize = 2;
-/// A controller that answers nothing for so long, while it is asked what it answers quickly, is gone.
-const GONE: Duration = Duration::from_millis(1000);
+/// Without a response to a quick request for this time the controller is lost.
+const LOST_AFTER: Duration = Duration::from_millis(1000);
 
 /// Who wants the response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -24,7 +24,7 @@ pub enum Purpose {
     Answer,
     /// A command that moves the arm: only a refusal is of interest.
     Motion,
-    /// It tells how the controller is.
+    /// Requests the controller's condition.
     Health,
     /// It is for the gripper.
     Gripper,
@@ -149,15 +149,15 @@ impl Control {
         self.pending.iter().flatten().any(Pending::is_slow)
     }
 
-    /// Setpoints on their way: without response, and nothing that was sent later has one. A connection that stands
-    /// still keeps this count, however long it does.
+    /// Returns the number of setpoints in flight: without a response, and nothing sent later has one. While the
+    /// connection stalls, the number does not change.
     fn in_flight(&self) -> usize {
         let on_their_way = |p: &&Pending| p.purpose == Purpose::Motion && p.sent > self.answered_up_to;
         self.pending.iter().flatten().filter(on_their_way).count()
     }
 
-    /// Sends a request and returns its number at once. The response shows up in [`Control::next`]. `Busy` for a set
-    /// point while two are on their way.
+    /// Sends a request and returns its number at once. [`Control::next`] returns the response. `Busy` for a setpoint
+    /// while two are in flight.
     pub fn post(&mut self, command: &Command, purpose: Purpose) -> AdapterResult<u16> {
         let now = MonotonicClock.now();
         if purpose == Purpose::Motion && self.in_flight() >= IN_FLIGHT {
@@ -183,8 +183,8 @@ impl Control {
         Ok(transaction)
     }
 
-    /// What somebody waits for goes out, however far behind the controller is: it may be a stop. The response to the
-    /// oldest request is then nobody's.
+    /// Makes room for a request that a caller waits for, even if the controller is far behind: it may be a stop. The
+    /// response to the oldest request is then ignored.
     fn make_room(&mut self) {
         if self.pending.iter().all(Option::is_some)
             && let Some(oldest) = self.pending.iter_mut().min_by_key(|slot| slot.map(|pending| pending.sent))
@@ -283,9 +283,9 @@ impl Control {
                 pending.overdue = true;
                 self.counts.overdue += 1;
             }
-            let gone = age > GONE.max(pending.timeout);
+            let gone = age > LOST_AFTER.max(pending.timeout);
             if gone && last_response < pending.sent {
-                return Err(AdapterError::Io(format!("{} answers nothing any more", self.link.peer())));
+                return Err(AdapterError::Io(format!("{} does not answer", self.link.peer())));
             }
             if gone {
                 *slot = None; // lost, while others were answered
@@ -343,7 +343,7 @@ mod tests {
             panic!("no response")
         };
         go.send(()).unwrap();
-        assert_eq!(next(&mut control).data(), [13], "the third came first, after one to nobody");
+        assert_eq!(next(&mut control).data(), [13], "the third came first, after one without a request");
         go.send(()).unwrap();
         assert_eq!(next(&mut control).data(), [11]);
         let second = |control: &Control| control.pending.iter().flatten().map(|p| p.transaction).collect::<Vec<_>>();
@@ -353,7 +353,7 @@ mod tests {
         assert_eq!(control.counts(), Counts { sent: 3, late: 0, overdue: 1, stray: 1 });
         go.send(()).unwrap();
         while control.counts().late == 0 {
-            assert_eq!(control.next().unwrap().map(|_| ()), None, "nobody wants it any more");
+            assert_eq!(control.next().unwrap().map(|_| ()), None, "its request was dropped");
         }
         assert_eq!(control.counts(), Counts { sent: 3, late: 1, overdue: 1, stray: 2 });
     }

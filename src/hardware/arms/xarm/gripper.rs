@@ -15,16 +15,16 @@ use crate::hardware::adapter::{AdapterError, AdapterResult};
 /// How often the position is asked for, and how often when the gripper does not answer.
 const POLL: Duration = Duration::from_millis(100);
 const POLL_SILENT: Duration = Duration::from_millis(1000);
-/// For how long it is asked again and again after a stop, to see whether it still moves.
+/// How long the gripper is polled after a stop, to see whether it still moves.
 const WATCH: Duration = Duration::from_millis(500);
 /// A telegram whose answer takes longer is lost.
 const TIMEOUT: Duration = Duration::from_secs(2);
-/// After so many equal positions, a few pulses apart at most, a gripper is at rest.
+/// Number of equal positions, within a few pulses, after which a gripper is at rest.
 const RESTS_AFTER: u32 = 10;
 const SAME_PULSES: u32 = 2;
-/// So many lost telegrams in a row mean that there is no gripper.
+/// Consecutive lost telegrams after which there is no gripper.
 const SILENT_AFTER: u32 = 3;
-/// After so many positions the error is asked for.
+/// Number of positions between two requests for the error.
 const ERROR_EVERY: u32 = 10;
 
 /// What a telegram was for.
@@ -43,7 +43,7 @@ enum Step {
 #[derive(Debug, Clone, Copy)]
 pub struct Gripper {
     kind: GripperKind,
-    /// What it must still be told before it takes targets; `None`: nothing.
+    /// The next step before it takes targets; `None` when it is ready.
     wake: Option<Step>,
     wanted: Option<i32>,
     clear: bool,
@@ -99,7 +99,7 @@ impl Gripper {
         Ok(())
     }
 
-    /// The arm was told to stop. A target that is not sent yet is dropped; whether it still goes to one shows soon.
+    /// The arm was stopped. An unsent target is dropped; the next positions show whether the gripper still moves.
     pub fn stopped(&mut self, now: Mono) {
         self.wanted = None;
         self.watched_until = now.after(WATCH);
@@ -199,7 +199,7 @@ impl Gripper {
         self.under_way = None;
         self.failures += 1;
         if self.failures >= SILENT_AFTER {
-            // Where it is, and what it was told, is not known any more.
+            // Its position and target are unknown now.
             (self.pulses, self.wanted, self.wake, self.clear) = (None, None, Some(Step::Enable), false);
         }
     }

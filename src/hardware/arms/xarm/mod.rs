@@ -50,7 +50,7 @@ use protocol::gripper::GripperKind;
 /// The modes of the arm.
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 
-/// Those of firmware before 1.8.0, which does not end a velocity by itself.
+/// Modes of firmware before 1.8.0, which does not end a velocity after a time.
 const MODES_WITHOUT_VELOCITY: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition];
 
 /// How often a controller with firmware 2.1.0 or newer reports [Hz]. Older ones do 100 times a second.

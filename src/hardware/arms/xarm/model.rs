@@ -61,7 +61,7 @@ const XARM6_1305: [(f64, f64); 6] = [TURN, SHOULDER_1305, ELBOW_1305, TURN, WRIS
 const XARM7_1305: [(f64, f64); 7] = [TURN, SHOULDER_1305, TURN, (-0.10472, 3.92699), TURN, WRIST, TURN];
 
 impl Model {
-    /// The model that an arm with so many joints is unless somebody says otherwise.
+    /// Returns the default model with this number of joints.
     pub fn of_dof(dof: usize) -> Option<Self> {
         match dof {
             5 => Some(Self::Xarm5),

@@ -9,7 +9,7 @@ use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::transport::tcp::TcpLink;
 
-/// A connection on which the controller reports by itself.
+/// A connection on which the controller streams reports.
 pub struct Stream<T> {
     link: TcpLink,
     kind: Kind,

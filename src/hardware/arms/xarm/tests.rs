@@ -172,7 +172,7 @@ fn why_a_mode_was_not_reached_is_told_by_whichever_call_comes_next() {
     emulator.keep_mode(true);
     let under_way = set(&mut arm, ControlMode::Velocity).unwrap_err();
     assert_eq!(under_way, AdapterError::Rejected("the change of mode is under way".into()));
-    // The change goes on with every reading, and comes to nothing in one of them.
+    // The change continues with every reading, and fails in one of them.
     let end = Instant::now() + Duration::from_secs(3);
     while Instant::now() < end {
         read(&mut arm).unwrap();
@@ -181,7 +181,7 @@ fn why_a_mode_was_not_reached_is_told_by_whichever_call_comes_next() {
     let error = set(&mut arm, ControlMode::Velocity).unwrap_err();
     assert_eq!(error, AdapterError::Protocol("xarm did not change to mode 4: it does not take the mode".into()));
     let refused = set(&mut arm, ControlMode::Velocity).unwrap_err().to_string();
-    assert_eq!(refused, "the arm was stopped: enable it again", "told once");
+    assert_eq!(refused, "the arm was stopped: enable it again", "reported once");
     emulator.keep_mode(false);
     arm.activate().unwrap();
     until("velocity mode", || set(&mut arm, ControlMode::Velocity).is_ok());
@@ -261,7 +261,7 @@ fn errors_are_told_with_what_to_do_and_stay_until_they_are_cleared() {
 fn an_error_shows_at_once_and_refuses_set_points() {
     let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
     let hold = six(&mut arm);
-    // A stop shows in the next report, and register 15 is asked then: nobody waits for the 5 Hz report.
+    // A stop shows in the next report and triggers a request of register 15: no need to wait for the 5 Hz report.
     emulator.mute_condition(true);
     emulator.inject(Fault::new(FaultKind::ErrorCode).code(24)).unwrap();
     until("the error", || {

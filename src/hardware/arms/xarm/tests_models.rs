@@ -21,8 +21,8 @@ fn other_models_options_and_firmwares_conform_too() {
     ] {
         let old = options["sim"].is_object();
         let subject = Subject { config: config("", dof, options.clone()), ..Subject::emulated(&SPEC) };
-        // Reports before firmware 2.1.0 have no time: a measurement that is repeated cannot be told from an arm that
-        // stands still. Before 1.8.0 there is no velocity mode.
+        // Reports before firmware 2.1.0 have no time stamp, so a repeated measurement looks like an arm at rest. Before
+        // 1.8.0 there is no velocity mode.
         let old_modes = options["sim"]["firmware"] == "1.5.20";
         let modes = if old_modes { MODES_WITHOUT_VELOCITY } else { SPEC.modes };
         let subject = Subject { row: AdapterSpec { modes, ..SPEC }, ..subject };

@@ -45,7 +45,7 @@ pub struct YourArmAdapter {
     hello: Option<Hello>,
     /// Number of the last command; its reply carries the same.
     sequence: u16,
-    /// The last packet, and when it arrived; `Mono::ZERO` when it must not answer anything any more.
+    /// The last packet, and when it arrived; `Mono::ZERO`: it is outdated.
     state: protocol::State,
     state_at: Mono,
     device_time: DeviceTime,
@@ -71,14 +71,14 @@ impl YourArmAdapter {
     fn request<T>(
         &mut self,
         command: &Command,
-        patience: Retry,
+        timeout: Retry,
         decode: impl Fn(&[u8]) -> Option<T>,
     ) -> AdapterResult<T> {
         self.sequence = self.sequence.wrapping_add(1);
         let (sequence, opcode) = (self.sequence, command.opcode());
         let mut frame = [0; MAX_FRAME];
         let frame = protocol::encode(command, sequence, &mut frame);
-        self.line.request(frame, patience, |bytes| {
+        self.line.request(frame, timeout, |bytes| {
             frame::scan(bytes, opcode, sequence).map(|reply| read_reply(command, &reply, &decode))
         })?
     }

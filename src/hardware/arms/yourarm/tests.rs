@@ -143,7 +143,7 @@ fn modes_change_at_standstill_only_and_velocities_time_out() {
     assert_eq!(arm.get_control_mode(), ControlMode::Velocity);
     assert_eq!(arm.set_control_mode(ControlMode::Torque), Err(AdapterError::Unsupported));
     arm.write_joint_velocities(&[0.5, 0.0, 0.0, 0.0, 0.0, -1.0]).unwrap();
-    // No further velocity: the controller stops by itself after 200 ms.
+    // No further velocity: the controller stops after 200 ms.
     until("standstill", || emulator.joints().0[0] > 0.01 && emulator.joints().1.iter().all(|v| *v == 0.0));
     let moved = emulator.joints().0[0];
     assert!(moved > 0.01 && moved < 0.5 * 0.2 + 0.5 * 0.5 / 10.0 + 1e-3, "{moved}");

@@ -132,7 +132,7 @@ impl Controller {
                 self.lose_power();
             }
             Request::Halt { teach, .. } => self.teach(teach),
-            // Standby; a mode that this emulator has not; whoever is being taught does not listen.
+            // Standby; a mode that is not emulated; an arm in teaching ignores commands.
             Request::Control { control: 0, .. } => self.control = 0,
             Request::Control { mode: 2.., .. } | Request::Mit(_) => self.cannot(),
             Request::Control { .. } if self.teaching => {}
@@ -187,7 +187,7 @@ impl Controller {
         }
     }
 
-    /// A mode that is not emulated: said, not passed over.
+    /// Reports a mode that is not emulated as an error.
     fn cannot(&mut self) {
         let other = if self.arm.error() == 0 { state::OTHER } else { self.arm.error() };
         self.arm.fail(other);

@@ -1,8 +1,8 @@
-//! The emulator: plays a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface
-//! or a serial line.
+//! Emulator of a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface or a
+//! serial line.
 //!
-//! Like the arm it sends its state by itself, at the arm's rates (3 040 frames/s in all), whether somebody listens or
-//! not, and takes commands from every node on its bus. The bus and the joints are those of the simulation kit
+//! Like the arm it streams its state at the arm's rates (3 040 frames/s in all), whether or not a program receives it,
+//! and takes commands from every node on its bus. The bus and the joints are those of the simulation kit
 //! ([`crate::hardware::sim`]).
 
 mod controller;
@@ -54,8 +54,8 @@ const ANYWHERE: usize = PLAYABLE.len() - 3;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an arm may rest
-    /// that nobody holds; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
+    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an unsupported arm
+    /// may rest; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
     pub initial_positions: Vec<f64>,
     /// How often it sends its state, 20 to 200 [Hz]: an arm's 200, or less for a client that cannot keep up.
     #[serde(deserialize_with = "rate")]
@@ -87,7 +87,7 @@ impl Default for SimOptions {
 }
 
 impl SimOptions {
-    /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
+    /// Refuses a pose outside the joint limits, an invalid firmware version, and faults that are not among `playable`.
     pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), ConfigError> {
         self.common().check("piper", &stops(), playable)?;
         match self.firmware.len() {
@@ -153,7 +153,7 @@ impl PiperEmulator {
         self.server.with(|controller, _| controller.arm().enabled())
     }
 
-    /// Whether it refuses targets outside its limits (it does, unless told otherwise) or takes them.
+    /// Sets whether it refuses targets outside its limits (the default) or takes them.
     pub fn refuse_outside(&self, refuse: bool) {
         self.server.with(|controller, _| controller.lenient = !refuse);
     }
@@ -169,7 +169,7 @@ impl PiperEmulator {
         self.server.with(|controller, _| controller.power_drops)
     }
 
-    /// Lets it leave out the frames with these identifiers, or none again; all others go on.
+    /// Suppresses the frames with these identifiers, or none; all others continue.
     pub fn mute(&self, identifiers: Option<RangeInclusive<u16>>) {
         self.server.with(|controller, _| controller.muted = identifiers);
     }

@@ -85,7 +85,7 @@ pub struct Controller {
     pub(super) settings: Settings,
     /// It answers to a change of mode, and stays in the mode that it is in.
     pub keeps_mode: bool,
-    /// It sends no reports of how it is; all others go on.
+    /// Suppresses the reports of the condition; all others continue.
     pub condition_muted: bool,
     /// What becomes of the full reports.
     pub withhold: Withhold,

@@ -67,7 +67,7 @@ const REPORT_PORTS: u16 = Kind::ALL.len() as u16;
 const SECOND: usize = Kind::ALL.len() + 1;
 /// Most control connections at once.
 const CLIENTS: usize = 16;
-/// Attempts to find so many free ports in a row.
+/// Attempts to find consecutive free ports.
 const ATTEMPTS: u32 = 200;
 
 /// What the emulator does.
@@ -207,17 +207,17 @@ impl XArmEmulator {
         self.server.with(|controller, _| controller.arm().release_estop());
     }
 
-    /// Lets it stay in its mode whatever it is told, or obey again.
+    /// Makes the controller ignore changes of the mode, or accept them again.
     pub fn keep_mode(&self, keep: bool) {
         self.server.with(|controller, _| controller.keeps_mode = keep);
     }
 
-    /// Lets port 30001 fall silent while its connections stay open and all other ports go on, or report again.
+    /// Mutes port 30001 while its connections stay open and all other ports continue, or unmutes it.
     pub fn mute_condition(&self, mute: bool) {
         self.server.with(|controller, _| controller.condition_muted = mute);
     }
 
-    /// Lets the replies to a register take so long [s] from now on.
+    /// Delays the responses to a register by this time [s].
     pub fn slow_down(&self, register: u8, delay: f64) {
         self.server.with(|controller, _| controller.slow_down(SlowReply { register, delay }));
     }

@@ -178,7 +178,7 @@ fn wrong_requests_raise_what_the_sheet_says() {
     arm.arm.release_estop();
     ask(&mut arm, 16, &[], 0.0);
     ask(&mut arm, 124, &[9, 7, 3, 0, 0, 0, 1], 0.0);
-    assert_eq!(arm.error(), 19, "nobody of that number at the tool");
+    assert_eq!(arm.error(), 19, "no device with that number at the tool");
 }
 
 #[test]

@@ -95,7 +95,7 @@ impl YourArmEmulator {
         self.server.with(|controller, _| controller.trace.entries())
     }
 
-    /// How many clients were turned away because another one was connected.
+    /// Returns how many clients were rejected because another one was connected.
     pub fn refused_clients(&self) -> u64 {
         self.server.refused()
     }
