@@ -1,4 +1,4 @@
-//! The Piper adapter: the adapter protocol on one side, the arm's CAN frames on the other.
+//! The Piper adapter: the adapter trait on one side, the arm's CAN frames on the other.
 //!
 //! Wire: 0.001°, 0.001 mm, 0.001 rad/s, mA. Here: rad, m, rad/s, Nm. The conversions are in this file, those of angles
 //! in `protocol.rs`.
@@ -27,13 +27,13 @@ use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::can::CanAddress;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
-/// How long clearing may take; drivers report every 25 ms.
+/// Timeout of clearing errors; drivers report every 25 ms.
 const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
-/// How long a stop waits for the joints to get slower, and what counts as slower [0.001 rad/s].
+/// How long a stop waits for the joints to decelerate, and the change of speed that shows it [0.001 rad/s].
 const STOP_TIMEOUT: Duration = Duration::from_millis(20);
-const SLOWER: i32 = 20;
-/// So far outside its limits a joint may be sent [rad]: the coordinator keeps to the limits, and an arm that lies
-/// beyond one must find back.
+const DECELERATION: i32 = 20;
+/// How far outside its limits a target may be [rad]: the coordinator keeps the limits, but an arm outside must be able
+/// to return.
 const MARGIN: f64 = 0.1;
 /// Motor torque per current [Nm/A]: joints 1 to 3, and 4 to 6.
 const TORQUE: [f64; DOF] = [1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844];
@@ -51,7 +51,7 @@ pub struct PiperAdapter {
 }
 
 impl PiperAdapter {
-    /// An adapter for the arm on the bus at `config.address`. Does not connect.
+    /// Creates an adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
         config.check(check)?;
@@ -61,12 +61,12 @@ impl PiperAdapter {
         Ok(Self { arm, options, mode: ControlMode::Position })
     }
 
-    /// What was counted since the connection was made: frames of the arm, and of the bus.
+    /// Returns the counts since the connection was made: frames of the arm, and of the bus.
     pub fn counts(&self) -> (Counts, WireCounts) {
         (self.arm.feedback.counts, self.arm.wire.as_ref().map(|wire| wire.counts).unwrap_or_default())
     }
 
-    /// Speed of a planned move [%] from a fraction of the top speed.
+    /// Returns the speed of a planned move [%] from a fraction of the top speed.
     fn percent(&self, velocity: f64) -> u8 {
         (velocity * self.options.speed_scale * 100.0).round().clamp(1.0, 100.0) as u8
     }
@@ -78,7 +78,7 @@ impl PiperAdapter {
         }
     }
 
-    /// With how much torque the gripper closes at most [mNm].
+    /// Returns the maximum closing torque of the gripper [mNm].
     fn gripper_torque(&self) -> u16 {
         (self.options.gripper_torque / MILLI).round() as u16
     }
@@ -111,7 +111,7 @@ fn fill(out: &mut [f64], values: &[f64]) {
     out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
 }
 
-/// How long a stop waits for positions that are measured now.
+/// How long a stop waits for current positions.
 const LIVE_TIMEOUT: Duration = Duration::from_millis(60);
 
 impl ManipulatorAdapter for PiperAdapter {
@@ -130,7 +130,7 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.wire.is_some()
     }
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         ManipulatorInfo {
@@ -150,7 +150,7 @@ impl ManipulatorAdapter for PiperAdapter {
         DOF
     }
 
-    /// The data sheet's limits, narrowed by those that the controller has been given.
+    /// Returns the limits of the data sheet, narrowed by those of the controller.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
         let (limits, odd) = self.arm.limits();
         odd.iter().for_each(|what| tracing::warn!("{}", self.arm.about(what)));
@@ -170,7 +170,7 @@ impl ManipulatorAdapter for PiperAdapter {
         Ok(())
     }
 
-    /// The ordered mode, or another one when somebody else has changed it.
+    /// Returns the ordered mode, or another one if another client has changed it.
     fn get_control_mode(&self) -> ControlMode {
         self.arm.feedback.guard.change.map_or(self.mode, |change| change.mode(self.mode))
     }
@@ -236,7 +236,7 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(self.arm.refuse(format!("{DOF} values are needed, one per joint")));
         };
         for (i, (value, (lower, upper))) in positions.iter().zip(super::RANGES).enumerate() {
-            // Not finite is not inside either.
+            // NaN is not inside either.
             if !(lower - MARGIN..=upper + MARGIN).contains(value) {
                 let joint = i + 1;
                 return Err(self.arm.refuse(format!("joint {joint}: {value} rad is not within {lower} to {upper}")));
@@ -260,10 +260,10 @@ impl ManipulatorAdapter for PiperAdapter {
     /// Holds the arm at the last written target, at most 0.02 rad from its position. Confirmed when the feedback shows
     /// that every joint decelerates or is at rest.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
-        self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
+        self.arm.refresh()?; // a hold needs a current position
         if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
-            // Where the arm is now: not where it was before a pause of its feedback. One that stays silent is held
-            // there.
+            // Use current positions, not those from before a gap in the feedback. An arm that stays silent is held at
+            // the old ones.
             self.arm.watch(LIVE_TIMEOUT, Feedback::is_live)?;
             self.arm.settle()?;
         }
@@ -275,12 +275,12 @@ impl ManipulatorAdapter for PiperAdapter {
         let slower = |feedback: &Feedback| {
             let speeds = feedback.motors.iter().map(|motor| i32::from(motor.speed).abs());
             feedback.motors_heard(sent)
-                && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
+                && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + DECELERATION <= then)
         };
         Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
     }
 
-    /// Enabling holds the arm where it is: the target is set before the motors come on, and again when they are on.
+    /// Enabling holds the arm at its position: the target is set before the motors come on, and again when they are on.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         if !enable {
             self.arm.drain()?;
@@ -341,7 +341,7 @@ impl ManipulatorAdapter for PiperAdapter {
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
-        // Ten metres and ten turns are far beyond the arm, and far inside the wire's numbers.
+        // Ten metres and ten turns are far beyond the arm's reach, and fit the wire's numbers.
         let sensible = pose.xyz.iter().all(|v| v.abs() < 10.0) && pose.rpy.iter().all(|v| v.abs() < 62.0);
         if !sensible {
             return Err(self.arm.refuse("the pose is not finite, or absurd".into()));

@@ -1,5 +1,5 @@
-//! The adapter's dealings with the arm, apart from units: what arrives is taken up, silence is noticed, and what may be
-//! sent is decided by what the arm says of itself.
+//! A session with the arm, in wire units: processes received frames, detects silence, and decides from the arm's
+//! feedback what may be sent.
 
 use std::time::Duration;
 
@@ -14,50 +14,50 @@ use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::{CanAddress, CanFrame};
 use crate::joint::JointLimits;
 
-/// Longest waits for the first whole state, and then for what was asked.
+/// Timeouts of the first complete state, and of responses.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(300);
-/// What has arrived within this time need not be looked for again: the arm's period.
+/// Received frames are not processed again within this time: the arm's period.
 const RECENT: Duration = Duration::from_millis(5);
-/// A state older than this is no state: a living arm sends one every 5 ms; the rest is for a busy host.
-const SILENCE: Duration = Duration::from_millis(150);
-/// The same of what the drivers say, which comes every 25 ms.
-const DRIVERS_SILENCE: Duration = Duration::from_millis(300);
-/// After this long without a state the connection is given up: the arm has lost its power.
-const LOST: Duration = Duration::from_millis(400);
+/// Maximum age of the state: a live arm sends one every 5 ms; the rest is for a busy host.
+const STALE_AFTER: Duration = Duration::from_millis(150);
+/// Maximum age of the drivers' reports, which arrive every 25 ms.
+const DRIVERS_STALE_AFTER: Duration = Duration::from_millis(300);
+/// Without a state for this long the connection is closed: the arm has lost power.
+const LOST_AFTER: Duration = Duration::from_millis(400);
 /// Period of the repeated commands for enabling and disabling, as in the vendor's SDK.
 const REPEAT: Duration = Duration::from_millis(10);
 const ENABLE_TIMEOUT: Duration = Duration::from_millis(1000);
-/// The E-stop among the arm's states.
+/// State of the arm: E-stop.
 pub const ESTOP: u8 = 1;
-/// So far outside its limits a joint may lie and still be enabled [rad].
-const PLAUSIBLE: f64 = 0.2;
+/// How far outside its limits a joint may be when it is enabled [rad].
+const MAX_OUTSIDE: f64 = 0.2;
 
 /// An arm on its bus, connected or not.
 pub struct Session {
-    /// The arm's name in the blueprint, for messages.
+    /// The arm's `hardware_id`, for messages.
     hardware_id: String,
     address: CanAddress,
     /// The open port, while connected.
     pub wire: Option<Wire>,
-    /// What is known of the arm.
+    /// The arm's feedback.
     pub feedback: Feedback,
-    /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
+    /// The last joint targets [0.001°]; `None` if the arm does not follow them.
     pub written: Option<WireJoints>,
-    /// It is a setpoint of a stream: the arm is at most its lag behind it.
+    /// Whether they are a setpoint of a stream: the arm is at most its lag behind it.
     pub streamed: bool,
-    /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
+    /// Speed [%] and mode of following in the last control frame for joint targets, unless another one followed it.
     pub control: Option<(u8, Follow)>,
-    /// Its joint limits [0.001°].
+    /// Joint limits [0.001°].
     pub ranges: WireRanges,
-    /// The controller refuses targets outside its limits.
+    /// Whether the controller refuses targets outside its limits.
     pub strict: bool,
-    /// When what had arrived was last taken up.
+    /// When received frames were last processed.
     drained_at: Mono,
 }
 
 impl Session {
-    /// A session with the arm on the bus at `address`. Does not connect.
+    /// Creates a session with the arm on the bus at `address`. Does not connect.
     pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
         let feedback = Feedback::of_arm(gripper_used);
         let ranges = [(0, 0); DOF];
@@ -75,7 +75,7 @@ impl Session {
         }
     }
 
-    /// Opens the port and waits for a whole state. Only asks.
+    /// Opens the port and waits for a complete state. Sends only requests.
     pub fn connect(&mut self) -> AdapterResult<()> {
         self.feedback = Feedback::of_arm(self.feedback.gripper_used);
         (self.written, self.control, self.strict) = (None, None, false);
@@ -89,7 +89,7 @@ impl Session {
 
     // --- The wire ---
 
-    /// Takes up what has arrived. A broken wire ends the session.
+    /// Processes received frames. A broken connection ends the session.
     pub fn drain(&mut self) -> AdapterResult<()> {
         let wire = self.wire.as_mut().ok_or(AdapterError::NotConnected)?;
         self.drained_at = MonotonicClock.now();
@@ -100,12 +100,12 @@ impl Session {
         result
     }
 
-    /// Sends a command: an error unless the bus has taken all of it.
+    /// Sends a command; an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
         self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
     }
 
-    /// Sends a joint target, with its control frame, and remembers it.
+    /// Sends a joint target with its control frame, and records it.
     pub fn write(&mut self, speed: u8, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         let frames = protocol::joint_targets(speed, follow, target);
         self.feedback.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
@@ -114,8 +114,8 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a setpoint. The control frame is left out where the arm reports that it is in the mode: another program
-    /// that has just changed it would have that undone before it shows.
+    /// Sends a setpoint. The control frame is omitted while the arm reports the mode: it would undo a change by another
+    /// program before that shows.
     pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         const SPEED: u8 = 100;
         let Status { control, mode, .. } = self.feedback.status;
@@ -130,12 +130,12 @@ impl Session {
         Ok(())
     }
 
-    /// Whether another setpoint may wait for the bus.
+    /// Returns whether another setpoint may wait for the bus.
     pub fn has_room(&self) -> bool {
         self.wire.as_ref().is_some_and(Wire::has_room)
     }
 
-    /// Takes back what has not left this computer; see [`Wire::discard`]. Where that fails, the connection ends.
+    /// Discards unsent frames; see [`Wire::discard`]. If that fails, closes the connection.
     pub fn discard(&mut self) {
         let discarded = self.wire.as_mut().map(Wire::discard);
         if let Some(Err(_)) = discarded {
@@ -143,7 +143,7 @@ impl Session {
         }
     }
 
-    /// Takes up feedback until `done` says so; `false` when the time is over.
+    /// Processes feedback until `done` returns true; `false` after the timeout.
     pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Feedback) -> bool) -> AdapterResult<bool> {
         let end = MonotonicClock.now().after(timeout);
         loop {
@@ -158,41 +158,44 @@ impl Session {
         }
     }
 
-    /// Takes up what has arrived; an error when the newest positions are too old to act on.
+    /// Processes received frames; an error if the newest positions are stale.
     pub fn refresh(&mut self) -> AdapterResult<()> {
         self.drain()?;
         let age = MonotonicClock.now().since(self.feedback.joints_at);
-        if age <= SILENCE {
+        if age <= STALE_AFTER {
             return Ok(());
         }
         // The same text each time, so that it is logged once.
-        if age > LOST {
+        if age > LOST_AFTER {
             self.wire = None;
-            let text =
-                format!("the connection to piper at {} broke: no state for {} ms", self.address, LOST.as_millis());
+            let text = format!(
+                "the connection to piper at {} broke: no state for {} ms",
+                self.address,
+                LOST_AFTER.as_millis()
+            );
             return Err(AdapterError::Io(text));
         }
-        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, SILENCE.as_millis())))
+        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, STALE_AFTER.as_millis())))
     }
 
     /// Processes what has arrived; an error if the state is stale, or if the drivers no longer report whether the
     /// motors are on.
     pub fn whole(&mut self) -> AdapterResult<()> {
         self.refresh()?;
-        let earliest = MonotonicClock.now().before(DRIVERS_SILENCE);
+        let earliest = MonotonicClock.now().before(DRIVERS_STALE_AFTER);
         if self.feedback.drivers_heard(earliest) {
             return Ok(());
         }
         let (address, silent) = (&self.address, self.feedback.silent_drivers(earliest));
         Err(AdapterError::Timeout(format!(
             "piper at {address}: the drivers of joints {silent} have said nothing for {} ms",
-            DRIVERS_SILENCE.as_millis()
+            DRIVERS_STALE_AFTER.as_millis()
         )))
     }
 
     /// Returns whether the motors' speeds and currents are recent.
     pub fn measures(&self) -> bool {
-        self.feedback.motors_heard(MonotonicClock.now().before(SILENCE))
+        self.feedback.motors_heard(MonotonicClock.now().before(STALE_AFTER))
     }
 
     /// The feedback, for reads that mostly follow one of the joints and then answer from memory.
@@ -290,7 +293,7 @@ impl Session {
             }
             return Err(AdapterError::Fault { code, text });
         }
-        if MonotonicClock.now().since(self.feedback.commanded_at) < SILENCE {
+        if MonotonicClock.now().since(self.feedback.commanded_at) < STALE_AFTER {
             return Err(self.refuse(
                 "somebody else commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
                     .into(),
@@ -358,7 +361,7 @@ impl Session {
         let range = limits.position_lower.iter().zip(&limits.position_upper);
         for (i, (wire, (lower, upper))) in self.feedback.joints.iter().zip(range).enumerate() {
             let value = radians(*wire);
-            if !(lower - PLAUSIBLE..=upper + PLAUSIBLE).contains(&value) {
+            if !(lower - MAX_OUTSIDE..=upper + MAX_OUTSIDE).contains(&value) {
                 let joint = i + 1;
                 return Err(self.refuse(format!(
                     "joint {joint} reads {value:.3} rad, outside its range of {lower} to {upper}: not enabled\nhint: \

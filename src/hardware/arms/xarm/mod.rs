@@ -53,7 +53,7 @@ const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPositio
 /// Modes of firmware before 1.8.0, which does not end a velocity after a time.
 const MODES_WITHOUT_VELOCITY: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition];
 
-/// How often a controller with firmware 2.1.0 or newer reports [Hz]. Older ones do 100 times a second.
+/// Rate of the reports with firmware 2.1.0 or newer [Hz]. Older ones report at 100 Hz.
 const NATIVE_RATE: f64 = 250.0;
 
 /// Whether the arm keeps its pose when its motors are off: it has brakes.
@@ -116,7 +116,7 @@ impl Default for Options {
     }
 }
 
-/// The model says how many joints there are, and what their limits are.
+/// Returns the limits of the configured model.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options: Options = config.options()?;
     let limits = model_of(&options, config.dof)?.limits();
@@ -124,7 +124,7 @@ fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     Ok(Checked { limits })
 }
 
-/// The model that options and number of joints say; or why they do not go together.
+/// Returns the model of options and number of joints, or why they conflict.
 fn model_of(options: &Options, dof: usize) -> Result<Model, ConfigError> {
     let model = options.model.or(Model::of_dof(dof));
     let model = model.ok_or_else(|| ConfigError::new("", format!("no xArm has {dof} joints")))?;
