@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use dimos::arm::Pose;
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::hardware::spec::{AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
+use dimos::hardware::adapter::{AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use dimos::joint::{ControlMode, JointLimits};
 
 /// Returns a time stamp as a joint position: microseconds of the current second, a nanoradian each.

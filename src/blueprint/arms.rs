@@ -156,7 +156,7 @@ fn fit(
     row: &AdapterSpec,
     config: &AdapterConfig,
 ) -> Option<JointLimits> {
-    match (row.fit)(config) {
+    match (row.check)(config) {
         Ok(fit) => Some(fit.limits),
         Err(misfit) => {
             let at = match &entry.options {

@@ -8,9 +8,9 @@ use super::device_lock::{self, DeviceLock};
 use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
 use crate::clock::MonotonicClock;
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
-use crate::hardware::spec::AdapterError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, SIM};
 use crate::joint::JointLimits;
 use crate::message::Message;
 use crate::rt::heartbeat::Heartbeat;
@@ -117,7 +117,7 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     };
     match arm.adapter.emulate {
         Some(emulate) if arm.address == SIM => {
-            let emulator = emulate(&config, &Place::InProcess).map_err(|e| unfit(arm, &e))?;
+            let emulator = emulate(&config, &EmulatorAddress::InProcess).map_err(|e| unfit(arm, &e))?;
             config.address = emulator.address();
             arms._emulators.push(emulator);
         }

@@ -2,7 +2,7 @@
 
 use std::os::fd::AsFd;
 
-use dimos::hardware::spec::AdapterError;
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::transport::can::bus::{Bus, RECEIVE_QUEUE};
 use dimos::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble, open};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};

@@ -3,11 +3,11 @@
 use std::os::fd::BorrowedFd;
 
 use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::adapter::*;
 use dimos::hardware::arms::{mock, xarm, yourarm};
-use dimos::hardware::conformance::gently::{Motion, move_gently, refusal};
+use dimos::hardware::conformance::first_motion::{Motion, refusal, run_first_motion};
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits};
 
 use crate::support::counting;
@@ -332,7 +332,7 @@ fn moved_gently(row: &AdapterSpec, looks: u32) -> (Motion, Inner) {
     adapter.connect().unwrap();
     let mut left = looks;
     let interrupted = std::cell::Cell::new(false);
-    let motion = move_gently(&mut *adapter, &|| interrupted.get(), &mut |_| {
+    let motion = run_first_motion(&mut *adapter, &|| interrupted.get(), &mut |_| {
         left -= 1;
         interrupted.set(left == 0);
     });

@@ -8,10 +8,10 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
+use dimos::hardware::adapter::*;
 use dimos::hardware::arms::mock;
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits};
 
 /// What is wrong with an adapter.

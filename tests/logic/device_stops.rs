@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link, Supervision};
 use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
-use dimos::hardware::spec::{AdapterError, ManipulatorAdapter};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::joint::ControlMode;
 use dimos::rt::heartbeat::Heartbeat;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
@@ -170,7 +170,7 @@ fn a_change_of_mode_that_a_moving_arm_refuses_is_asked_for_again_and_is_no_fault
 fn a_gripper_that_goes_on_after_a_stop_is_held() {
     let options = serde_json::json!({ "gripper": "xarm" });
     let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
-    let emulator = XArmEmulator::start(&config, &Place::InProcess).unwrap();
+    let emulator = XArmEmulator::start(&config, &EmulatorAddress::InProcess).unwrap();
     config.address = emulator.address();
     let mut bench = bench_of((xarm::SPEC.create)(&config).unwrap(), MockAdapter::new(6), 250.0);
     let send = |bench: &mut Bench, opening: f64| {

@@ -5,7 +5,7 @@
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use dimos::hardware::spec::AdapterError;
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::transport::can::socket::SEND_QUEUE;
 use dimos::hardware::transport::can::{
     CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble, SlcanPty, open as open_at,

@@ -7,12 +7,12 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use dimos::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter};
 use dimos::hardware::arms::piper::GripperKind;
 use dimos::hardware::arms::piper::adapter::PiperAdapter;
 use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
-use dimos::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
 use dimos::joint::ControlMode;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
@@ -23,7 +23,7 @@ use crate::support::uml::{Guest, in_guest, sh};
 const WAIT: Duration = Duration::from_secs(20);
 
 fn emulator(interface: &str, options: &SimOptions) -> PiperEmulator {
-    PiperEmulator::with(options, GripperKind::Small, &Place::Can(interface.into())).unwrap()
+    PiperEmulator::with(options, GripperKind::Small, &EmulatorAddress::Can(interface.into())).unwrap()
 }
 
 fn adapter(interface: &str) -> PiperAdapter {

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use dimos::hardware::arms::piper::GripperKind;
 use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
-use dimos::hardware::registry::{Emulator, Place};
+use dimos::hardware::registry::{Emulator, EmulatorAddress};
 
 /// The longest that the SDK's script may take.
 const PATIENCE: Duration = Duration::from_secs(90);
@@ -48,7 +48,7 @@ fn python(name: &str, arguments: &[&str]) -> Option<String> {
 #[test]
 fn the_vendors_sdk_reads_the_emulator_and_moves_it() {
     let options = SimOptions { feedback_hz: RATE, firmware: "S-V1.6-3".into(), ..SimOptions::default() };
-    let emulator = PiperEmulator::with(&options, GripperKind::Small, &Place::Pty).unwrap();
+    let emulator = PiperEmulator::with(&options, GripperKind::Small, &EmulatorAddress::Pty).unwrap();
     let address = emulator.address();
     let path = address.strip_prefix("slcan:").unwrap().split('@').next().unwrap();
     emulator.record();

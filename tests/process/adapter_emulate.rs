@@ -41,7 +41,7 @@ fn a_run_in_another_process_moves_the_emulated_arm() {
 }
 
 #[test]
-fn a_scripted_fault_strikes() {
+fn a_scripted_fault_is_played() {
     let (home, address) = (Home::new(), loopback(2));
     home.write("faults.yaml", "- {at: 0.5, kind: error_code, code: 3}\n");
     let emulator = emulate(&home, &format!("yourarm --bind {address} --fault faults.yaml --fault at=1e5,kind=estop"));

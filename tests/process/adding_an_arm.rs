@@ -274,7 +274,7 @@ fn the_page_is_true_from_beginning_to_end() {
 
 #[test]
 fn the_table_has_every_method_of_the_trait() {
-    let spec = include_str!("../../src/hardware/spec.rs");
+    let spec = include_str!("../../src/hardware/adapter.rs");
     let body = spec.split("pub trait ManipulatorAdapter").nth(1).unwrap();
     let methods: Vec<&str> =
         body.lines().filter_map(|line| line.strip_prefix("    fn ")?.split(['(', '<']).next()).collect();

@@ -14,7 +14,7 @@ use std::time::Duration;
 use dimos::hardware::arms::remote::SPEC;
 use dimos::hardware::arms::xarm::emulator::XArmEmulator;
 use dimos::hardware::conformance::{Check, Outcome, checks, run};
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;
 
@@ -275,7 +275,7 @@ fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
     }
     let (ip, options) = (IpAddr::V4(Ipv4Addr::new(127, 0, 7, 2)), serde_json::json!({}));
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
-    let emulator = match XArmEmulator::start(&config, &Place::Bind(ip)) {
+    let emulator = match XArmEmulator::start(&config, &EmulatorAddress::Bind(ip)) {
         Ok(emulator) => emulator,
         Err(error) if error.to_string().contains(":502: ") => return skip("port 502"),
         Err(error) => panic!("{error}"),
@@ -316,7 +316,7 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     for (trouble, parts) in [
         ("nan", &["error: arm: ", "read_joint_positions() answers nan for joint 3"][..]),
         ("short", &["error: arm: ", "read_joint_positions() answers 5 values for 6 joints"]),
-        ("read_enabled", &["cannot be enabled: enabled, but the motors do not come on"]),
+        ("read_enabled", &["cannot be enabled: the motors did not come on within 1 s"]),
     ] {
         let home = Home::new();
         let _shim = served(&home, &[("TROUBLE", trouble)]);

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::registry::AdapterSpec;
-use dimos::hardware::spec::AdapterError;
 use dimos::joint::JointLimits;
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Builder, Options, Record, Run, StartError};

@@ -12,7 +12,7 @@ use std::time::Duration;
 use dimos::hardware::arms::yourarm;
 use dimos::hardware::arms::yourarm::emulator::wire::Request;
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place, Registry};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Registry};
 use dimos::rpc::Code;
 use dimos::rpc::api::{
     ArmEnable, ArmReset, Confirmation, Execute, Point, Servo, State, Status, Stop, Trajectory, Velocity,
@@ -284,7 +284,7 @@ fn a_stop_that_arrives_after_the_reconnect_is_reported() {
     let ip = IpAddr::from([127, 78, (std::process::id() >> 8) as u8, std::process::id() as u8 | 1]);
     let power_on = || {
         let config = AdapterConfig { hardware_id: "arm".into(), address: ip.to_string(), dof: 6, options: json!({}) };
-        (yourarm::SPEC.emulate.unwrap())(&config, &Place::Bind(ip)).unwrap()
+        (yourarm::SPEC.emulate.unwrap())(&config, &EmulatorAddress::Bind(ip)).unwrap()
     };
     let arm = power_on();
     let run = home.run(&format!("coordinator-yourarm --no-record --set hardware.arm.address={ip}"));

@@ -6,7 +6,7 @@ use std::net::TcpStream;
 use std::time::Duration;
 
 use dimos::hardware::arms::xarm::emulator::{Received, XArmEmulator};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use serde_json::{Value, json};
 
@@ -15,7 +15,7 @@ use crate::support::program::{Home, Started, eventually};
 
 fn emulator(options: Value) -> XArmEmulator {
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
-    XArmEmulator::start(&config, &Place::InProcess).unwrap()
+    XArmEmulator::start(&config, &EmulatorAddress::InProcess).unwrap()
 }
 
 fn run(home: &Home, emulator: &XArmEmulator, more: &str) -> Started {

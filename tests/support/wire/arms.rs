@@ -4,7 +4,7 @@ use std::any::Any;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry};
 use dimos::hardware::sim::faults::Fault;
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Record, Run};
@@ -133,7 +133,7 @@ impl World {
         let start = if setup.start.is_empty() { arm.ends[0].to_vec() } else { setup.start.clone() };
         let options = json!({ "sim": { "initial_positions": start, "faults": setup.faults } });
         let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof: 6, options };
-        let emulator = arm.spec().emulate.unwrap()(&config, &Place::InProcess).unwrap();
+        let emulator = arm.spec().emulate.unwrap()(&config, &EmulatorAddress::InProcess).unwrap();
         let address = emulator.address();
         let emulator = Arc::new(Mutex::new(emulator));
         let watched = emulator.clone();

@@ -9,12 +9,12 @@ use std::time::Duration;
 use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
-use super::{MODES, NATIVE_RATE, fit, limits, same_modes};
+use super::{MODES, NATIVE_RATE, check, limits, same_modes};
 use crate::arm::Pose;
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
 /// Longest wait for the motors: a vendor's SDK may take its time.
@@ -37,7 +37,7 @@ impl RemoteAdapter {
     /// An adapter for the peer at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let (mode, assumed_enabled) = (ControlMode::Position, false);
         Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })
@@ -53,11 +53,11 @@ impl RemoteAdapter {
     }
 
     /// Asks for an act and waits for its answer.
-    fn act(&mut self, act: &Act, patience: Duration) -> AdapterResult<()> {
-        let answer = self.with(|session| session.act(act, patience))?;
+    fn act(&mut self, act: &Act, timeout: Duration) -> AdapterResult<()> {
+        let answer = self.with(|session| session.act(act, timeout))?;
         answer.unwrap_or_else(|| {
             let peer = self.session.as_ref().map(Session::peer).unwrap_or_default();
-            let text = format!("{peer} has not answered {} within {patience:?}", act.method());
+            let text = format!("{peer} has not answered {} within {timeout:?}", act.method());
             Err(AdapterError::Timeout(text))
         })
     }
@@ -78,7 +78,7 @@ impl RemoteAdapter {
     /// Refuses what the arm would refuse, and sends the rest.
     fn command(&mut self, mode: ControlMode, values: &[f64], velocity: f64) -> AdapterResult<()> {
         if values.len() != self.dof || !values.iter().all(|value| value.is_finite()) {
-            return Err(AdapterError::Rejected(format!("{} finite values are needed, one per joint", self.dof)));
+            return Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)));
         }
         self.with(Session::take_up)?;
         let (enabled, held, error) = self.recent(|state| (state.enabled, state.held, state.error))?;
@@ -86,9 +86,7 @@ impl RemoteAdapter {
             return Err(AdapterError::Fault { code, text: text.to_string() });
         }
         if held {
-            return Err(AdapterError::Rejected(
-                "the process that serves the arm has stopped it: enable it anew".into(),
-            ));
+            return Err(AdapterError::Rejected("the arm's server process stopped the arm; enable it again".into()));
         }
         if enabled == Some(false) {
             return Err(AdapterError::Rejected("the motors are disabled".into()));
@@ -170,9 +168,9 @@ impl ManipulatorAdapter for RemoteAdapter {
         if !self.get_info().modes.contains(&mode) {
             return Err(AdapterError::Unsupported);
         }
-        let patience = self.late()?;
-        match self.act(&Act::Mode(mode), patience) {
-            // It is asked for again with the next command, and goes on then.
+        let timeout = self.late()?;
+        match self.act(&Act::Mode(mode), timeout) {
+            // The next command retries it; the server has continued meanwhile.
             Err(AdapterError::Timeout(text)) => Err(AdapterError::Rejected(text)),
             result => result.map(|()| self.mode = mode),
         }
@@ -264,8 +262,8 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
-        let patience = self.late()?;
-        self.act(&Act::Stop, patience).map(|()| Stop::Confirmed)
+        let timeout = self.late()?;
+        self.act(&Act::Stop, timeout).map(|()| Stop::Confirmed)
     }
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
@@ -294,14 +292,14 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
-        let patience = self.late()?;
+        let timeout = self.late()?;
         if !self.has_part("read_cartesian_position") {
             return Err(AdapterError::Unsupported);
         }
         if !pose.xyz.iter().chain(&pose.rpy).all(|value| value.is_finite()) {
             return Err(AdapterError::Rejected("the pose is not finite".into()));
         }
-        self.act(&Act::Cartesian(WirePose::of(pose), velocity), patience)
+        self.act(&Act::Cartesian(WirePose::of(pose), velocity), timeout)
     }
 
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
@@ -313,14 +311,14 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        let patience = self.late()?;
+        let timeout = self.late()?;
         if !self.has_part("read_gripper_position") {
             return Err(AdapterError::Unsupported);
         }
         if !position.is_finite() {
             return Err(AdapterError::Rejected(format!("a gripper opening of {position} m")));
         }
-        self.act(&Act::Gripper(position), patience)
+        self.act(&Act::Gripper(position), timeout)
     }
 
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {

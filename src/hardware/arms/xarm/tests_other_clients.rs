@@ -9,9 +9,9 @@ use serde_json::json;
 use super::adapter::XArmAdapter;
 use super::emulator::XArmEmulator;
 use super::tests::{read, ready, sent, six, until};
+use crate::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, ManipulatorAdapter};
 use crate::joint::ControlMode::{self, Impedance, Position, ServoPosition};
 
 /// Another client of the controller. It speaks protocol 2, the adapter 3.

@@ -1,6 +1,6 @@
-//! Whether a report holds measurements. A controller that has not read its encoders yet reports zeros, and zeros are
-//! also the usual zero pose of these arms. The tool's pose, which the controller computes from the joints, tells the
-//! two apart.
+//! Detects reports without measurements. A controller that has not read its encoders yet reports zeros, but zeros are
+//! also the usual zero pose of these arms. The pose of the tool, which the controller computes from the joints,
+//! separates the two.
 
 use super::model::Model;
 use super::protocol::report::Motion;

@@ -1,7 +1,7 @@
-//! The wire is cut, in every state that an arm can be in, and connected again.
+//! Disconnects in every state of an arm, and the reconnects after them.
 //!
-//! What must be true each time: the cut is noticed, `connect` mends it, the first state after that was measured after
-//! that, and neither motors nor joints nor errors have changed by the adapter's doing.
+//! Each time: the adapter notices the disconnect, `connect` reconnects, the first state after that is newer than the
+//! connection, and the adapter has changed neither motors nor joints nor errors.
 
 use std::time::{Duration, Instant};
 
@@ -9,30 +9,30 @@ use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, Stop};
 use crate::joint::ControlMode;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Faults, "cut_when_disabled", "a wire cut while disabled is noticed and mended", when_disabled),
-    Check::new(Faults, "cut_when_enabled", "a wire cut while enabled: the same, and it holds", when_enabled),
-    Check::new(Faults, "cut_in_motion", "a wire cut in motion: the same, and it can be stopped", in_motion),
-    Check::new(Faults, "cut_while_streaming", "a wire cut between setpoints: it stands still", while_streaming),
-    Check::new(Faults, "cut_in_error", "a wire cut in error: reconnecting clears nothing", in_error),
-    Check::new(Faults, "power_cut", "after a loss of power nothing comes on by itself", power),
-    Check::new(Faults, "stop_into_the_void", "no stop is confirmed once the wire is cut", stop_into_the_void),
+    Check::new(Faults, "cut_when_disabled", "a cut connection is noticed and reconnects while disabled", when_disabled),
+    Check::new(Faults, "cut_when_enabled", "the same while enabled, and the arm holds", when_enabled),
+    Check::new(Faults, "cut_in_motion", "the same in motion, and the arm can be stopped", in_motion),
+    Check::new(Faults, "cut_while_streaming", "the same between setpoints, and the arm stops", while_streaming),
+    Check::new(Faults, "cut_in_error", "the same in error: reconnecting clears nothing", in_error),
+    Check::new(Faults, "power_cut", "after a loss of power the motors stay off", power),
+    Check::new(Faults, "stop_into_the_void", "no stop is confirmed without a connection", stop_into_the_void),
 ];
 
-const NO_CUT: &str = "its double cannot cut the wire";
-/// The longest that any call may take on a wire that is cut.
-const BOUND: Duration = Duration::from_secs(3);
-/// How long the power stays away.
-const DARK: f64 = 0.5;
+const NO_CUT: &str = "its emulator cannot cut the connection";
+/// Maximum duration of a call without a connection.
+const CALL_TIMEOUT: Duration = Duration::from_secs(3);
+/// Duration of the loss of power [s].
+const POWER_OFF_TIME: f64 = 0.5;
 
-/// Lets the prepared cut happen and waits until the adapter has noticed.
+/// Cuts the connection and waits until the adapter has noticed.
 fn cut(context: &mut Context) -> Result<(), String> {
-    context.strike()?;
+    context.trigger_faults()?;
     let mut reading = JointReading::default();
     context.until("the cut", |context| Ok(context.adapter.read_joints(&mut reading).is_err()))?;
     context.until("is_connected to be false", |context| {
@@ -43,7 +43,7 @@ fn cut(context: &mut Context) -> Result<(), String> {
     require(answer == Err(AdapterError::NotConnected), || format!("after the cut: {answer:?}"))
 }
 
-/// Connects again, as the device thread does: until it works. Joint positions [rad] after that.
+/// Reconnects with retries, as the device thread does. Returns the joint positions [rad] after that.
 fn mend(context: &mut Context) -> Result<Vec<f64>, String> {
     let mut began = MonotonicClock.now();
     context.until("the connection", |context| {
@@ -87,13 +87,13 @@ fn when_enabled(context: &mut Context) -> Result<(), String> {
 
 fn in_motion(context: &mut Context) -> Result<(), String> {
     if !context.row.modes.contains(&ControlMode::Position) || !context.prepare(Fault::new(FaultKind::Disconnect)) {
-        return context.skip("no planned moves, or its double cannot cut the wire");
+        return context.skip("no planned moves, or its emulator cannot cut the connection");
     }
     context.ready(ControlMode::Position)?;
     set_off(context)?;
     cut(context)?;
     mend(context)?;
-    // Where it stops by itself it needs a moment for that.
+    // An arm that stops on its own needs some time.
     std::thread::sleep(Duration::from_millis(300));
     let here = context.positions()?;
     std::thread::sleep(Duration::from_millis(100));
@@ -102,13 +102,13 @@ fn in_motion(context: &mut Context) -> Result<(), String> {
     let stopped = context.standstill()?;
     context.stays(&stopped, 1e-3)?;
     context.found(if went_on {
-        "the arm ends its move without a client; a stop after reconnecting ends it"
+        "the arm continues its move without a client; a stop after reconnecting ends it"
     } else {
-        "the arm stops when its client is gone"
+        "the arm stops when its client disconnects"
     })
 }
 
-/// Sends the arm far away, slowly, and waits until it is on its way.
+/// Starts a long, slow move, and waits until the arm is moving.
 fn set_off(context: &mut Context) -> Result<(), String> {
     let (start, far) = (context.positions()?, context.far()?);
     context.command(&far, 0.05)?;
@@ -118,7 +118,7 @@ fn set_off(context: &mut Context) -> Result<(), String> {
 fn while_streaming(context: &mut Context) -> Result<(), String> {
     let servo = ControlMode::ServoPosition;
     if !context.row.modes.contains(&servo) || !context.prepare(Fault::new(FaultKind::Disconnect)) {
-        return context.skip("it has no servo mode, or its double cannot cut the wire");
+        return context.skip("it has no servo mode, or its emulator cannot cut the connection");
     }
     context.ready(servo)?;
     let mut point = context.positions()?;
@@ -134,17 +134,17 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     require(refused == Err(AdapterError::NotConnected), || format!("a setpoint after the cut: {refused:?}"))?;
     let here = mend(context)?;
     let off = farthest(&here, &point);
-    require(off < 0.02, || format!("it stands {off:.4} rad from its last setpoint"))?;
+    require(off < 0.02, || format!("it is {off:.4} rad from its last setpoint"))?;
     context.stays(&here, 0.005)
 }
 
 fn in_error(context: &mut Context) -> Result<(), String> {
     let faults = [FaultKind::ErrorCode, FaultKind::Disconnect];
     if !faults.into_iter().all(|kind| context.prepare(Fault::new(kind))) {
-        return context.skip("its double cannot be in error, or cannot cut the wire");
+        return context.skip("its emulator cannot be in error, or cannot cut the connection");
     }
     context.ready(context.first_mode())?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (error, start) = (context.error()?, context.standstill()?);
     cut(context)?;
@@ -155,8 +155,8 @@ fn in_error(context: &mut Context) -> Result<(), String> {
 }
 
 fn power(context: &mut Context) -> Result<(), String> {
-    if !context.prepare(Fault::new(FaultKind::PowerLoss).lasting(DARK)) {
-        return context.skip("its double cannot lose power");
+    if !context.prepare(Fault::new(FaultKind::PowerLoss).lasting(POWER_OFF_TIME)) {
+        return context.skip("its emulator cannot lose power");
     }
     context.ready(context.first_mode())?;
     cut(context)?;
@@ -172,19 +172,19 @@ fn stop_into_the_void(context: &mut Context) -> Result<(), String> {
         return context.skip(NO_CUT);
     }
     context.ready(context.first_mode())?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("a stop that is not taken", |context| {
         let began = Instant::now();
         let result = context.adapter.write_stop();
         let took = began.elapsed();
-        require(took < BOUND, || format!("write_stop on a cut wire took {took:?}"))?;
-        // Who cannot confirm may have to read before it knows.
+        require(took < CALL_TIMEOUT, || format!("write_stop on a cut wire took {took:?}"))?;
+        // An adapter whose stop is not confirmed may have to read before it notices.
         let _ = context.adapter.read_joints(&mut JointReading::default());
         Ok(result.is_err())
     })?;
     for _ in 0..20 {
         let result = context.adapter.write_stop();
-        require(result != Ok(Stop::Confirmed), || "a stop is confirmed by nobody".into())?;
+        require(result != Ok(Stop::Confirmed), || "a stop is confirmed without a connection".into())?;
     }
     Ok(())
 }

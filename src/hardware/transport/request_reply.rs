@@ -1,22 +1,22 @@
-//! Commands and replies over a stream of bytes: one at a time, every wait bounded, a dead controller noticed.
+//! Commands and replies over a byte stream: one at a time, with a timeout, closing the connection to a dead controller.
 
 use std::time::Duration;
 
 use super::Scan;
 use super::serial::SerialLink;
 use super::tcp::TcpLink;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// So many replies in a row that do not come end the connection. One lost reply is not a lost arm.
+/// Close the connection after this many consecutive missing replies; a single lost reply is tolerated.
 const LOST_AFTER: u32 = 3;
 
-/// A way for bytes to and fro.
+/// A byte stream in both directions.
 pub trait ByteLink {
     /// Sends all of `bytes`.
     fn send(&mut self, bytes: &[u8]) -> AdapterResult<()>;
-    /// Waits up to `timeout` for what `scan` takes. `Timeout` leaves the link usable; other errors do not.
+    /// Waits up to `timeout` for a frame that `scan` takes. `Timeout` leaves the link usable; other errors do not.
     fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T>;
-    /// Closes the link and discards what has not left this computer.
+    /// Closes the link and discards unsent bytes.
     fn abort(self)
     where
         Self: Sized,
@@ -52,48 +52,48 @@ impl ByteLink for SerialLink {
     }
 }
 
-/// How long a reply is waited for.
+/// Timeout and attempts of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Patience {
-    /// The longest wait after each time that the command is sent.
+pub struct Retry {
+    /// Timeout of each attempt.
     pub each: Duration,
-    /// How often it is sent: more than once only where being obeyed twice does no harm.
+    /// Number of attempts: more than one only if executing the command twice does no harm.
     pub times: u32,
 }
 
-impl Patience {
-    /// The command is sent once.
+impl Retry {
+    /// One attempt.
     pub const fn once(each: Duration) -> Self {
         Self { each, times: 1 }
     }
 }
 
-/// The connection to a controller that answers each command, or none.
+/// A connection to a controller that replies to each command.
 #[derive(Debug)]
-pub struct Dialogue<L> {
+pub struct RequestReply<L> {
     link: Option<L>,
-    /// Replies in a row that did not come.
+    /// Consecutive missing replies.
     lost: u32,
 }
 
-impl<L> Default for Dialogue<L> {
+impl<L> Default for RequestReply<L> {
     fn default() -> Self {
         Self { link: None, lost: 0 }
     }
 }
 
-impl<L: ByteLink> Dialogue<L> {
+impl<L: ByteLink> RequestReply<L> {
     /// Takes a new connection.
     pub fn open(&mut self, link: L) {
         *self = Self { link: Some(link), lost: 0 };
     }
 
-    /// Ends the connection.
+    /// Closes the connection.
     pub fn close(&mut self) {
         *self = Self::default();
     }
 
-    /// Ends the connection and discards what has not left this computer: the arm did not acknowledge it in time.
+    /// Closes the connection and discards unsent bytes: the arm did not acknowledge them in time.
     pub fn abort(&mut self) {
         self.lost = 0;
         if let Some(link) = self.link.take() {
@@ -101,23 +101,23 @@ impl<L: ByteLink> Dialogue<L> {
         }
     }
 
-    /// Whether there is a connection, as far as is known.
+    /// Returns whether the connection is open, as far as known.
     pub fn is_open(&self) -> bool {
         self.link.is_some()
     }
 
-    /// Sends a command and waits for its reply: what `scan` takes, which must skip everything else. The connection ends
-    /// when several replies in a row have not come, and when it breaks.
+    /// Sends a command and waits for its reply: what `scan` takes, skipping everything else. Closes the connection
+    /// after several consecutive missing replies, and when it breaks.
     pub fn request<T>(
         &mut self,
         command: &[u8],
-        patience: Patience,
+        timeout: Retry,
         mut scan: impl FnMut(&[u8]) -> Scan<T>,
     ) -> AdapterResult<T> {
         let link = self.link.as_mut().ok_or(AdapterError::NotConnected)?;
-        let mut ask = || link.send(command).and_then(|()| link.receive(patience.each, &mut scan));
+        let mut ask = || link.send(command).and_then(|()| link.receive(timeout.each, &mut scan));
         let mut result = ask();
-        for _ in 1..patience.times {
+        for _ in 1..timeout.times {
             if !matches!(result, Err(AdapterError::Timeout(_))) {
                 break;
             }
@@ -136,7 +136,7 @@ impl<L: ByteLink> Dialogue<L> {
 mod tests {
     use super::*;
 
-    /// Answers as the script says: `None` for a reply that does not come.
+    /// Replies according to a script; `None` for a missing reply.
     struct Script(Vec<Option<u8>>, usize);
 
     impl ByteLink for Script {
@@ -160,8 +160,8 @@ mod tests {
 
     #[test]
     fn only_replies_missing_in_a_row_end_it() {
-        let mut line = Dialogue::default();
-        let once = Patience::once(Duration::ZERO);
+        let mut line = RequestReply::default();
+        let once = Retry::once(Duration::ZERO);
         assert_eq!(line.request(b"?", once, scan), Err(AdapterError::NotConnected));
         line.open(Script(vec![None, None, Some(7), None, None, None], 0));
         let answers: Vec<_> = (0..6).map(|_| (line.request(b"?", once, scan).ok(), line.is_open())).collect();
@@ -172,13 +172,13 @@ mod tests {
     }
 
     #[test]
-    fn a_patient_request_is_sent_again_and_counts_once() {
-        let mut line = Dialogue::default();
-        let patient = Patience { each: Duration::ZERO, times: 3 };
+    fn a_request_with_retries_is_sent_again_and_counts_once() {
+        let mut line = RequestReply::default();
+        let retried = Retry { each: Duration::ZERO, times: 3 };
         line.open(Script(vec![None, None, Some(9), None, None, None], 0));
-        assert_eq!(line.request(b"?", patient, scan), Ok(9));
+        assert_eq!(line.request(b"?", retried, scan), Ok(9));
         assert_eq!(line.link.as_ref().map(|script| script.1), Some(3));
-        assert!(matches!(line.request(b"?", patient, scan), Err(AdapterError::Timeout(_))));
+        assert!(matches!(line.request(b"?", retried, scan), Err(AdapterError::Timeout(_))));
         assert_eq!((line.is_open(), line.lost), (true, 1));
     }
 }

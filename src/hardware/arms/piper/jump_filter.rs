@@ -1,40 +1,40 @@
-//! Which measured joint positions are believed: those that the arm can have reached since the last believed ones.
+//! Filters joint positions: accepts those that the arm can have reached since the last accepted ones.
 //!
-//! Controllers of this make are known to report a wrong angle now and then. A set that jumps is not believed; three in
-//! a row that agree with each other are: then the arm was moved, or its zero points were, while nothing was heard.
+//! These controllers occasionally report a wrong position. A set that jumps is rejected; three consecutive ones that
+//! agree are accepted: then the arm or its zero points were moved without feedback.
 
 use super::SPEED;
 use super::protocol::{WireJoints, millidegrees};
 use crate::clock::Mono;
 
-/// Steps beyond what the arm's speed explains, at half as much again, are not believed from here on [rad].
+/// Steps are rejected beyond this [rad] plus what the arm's speed allows, times a margin.
 const STEP: f64 = 0.02;
-const HASTE: f64 = 1.5;
-/// Period of the arm [s]: sets that this computer fetched together were not measured together.
+const SPEED_MARGIN: f64 = 1.5;
+/// Period of the arm [s]: sets that arrive together were not measured together.
 const PERIOD: f64 = 0.005;
-/// Consecutive refused sets that agree with each other until they are believed.
+/// Consecutive rejected sets that agree, before they are accepted.
 const AGREEING: u32 = 3;
-/// Consecutive undisputed sets that end a dispute, and for how long one lasts at most [s].
+/// Consecutive accepted sets that end a dispute, and its maximum duration [s].
 const UNDISPUTED: u32 = 5;
 const DISPUTE: f64 = 0.1;
 
-/// The believed joint positions and what speaks against them.
+/// The accepted joint positions, and rejected ones.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Belief {
-    /// The believed positions [0.001°].
+pub struct JumpFilter {
+    /// The accepted positions [0.001°].
     pub joints: WireJoints,
-    /// When they arrived; `Mono::ZERO`: there are none.
+    /// When they arrived; `Mono::ZERO`: never.
     pub at: Mono,
-    /// The last refused set, when it arrived, and how many in a row agree with it.
+    /// The last rejected set, when it arrived, and how many consecutive ones agree with it.
     refused: WireJoints,
     refused_at: Mono,
     agreeing: u32,
-    /// Consecutive believed sets.
+    /// Consecutive accepted sets.
     undisputed: u32,
 }
 
-impl Belief {
-    /// Takes a set that arrived at `now`. `true`: it is believed.
+impl JumpFilter {
+    /// Takes a set that arrived at `now`. Returns whether it is accepted.
     pub fn take(&mut self, joints: WireJoints, now: Mono) -> bool {
         if self.at == Mono::ZERO || reachable(&joints, &self.joints, now.seconds_since(self.at)) {
             self.undisputed = self.undisputed.saturating_add(1);
@@ -53,16 +53,16 @@ impl Belief {
         true
     }
 
-    /// Whether sets were refused lately, so that the believed ones may be the wrong ones.
+    /// Returns whether sets were rejected recently, so that the accepted ones may be wrong.
     pub fn disputed(&self, now: Mono) -> bool {
         let lately = self.refused_at != Mono::ZERO && now.seconds_since(self.refused_at) < DISPUTE;
         lately && self.undisputed < UNDISPUTED
     }
 }
 
-/// Whether an arm at `from` can be at `to` after `dt` [s].
+/// Returns whether an arm at `from` can be at `to` after `dt` [s].
 fn reachable(to: &WireJoints, from: &WireJoints, dt: f64) -> bool {
-    let reach = millidegrees(HASTE * SPEED * dt.clamp(PERIOD, 60.0) + STEP);
+    let reach = millidegrees(SPEED_MARGIN * SPEED * dt.clamp(PERIOD, 60.0) + STEP);
     to.iter().zip(from).all(|(to, from)| to.saturating_sub(*from).saturating_abs() <= reach)
 }
 
@@ -75,22 +75,22 @@ mod tests {
     }
 
     #[test]
-    fn what_the_arm_cannot_have_reached_is_not_believed() {
-        let mut belief = Belief::default();
+    fn unreachable_positions_are_rejected() {
+        let mut belief = JumpFilter::default();
         assert!(belief.take([10_000; 6], ms(0)) && belief.take([12_000; 6], ms(5)), "0.035 rad in 5 ms");
         assert!(!belief.disputed(ms(5)));
         assert!(!belief.take([15_000; 6], ms(10)), "0.052 rad in 5 ms");
         assert!(belief.disputed(ms(10)));
         assert_eq!((belief.joints, belief.at), ([12_000; 6], ms(5)));
         assert!(belief.take([15_000; 6], ms(15)), "but in 10 ms");
-        // One joint is enough, and time alone makes longer ways possible, without bound.
+        // One joint is enough to reject a set. The reachable distance grows with time, without bound.
         assert!(!belief.take([15_000, 15_000, 15_000, 75_000, 15_000, 15_000], ms(20)));
         assert!(belief.take([75_000; 6], ms(300)));
     }
 
     #[test]
-    fn three_in_a_row_that_agree_are_believed() {
-        let mut belief = Belief::default();
+    fn three_consecutive_sets_that_agree_are_accepted() {
+        let mut belief = JumpFilter::default();
         belief.take([0; 6], ms(0));
         let far = [90_000; 6];
         let took = [far, far, [0; 6], far, [-90_000; 6], far, far, far].map(|joints| belief.take(joints, ms(5)));

@@ -1,15 +1,15 @@
-//! The limits of the joints: the data sheet's, narrowed by those that the arm's controller has been given.
+//! Joint limits: those of the data sheet, narrowed by those of the arm's controller.
 
 use super::limits;
 use super::protocol::{DOF, MotorLimits};
 use crate::joint::JointLimits;
 
-/// A range that is narrower than this is no range [rad].
-const NARROWEST: f64 = 0.02;
-/// A top speed below this is unusual enough to be mentioned [rad/s].
-const SLOW: f64 = 0.1;
+/// A narrower range is invalid [rad].
+const MIN_RANGE: f64 = 0.02;
+/// A lower top speed causes a warning [rad/s].
+const LOW_SPEED: f64 = 0.1;
 
-/// The limits, and what of the controller's own is odd: each a line for the log.
+/// Returns the limits, and a log line for each unusual limit of the controller.
 pub fn narrowed(own: &[Option<MotorLimits>; DOF]) -> (JointLimits, Vec<String>) {
     let mut limits = limits();
     let mut odd = Vec::new();
@@ -19,7 +19,7 @@ pub fn narrowed(own: &[Option<MotorLimits>; DOF]) -> (JointLimits, Vec<String>) 
         let Some(own) = own else { continue };
         let (low, high) = (f64::from(own.lower) / 10.0, f64::from(own.upper) / 10.0);
         let (inner, outer) = (lower.max(low.to_radians()), upper.min(high.to_radians()));
-        if outer - inner >= NARROWEST {
+        if outer - inner >= MIN_RANGE {
             (*lower, *upper) = (inner, outer);
         } else {
             odd.push(format!(
@@ -37,7 +37,7 @@ pub fn narrowed(own: &[Option<MotorLimits>; DOF]) -> (JointLimits, Vec<String>) 
             continue;
         }
         *speed = speed.min(own_speed);
-        if own_speed < SLOW {
+        if own_speed < LOW_SPEED {
             odd.push(format!(
                 "joint {joint}: the controller has been given a top speed of {own_speed} rad/s, which it moves with at most\n\
                  hint: MotorAngleLimitMaxSpdSet of the vendor's SDK sets another one"
@@ -58,7 +58,7 @@ mod tests {
     }
 
     #[test]
-    fn sensible_limits_narrow_those_of_the_sheet_without_a_word() {
+    fn valid_limits_narrow_those_of_the_sheet_silently() {
         let (narrow, odd) = with(1, -900, 900, 1500);
         let lower = narrow.position_lower[0].to_degrees();
         assert!((lower + 90.0).abs() < 1e-9 && narrow.velocity_max[0] == 1.5 && odd.is_empty());
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_dropped_with_a_warning() {
+    fn invalid_limits_are_ignored_with_a_warning() {
         for (lower, upper) in [(-1, -1), (900, -900), (-1800, -10), (0, 10)] {
             let (same, odd) = with(2, lower, upper, 3000);
             assert_eq!(same, limits());
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_speed_that_is_hardly_one_is_taken_with_a_warning() {
+    fn a_very_low_speed_is_accepted_with_a_warning() {
         let (slow, odd) = with(6, -1200, 1200, 1);
         assert_eq!(slow.velocity_max[5], 0.001);
         assert!(

@@ -1,28 +1,28 @@
-//! What adapters of all kinds need, so that an adapter's own files say only what is its own.
+//! Helpers shared by adapters.
 
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{AdapterError, AdapterResult};
 
-/// Copies the first values; `out` has length dof.
+/// Copies the first values into `out`, which has length dof.
 pub fn fill(out: &mut [f64], values: &[f64]) {
     out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
 }
 
-/// The values of a command: one finite number for each of N joints, else `Rejected`.
+/// Returns the values of a command: one finite number for each of N joints, otherwise `Rejected`.
 pub fn finite<const N: usize>(values: &[f64]) -> AdapterResult<[f64; N]> {
     match <[f64; N]>::try_from(values) {
         Ok(values) if values.iter().all(|value| value.is_finite()) => Ok(values),
-        _ => Err(AdapterError::Rejected(format!("{N} finite values are needed, one per joint"))),
+        _ => Err(AdapterError::Rejected(format!("expected {N} finite values, one per joint"))),
     }
 }
 
-/// A device's error with what it means.
+/// Returns a device's error with its text.
 pub fn fault(code: u16, text: &str) -> AdapterError {
     AdapterError::Fault { code: code.into(), text: text.to_owned() }
 }
 
 impl AdapterConfig {
-    /// The address as `parse` reads it; an error names the arm.
+    /// Parses the address; the error names the arm.
     pub fn parse_address<A>(&self, parse: impl FnOnce(&str) -> Result<A, String>) -> AdapterResult<A> {
         parse(&self.address).map_err(|e| AdapterError::Rejected(format!("{}: address: {e}", self.hardware_id)))
     }
@@ -37,7 +37,7 @@ mod tests {
         assert_eq!(finite::<2>(&[1.0, -2.0]), Ok([1.0, -2.0]));
         for bad in [&[1.0][..], &[1.0, 2.0, 3.0], &[1.0, f64::NAN], &[f64::INFINITY, 0.0]] {
             let error = finite::<2>(bad).unwrap_err().to_string();
-            assert_eq!(error, "2 finite values are needed, one per joint", "{bad:?}");
+            assert_eq!(error, "expected 2 finite values, one per joint", "{bad:?}");
         }
         let mut out = [9.0; 2];
         fill(&mut out, &[1.0, 2.0, 3.0]);

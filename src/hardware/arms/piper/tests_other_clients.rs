@@ -1,13 +1,13 @@
-//! Somebody else changes the arm's mode or power: it is left alone, and that shows. Two calls of the vendor's SDK, as
-//! its frames, with pauses between them; from a program that this computer hears, and from one that it does not.
+//! Another client changes the arm's mode or power: it is reported and not undone. Two calls of the vendor's SDK, as
+//! frames, with pauses between them; from a program that this computer receives, and from one that it does not.
 
 use std::time::{Duration, Instant};
 
 use super::adapter::PiperAdapter;
 use super::golden::frame;
 use super::tests::{START, activate, connected, farthest, read, until};
+use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::registry::Emulator;
-use crate::hardware::spec::ManipulatorAdapter;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
 use crate::joint::ControlMode;
 
@@ -24,7 +24,7 @@ const POWER: Calls = (&["471#0701000000000000"], &["471#0702000000000000"]);
 
 const PAUSES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(5), Duration::from_millis(200)];
 
-/// Streams as the device thread does, until the arm is not as ordered any more. Answers whether the mode showed it.
+/// Streams as the device thread does, until the arm is not as ordered. Returns whether the mode showed it.
 fn stream_until_changed(arm: &mut PiperAdapter) -> bool {
     let end = Instant::now() + Duration::from_secs(10);
     loop {
@@ -63,7 +63,7 @@ fn interfere(calls: Calls, pause: Duration, heard: bool) {
                 let frames: Vec<CanFrame> = part.iter().map(|text| frame(text)).collect();
                 match heard {
                     true => drop(port.send(&frames).unwrap()),
-                    false => frames.iter().for_each(|frame| emulator.obey_unheard(frame)),
+                    false => frames.iter().for_each(|frame| emulator.execute_unheard(frame)),
                 }
                 if i == 0 {
                     std::thread::sleep(pause);
@@ -74,8 +74,7 @@ fn interfere(calls: Calls, pause: Duration, heard: bool) {
     });
     assert!(changed || calls == POWER, "the mode shows it");
     let what = format!("{calls:?} {pause:?} heard: {heard}");
-    // It is not undone: no frame that takes the mode back, nor one that switches motors, and nothing is written any
-    // more.
+    // It is not undone: no frame restores the mode or switches motors, and nothing more is written.
     let others: Vec<CanFrame> = calls.0.iter().chain(calls.1).map(|text| frame(text)).collect();
     let ours = || emulator.trace().iter().map(|(_, f)| *f).filter(|f| !others.contains(f)).collect::<Vec<_>>();
     assert!(ours().iter().all(|f| (0x155..=0x157).contains(&f.id)), "{what}: {:x?}", ours());

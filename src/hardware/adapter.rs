@@ -4,9 +4,9 @@
 //! default body and those of the rest that its device can do; the defaults say "no" in the agreed way, so the
 //! absence of a feature is never an error.
 //!
-//! A device either answers when it is asked, or sends its state by itself. For the second kind
-//! [`ManipulatorAdapter::state_fd`] names the descriptor on which the state arrives: the device thread then reads when
-//! something has come, and the age of the state is the device's doing alone.
+//! A device is either polled, or streams its state. For the second kind, [`ManipulatorAdapter::state_fd`] returns the
+//! descriptor on which the state arrives: the device thread then reads when data has arrived, so the age of the state
+//! depends on the device only.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -52,48 +52,48 @@ pub enum AdapterError {
 /// Result of an adapter call.
 pub type AdapterResult<T> = Result<T, AdapterError>;
 
-/// What an arm is.
+/// Description of an arm.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ManipulatorInfo {
-    /// Who made it.
+    /// Vendor.
     pub vendor: String,
-    /// Which model it is.
+    /// Model.
     pub model: String,
     /// Number of joints.
     pub dof: usize,
-    /// Firmware version, where the device tells.
+    /// Firmware version, if the device reports it.
     pub firmware_version: Option<String>,
-    /// Serial number, where the device tells.
+    /// Serial number, if the device reports it.
     pub serial_number: Option<String>,
-    /// How often the device can deliver its state [Hz].
+    /// Rate at which the device can deliver its state [Hz].
     pub native_rate: f64,
     /// The modes that `set_control_mode` accepts.
     pub modes: &'static [ControlMode],
     /// Whether the arm keeps its pose when its motors are disabled (brakes), or falls.
     pub holds_when_disabled: bool,
-    /// Whether `read_joints` brings the whole state, so that the other reads answer from memory. Otherwise each of
-    /// them costs a round trip, and they are made in turns, one a cycle.
+    /// Whether `read_joints` gets the whole state, so that the other reads are answered from memory. Otherwise each
+    /// costs a round trip, and one of them is made per cycle.
     pub whole_state_at_once: bool,
 }
 
-/// Joint positions, velocities and efforts of one moment, read in one go.
+/// Joint positions, velocities and efforts from one reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct JointReading {
-    /// When the device measured, where it tells (translated to the monotonic clock).
+    /// When the device measured, if it reports that (translated to the monotonic clock).
     pub stamp: Option<Mono>,
     /// Joint positions [rad].
     pub position: Joints,
-    /// Joint velocities [rad/s], where the device has them.
+    /// Joint velocities [rad/s], if the device has them.
     pub velocity: Option<Joints>,
-    /// Joint torques [Nm], where the device has them.
+    /// Joint torques [Nm], if the device has them.
     pub effort: Option<Joints>,
-    /// The device's own sign that the positions are measured: `Some(true)` confirms them, `Some(false)` says that they
-    /// are not measured yet, `None`: the device has no such sign. Without a confirmation, exactly zero on all joints
-    /// counts as missing when the motors are to be enabled.
+    /// Whether the device confirms that the positions are measured: `Some(false)` means not yet, `None` that the device
+    /// cannot tell. Without a confirmation, exactly zero on all joints counts as missing when the motors are to be
+    /// enabled.
     pub valid: Option<bool>,
 }
 
-/// The device's own state words, as it reports them.
+/// The device's own state codes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RobotState {
     /// The device's state code.
@@ -102,79 +102,79 @@ pub struct RobotState {
     pub mode: i32,
 }
 
-/// What `write_stop` achieved.
+/// Result of `write_stop`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stop {
-    /// The device answered that it stops.
+    /// The device confirmed the stop.
     Confirmed,
     /// The stop was sent; the device has no way to confirm it.
     Sent,
 }
 
-/// An arm, as the rest of the program sees it. One device thread owns it and makes all calls.
+/// Interface of the program to an arm. One device thread owns it and makes all calls.
 ///
 /// Methods that fill a slice get one of length dof and must not allocate: they run every cycle.
 pub trait ManipulatorAdapter: Send {
     // --- Lifecycle ---
 
-    /// Connects and verifies that the right device is alive. Moves nothing, enables nothing.
+    /// Connects and verifies the device. Moves and enables nothing.
     fn connect(&mut self) -> AdapterResult<()>;
-    /// Ends the connection. Never fails; harmless when not connected.
+    /// Closes the connection. Never fails; has no effect when not connected.
     fn disconnect(&mut self);
-    /// Whether the connection is up, as far as is known without asking the device.
+    /// Returns whether the connection is up, without asking the device.
     fn is_connected(&self) -> bool;
-    /// Prepares for commanded motion: enables the servos and leaves the arm where it is.
+    /// Prepares for commanded motion: enables the motors and holds the current position.
     fn activate(&mut self) -> AdapterResult<()> {
         self.write_enable(true)
     }
-    /// Ends commanded motion gracefully, before `disconnect`. Motor power stays as it is.
+    /// Ends commanded motion in a regular way, before `disconnect`. Motor power does not change.
     fn deactivate(&mut self) -> AdapterResult<()> {
         self.write_stop().map(|_| ())
     }
 
-    // --- What it is ---
+    // --- Identity ---
 
-    /// Vendor, model, dof, versions, rate, modes.
+    /// Returns vendor, model, dof, versions, rate, modes.
     fn get_info(&self) -> ManipulatorInfo;
-    /// Number of joints.
+    /// Returns the number of joints.
     fn get_dof(&self) -> usize;
-    /// Joint limits, known or asked of the device.
+    /// Returns the joint limits, known or read from the device.
     fn get_limits(&mut self) -> AdapterResult<JointLimits>;
 
     // --- Mode ---
 
-    /// Brings the device into a mode; `Unsupported` for one that it lacks.
+    /// Sets the control mode; `Unsupported` for one that the device lacks.
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()>;
-    /// The mode the device is in, verified where it can tell.
+    /// Returns the mode of the device, as it reports it if it can.
     fn get_control_mode(&self) -> ControlMode;
 
-    /// What another client of the device, or a person at its panel, changed since the last `activate` or
-    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: nothing, or the device itself is the
-    /// cause (`read_error`). An adapter never undoes such a change by itself. Must not allocate.
+    /// Returns what another client of the device, or a person at its panel, changed since the last `activate` or
+    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: no change, or the device itself is the
+    /// cause (`read_error`). An adapter never undoes such a change. Must not allocate.
     fn foreign_change(&self) -> Option<&'static str> {
         None
     }
 
     // --- State ---
 
-    /// For a device that sends its state by itself: what becomes readable when something has arrived. The device
-    /// thread then calls [`ManipulatorAdapter::read_joints`] at once, which must take up all that has arrived without
-    /// waiting, and answer with the newest state and its own `stamp`: the same as before when nothing newer has come.
-    /// After a silence that a living device never keeps it answers with an error. `None`: the device is asked.
+    /// For a device that streams its state: returns the descriptor that becomes readable when data has arrived. The
+    /// device thread then calls [`ManipulatorAdapter::read_joints`] at once, which must process everything that has
+    /// arrived without waiting, and return the newest state with its own `stamp`, the same as before if there is no
+    /// newer one. After a silence that is too long for a live device it returns an error. `None`: the device is polled.
     fn state_fd(&self) -> Option<BorrowedFd<'_>> {
         None
     }
     /// Fills in the joint positions [rad].
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()>;
-    /// Fills in the joint velocities [rad/s]; `false` when the device has none (the coordinator estimates them).
+    /// Fills in the joint velocities [rad/s]; `false` if the device has none (the coordinator estimates them).
     fn read_joint_velocities(&mut self, _velocities: &mut [f64]) -> AdapterResult<bool> {
         Ok(false)
     }
-    /// Fills in the joint torques [Nm]; `false` when the device has none.
+    /// Fills in the joint torques [Nm]; `false` if the device has none.
     fn read_joint_efforts(&mut self, _efforts: &mut [f64]) -> AdapterResult<bool> {
         Ok(false)
     }
-    /// All three at once. An arm that gets them in one packet overrides this.
+    /// Reads all three. Override it for a device that sends them in one packet.
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         let dof = self.get_dof().min(MAX_DOF);
         let mut buffer = [0.0; MAX_DOF];
@@ -190,59 +190,58 @@ pub trait ManipulatorAdapter: Send {
         reading.effort = self.read_joint_efforts(slice)?.then_some(buffer);
         Ok(())
     }
-    /// The device's own state and mode codes.
+    /// Returns the device's own state and mode codes.
     fn read_state(&mut self) -> AdapterResult<RobotState>;
-    /// The device's error: code and text; `(0, "")` when there is none. The text is only built when the code is
-    /// not 0, so a healthy cycle allocates nothing.
+    /// Returns the device's error: code and text; `(0, "")` without an error. The text is built only for an error, so a
+    /// healthy cycle allocates nothing.
     fn read_error(&mut self) -> AdapterResult<(i32, String)>;
-    /// Whether the servos are enabled.
+    /// Returns whether the motors are enabled.
     fn read_enabled(&mut self) -> AdapterResult<bool>;
 
     // --- Motion ---
 
-    /// Commands joint positions [rad]. `velocity` is a fraction of the device's top speed (0–1], used where the
-    /// device plans the way itself.
+    /// Commands joint positions [rad]. `velocity` is a fraction of the device's top speed (0–1], used where the device
+    /// plans the motion.
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()>;
     /// Commands joint velocities [rad/s].
     fn write_joint_velocities(&mut self, _velocities: &[f64]) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Stops all motion at once by the device's own means; the motors stay powered. An operational stop. A gripper that
-    /// still moves afterwards is held by the device thread, which sends it to where it is.
+    /// Stops all motion at once with the device's own stop; the motors stay powered. An operational stop. The device
+    /// thread holds a gripper that still moves afterwards at its current position.
     fn write_stop(&mut self) -> AdapterResult<Stop>;
-    /// Enables or disables the servos.
+    /// Enables or disables the motors.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
-    /// Clears the device's error state. Moves nothing, enables nothing.
+    /// Clears the device's error state. Moves and enables nothing.
     fn write_clear_errors(&mut self) -> AdapterResult<()>;
-    /// Longest regular time between two setpoints that the device takes, known once it is connected. `None`: it takes
-    /// one in every tick, or in every period of its states where that is longer.
+    /// Returns the longest regular time between two setpoints, known once connected. `None`: one per tick or, if
+    /// longer, per period of the states.
     fn set_point_period(&self) -> Option<Duration> {
         None
     }
     /// Discards setpoints that have not left this computer. Called when the arm stopped answering, before anything else
-    /// is sent: a setpoint that waits in a queue must not reach the arm later. By default the connection is dropped,
-    /// and the device thread connects again; a TCP connection is reset, not closed, so that its send buffer is
-    /// discarded.
+    /// is sent: a queued setpoint must not reach the arm later. By default the connection is dropped, and the device
+    /// thread reconnects. A TCP connection is reset, not closed, which discards its send buffer.
     fn discard_pending(&mut self) {
         self.disconnect();
     }
 
     // --- Optional parts ---
 
-    /// End-effector pose; `None` when the device has none.
+    /// Returns the end-effector pose; `None` if the device has none.
     fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>> {
         Ok(None)
     }
-    /// Commands an end-effector pose; the device plans the way. `velocity` as above.
+    /// Commands an end-effector pose; the device plans the motion. `velocity` as above.
     fn write_cartesian_position(&mut self, _pose: &Pose, _velocity: f64) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Gripper opening [m]; `None` when there is no gripper.
+    /// Returns the gripper opening [m]; `None` without a gripper.
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         Ok(None)
     }
-    /// How far the gripper closes and opens [m], as the data sheet says: what `open` and `close` mean. `None` when
-    /// there is no gripper, or nobody knows.
+    /// Returns the gripper opening when closed and when open [m], according to the data sheet. `None` without a
+    /// gripper, or if unknown.
     fn get_gripper_range(&self) -> Option<(f64, f64)> {
         None
     }
@@ -250,7 +249,7 @@ pub trait ManipulatorAdapter: Send {
     fn write_gripper_position(&mut self, _position: f64) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }
-    /// Force and torque [N, N, N, Nm, Nm, Nm]; `None` when there is no sensor.
+    /// Returns force and torque [N, N, N, Nm, Nm, Nm]; `None` without a sensor.
     fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>> {
         Ok(None)
     }

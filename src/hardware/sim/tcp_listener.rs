@@ -1,4 +1,4 @@
-//! The listening thread of a [`super::tcp_server::TcpServer`]: lets clients in and sends reports when they are due.
+//! The listening thread of a [`super::tcp_server::TcpServer`]: accepts clients and sends periodic reports.
 
 use std::io::Write;
 use std::net::{TcpListener, TcpStream};
@@ -15,13 +15,13 @@ use super::stream::{Controller, Ending};
 use super::tcp_server::{Inner, Port};
 use crate::sync::lock;
 
-/// Time between attempts to listen again after a loss of power.
+/// Time between two attempts to listen again after a loss of power.
 const RETRY: Duration = Duration::from_millis(20);
 
-/// What the listening thread works with.
+/// State of the listening thread.
 pub(super) struct Floor<C> {
     inner: Arc<Inner<C>>,
-    /// None while the controller has no power.
+    /// `None` while the controller has no power.
     listeners: Option<Vec<TcpListener>>,
     sessions: Vec<JoinHandle<()>>,
     readers: Vec<Reader>,
@@ -33,7 +33,7 @@ struct Reader {
     period: Duration,
     stream: TcpStream,
     due: Instant,
-    /// The report that was sent last.
+    /// The last report sent.
     last: Vec<u8>,
 }
 
@@ -42,7 +42,7 @@ impl<C: Controller> Floor<C> {
         Self { inner, listeners: Some(listeners), sessions: Vec::new(), readers: Vec::new() }
     }
 
-    /// Serves until the emulator ends.
+    /// Runs until the emulator ends.
     pub fn run(mut self) {
         let inner = self.inner.clone();
         loop {
@@ -63,7 +63,7 @@ impl<C: Controller> Floor<C> {
                 self.listeners = Some(listeners);
                 self.send_reports();
             } else {
-                // On the same ports.
+                // On the same ports as before.
                 self.listeners = inner.ports.iter().map(|(address, _)| TcpListener::bind(address).ok()).collect();
                 if self.listeners.is_none() {
                     std::thread::sleep(RETRY);
@@ -73,7 +73,7 @@ impl<C: Controller> Floor<C> {
         self.sessions.into_iter().for_each(|session| drop(session.join()));
     }
 
-    /// Waits for clients until a report is due, and lets them in.
+    /// Accepts clients until a report is due.
     fn look(&mut self, listeners: &[TcpListener]) {
         let due = self.readers.iter().map(|reader| reader.due).min();
         let left = due.map_or(Duration::from_secs(1), |due| due.saturating_duration_since(Instant::now()));
@@ -93,7 +93,7 @@ impl<C: Controller> Floor<C> {
         for (port, listener) in listeners.iter().enumerate().filter(|(port, _)| ready.get(*port) == Some(&true)) {
             match listener.accept() {
                 Ok((stream, _)) => self.let_in(stream, port),
-                Err(_) => std::thread::sleep(Duration::from_millis(10)), // out of descriptors, say: do not spin
+                Err(_) => std::thread::sleep(Duration::from_millis(10)), // for example, no descriptors left: do not spin
             }
         }
     }

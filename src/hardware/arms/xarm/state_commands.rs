@@ -9,9 +9,9 @@ use super::mode::{ModeChange, Next};
 use super::protocol::commands::{Command, STOP};
 use super::session::{Ready, Session};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult, Stop};
+use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
 
-/// How long one call may work on a change of mode. It goes on with the next call.
+/// How long one call may work on a change of mode. The next call continues it.
 const MODE_SLICE: Duration = Duration::from_millis(15);
 /// How long the motors may take to show in the reports (5 Hz) after the controller has answered.
 const MOTORS_LIMIT: Duration = Duration::from_secs(2);
@@ -44,7 +44,7 @@ impl Session {
             let peer = self.control.peer();
             AdapterError::Timeout(format!("{peer} did not answer register 11 (motors) within {limit:?}"))
         })?;
-        // An error stands against enabling; it does not against disabling.
+        // An error prevents enabling, but not disabling.
         if on && error {
             self.check_error()?;
         }
@@ -92,7 +92,7 @@ impl Session {
         if self.change.is_none() {
             // A change that came to nothing between two calls has stopped the arm: first why, then that.
             self.reached()?;
-            let _ = self.heed_refusal(); // of a setpoint; but it may tell that the arm was stopped
+            let _ = self.check_refusal(); // of a setpoint; but it may tell that the arm was stopped
             self.may_be_commanded()?;
         }
         if self.change.is_none_or(|change| change.target != mode) {
@@ -123,13 +123,13 @@ impl Session {
         self.reached().map(|()| true)
     }
 
-    /// An error, told once, when the last change did not reach its mode.
+    /// Returns an error, once, if the last change did not reach its mode.
     fn reached(&mut self) -> AdapterResult<()> {
         let Some((mode, why)) = self.failed.take() else { return Ok(()) };
         Err(AdapterError::Protocol(format!("xarm did not change to mode {mode}: {why}")))
     }
 
-    /// Goes on with the change of mode, as far as the newest report allows.
+    /// Continues the change of mode, as far as the newest report allows.
     pub(super) fn advance_change(&mut self) -> AdapterResult<()> {
         let Some(mut change) = self.change.take() else { return Ok(()) };
         if self.condition().error != 0 {

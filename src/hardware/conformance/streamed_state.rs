@@ -1,4 +1,4 @@
-//! A device that sends its state by itself, and the descriptor on which that wakes its thread.
+//! Devices that stream their state, and the descriptor that wakes the device thread.
 
 use std::os::fd::AsFd;
 use std::time::Duration;
@@ -9,21 +9,31 @@ use super::Check;
 use super::Needs::Nothing;
 use super::context::{Context, require};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::JointReading;
+use crate::hardware::adapter::JointReading;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Nothing, "state_wakes_its_reader", "what arrives wakes the reader, and is new", wakes),
-    Check::new(Nothing, "reads_take_all_that_came", "after a read the descriptor is quiet: no busy loop", drains),
-    Check::new(Nothing, "reads_never_wait", "without news a read answers at once, with the old stamp", never_waits),
+    Check::new(Nothing, "state_wakes_its_reader", "a new state wakes the reader", wakes),
+    Check::new(
+        Nothing,
+        "reads_take_all_that_came",
+        "after a read the descriptor is not readable: no busy loop",
+        drains,
+    ),
+    Check::new(
+        Nothing,
+        "reads_never_wait",
+        "without a new state a read returns at once, with the old stamp",
+        never_waits,
+    ),
 ];
 
-const ASKED: &str = "it is asked for its state";
+const ASKED: &str = "its state is polled";
 /// How often each thing is tried. The limits below leave room for news that come at the wrong moment and for a
 /// machine that is busy: an adapter that is wrong is wrong nearly every time.
 const TRIES: usize = 60;
 /// Longest wait for the next state.
-const PATIENCE: Duration = Duration::from_secs(2);
+const STATE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Whether the adapter's descriptor becomes readable within `limit`.
 fn readable(context: &Context, limit: Duration) -> Result<bool, String> {
@@ -37,9 +47,9 @@ fn readable(context: &Context, limit: Duration) -> Result<bool, String> {
 /// Waits for the next state as the device thread does, which also reads when a period has passed without news.
 pub(super) fn await_news(context: &mut Context) -> Result<(), String> {
     let period = Duration::from_secs_f64(1.0 / context.adapter.get_info().native_rate);
-    let end = MonotonicClock.now().after(PATIENCE);
+    let end = MonotonicClock.now().after(STATE_TIMEOUT);
     while !readable(context, period)? {
-        require(MonotonicClock.now() < end, || format!("nothing came for {PATIENCE:?}"))?;
+        require(MonotonicClock.now() < end, || format!("nothing came for {STATE_TIMEOUT:?}"))?;
         stamp(context)?;
     }
     Ok(())
@@ -49,7 +59,7 @@ pub(super) fn await_news(context: &mut Context) -> Result<(), String> {
 fn stamp(context: &mut Context) -> Result<Mono, String> {
     let mut reading = JointReading::default();
     context.adapter.read_joints(&mut reading).map_err(|e| format!("read_joints: {e}"))?;
-    reading.stamp.ok_or_else(|| "it sends by itself, but its readings have no stamp".to_owned())
+    reading.stamp.ok_or_else(|| "it streams its state, but its readings have no stamp".to_owned())
 }
 
 fn wakes(context: &mut Context) -> Result<(), String> {
