@@ -1,7 +1,7 @@
 //! What the coordinator and the log are made from: names and limits of a blueprint, and what its arms said.
 
 use crate::blueprint::Blueprint;
-use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::task::Task;
 use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::device;
@@ -47,7 +47,7 @@ pub(super) fn coordinator_config(
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
-        version: CONTROL_VERSION,
+        version: CONFIG_VERSION,
         rate: blueprint.coordinator.tick_rate,
         arms: arms
             .map(|(arm, (said, limits))| ArmConfig {

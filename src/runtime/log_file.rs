@@ -12,7 +12,7 @@ use crate::message::Message;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::Notes;
 use crate::recording::recorder::Note;
-use crate::recording::{disk_space, files};
+use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, files};
 use crate::telemetry::describe::{Names, Severity};
 
 /// The log of a run, where it has one; refused where there is no room for it.
@@ -64,7 +64,7 @@ pub(super) fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> 
     let mut all = vec![yaml("blueprint.yaml".to_owned(), &blueprint.source_yaml)];
     all.extend(blueprint.sources.iter().map(|(name, text)| yaml(format!("source/{name}"), text)));
     all.push(LogAttachment {
-        name: "coordinator.json".to_owned(),
+        name: COORDINATOR.to_owned(),
         media_type: "application/json".to_owned(),
         // Plain structs with string keys always encode.
         data: serde_json::to_vec_pretty(config).unwrap_or_default(),
@@ -73,11 +73,12 @@ pub(super) fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> 
 }
 
 /// More about the run, for the log's reader.
-pub(super) fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
+pub(super) fn metadata(blueprint: &Blueprint, config: &CoordinatorConfig) -> BTreeMap<String, String> {
     BTreeMap::from([
         ("blueprint".to_owned(), blueprint.name.clone()),
         ("tick_rate".to_owned(), blueprint.coordinator.tick_rate.to_string()),
         ("dimos_version".to_owned(), crate::VERSION.to_owned()),
+        (CONFIG_VERSION_KEY.to_owned(), config.version.to_string()),
         ("simulated".to_owned(), blueprint.arms.iter().any(|a| a.simulated).to_string()),
     ])
 }

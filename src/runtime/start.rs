@@ -199,7 +199,7 @@ fn start_recorder(
         names: prepared.names.clone(),
         frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
         attachments: attachments(blueprint, config),
-        metadata: metadata(blueprint),
+        metadata: metadata(blueprint, config),
         wall,
         min_free: blueprint.recording.min_free.0,
     };

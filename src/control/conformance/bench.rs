@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::arm::{ArmState, Link, Supervision, VelocitySource};
 use crate::clock::Mono;
-use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::coordinator::{Coordinator, TickTime};
 use crate::control::request::{Envelope, Goal, Motion, Request};
 use crate::control::task::Task;
@@ -325,7 +325,7 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
     };
     let stronger = kind(stronger.name, (stronger.params.default)(), None);
     CoordinatorConfig {
-        version: CONTROL_VERSION,
+        version: CONFIG_VERSION,
         rate: RATE,
         arms: vec![arm],
         tasks: vec![
