@@ -1,4 +1,4 @@
-//! What the coordinator and the log are made from: names and limits of a blueprint, and what its arms said.
+//! The coordinator's configuration: names and limits of a blueprint, and what its arms report.
 
 use crate::blueprint::Blueprint;
 use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
@@ -8,7 +8,7 @@ use crate::hardware::device;
 use crate::joint::{JointLimits, MAX_DOF};
 use crate::telemetry::describe::{ArmNames, Names};
 
-/// Names of arms, joints and tasks, in the order of their indices.
+/// Returns the names of arms, joints and tasks, in the order of their indices.
 pub(super) fn names_of(blueprint: &Blueprint) -> Names {
     Names {
         arms: blueprint
@@ -39,7 +39,7 @@ pub(super) fn tasks(blueprint: &Blueprint) -> Result<(Vec<TaskConfig>, Vec<Task>
     Ok((configs, tasks))
 }
 
-/// Arms with their effective limits, and tasks.
+/// Returns the configuration of arms with their effective limits, and of tasks.
 pub(super) fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, JointLimits)],
