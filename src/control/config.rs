@@ -8,7 +8,7 @@ use crate::arm::Supervision;
 use crate::joint::{ControlMode, JointLimits};
 
 pub use super::task_config::{TaskConfig, TaskKind};
-pub use super::task_robot::{NO_ROTATION, Place, TaskKinematics};
+pub use super::task_robot::{FramePose, NO_ROTATION, TaskKinematics};
 pub use super::tasks::cartesian::CartesianParams;
 pub use super::tasks::servo::ServoParams;
 pub use super::tasks::trajectory::TrajectoryParams;

@@ -3,10 +3,10 @@
 
 use std::time::Duration;
 
-use super::belief::{Belief, Verdict};
 use super::config::ArmConfig;
 use super::estimate::VelocityEstimator;
 use super::failsafe::Freshness;
+use super::plausibility::{Plausibility, Verdict};
 use super::stalls::Stalls;
 use crate::arm::{ArmState, Link, VelocitySource};
 use crate::clock::Mono;
@@ -29,7 +29,7 @@ pub struct Feedback {
     state: ArmState,
     /// The latest reading, while its positions are rejected.
     rejected: Option<ArmState>,
-    belief: Belief,
+    plausibility: Plausibility,
     estimator: VelocityEstimator,
     freshness: Freshness,
 }
@@ -46,7 +46,7 @@ impl Feedback {
             max_age: config.supervision.stale_after.max(3 * config.read_period),
             state: ArmState::default(),
             rejected: None,
-            belief: Belief::new(own, &l.position_lower, &l.position_upper, read.as_secs_f64()),
+            plausibility: Plausibility::new(own, &l.position_lower, &l.position_upper, read.as_secs_f64()),
             estimator: VelocityEstimator::default(),
             freshness: Freshness::default(),
         }
@@ -64,7 +64,7 @@ impl Feedback {
 
     /// Returns whether the latest reading was rejected as implausible.
     pub fn is_rejected(&self) -> bool {
-        self.belief.refused() > 0
+        self.plausibility.rejected() > 0
     }
 
     /// Returns whether the state is fresh and plausible.
@@ -92,8 +92,8 @@ impl Feedback {
 
     fn accept(&mut self, state: &ArmState) -> Verdict {
         // Positions that are not numbers are no measurement.
-        let verdict = if self.is_finite(&state.position) { self.belief.take(state) } else { Verdict::Refused };
-        if verdict == Verdict::Refused || (verdict == Verdict::Same && self.is_rejected()) {
+        let verdict = if self.is_finite(&state.position) { self.plausibility.take(state) } else { Verdict::Rejected };
+        if verdict == Verdict::Rejected || (verdict == Verdict::Same && self.is_rejected()) {
             // The last accepted measurement stays, and ages.
             self.rejected = Some(*state);
             let before = std::mem::replace(&mut self.state, *state);
@@ -119,7 +119,7 @@ impl Feedback {
         // An arm whose readings are rejected still answers: its age counts from the latest of them until it had the
         // time to confirm a jump.
         let confirmation = CONFIRMATIONS * self.read_period.max(Duration::from_millis(1));
-        let waits = self.is_rejected() && now.since(self.belief.stamp()) <= self.max_age + confirmation;
+        let waits = self.is_rejected() && now.since(self.plausibility.stamp()) <= self.max_age + confirmation;
         let stamp = self.rejected.as_ref().filter(|_| waits).map_or(self.state.stamp, |read| read.stamp);
         let age = now.since(stamp);
         let device = Duration::from_nanos(self.state.own_delay_ns);

@@ -6,7 +6,6 @@
 
 pub mod arbitrate;
 pub mod arm_control;
-pub mod belief;
 pub mod config;
 pub mod conformance;
 pub mod coordinator;
@@ -15,6 +14,7 @@ pub mod failsafe;
 pub mod feedback;
 pub mod limit;
 pub mod path_clock;
+pub mod plausibility;
 pub mod point_to_point;
 pub mod request;
 pub mod set_points;

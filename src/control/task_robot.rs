@@ -34,7 +34,7 @@ pub struct TaskKinematics {
     /// The end effector: index of its link.
     pub link: usize,
     /// Pose of the model's root in the frame of the task's poses.
-    pub root: Place,
+    pub root: FramePose,
     /// Orientation of the base, along whose axes twists are given, in the frame of the model's root: quaternion x, y,
     /// z, w.
     pub base: [f64; 4],
@@ -42,7 +42,7 @@ pub struct TaskKinematics {
 
 /// Pose of a frame in another frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Place {
+pub struct FramePose {
     /// x, y, z [m].
     pub position: [f64; 3],
     /// Quaternion x, y, z, w.
@@ -52,7 +52,7 @@ pub struct Place {
 /// The quaternion of no rotation.
 pub const NO_ROTATION: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
 
-impl Place {
+impl FramePose {
     /// Identity.
     pub const SAME: Self = Self { position: [0.0; 3], orientation: NO_ROTATION };
 }
@@ -60,7 +60,7 @@ impl Place {
 impl TaskKinematics {
     /// Creates the kinematics of a robot whose poses and twists are in the frame of its root.
     pub fn new(kinematics: Kinematics, link: usize) -> Self {
-        Self { kinematics, link, root: Place::SAME, base: NO_ROTATION }
+        Self { kinematics, link, root: FramePose::SAME, base: NO_ROTATION }
     }
 
     /// Checks that a task with this number of joints can use it. The error names the problem.

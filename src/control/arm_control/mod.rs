@@ -12,11 +12,11 @@ mod rest;
 
 use std::time::Duration;
 
-use super::belief::Verdict;
 use super::config::ArmConfig;
 use super::failsafe::{Failsafe, Freshness};
 use super::feedback::Feedback;
 use super::limit::{Bounds, Limiter, Refusal};
+use super::plausibility::Verdict;
 use super::stalls::Stalls;
 use super::task_body::Demand;
 use super::tracking::{Tracking, furthest};
