@@ -1,5 +1,5 @@
-//! One program per device: a name in the kernel for each address that the device's own resolves to, taken before a byte
-//! is sent. It belongs to the machine, not to a user or a folder, and dies with the process.
+//! One program per device: an abstract socket name for each address that the device's address resolves to, bound before
+//! a byte is sent. It is valid for all users of this computer, and ends with the process.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -14,17 +14,17 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connec
 
 /// Longest name of a socket in the kernel, without its leading zero [bytes].
 const MAX_NAME: usize = 107;
-/// How long the look-up of a host may take.
+/// Timeout for the lookup of a host name.
 const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);
 
 /// A lock on devices, held for the lifetime of this value.
 #[derive(Debug)]
 pub struct DeviceLock(#[expect(dead_code, reason = "the names are ours while the sockets are open")] Vec<UnixListener>);
 
-/// Why a device is not ours.
+/// Why a device cannot be locked.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceTaken {
-    /// Another process has it.
+    /// Another process holds it.
     #[error("{adapter} at {address} is in use by process {pid}")]
     By {
         /// The adapter.
@@ -34,19 +34,19 @@ pub enum DeviceTaken {
         /// The process.
         pid: String,
     },
-    /// The name cannot be taken.
+    /// The name cannot be bound.
     #[error("cannot lock {adapter} at {address}: {error}")]
     Io {
         /// The adapter.
         adapter: String,
         /// The device's address.
         address: String,
-        /// Why.
+        /// The error.
         error: io::Error,
     },
 }
 
-/// Takes the device at an address, which is given in full, or says who has it. Looks names of hosts up.
+/// Locks the device at a complete address; the error names the process that holds it. Resolves host names.
 pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
     let names = places(address).into_iter().map(|place| name(adapter, &place));
     let mut taken = Vec::new();
@@ -72,16 +72,16 @@ fn holder(name: &str) -> Option<i32> {
     Some(sockopt::socket_peercred(&socket).ok()?.pid.as_raw_nonzero().get())
 }
 
-/// Where a device is, the same for every spelling of its address: the addresses that its host resolves to, each with
-/// the first port; the device file behind a link. At least one.
+/// Returns canonical addresses of a device, the same for every spelling: the addresses of its host, each with the first
+/// port, or the device file behind a link. At least one.
 fn places(address: &str) -> BTreeSet<String> {
     let text = address.trim();
     if text.starts_with("memory:") {
-        // A bus in memory belongs to one process: others have their own of the same number.
+        // A bus in memory belongs to its process: others have their own with the same number.
         return BTreeSet::from([format!("{text} of process {}", std::process::id())]);
     }
     if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
-        // The part after an `@` is how to talk to it.
+        // The part after an `@` is the bit rate.
         let path = path.split_once('@').map_or(path, |(path, _)| path);
         let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
         return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), real.display())]);
@@ -101,7 +101,7 @@ fn places(address: &str) -> BTreeSet<String> {
     ips.into_iter().map(|ip| SocketIp::new(canonical(ip), port).to_string()).collect()
 }
 
-/// The host and the first port of `HOST:PORT` or `[HOST]:PORT`; what follows are more ports of the same device.
+/// Returns host and first port of `HOST:PORT` or `[HOST]:PORT`; further ports belong to the same device.
 fn host_and_port(text: &str) -> Option<(&str, u16)> {
     let (host, ports) = match text.strip_prefix('[') {
         Some(rest) => rest.split_once("]:")?,
@@ -111,7 +111,7 @@ fn host_and_port(text: &str) -> Option<(&str, u16)> {
     Some((host, port))
 }
 
-/// One spelling of an address: IPv4 where it is one in other clothes, the loopback for "this host".
+/// Returns the canonical form of an address: IPv4 for IPv4-mapped ones, the loopback address for "this host".
 fn canonical(ip: IpAddr) -> IpAddr {
     match ip.to_canonical() {
         IpAddr::V4(v4) if v4.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
@@ -120,9 +120,9 @@ fn canonical(ip: IpAddr) -> IpAddr {
     }
 }
 
-/// All addresses of a host name; none where it is not known in time.
+/// Returns all addresses of a host name; none if it is unknown or the lookup times out.
 fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
-    // The system's resolver has no deadline, so it runs on its own thread, which is abandoned when it is late.
+    // The system's resolver has no deadline, so it runs on its own thread, which is abandoned at the timeout.
     let (sender, found) = mpsc::channel();
     let target = (host.to_owned(), port);
     let asked = std::thread::Builder::new().name("resolve".into()).spawn(move || {
@@ -132,10 +132,10 @@ fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
     asked.ok().and_then(|_| found.recv_timeout(LOOK_UP_LIMIT).ok()).unwrap_or_default()
 }
 
-/// The name in the kernel.
+/// Returns the socket name.
 fn name(adapter: &str, place: &str) -> String {
     let name = format!("dimos/device/{adapter}/{place}");
-    // Hosts may have names longer than that; they differ at their beginning, ports at their end.
+    // Longer names are cut in the middle: hosts differ at the beginning, ports at the end.
     match name.char_indices().nth(MAX_NAME / 2) {
         Some((half, _)) if name.len() > MAX_NAME => {
             let tail = name.char_indices().rev().nth(MAX_NAME / 4).map_or(half, |(at, _)| at);

@@ -7,7 +7,7 @@ use std::time::Duration;
 use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
@@ -50,7 +50,7 @@ fn config() -> CoordinatorConfig {
         priority: 10,
         auto_start: false,
     };
-    CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
+    CoordinatorConfig { version: CONFIG_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
 }
 
 /// The coordinator on a clock that is set forward, with an arm that does what it is told, a period later.

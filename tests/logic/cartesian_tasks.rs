@@ -127,7 +127,7 @@ fn a_pose_is_reached_smoothly_within_a_millimetre_and_a_tenth_of_a_degree() {
 fn poses_are_in_the_frame_that_the_root_is_placed_in() {
     let turn = DQuat::from_rotation_z(PI / 2.0);
     let root = DAffine3::from_rotation_translation(turn, DVec3::new(1.0, 2.0, 0.5));
-    let place = Place { position: root.translation.to_array(), orientation: turn.to_array() };
+    let place = FramePose { position: root.translation.to_array(), orientation: turn.to_array() };
     let mut rig = rig_at(&HOME, TaskKinematics { root: place, ..robot() }, &CartesianParams::default());
     let mut goal = HOME;
     goal[0] += 0.2;

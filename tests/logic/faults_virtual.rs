@@ -735,7 +735,7 @@ fn f36_a_start_elsewhere_names_joint_and_amount_and_moves_nothing() {
 
 #[test]
 fn a_coordinator_without_arms_or_tasks_ticks() {
-    let config = CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![], tasks: vec![] };
+    let config = CoordinatorConfig { version: CONFIG_VERSION, rate: 100.0, arms: vec![], tasks: vec![] };
     let rig = Rig::new(100.0, vec![], vec![]);
     let time =
         dimos::control::coordinator::TickTime { now: rig.now, next: rig.now, skipped: 0, late_ns: 0, woke_late_ns: 0 };

@@ -125,7 +125,7 @@ fn the_tick_loop_takes_and_gives_back_no_memory() {
     const TICKS: u64 = 1_000;
     let tasks = vec![task("t", trajectory(), 0..6, 10), task("v", velocity(), 0..6, 20)];
     let config = CoordinatorConfig {
-        version: dimos::control::config::CONTROL_VERSION,
+        version: dimos::control::config::CONFIG_VERSION,
         rate: 1000.0,
         arms: vec![arm("arm", 6)],
         tasks,

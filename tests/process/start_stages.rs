@@ -32,7 +32,7 @@ const SPEC: AdapterSpec = AdapterSpec {
 };
 
 /// Threads of a run begin with one of these.
-const THREADS: &[&str] = &["tick", "courier", "recorder", "watchdog", "device/", "planner", "rpc", "replan"];
+const THREADS: &[&str] = &["tick", "outcomes", "recorder", "watchdog", "device/", "planner", "rpc", "replan"];
 
 /// The arms are the same in all of these tests.
 static ALONE: Mutex<()> = Mutex::new(());

@@ -255,7 +255,7 @@ impl Rig {
 
     /// With tasks of a table's types.
     pub fn with_types(table: &TaskTable, rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
-        let config = CoordinatorConfig { version: CONTROL_VERSION, rate, arms, tasks };
+        let config = CoordinatorConfig { version: CONFIG_VERSION, rate, arms, tasks };
         let wire = |a: &ArmConfig| Wire {
             mode: None,
             values: vec![0.0; a.dof],

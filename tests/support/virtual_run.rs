@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::{Mono, WallOffset};
-use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
@@ -46,7 +46,7 @@ pub fn one_arm(dof: usize) -> CoordinatorConfig {
         priority: 10,
         auto_start: false,
     };
-    CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
+    CoordinatorConfig { version: CONFIG_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
 }
 
 /// A run on a clock that is set forward.
@@ -94,7 +94,7 @@ impl VirtualRun {
             names: names.clone(),
             frame_id: "coordinator".into(),
             attachments: vec![attachment],
-            metadata: BTreeMap::new(),
+            metadata: BTreeMap::from([("config_version".to_owned(), config.version.to_string())]),
             wall: WallOffset::of(START.0, START.1),
             min_free: 0,
         };
