@@ -65,7 +65,7 @@ impl Soaked {
         self.run.as_ref().unwrap().until(UP);
     }
 
-    /// Swings every joint by 0.2 rad for so long [s].
+    /// Swings every joint by 0.2 rad for this time [s].
     fn move_all(&self, seconds: f64) -> Result<(), String> {
         let mut client: Client = self.home.client();
         for arm in client.call(State {}).unwrap().arms {
@@ -122,9 +122,9 @@ struct Hold {
 }
 
 impl Hold {
-    /// A processor that runs nothing for so long must hold an arm.
+    /// A processor that runs nothing for this time must hold an arm.
     const LIMIT: Duration = Duration::from_millis(100);
-    /// So long after a stall its last effect shows: states of a remote arm are valid for 200 ms.
+    /// Time after a stall until its last effect shows: states of a remote arm are valid for 200 ms.
     const AFTER: Duration = Duration::from_millis(300);
 
     /// Returns the stall that explains it.

@@ -1,4 +1,4 @@
-//! Whether this computer stood still while something was measured.
+//! Whether this computer was stalled during a measurement.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
