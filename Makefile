@@ -1,6 +1,8 @@
 # run install dist check test test-fast · test-tools test-rerun deny mutants · bench bench-quick jitter soak
 
 PYTHON ?= python3
+# Most tests wait rather than compute. More at a time than this and whole runs no longer keep their time.
+export NEXTEST_TEST_THREADS ?= $(shell echo $$((2 * $$(nproc))))
 READERS := tests/readers
 SYSTEM_TOOLS := cyclictest linux.uml insmod ip tc cansend
 SYSTEM_PACKAGES := rt-tests user-mode-linux kmod iproute2 can-utils
@@ -61,7 +63,7 @@ test:
 	else cargo test --locked --lib --bins --tests; \
 	fi
 
-# The logic, in a minute and a half: no run of the program, no vendor's tool.
+# The logic, in a minute: no run of the program, no vendor's tool.
 test-fast:
 	@if cargo nextest --version >/dev/null 2>&1; \
 	then cargo nextest run --locked --profile fast --lib --test logic; \

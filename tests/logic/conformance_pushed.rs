@@ -1,4 +1,4 @@
-//! The part of the conformance suite that is for devices which send their state by themselves: an arm that does it
+//! The part of the conformance suite that is for devices that stream their state: an arm that does it
 //! right, and arms that do it wrong in one way each.
 
 use std::io::{Read, Write};

@@ -1,5 +1,5 @@
-//! A stop that an arm does not take at once is asked for again, whoever wants it: the tick, or the device thread
-//! by itself because the tick fell silent.
+//! A stop that an arm does not take at once is retried, whether the tick requested it or the device thread did
+//! because no tick came.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -32,7 +32,7 @@ fn bench(native_rate: f64) -> Bench {
     bench_of(Box::new(mock.clone()), mock, native_rate)
 }
 
-/// A device thread with this adapter; `mock` is it, or stands idle.
+/// A device thread with this adapter; `mock` is that adapter, or unused.
 fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
     let beat = Arc::new(Heartbeat::default());
     let (state_writer, states) = slot(ArmState::default());
@@ -91,7 +91,7 @@ fn a_stop_that_fails_is_sent_again_and_confirmed() {
     bench.mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
     bench.mock.fail("write_stop", AdapterError::Rejected("busy".into()));
     bench.tick(|c| (c.mode, c.stop_seq) = (None, 1));
-    // No tick comes any more: the thread goes on by itself.
+    // No more ticks come: the thread continues on its own.
     bench.until("the stop", |b| b.device.health().stop_confirmed.load(Relaxed) == 1);
     assert_eq!(bench.stops(), 3);
     bench.end();
@@ -190,7 +190,7 @@ fn a_gripper_that_goes_on_after_a_stop_is_held() {
             std::thread::sleep(Duration::from_millis(1200));
             let held = emulator.gripper();
             std::thread::sleep(Duration::from_millis(300));
-            assert!(held < 0.0849, "stopped at {at_the_stop} m, it went on to {held} m");
+            assert!(held < 0.0849, "stopped at {at_the_stop} m, it continued to {held} m");
             assert!((emulator.gripper() - held).abs() < 1e-6, "held");
             return bench.end();
         }

@@ -1,4 +1,4 @@
-//! The vendor's own client, in a process of its own, against our emulator at the arm's own ports: it connects,
+//! The vendor's own client, in its own process, against our emulator at the arm's own ports: it connects,
 //! enables, moves, reads, sets velocities, uses the gripper and the force/torque sensor, sees errors and clears them.
 
 use std::net::{IpAddr, Ipv4Addr};

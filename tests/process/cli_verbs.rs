@@ -110,7 +110,7 @@ pose     xyz 0.1000 0.2000 0.3000 m, rpy 0.0000 0.0000 0.0000 rad
     {
         assert!(status.contains(part), "{part:?} is not in\n{status}");
     }
-    assert!(!status.contains('\x1b'), "no colour where nobody looks");
+    assert!(!status.contains('\x1b'), "no colour without a terminal");
 }
 
 #[test]
@@ -165,7 +165,7 @@ fn a_motion_that_ends_elsewhere_is_a_failure() {
     let _run = start(&home.runs(), "test", FakeBackend { aborts: true, ..Default::default() });
     let ended = home.run("move arm 0.3 -0.2").with(1);
     assert!(ended.err.contains("error: motion 7: ABORTED: arm_joint1 was 0.2000 rad off the path"), "{}", ended.err);
-    assert!(ended.out.contains("arm_joint2"), "where it ended is told all the same");
+    assert!(ended.out.contains("arm_joint2"), "where it ended is printed all the same");
 }
 
 #[test]

@@ -109,7 +109,7 @@ planner:
     }
 }
 
-/// The threads of runs in this process; those of other tests cannot be told apart, where there are such.
+/// The threads of runs in this process; those of other tests in the same process cannot be distinguished.
 fn threads() -> Vec<String> {
     if std::env::var_os("NEXTEST").is_none() {
         return Vec::new();

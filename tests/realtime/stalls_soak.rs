@@ -65,7 +65,7 @@ impl Soaked {
         self.run.as_ref().unwrap().until(UP);
     }
 
-    /// Swings every joint by 0.2 rad for so long [s].
+    /// Swings every joint by 0.2 rad for this time [s].
     fn move_all(&self, seconds: f64) -> Result<(), String> {
         let mut client: Client = self.home.client();
         for arm in client.call(State {}).unwrap().arms {
@@ -122,7 +122,7 @@ struct Hold {
 }
 
 impl Hold {
-    /// A processor that runs nothing for so long must hold an arm.
+    /// A processor that runs nothing for this time must hold an arm.
     const LIMIT: Duration = Duration::from_millis(100);
     /// The last effects of a stall are logged this much later: states of a remote arm are valid for 200 ms, and the
     /// text log is written by an ordinary thread.

@@ -1,7 +1,7 @@
-//! What an arm is told when the wire to it stalls at full speed, judged on the wire: five arms, every kind of stall,
+//! Commands to an arm whose wire stalls at full speed, judged on the wire: five arms, every kind of stall,
 //! from 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and
-//! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and tells what went over the wire where
-//! something is wrong.
+//! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and prints what went over the wire at a
+//! failure.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +19,7 @@ use crate::support::wire::{Stall, now};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Wire(Stall),
-    /// The arm's controller: it reads nothing and says nothing, then goes on.
+    /// The arm's controller: it neither reads nor sends, then continues.
     Controller,
 }
 
@@ -42,7 +42,7 @@ fn arms() -> Vec<Arm> {
     all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect()
 }
 
-/// The cases of an arm: `n` tells arms apart, so that together they have more than each.
+/// The cases of arm number `n`; all arms together cover more cases than each.
 fn cases(n: usize) -> Vec<(Kind, Duration)> {
     let full = std::env::var("DIMOS_WIRE").is_ok_and(|v| v == "full");
     let all =
@@ -54,7 +54,7 @@ fn cases(n: usize) -> Vec<(Kind, Duration)> {
     some.map(|(_, kind, _, ms)| (*kind, Duration::from_millis(*ms))).collect()
 }
 
-/// Runs the cases of all arms, the arms side by side, and tells all that went wrong.
+/// Runs the cases of all arms, the arms side by side, and reports all failures.
 fn judge_all(arms: &[Arm], case: fn(&Bed, Kind, Duration) -> Vec<String>) {
     let (realtime, ordinary) = (Watch::of_emulators(), Watch::of_programs());
     let failures: Vec<String> = std::thread::scope(|scope| {
@@ -139,8 +139,8 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     let failures: Vec<String> = verdicts.into_iter().filter_map(Result::err).collect();
     if !failures.is_empty() && std::env::var_os("DIMOS_WIRE_ARM").is_some() {
         let near = |at: dimos::clock::Mono| (-0.05..time.as_secs_f64() + 0.1).contains(&at.seconds_since(began));
-        for told in delivered.iter().filter(|told| near(told.at)) {
-            println!("{:8.1} ms {:?} {:?}", told.at.seconds_since(began) * 1e3, told.what, told.truth);
+        for command in delivered.iter().filter(|command| near(command.at)) {
+            println!("{:8.1} ms {:?} {:?}", command.at.seconds_since(began) * 1e3, command.what, command.truth);
         }
     }
     failures

@@ -1,4 +1,4 @@
-//! Whether this computer ran no program while something was measured.
+//! Whether this computer was stalled during a measurement.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
