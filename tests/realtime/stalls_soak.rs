@@ -197,7 +197,7 @@ fn soak(realtime: bool) {
             shorter.iter().filter(|(at, _)| at.duration_since(hold.at).unwrap_or_else(|e| e.duration()) < Hold::AFTER);
         format!("{} (stalls nearby: {:?})", hold.what, near.map(|(_, length)| length).collect::<Vec<_>>())
     };
-    let failures: Vec<String> = failures.iter().map(|hold| nearby(hold)).collect();
+    let failures: Vec<String> = failures.iter().map(nearby).collect();
     assert!(failures.is_empty(), "{} holds:\n{}", failures.len(), failures.join("\n"));
 }
 
