@@ -10,6 +10,7 @@
 mod arm_messages;
 pub mod cdr;
 pub mod disk_space;
+mod disk_sync;
 mod entries;
 pub mod files;
 pub mod log_writer;

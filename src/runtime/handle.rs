@@ -83,7 +83,7 @@ impl Handle {
     }
 
     /// Holds all arms at once, latched: tasks are cancelled, and nothing moves an arm until it is reset and enabled.
-    /// An operational stop, no safety function.
+    /// An operational stop, not a safety function.
     pub fn stop_arms(&self) -> Result<StopReply, RpcError> {
         self.call(Stop { arm: None })
     }

@@ -159,6 +159,10 @@ impl Service {
                 self.tell(tick, described, wall);
             }
             Notice::Lost(count) => tracing::warn!("the recorder fell behind: {count} samples are missing in the log"),
+            Notice::Unsynced(after) => tracing::warn!(
+                "the log is closed, but its disk has not stored all of it after {} s; keep the power on",
+                after.as_secs()
+            ),
             Notice::Stopped(error) => {
                 tracing::error!("{error}");
                 let first = error.to_string().lines().next().unwrap_or_default().to_owned();

@@ -2,9 +2,12 @@
 //! code 5. The real binary, on a small file system of its own where this user may mount one.
 
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
-use crate::support::program::{Home, Started, eventually};
+use rustix::process::Signal;
+
+use crate::support::program::{Home, Started, UP, eventually};
 
 const RUN: &str = "coordinator-mock";
 
@@ -89,4 +92,30 @@ fn a_log_that_is_removed_ends_the_run() {
     std::fs::remove_file(&log).unwrap();
     eventually("the run has ended", || home.runs().runs().unwrap().is_empty());
     home.dimos(&format!("down {RUN}")).with(1).says(&["it was removed or replaced"]);
+}
+
+/// A disk on which a sync takes longer than the recorder's ring lasts.
+const SLOW_SYNC: &str = "
+#include <unistd.h>
+int fdatasync(int file) { (void)file; return sleep(7); }
+";
+
+#[test]
+fn a_disk_that_syncs_slowly_costs_no_sample_and_delays_no_end() {
+    let home = Home::new();
+    home.write("slow.c", SLOW_SYNC);
+    let (library, log) = (home.path().join("slow.so"), home.path().join("run.mcap"));
+    let mut compiler = Command::new("cc");
+    compiler.args(["-shared", "-fPIC", "-o"]).arg(&library).arg(home.path().join("slow.c"));
+    assert!(compiler.status().unwrap().success());
+    let mut command = home.command(&format!("run {RUN} --record {}", log.display()));
+    let run = Started::of(command.stdin(Stdio::null()).env("LD_PRELOAD", &library));
+    run.until(UP);
+    // The first sync begins after a second and lasts seven; the ring holds five.
+    std::thread::sleep(Duration::from_millis(8500));
+    let asked = Instant::now();
+    let ended = run.end(Signal::INT).with(130).says(&["the log is closed, but its disk", "keep the power on"]);
+    assert!(asked.elapsed() < Duration::from_secs(5), "{:?}", asked.elapsed());
+    assert!(!ended.err.contains("fell behind"), "{}", ended.err);
+    home.dimos(&format!("replay {} --verify", log.display())).with(0);
 }

@@ -9,7 +9,6 @@
 pub mod arms;
 pub mod can;
 pub mod decode;
-pub mod host_stalls;
 pub mod judge;
 pub mod stream;
 pub mod watch;
