@@ -36,14 +36,15 @@ pub fn share_builds(folder: &Path) {
     fs::write(folder.join("Cargo.toml"), manifest).unwrap();
 }
 
-/// Removes what the cargo that runs this test has set, which is not for the crates that it builds.
+/// Removes what the cargo that runs this test has set. With its `CARGO_PKG_NAME` or `OUT_DIR`, build scripts such as
+/// ring's run again: dimos would be compiled again for each crate, and again by the next build of the checkout.
 pub fn without_cargo_settings(command: &mut Command) -> &mut Command {
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("CARGO_") && name != "CARGO_HOME") {
         command.env_remove(name);
     }
     // As many jobs as the outer build may have.
-    for name in ["CARGO_BUILD_JOBS", "CARGO_BUILD_RUSTC_WRAPPER"] {
-        std::env::var_os(name).into_iter().for_each(|value| _ = command.env(name, value));
+    if let Some(jobs) = std::env::var_os("CARGO_BUILD_JOBS") {
+        command.env("CARGO_BUILD_JOBS", jobs);
     }
-    command.env("CARGO_NET_OFFLINE", "true")
+    command.env_remove("OUT_DIR").env("CARGO_NET_OFFLINE", "true")
 }
