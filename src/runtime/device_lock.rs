@@ -8,14 +8,17 @@ use std::os::fd::AsFd;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::sync::mpsc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with, sockopt};
 
 /// Longest name of a socket in the kernel, without its leading zero [bytes].
 const MAX_NAME: usize = 107;
 /// Timeout for the lookup of a host name.
 const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);
+/// How long a process that takes a name may need from binding its socket to listening.
+const HOLDER_LIMIT: Duration = Duration::from_millis(500);
 
 /// A lock on devices, held for the lifetime of this value.
 #[derive(Debug)]
@@ -51,25 +54,48 @@ pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
     let names = places(address).into_iter().map(|place| name(adapter, &place));
     let mut taken = Vec::new();
     for name in names {
-        let bound = SocketAddr::from_abstract_name(&name).and_then(|at| UnixListener::bind_addr(&at));
         let (adapter, address) = (adapter.to_owned(), address.to_owned());
-        taken.push(bound.map_err(|error| match error.kind() {
-            io::ErrorKind::AddrInUse => {
-                let pid = holder(&name).map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
+        taken.push(take_name(&name).map_err(|refused| match refused {
+            Refused::Taken(pid) => {
+                let pid = pid.map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
                 DeviceTaken::By { adapter, address, pid }
             }
-            _ => DeviceTaken::Io { adapter, address, error },
+            Refused::Io(error) => DeviceTaken::Io { adapter, address, error },
         })?);
     }
     Ok(DeviceLock(taken))
 }
 
+/// Why a name cannot be taken.
+enum Refused {
+    /// A process has it; its pid where the kernel knows it.
+    Taken(Option<i32>),
+    /// The kernel refused.
+    Io(io::Error),
+}
+
+/// Takes the name, or returns who has it.
+fn take_name(name: &str) -> Result<UnixListener, Refused> {
+    let at = SocketAddr::from_abstract_name(name).map_err(Refused::Io)?;
+    let deadline = Instant::now() + HOLDER_LIMIT;
+    loop {
+        match UnixListener::bind_addr(&at) {
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse => match holder(name) {
+                // The holder has bound its socket and does not listen yet, or has just ended: the next try shows which.
+                Err(Errno::CONNREFUSED) if Instant::now() < deadline => std::thread::sleep(Duration::from_millis(1)),
+                pid => return Err(Refused::Taken(pid.ok())),
+            },
+            bound => return bound.map_err(Refused::Io),
+        }
+    }
+}
+
 /// Returns the pid that holds the name, taken from the socket's peer credentials. Never blocks.
-fn holder(name: &str) -> Option<i32> {
+fn holder(name: &str) -> Result<i32, Errno> {
     let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
-    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).ok()?;
-    connect(socket.as_fd(), &SocketAddrUnix::new_abstract_name(name.as_bytes()).ok()?).ok()?;
-    Some(sockopt::socket_peercred(&socket).ok()?.pid.as_raw_nonzero().get())
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    connect(socket.as_fd(), &SocketAddrUnix::new_abstract_name(name.as_bytes())?)?;
+    Ok(sockopt::socket_peercred(&socket)?.pid.as_raw_nonzero().get())
 }
 
 /// Returns canonical addresses of a device, the same for every spelling: the addresses of its host, each with the first
@@ -163,6 +189,22 @@ mod tests {
         assert!(take("other", &at("127.0.0.1")).is_ok());
         drop(held);
         assert!(take("test", &at("127.0.0.1")).is_ok());
+    }
+
+    #[test]
+    fn a_holder_that_does_not_listen_yet_is_named() {
+        let (port, name) = (std::process::id(), name("starting", &format!("127.0.0.1:{}", std::process::id())));
+        let flags = SocketFlags::CLOEXEC;
+        let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).unwrap();
+        rustix::net::bind(&socket, &SocketAddrUnix::new_abstract_name(name.as_bytes()).unwrap()).unwrap();
+        let late = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(50));
+            rustix::net::listen(&socket, 8).map(|()| socket).unwrap()
+        });
+        let refused = take("starting", &format!("127.0.0.1:{port}")).unwrap_err().to_string();
+        assert!(refused.contains(&format!("in use by process {port}")), "{refused}");
+        drop(late.join().unwrap());
+        assert!(take("starting", &format!("127.0.0.1:{port}")).is_ok(), "the holder has ended");
     }
 
     #[test]

@@ -54,7 +54,7 @@ impl Choice {
             match (row.check)(&config) {
                 Ok(_) => return Ok(config),
                 // With another number of joints it may be the model that was asked for.
-                Err(misfit) => refusal = refusal.or(Some(misfit)),
+                Err(error) => refusal = refusal.or(Some(error)),
             }
         }
         let refusal = refusal.unwrap_or_else(|| ConfigError::new("", format!("{} has no joints", row.name)));

@@ -16,7 +16,7 @@ impl ArmControl {
         mut report: impl FnMut(usize, LimitKind, f64),
     ) -> Routed {
         let Some(mode) = self.mode_for(demand) else {
-            // The arm lacks the mode: it comes to rest in its present one.
+            // The arm lacks the mode: it stops in its present one.
             if let Some(present) = self.command.mode {
                 self.hold(present, dt);
             }

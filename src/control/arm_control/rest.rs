@@ -1,4 +1,4 @@
-//! How an arm comes to rest: it decelerates by commands, settles at the last of them, and then gets a stop from its
+//! How an arm stops: it decelerates by commands, settles at the last of them, and then gets a stop from its
 //! own controller.
 
 use super::ArmControl;

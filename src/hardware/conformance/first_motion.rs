@@ -1,4 +1,5 @@
-//! The first motion of a real arm: each joint in turn moves slowly by 2° to both sides and back, monitored all the time.
+//! The first motion of a real arm: each joint in turn moves slowly by 2° to both sides and back, monitored all the
+//! time.
 //!
 //! It shows that the joints are in order, that signs and units are right, that the mode works, and that a stop stops.
 //! Anything unexpected ends it with `write_stop`; nothing is commanded after that.

@@ -149,7 +149,8 @@ impl Worker {
         }
     }
 
-    /// Runs one cycle: waits, executes orders, sends the newest command, reads. Returns `true` when the thread is to end.
+    /// Runs one cycle: waits, executes orders, sends the newest command, reads. Returns `true` when the thread is to
+    /// end.
     fn cycle(&mut self, adapter: &mut dyn ManipulatorAdapter, orders: &Receiver<Order>) -> bool {
         let due = if self.connected { self.next_read } else { self.reconnect.0 };
         let now = self.config.clock.now();

@@ -52,7 +52,7 @@ impl SimOptions {
             .and_then(|()| check_pose(&self.initial_positions, limits))
             .and_then(|()| within("lag", self.lag, MAX_LAG, "s"))
             .and_then(|()| within("droop", self.droop, MAX_DROOP, "rad"))
-            .map_err(|misfit| misfit.within("sim"))
+            .map_err(|error| error.within("sim"))
     }
 }
 

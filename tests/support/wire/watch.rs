@@ -22,7 +22,7 @@ pub struct Delay {
     pub length: Duration,
 }
 
-/// Threads that sleep for 1 ms again and again, and record how late they wake.
+/// Threads that sleep for 1 ms in a loop, and record how late they wake.
 pub struct Watch {
     delays: Arc<Mutex<Vec<Delay>>>,
     closing: Arc<AtomicBool>,

@@ -365,7 +365,7 @@ impl Session {
                 let joint = i + 1;
                 return Err(self.refuse(format!(
                     "joint {joint} reads {value:.3} rad, outside its range of {lower} to {upper}: not enabled\nhint: \
-                     move it back by hand, or set its zero point anew with the vendor's tool"
+                     move it back by hand, or set its zero point again with the vendor's tool"
                 )));
             }
         }

@@ -1,4 +1,5 @@
-//! Faults of the CAN bus: interface down, loss of power, no buffers, bus-off, damaged frames. Numbers as in `docs/faults.md`.
+//! Faults of the CAN bus: interface down, loss of power, no buffers, bus-off, damaged frames. Numbers as in
+//! `docs/faults.md`.
 
 use std::time::Duration;
 

@@ -47,8 +47,8 @@ impl Session {
         Ok(())
     }
 
-    /// Returns an error if the controller refused a setpoint. Its response may show that the arm is not ready before the
-    /// report does.
+    /// Returns an error if the controller refused a setpoint. Its response may show that the arm is not ready before
+    /// the report does.
     pub(super) fn check_refusal(&mut self) -> AdapterResult<()> {
         let Some((status, sent)) = self.control.take_refusal() else { return Ok(()) };
         if self.ready.is_none_or(|ready| sent < ready.since) && self.foreign.is_none() {

@@ -21,8 +21,8 @@ use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
 use crate::joint::JointLimits;
 
-/// A live controller reports 100 or 250 times per second. Without a report for this time the connection is lost, even if
-/// the socket is open.
+/// A live controller reports 100 or 250 times per second. Without a report for this time the connection is lost, even
+/// if the socket is open.
 pub const REPORT_TIMEOUT: Duration = Duration::from_millis(500);
 /// How long after a response older reports may still arrive: two periods of the slower kind.
 const REPORT_DELAY: Duration = Duration::from_millis(20);
@@ -192,8 +192,8 @@ impl Session {
         self.bus.into_iter().for_each(Control::abort);
     }
 
-    /// Processes all that has arrived, without waiting, and sends requests that are due. Does nothing within `age` of the
-    /// previous call.
+    /// Processes all that has arrived, without waiting, and sends requests that are due. Does nothing within `age` of
+    /// the previous call.
     pub fn update(&mut self, age: Duration) -> AdapterResult<()> {
         let now = MonotonicClock.now();
         if now.since(self.updated) < age {

@@ -171,7 +171,8 @@ impl Worker {
         }
     }
 
-    /// Discards setpoints in flight when the arm's state is stale: unacknowledged setpoints must not reach the arm later.
+    /// Discards setpoints in flight when the arm's state is stale: unacknowledged setpoints must not reach the arm
+    /// later.
     pub(super) fn discard_if_stale(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let age = self.config.clock.now().since(self.state.stamp.max(self.last_read));
         let stale = age > self.config.state_timeout() && self.state.seq != 0;

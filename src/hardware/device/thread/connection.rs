@@ -131,7 +131,8 @@ impl Worker {
         result
     }
 
-    /// Waits until the arm is at rest, at most [`REST_TIMEOUT`]: brakes and disabled motors should not meet a moving arm.
+    /// Waits until the arm is at rest, at most [`REST_TIMEOUT`]: brakes and disabled motors should not meet a moving
+    /// arm.
     pub(super) fn wait_for_standstill(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let limit = self.config.clock.now().after(REST_TIMEOUT);
         let mut rest_time = 0.0;

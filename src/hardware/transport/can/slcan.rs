@@ -176,8 +176,8 @@ impl<F: AsFd> Lines<F> {
         Self { fd, peer, incoming: Incoming::new(), rest: ([0; MAX_LINE], 0) }
     }
 
-    /// Writes lines of at most [`MAX_LINE`] bytes in total; `false` if there is no room. A partly written line counts as
-    /// written.
+    /// Writes lines of at most [`MAX_LINE`] bytes in total; `false` if there is no room. A partly written line counts
+    /// as written.
     pub(super) fn put(&mut self, bytes: &[u8]) -> AdapterResult<bool> {
         let (rest, len) = self.rest;
         if len > 0 {

@@ -4,8 +4,8 @@ use super::super::protocol::{DOF, Driver, Status, arm_text, driver_text, gripper
 use super::Feedback;
 
 impl Feedback {
-    /// Returns the most severe error: 1–15 and above a state of the arm, 201–206 a joint that does not answer, 101–106 a
-    /// joint beyond its limits, 3jb bit b of the driver of joint j, 40b bit b of the gripper; 0 = none.
+    /// Returns the most severe error: 1–15 and above a state of the arm, 201–206 a joint that does not answer, 101–106
+    /// a joint beyond its limits, 3jb bit b of the driver of joint j, 40b bit b of the gripper; 0 = none.
     pub fn error_code(&self) -> i32 {
         let bit = |bits: u8| bits.trailing_zeros() as i32 + 1;
         let Status { arm, limits, silent, .. } = self.status;

@@ -189,7 +189,10 @@ fn wrong_options_are_refused() {
     };
     assert_eq!(start(serde_json::json!({}), 6), "");
     assert!(start(serde_json::json!({"model": "xarm7"}), 6).contains("xArm 7 has 7 joints, not 6"));
-    assert!(start(serde_json::json!({"sim": {"initial_positions": [0, 0, 9, 0, 0, 0]}}), 6).contains("6 angles"));
+    assert!(
+        start(serde_json::json!({"sim": {"initial_positions": [0, 0, 9, 0, 0, 0]}}), 6)
+            .contains("initial_positions must be 6 positions [rad] within the joint limits: joint 3")
+    );
     assert!(start(serde_json::json!({"sim": {"firmware": "new"}}), 6).contains("not a version"));
     assert!(start(serde_json::json!({"sim": {"faults": [{"kind": "panic"}]}}), 6).contains("cannot play"));
     let denied = std::io::Error::from(io::ErrorKind::PermissionDenied);
