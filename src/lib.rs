@@ -15,7 +15,7 @@
 //! A module may use only those above it in this list; `tests/logic/layering.rs` checks that.
 //!
 //! As a library: [`runtime::Run`] builds a run from a blueprint, [`hardware::registry`] makes adapters,
-//! [`hardware::spec::ManipulatorAdapter`] is what a new arm implements, [`testing`] has a mock for unit tests,
+//! [`hardware::adapter::ManipulatorAdapter`] is what a new arm implements, [`testing`] has a mock for unit tests,
 //! [`cli::main_with`] is the whole program with more arms. `docs/library.md` shows each.
 //!
 //! ```

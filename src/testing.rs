@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use crate::arm::Pose;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
 use crate::joint::{ControlMode, JointLimits};
@@ -91,7 +91,7 @@ struct Shared {
 /// `mock`.) Clones share everything, so a test keeps one and hands the other over.
 ///
 /// ```
-/// use dimos::hardware::spec::{AdapterError, ManipulatorAdapter};
+/// use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 /// use dimos::testing::{Call, MockAdapter};
 ///
 /// let mock = MockAdapter::new(6).positions(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]);

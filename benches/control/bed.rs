@@ -6,7 +6,7 @@ use std::time::Duration;
 use dimos::arm::{ArmCommand, ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::control::config::{
-    ArmConfig, CONTROL_VERSION, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TaskKinematics,
+    ArmConfig, CONFIG_VERSION, CartesianParams, CoordinatorConfig, ServoParams, TaskConfig, TaskKind, TaskKinematics,
     TrajectoryParams, VelocityParams,
 };
 use dimos::control::request::{Envelope, Goal, Motion, Request};
@@ -84,7 +84,7 @@ impl Bed {
             auto_start: false,
         };
         let config = CoordinatorConfig {
-            version: CONTROL_VERSION,
+            version: CONFIG_VERSION,
             rate: 100.0,
             arms: (0..arms).map(arm).collect(),
             tasks: (0..arms).map(task).collect(),

@@ -7,8 +7,8 @@ use std::time::Duration;
 use dimos::arm::{ArmCommand, ArmState, Link};
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::control::tick_loop::next_deadline;
+use dimos::hardware::adapter::ManipulatorAdapter;
 use dimos::hardware::device::{Device, DeviceConfig};
-use dimos::hardware::spec::ManipulatorAdapter;
 use dimos::joint::{ControlMode, MAX_DOF};
 use dimos::rt::heartbeat::Heartbeat;
 use dimos::rt::host;
@@ -43,7 +43,7 @@ impl Arm {
         beat: &Arc<Heartbeat>,
         room: usize,
     ) -> Result<Self, String> {
-        let text = |e: dimos::hardware::spec::AdapterError| e.to_string();
+        let text = |e: dimos::hardware::adapter::AdapterError| e.to_string();
         let dof = inner.get_dof();
         let [sent, arrived] = [(); 2].map(|()| Arc::new(Mutex::new(Vec::with_capacity(room))));
         let adapter = Box::new(Timed { inner, sent: sent.clone(), arrived: arrived.clone() });

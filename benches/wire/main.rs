@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use bed::{Arm, tick};
 use dimos::hardware::arms::xarm;
-use dimos::hardware::registry::{self, AdapterConfig, Place};
+use dimos::hardware::registry::{self, AdapterConfig, EmulatorAddress};
 use dimos::rt::heartbeat::Heartbeat;
 use support::measure::{Goal, Measure, print, quantile};
 use support::{Effort, machine};
@@ -57,7 +57,7 @@ fn config(adapter: &str, address: String, dof: usize) -> AdapterConfig {
 
 /// Returns a built-in arm with its emulator.
 fn arm(name: &str, dof: usize, period: Duration, beat: &Arc<Heartbeat>, room: usize) -> Result<Arm, String> {
-    let text = |e: dimos::hardware::spec::AdapterError| e.to_string();
+    let text = |e: dimos::hardware::adapter::AdapterError| e.to_string();
     let emulator = registry::emulate(name, dof).map_err(text)?;
     let adapter = registry::create(name, &emulator.address(), dof).map_err(text)?;
     Arm::new(adapter, Box::new(emulator), period, beat, room)
@@ -117,8 +117,9 @@ fn streams(effort: Effort) -> Result<(), String> {
     let seconds: u64 = effort.of(1, 60);
     stream("xArm 6 at 250 Hz", 250, seconds, |period, beat, room| {
         let settings = config("xarm", "sim".into(), 6);
-        let emulator =
-            Arc::new(xarm::emulator::XArmEmulator::start(&settings, &Place::InProcess).map_err(|e| e.to_string())?);
+        let emulator = Arc::new(
+            xarm::emulator::XArmEmulator::start(&settings, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?,
+        );
         emulator.record();
         let address = dimos::hardware::registry::Emulator::address(&*emulator);
         let adapter = registry::create("xarm", &address, 6).map_err(|e| e.to_string())?;
@@ -129,8 +130,9 @@ fn streams(effort: Effort) -> Result<(), String> {
     stream("Piper at 200 Hz", 200, seconds, |period, beat, room| {
         use dimos::hardware::arms::piper;
         let settings = config("piper", "sim".into(), 6);
-        let emulator =
-            Arc::new(piper::emulator::PiperEmulator::start(&settings, &Place::InProcess).map_err(|e| e.to_string())?);
+        let emulator = Arc::new(
+            piper::emulator::PiperEmulator::start(&settings, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?,
+        );
         emulator.record();
         let address = dimos::hardware::registry::Emulator::address(&*emulator);
         let adapter = registry::create("piper", &address, 6).map_err(|e| e.to_string())?;

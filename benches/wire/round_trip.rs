@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use dimos::hardware::adapter::{AdapterResult, JointReading};
 use dimos::hardware::registry;
-use dimos::hardware::spec::{AdapterResult, JointReading};
 use dimos::joint::ControlMode;
 use dimos::rt::host;
 use dimos::rt::wake::Wake;
@@ -49,7 +49,7 @@ class IdleArm:
 
 /// Measures both servers.
 pub fn measure(effort: Effort) -> Result<(), String> {
-    let text = |e: dimos::hardware::spec::AdapterError| e.to_string();
+    let text = |e: dimos::hardware::adapter::AdapterError| e.to_string();
     let folder = tempfile::tempdir().map_err(|e| e.to_string())?;
     let emulator = registry::emulate("remote", DOF).map_err(text)?;
     let rust = repeats(effort, &emulator.address())?;
@@ -116,7 +116,7 @@ fn series(address: &str, cycles: usize) -> AdapterResult<Vec<f64>> {
     arm.activate()?;
     arm.set_control_mode(ControlMode::ServoPosition)?;
     host::enter_realtime(host::DEVICE_PRIORITY);
-    let wake = Wake::new().map_err(|e| dimos::hardware::spec::AdapterError::Io(e.to_string()))?;
+    let wake = Wake::new().map_err(|e| dimos::hardware::adapter::AdapterError::Io(e.to_string()))?;
     let mut reading = JointReading::default();
     arm.read_joints(&mut reading)?;
     let hold = reading.position;

@@ -4,7 +4,7 @@ use std::os::fd::BorrowedFd;
 use std::sync::{Arc, Mutex};
 
 use dimos::clock::{Clock, MonotonicClock};
-use dimos::hardware::spec::{
+use dimos::hardware::adapter::{
     AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
 use dimos::joint::{ControlMode, JointLimits};

@@ -156,14 +156,14 @@ fn fit(
     row: &AdapterSpec,
     config: &AdapterConfig,
 ) -> Option<JointLimits> {
-    match (row.fit)(config) {
-        Ok(fit) => Some(fit.limits),
-        Err(misfit) => {
+    match (row.check)(config) {
+        Ok(checked) => Some(checked.limits),
+        Err(refused) => {
             let at = match &entry.options {
-                Some(options) if !misfit.option.is_empty() => checker.tree.nearest(options.at, &misfit.option),
+                Some(options) if !refused.option.is_empty() => checker.tree.nearest(options.at, &refused.option),
                 _ => counted_at(entry),
             };
-            checker.error(at, Diag::error(misfit.what).maybe_hint(misfit.hint));
+            checker.error(at, Diag::error(refused.what).maybe_hint(refused.hint));
             None
         }
     }

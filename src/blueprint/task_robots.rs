@@ -12,7 +12,7 @@ use crate::blueprint::arms::Found;
 use crate::blueprint::planner_files::file;
 use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
-use crate::control::task_robot::{Place as Frame, RobotParams, TaskKinematics};
+use crate::control::task_robot::{FramePose, RobotParams, TaskKinematics};
 use crate::planning::config::{PlannerConfig, RobotConfig};
 use crate::robot::kinematics::{Kinematics, frame};
 use crate::robot::model::{JointKind, RobotModel};
@@ -244,7 +244,7 @@ impl TaskRobot {
             let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
             let root = frame(&(base_pose * base.inverse()));
             let turn = DQuat::from_mat3(&root.matrix3).to_array();
-            robot.root = Frame { position: root.translation.to_array(), orientation: turn };
+            robot.root = FramePose { position: root.translation.to_array(), orientation: turn };
             robot.base = DQuat::from_mat3(&frame(&base).matrix3).to_array();
         }
         Ok(robot)

@@ -52,7 +52,7 @@ pub fn run(args: &Args) -> Result {
             Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it ended abnormally")) })
         }
         Some(RunRecord { log: Some(log), .. }) => {
-            output::note(format_args!("{} ended; its log: {}", found.name, log.display()));
+            output::note(format_args!("{} ended; log: {}", found.name, log.display()));
             Ok(Exit::Ok)
         }
         _ => {

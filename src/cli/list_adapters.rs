@@ -85,7 +85,7 @@ fn limits(row: &AdapterSpec) -> Option<(usize, JointLimits)> {
         dof,
         options: serde_json::Value::Null,
     };
-    (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.fit)(&config(dof)).ok()?.limits)))
+    (row.dof.0..=row.dof.1).rev().find_map(|dof| Some((dof, (row.check)(&config(dof)).ok()?.limits)))
 }
 
 /// Returns the names of its options.

@@ -55,7 +55,7 @@ Start with:  dimos run coordinator-yourarm
 Then, in a second terminal:  dimos status, dimos state, dimos move arm 0.3 -0.2 0.5 0 0.4 0";
 
 const NO_SAFETY_FUNCTION: &str = "\
-`stop` is an operational stop and no safety function: use the arm's own rated stop where people can come to harm.";
+`stop` is an operational stop, not a safety function. Use the arm's own rated stop to protect people.";
 
 fn after_help() -> String {
     let codes = exit::Exit::ALL.iter().map(|(exit, meaning)| format!("\n  {:<3}  {meaning}", *exit as u8));
@@ -72,23 +72,23 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Start a run from a blueprint, and keep it up until Ctrl-C
+    /// Start a run from a blueprint; Ctrl-C shuts it down
     Run(run::Args),
     /// Show all runs, or one in full: arms, tasks, timing, faults
     Status(status::Args),
-    /// Show the joints of a run, and gripper, pose, force where there are such
+    /// Show joints, gripper, pose and force of a run's arms
     State(state::Args),
-    /// Move an arm to joint positions, and wait until it is there
+    /// Move an arm to joint positions or a pose, and wait for the end
     Move(motion::Args),
-    /// Plan a collision-free motion of one robot or several and show it; moves nothing
+    /// Plan a collision-free motion of one or several arms; moves nothing
     Plan(plan::Args),
-    /// Show a plan moment by moment, or write its trajectory to a file
+    /// Show a plan point by point, or write its trajectory to a file
     Preview(preview::Args),
-    /// Carry out the newest plan, or a trajectory from a file (JSON or CSV), and wait for its end
+    /// Execute the newest plan, or a trajectory from a file (JSON or CSV), and wait for the end
     Execute(execute::Args),
-    /// The obstacles that the planner keeps clear of: list, add, move, remove, load, attach, detach
+    /// Edit the planner's obstacles: list, add, move, remove, load, attach, detach
     World(world::Args),
-    /// End running motions by decelerating, and planning
+    /// Decelerate running motions to rest, and end planning
     Cancel(cancel::Args),
     /// Hold arms at once and keep them held until `arm reset`: an operational stop
     Stop(stop::Args),
@@ -96,23 +96,23 @@ enum Command {
     Arm(arm::Args),
     /// Drive an arm from the keyboard, in the terminal
     Jog(jog::Args),
-    /// List tasks, ask something of one, or stream targets to it
+    /// List tasks, query one, or stream targets to it
     Task(task::Args),
     /// Shut down a run: decelerate, release the arms, close the log
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
     Logs(logs::Args),
-    /// Bring your own arm: generate its adapter, test one, run an emulator in its own process
+    /// Add an arm: generate its adapter, test it, run its emulator
     Adapter(adapter::Args),
-    /// List the arms that this program can talk to
+    /// List the supported arms
     ListAdapters(list_adapters::Args),
-    /// List the blueprints that `run` finds by name
+    /// List the blueprints that `run` knows by name
     ListBlueprints(list_blueprints::Args),
     /// Validate a blueprint and print the resolved configuration
     Check(check::Args),
     /// Print the JSON Schema of blueprints, for editors
     Schema(schema::Args),
-    /// Look into robot descriptions: joints, limits, shapes, mistakes
+    /// Inspect robot descriptions: joints, limits, shapes, mistakes
     Model(model::Args),
     /// Check this computer: real time, permissions, clock, disk, CAN links
     Doctor(doctor::Args),
@@ -120,7 +120,7 @@ enum Command {
     Completions(completions::Args),
     /// Print the manual page, or write one for every verb
     Man(man::Args),
-    #[command(about = "Play a log back to the terminal, verify it, or let arms follow it")]
+    #[command(about = "Play a log in the terminal, verify it, or repeat its motion with an arm")]
     Replay(replay::ReplayArgs),
 }
 

@@ -22,7 +22,7 @@ use crate::replay::recorded::RecordedError;
 use player::{Part, RealTime, play};
 use view::{JsonLines, Live, Plain, View};
 
-/// Play a log on the terminal, verify it, or drive arms with it
+/// Play a log in the terminal, verify it, or repeat its motion with an arm
 ///
 /// Plays in real time: a joint table and a progress bar on a terminal, one line per second elsewhere, one JSON object
 /// per message with --json. Exits with 3 if the log is truncated, or if the recorder lost samples.

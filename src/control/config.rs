@@ -8,7 +8,7 @@ use crate::arm::Supervision;
 use crate::joint::{ControlMode, JointLimits};
 
 pub use super::task_config::{TaskConfig, TaskKind};
-pub use super::task_robot::{NO_ROTATION, Place, TaskKinematics};
+pub use super::task_robot::{FramePose, NO_ROTATION, TaskKinematics};
 pub use super::tasks::cartesian::CartesianParams;
 pub use super::tasks::servo::ServoParams;
 pub use super::tasks::trajectory::TrajectoryParams;
@@ -21,18 +21,21 @@ pub const POSITION_MARGIN: f64 = 0.01;
 /// How long an arm only holds after it was enabled.
 pub const ACTIVATION_RAMP: Duration = Duration::from_millis(200);
 
-/// Version of the tick's rules. The same states and requests give the same commands only under the same version.
-pub const CONTROL_VERSION: u32 = 2;
+/// Config version: of the form of [`CoordinatorConfig`] and of the rules of the tick. The same configuration, states
+/// and requests give the same commands only under the same version. Increase it with every change of either.
+pub const CONFIG_VERSION: u32 = 2;
 
-/// Logs without a version are of the first one.
+/// Config version of logs that have none.
+pub const FIRST_CONFIG_VERSION: u32 = 1;
+
 fn first_version() -> u32 {
-    1
+    FIRST_CONFIG_VERSION
 }
 
 /// Everything a coordinator knows beforehand.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CoordinatorConfig {
-    /// Which rules its ticks follow, [`CONTROL_VERSION`] of the program that recorded it.
+    /// [`CONFIG_VERSION`] of the program that made it.
     #[serde(default = "first_version")]
     pub version: u32,
     /// Ticks per second [Hz].

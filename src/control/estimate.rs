@@ -1,4 +1,4 @@
-//! Joint velocities where the arm reports none: finite differences of its positions, low-pass filtered.
+//! Estimates joint velocities of an arm that reports none: finite differences of its positions, low-pass filtered.
 
 use crate::arm::{ArmState, VelocitySource};
 use crate::clock::Mono;
@@ -6,7 +6,7 @@ use crate::joint::{Joints, MAX_DOF};
 
 /// Time constant of the filter [s].
 const TIME_CONSTANT: f64 = 0.02;
-/// After a longer gap between two states the estimate starts from scratch [s].
+/// After a longer gap between two states the estimate restarts at 0 [s].
 const LONGEST_GAP: f64 = 0.1;
 
 /// Estimates one arm's joint velocities.
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_state_read_twice_changes_nothing_and_a_gap_starts_anew() {
+    fn the_same_state_read_twice_changes_nothing_and_a_gap_restarts_the_estimate() {
         let mut e = VelocityEstimator::default();
         e.fill(&mut state(1, 10, 0.0));
         let (mut a, mut b) = (state(2, 20, 0.01), state(2, 20, 0.01));
@@ -85,7 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn measured_velocities_are_left_alone() {
+    fn measured_velocities_stay() {
         let mut s = state(1, 10, 0.0);
         s.velocity[0] = 7.0;
         s.velocity_source = VelocitySource::Measured;

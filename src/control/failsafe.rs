@@ -1,5 +1,5 @@
-//! What an arm's condition makes of its phase. A fault latches a hold; only an operator's `reset` clears the
-//! latch, and only `enable` makes the arm ready again: two separate acts, neither moves anything.
+//! The phase of an arm. A fault latches a hold. Only `reset` by an operator clears the latch, and only `enable` makes
+//! the arm ready again: two separate acts, neither moves anything.
 //!
 //! ```text
 //!             ready (request)          ramp over
@@ -28,7 +28,7 @@ impl Default for Failsafe {
 /// Whether the latest state is recent enough to act on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Freshness {
-    /// It is.
+    /// Whether it is.
     pub fresh: bool,
     /// Its age.
     pub age: Age,
@@ -50,12 +50,12 @@ pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
 }
 
 impl Failsafe {
-    /// What the arm is ready for.
+    /// Returns the phase.
     pub fn phase(&self) -> Phase {
         self.phase
     }
 
-    /// Why.
+    /// Returns the cause of the phase.
     pub fn cause(&self) -> Cause {
         self.cause
     }
@@ -64,7 +64,7 @@ impl Failsafe {
         *self = Self { phase, cause, since: now };
     }
 
-    /// Follows the arm's condition. `true`: the phase changed.
+    /// Takes the arm's state. Returns whether the phase or its cause changed.
     pub fn update(&mut self, state: &ArmState, fresh: Freshness, now: Mono) -> bool {
         let before = (self.phase, self.cause);
         match self.phase {
@@ -77,9 +77,9 @@ impl Failsafe {
             Phase::Disabled | Phase::Held => {}
             Phase::Standby if !state.enabled && fresh.fresh => self.enter(Phase::Disabled, Cause::None, now),
             Phase::Standby => {
-                // A self-held arm is at rest already; `enable` takes it over again. One that is being enabled or
-                // disabled keeps its device thread busy, and its states wait: no command moves it meanwhile, `ready`
-                // asks for a fresh one, and a connection that breaks is reported as such.
+                // A self-held arm is at rest already, until `enable`. While an arm is being enabled or disabled, its
+                // device thread reads no states; no command moves it meanwhile, `ready` requires a fresh state, and a
+                // lost connection is reported as such.
                 let passes = |cause: &Cause| matches!(cause, Cause::HeartbeatLost | Cause::Stale(_));
                 if let Some(cause) = trouble(state, fresh).filter(|cause| !passes(cause)) {
                     self.enter(Phase::Held, cause, now);
@@ -97,27 +97,27 @@ impl Failsafe {
         before != (self.phase, self.cause)
     }
 
-    /// A latched hold. The first cause stays. An operator's stop holds a disabled arm too: it may be just about to be
+    /// Latches a hold. The first cause stays. An operator's stop also holds a disabled arm, which may be about to be
     /// enabled.
     pub fn hold(&mut self, cause: Cause, now: Mono) {
-        let heeded = match self.phase {
+        let holds = match self.phase {
             Phase::Held | Phase::Unknown => false,
             Phase::Disabled => cause == Cause::Operator,
             Phase::Standby | Phase::Activating | Phase::Ready => true,
         };
-        if heeded {
+        if holds {
             self.enter(Phase::Held, cause, now);
         }
     }
 
-    /// The arm will be disabled: no motion from here on, but nothing to reset either.
+    /// The arm will be disabled: refuses motion from now on, without a latch.
     pub fn park(&mut self, now: Mono) {
         if matches!(self.phase, Phase::Activating | Phase::Ready) {
             self.enter(Phase::Standby, Cause::None, now);
         }
     }
 
-    /// Clears a latch, unless its cause is still present.
+    /// Clears the latch, unless its cause persists.
     pub fn reset(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         if self.phase != Phase::Held {
             return Outcome::Accepted;
@@ -132,7 +132,7 @@ impl Failsafe {
         }
     }
 
-    /// The arm was enabled: hold first, then be ready.
+    /// The arm was enabled: holds it for a short time, then it is ready.
     pub fn ready(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         match self.phase {
             Phase::Activating | Phase::Ready => Outcome::Accepted,
@@ -149,7 +149,7 @@ impl Failsafe {
         }
     }
 
-    /// Whether a task may move the arm.
+    /// Returns whether a task may move the arm; otherwise the outcome for its client.
     pub fn admits(&self, arm: u16) -> Result<(), Outcome> {
         match self.phase {
             Phase::Ready => Ok(()),

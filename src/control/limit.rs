@@ -1,6 +1,6 @@
-//! The last thing before the wire: every command of a joint is finite, inside its position range, and changes no
-//! faster than the joint's velocity and acceleration allow. What is possible passes unchanged, bit for bit; what
-//! is too fast is followed as well as the limits allow, without overshoot; a jump is refused.
+//! The limiter of a joint, the last stage before the wire: every command is finite, inside the position range, and
+//! within the velocity and acceleration limits. A request within limits passes unchanged, bit for bit. A faster one is
+//! followed as closely as the limits allow, without overshoot. A jump is refused.
 
 use super::config::{JUMP, POSITION_MARGIN};
 use crate::joint::braking_speed;
@@ -12,9 +12,9 @@ const ROUNDING: f64 = 1e-9;
 /// Limits of one joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
-    /// Lowest position that is commanded [rad].
+    /// Lowest commanded position [rad].
     pub lower: f64,
-    /// Highest position that is commanded [rad].
+    /// Highest commanded position [rad].
     pub upper: f64,
     /// Highest speed [rad/s].
     pub velocity: f64,
@@ -23,13 +23,13 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// Bounds with the margin taken off the position range [rad].
+    /// Creates bounds, with the position range [rad] reduced by the margin.
     pub fn inside(lower: f64, upper: f64, velocity: f64, acceleration: f64) -> Self {
         let margin = POSITION_MARGIN.min((upper - lower) / 10.0);
         Self { lower: lower + margin, upper: upper - margin, velocity, acceleration }
     }
 
-    /// How far a position is outside [rad]; 0 inside.
+    /// Returns how far a position is outside the range [rad]; 0 inside.
     pub fn excess(&self, position: f64) -> f64 {
         (self.lower - position).max(position - self.upper).max(0.0)
     }
@@ -40,20 +40,20 @@ impl Bounds {
 pub enum Refusal {
     /// NaN or infinite.
     NonFinite,
-    /// Too far from the command before it: the step [rad].
+    /// Too far from the previous request or command: the step [rad].
     Jump(f64),
 }
 
-/// A command that may go to the wire.
+/// A command within limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limited {
     /// The command [rad] or [rad/s].
     pub value: f64,
-    /// Which limit changed it, and what was asked [rad, rad/s or rad/s²].
+    /// The limit that changed it, and the request [rad, rad/s or rad/s²].
     pub by: Option<(LimitKind, f64)>,
 }
 
-/// The limiter of one joint: knows what was commanded last.
+/// The limiter of one joint, with its last command.
 #[derive(Debug, Clone, Copy)]
 pub struct Limiter {
     bounds: Bounds,
@@ -68,46 +68,47 @@ pub struct Limiter {
 }
 
 impl Limiter {
-    /// A joint at rest at 0; `seed` it before use.
+    /// Creates the limiter of a joint at rest at 0; `seed` it before use.
     pub fn new(bounds: Bounds) -> Self {
         Self { bounds, position: 0.0, velocity: 0.0, request: None, request_velocity: 0.0 }
     }
 
-    /// Its bounds.
+    /// Returns its bounds.
     pub fn bounds(&self) -> &Bounds {
         &self.bounds
     }
 
-    /// Last commanded position [rad].
+    /// Returns the last commanded position [rad].
     pub fn position(&self) -> f64 {
         self.position
     }
 
-    /// Last commanded velocity [rad/s].
+    /// Returns the last commanded velocity [rad/s].
     pub fn velocity(&self) -> f64 {
         self.velocity
     }
 
-    /// Starts at rest from a measured position [rad].
+    /// Starts at rest at this position [rad].
     pub fn seed(&mut self, position: f64) {
         *self = Self { position, ..Self::new(self.bounds) };
     }
 
-    /// Goes back to what was written last: the commands after it did not reach the arm. Requests continue.
+    /// Goes back to the last written command: later ones did not reach the arm. Requests continue.
     pub fn rewind(&mut self, position: f64, velocity: f64) {
         (self.position, self.velocity) = (position, velocity);
     }
 
-    /// Why a requested position [rad] is not followed, if so. `new_hands`: its step counts from the last command.
-    pub fn refuses(&self, target: f64, new_hands: bool) -> Option<Refusal> {
+    /// Returns why a requested position [rad] must be refused, if so. `new_task`: another task requests it, so its step
+    /// counts from the last command.
+    pub fn refuses(&self, target: f64, new_task: bool) -> Option<Refusal> {
         if !target.is_finite() {
             return Some(Refusal::NonFinite);
         }
-        let step = target - self.request.filter(|_| !new_hands).unwrap_or(self.position);
+        let step = target - self.request.filter(|_| !new_task).unwrap_or(self.position);
         (step.abs() > JUMP).then_some(Refusal::Jump(step))
     }
 
-    /// A request that is not followed, because nothing can be sent just now: the next one counts from it.
+    /// Checks a request during a gap without following it. The step of the next request counts from it.
     pub fn pass(&mut self, target: f64) -> Result<(), Refusal> {
         match self.refuses(target, false) {
             Some(refusal) => Err(refusal),
@@ -118,32 +119,33 @@ impl Limiter {
         }
     }
 
-    /// Brings the command to where the joint is measured, at rest there: what holds the joint back must not find it
-    /// under way when it lets go. `step` is the largest change [rad].
+    /// Moves the command towards the measured position `at` [rad], by at most `step` [rad], with zero velocity: a
+    /// blocked joint must not move when it is released.
     pub fn draw(&mut self, at: f64, step: f64) {
         self.hand_over();
         self.position += (at - self.position).clamp(-step, step);
         self.velocity = 0.0;
     }
 
-    /// Whether nothing moves.
+    /// Returns whether the commanded velocity is 0.
     pub fn at_rest(&self) -> bool {
         self.velocity == 0.0
     }
 
-    /// The next request comes from someone else: its step counts from the last command.
+    /// Forgets the last request: the step of the next one counts from the last command.
     pub fn hand_over(&mut self) {
         self.request = None;
         self.request_velocity = 0.0;
     }
 
-    /// The position to command for a requested position [rad], `dt` [s] after the last.
+    /// Returns the position to command for a requested position [rad], `dt` [s] after the last command.
     pub fn follow_position(&mut self, target: f64, dt: f64) -> Result<Limited, Refusal> {
         if let Some(refusal) = self.refuses(target, false) {
             return Err(refusal);
         }
         let step = target - self.request.unwrap_or(self.position);
-        // In step with the requests, what comes next is their business; out of step, meet them at their own speed.
+        // A command equal to the last request may follow any request within limits; otherwise it must approach the
+        // requests at their own velocity.
         let in_step = self.request.is_none_or(|last| last == self.position);
         if self.request.is_some() {
             self.request_velocity += 0.5 * (step / dt - self.request_velocity);
@@ -174,7 +176,7 @@ impl Limiter {
             return Ok(Limited { value: goal, by });
         }
         let (slowest, fastest) = self.speeds_inside(lower, upper, self.position, dt);
-        // Follow: go with the target, plus what can be slowed down again by the time it is met.
+        // The velocity of the requests, plus the highest one from which the command can brake until it meets them.
         let pace = self.request_velocity.clamp(-b.velocity, b.velocity);
         let behind = goal - self.position - pace * dt;
         let wanted = pace + behind.signum() * self.braking_speed(behind.abs(), dt);
@@ -186,8 +188,8 @@ impl Limiter {
         Ok(Limited { value: self.position, by })
     }
 
-    /// The velocity to command for a requested velocity [rad/s]. `at`: where the joint may be by now [rad], lowest and
-    /// highest, with all that was commanded since it was measured.
+    /// Returns the velocity to command for a requested velocity [rad/s]. `at`: lowest and highest position that the
+    /// joint may have by now [rad], given the commands since it was measured.
     pub fn follow_velocity(&mut self, target: f64, at: (f64, f64), dt: f64) -> Result<Limited, Refusal> {
         if !target.is_finite() {
             return Err(Refusal::NonFinite);
@@ -213,7 +215,7 @@ impl Limiter {
         Ok(Limited { value: self.velocity, by })
     }
 
-    /// Without a request: the position to command on the way to rest, then always the same.
+    /// Returns the position to command without a request: decelerates to rest, then holds.
     pub fn hold_position(&mut self, dt: f64) -> f64 {
         self.hand_over();
         self.slow_down(dt);
@@ -222,7 +224,7 @@ impl Limiter {
         self.position
     }
 
-    /// Without a request: the velocity to command on the way to zero, with the joint measured at `at` [rad].
+    /// Returns the velocity to command without a request: decelerates to 0. `at`: measured position [rad].
     pub fn hold_velocity(&mut self, at: f64, dt: f64) -> f64 {
         self.hand_over();
         self.slow_down(dt);
@@ -235,20 +237,20 @@ impl Limiter {
         self.velocity -= self.velocity.clamp(-change, change);
     }
 
-    /// The range of positions that may be commanded: a joint that is outside may stay or come in, not go further.
+    /// Returns the range of commanded positions: a joint outside its limits may stay or move in, not further out.
     fn range(&self) -> (f64, f64) {
         (self.bounds.lower.min(self.position), self.bounds.upper.max(self.position))
     }
 
-    /// The velocities from which the joint can still be stopped inside its range [rad/s].
+    /// Returns the lowest and highest velocity from which the joint can stop inside its range [rad/s].
     fn speeds_inside(&self, lower: f64, upper: f64, at: f64, dt: f64) -> (f64, f64) {
         (-self.braking_speed((at - lower).max(0.0), dt), self.braking_speed((upper - at).max(0.0), dt))
     }
 
-    /// Whether the joint can be stopped from this speed [rad/s] within `room` [rad].
+    /// Returns whether the joint can stop from this speed [rad/s] within `room` [rad].
     fn stops_inside(&self, speed: f64, room: f64, dt: f64) -> bool {
         let (v, a) = (speed.abs(), self.bounds.acceleration);
-        // In steps of `dt` it takes v²/2a + v dt/2 + a dt²/8 at most: most joints are far from their limits.
+        // Braking in steps of `dt` takes at most v²/2a + v dt/2 + a dt²/8; most joints are further from their limits.
         room >= v * v / (2.0 * a) + v * dt + a * dt * dt || v <= self.braking_speed(room.max(0.0), dt) + ROUNDING
     }
 

@@ -6,14 +6,15 @@
 
 pub mod arbitrate;
 pub mod arm_control;
-pub mod belief;
 pub mod config;
 pub mod conformance;
 pub mod coordinator;
 pub mod estimate;
 pub mod failsafe;
+pub mod feedback;
 pub mod limit;
 pub mod path_clock;
+pub mod plausibility;
 pub mod point_to_point;
 pub mod request;
 pub mod set_points;
@@ -25,4 +26,5 @@ pub mod task_robot;
 pub mod task_spec;
 pub mod tasks;
 pub mod tick_loop;
+pub mod tracking;
 pub mod written;

@@ -1,19 +1,19 @@
-//! Time along a path. It runs at rate 1, slows down for a cancel, and after a gap starts again from rest where the arm
-//! is on the path: the path stays the same, only the time along it is scaled, within acceleration and jerk.
+//! Time along a path. It runs at rate 1, slows down for a cancel, and after a gap restarts from rest at the arm's point
+//! of the path. The path stays the same: only the time along it is scaled, within acceleration and jerk limits.
 
 use crate::clock::Mono;
 
-/// Ticks for which the time along the path is remembered.
+/// Number of ticks whose time along the path is kept.
 const KEPT: usize = 64;
-/// Part of the limits that the start from rest uses: the rest is for the path's own curvature and for rounding.
+/// Fraction of the limits that a start from rest uses; the remainder is for the path's curvature and for rounding.
 const SHARE: f64 = 0.9;
 
-/// How far the rate may change so that no joint exceeds its limits.
+/// Limits of the change of the rate, so that no joint exceeds its limits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RateLimits {
-    /// Largest change of the rate [1/s].
+    /// Maximum change of the rate [1/s].
     pub first: f64,
-    /// Largest change of that [1/s²].
+    /// Maximum change of that change [1/s²].
     pub second: f64,
 }
 
@@ -22,7 +22,7 @@ pub struct RateLimits {
 pub struct PathClock {
     /// Time along the path [s].
     elapsed: f64,
-    /// Time along the path per time.
+    /// Time along the path per second.
     rate: f64,
     /// Its change [1/s].
     change: f64,
@@ -37,27 +37,27 @@ impl Default for PathClock {
 }
 
 impl PathClock {
-    /// Time along the path [s].
+    /// Returns the time along the path [s].
     pub fn elapsed(&self) -> f64 {
         self.elapsed
     }
 
-    /// Time along the path per time.
+    /// Returns the time along the path per second.
     pub fn rate(&self) -> f64 {
         self.rate
     }
 
-    /// Whether it runs at full rate.
+    /// Returns whether it runs at full rate.
     pub fn full(&self) -> bool {
         self.rate >= 1.0
     }
 
-    /// Begins at the start of a path, at full rate: a path starts from rest anyway.
+    /// Starts a path, at full rate: every path starts from rest.
     pub fn start(&mut self) {
         *self = Self::default();
     }
 
-    /// Remembers which point of the path the tick of `now` commands.
+    /// Keeps the point of the path that the tick of `now` commands.
     pub fn mark(&mut self, now: Mono) {
         if let Some(slot) = self.kept.get_mut(self.next) {
             *slot = (now, self.elapsed);
@@ -77,12 +77,12 @@ impl PathClock {
         }
     }
 
-    /// A step of `dt` [s] forward.
+    /// Advances by a step of `dt` [s].
     pub fn advance(&mut self, dt: f64) {
         self.elapsed += dt * self.rate;
     }
 
-    /// Lets the rate fall by `by`.
+    /// Reduces the rate by `by`.
     pub fn slow_down(&mut self, by: f64) {
         (self.rate, self.change) = (self.rate - by, 0.0);
     }
@@ -93,7 +93,7 @@ impl PathClock {
             return;
         }
         let (first, second) = (SHARE * limits.first, SHARE * limits.second);
-        // The fastest change from which the rate still arrives at 1 with no change left.
+        // The fastest change from which the rate still reaches 1 with zero change.
         let arriving = (2.0 * second * (1.0 - self.rate).max(0.0)).sqrt();
         let wanted = first.min(arriving);
         self.change += (wanted - self.change).clamp(-second * dt, second * dt);

@@ -9,16 +9,16 @@ use rsruckig::prelude::{DataArrayOrVec, InputParameter, Ruckig, Synchronization,
 use crate::joint::JointLimits;
 use crate::trajectory::{JointTrajectory, TrajectoryPoint};
 
-/// Points closer together than this are one [s].
+/// Points closer together than this are merged [s].
 const SAME_TIME: f64 = 1e-6;
-/// The shortest motion [s]; also that of an arm that is there already.
+/// Duration of the shortest motion [s], also of one to the present position.
 const SHORTEST: f64 = 0.05;
 
-/// How much less jerk is tried where the generator finds nothing, and how often.
+/// Factor of the jerk for each further attempt if the generator finds nothing, and number of attempts.
 const LESS_JERK: f64 = 0.999;
 const LESS_JERK_TRIES: usize = 3;
 
-/// Why there is no such motion.
+/// Why there is no motion.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NoMotion {
     /// A target is outside its joint's limits.
@@ -26,21 +26,21 @@ pub enum NoMotion {
     OutOfLimits {
         /// The joint.
         joint: String,
-        /// Where it should go [rad].
+        /// Its target [rad].
         target: f64,
-        /// The lowest position that is commanded [rad].
+        /// Lowest commanded position [rad].
         lower: f64,
-        /// The highest position that is commanded [rad].
+        /// Highest commanded position [rad].
         upper: f64,
-        /// By how much the target is outside [rad].
+        /// Distance of the target from that range [rad].
         excess: f64,
     },
-    /// The generator found none.
+    /// The generator found no motion.
     #[error("no motion found: {0}")]
     NotFound(String),
 }
 
-/// The fastest motion from `start` to `target` [rad] with `speed` (0–1] times the joints' velocities, and
+/// Returns the fastest motion from `start` to `target` [rad] with `speed` (0–1] times the joints' velocities, and
 /// accelerations and jerks scaled to match (`speed²`, `speed³`), so that it is the same motion, slower.
 pub fn point_to_point(
     joints: &[String],
@@ -52,7 +52,7 @@ pub fn point_to_point(
     let n = joints.len();
     for (j, joint) in joints.iter().enumerate() {
         let bounds = super::limit::Bounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
-        // A joint that starts outside may stay or come in.
+        // A joint that starts outside its limits may stay or move in.
         let (lower, upper) = (bounds.lower.min(start[j]), bounds.upper.max(start[j]));
         let excess = (lower - target[j]).max(target[j] - upper);
         if excess.is_nan() || excess > 1e-9 {
@@ -60,7 +60,7 @@ pub fn point_to_point(
         }
     }
     let mut input = InputParameter::<0>::new(Some(n));
-    // A straight line in joint space, where the limits allow one: what people expect of a direct motion.
+    // A straight line in joint space, if the limits allow one: the expected path of a direct motion.
     input.synchronization = Synchronization::Phase;
     for j in 0..n {
         input.current_position[j] = start[j];
@@ -81,7 +81,7 @@ pub fn point_to_point(
         (0..n).for_each(|j| input.max_jerk[j] *= LESS_JERK);
         result = generator.calculate(&input, &mut found);
     }
-    // Its own words are a page of numbers; the first line says what it is.
+    // The generator's message is a page of numbers; its first line names the error.
     let first_line = |e: String| e.split("\\n").next().unwrap_or_default().to_owned();
     result.map_err(|e| NoMotion::NotFound(first_line(format!("{e:?}"))))?;
     let duration = found.get_duration();
@@ -109,7 +109,7 @@ pub fn point_to_point(
             accelerations: Vec::new(),
         });
     }
-    // The ends are what was asked for, not what rounding makes of it.
+    // The ends are exactly the requested positions, without rounding errors.
     for (point, exact) in [(0, start), (points.len() - 1, target)] {
         points[point].positions.copy_from_slice(exact);
         points[point].velocities.fill(0.0);

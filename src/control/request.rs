@@ -1,5 +1,5 @@
-//! Requests to the coordinator. They arrive through a ring; nothing in them is freed by the tick: a
-//! trajectory that is done goes back through [`TickOutput::retired`](super::coordinator::TickOutput).
+//! Requests to the coordinator. They arrive through a ring. The tick frees nothing: a motion that ended leaves it
+//! through [`TickOutput::retired`](super::coordinator::TickOutput).
 
 use crate::joint::Joints;
 use crate::trajectory::Spline;
@@ -9,11 +9,11 @@ use crate::trajectory::Spline;
 pub struct Envelope {
     /// Chosen by the sender; increases.
     pub id: u64,
-    /// What is asked.
+    /// The request.
     pub request: Request,
 }
 
-/// What can be asked of the coordinator. Indices are those of the configuration.
+/// Request to the coordinator. Indices are those of the configuration.
 #[derive(Debug)]
 pub enum Request {
     /// Execute a motion by a trajectory task.
@@ -23,33 +23,33 @@ pub enum Request {
         /// The motion.
         motion: Box<Motion>,
     },
-    /// Slow down and end what a task does, or what all do.
+    /// Decelerate and end the motion of a task, or of all.
     Cancel {
         /// The task; `None`: all.
         task: Option<u16>,
     },
-    /// A new target of a servo task [rad], in the order of the task's joints.
+    /// New target of a servo task [rad], in the order of the task's joints.
     Servo {
         /// The task.
         task: u16,
         /// Positions [rad].
         target: Joints,
     },
-    /// A new target of a velocity task [rad/s], in the order of the task's joints.
+    /// New target of a velocity task [rad/s], in the order of the task's joints.
     Velocity {
         /// The task.
         task: u16,
         /// Velocities [rad/s].
         target: Joints,
     },
-    /// A new goal of a Cartesian task: a pose, or a twist, as the task's type is.
+    /// New goal of a Cartesian task: a pose or a twist, by the task's type.
     Steer {
         /// The task.
         task: u16,
         /// The goal.
         goal: Goal,
     },
-    /// Latched hold of an arm, or of all.
+    /// Latch the hold of an arm, or of all.
     Stop {
         /// The arm; `None`: all.
         arm: Option<u16>,
@@ -59,12 +59,12 @@ pub enum Request {
         /// The arm.
         arm: u16,
     },
-    /// The arm was enabled: hold it where it is, then let it move.
+    /// The arm was enabled: hold it at its position, then accept motion.
     Ready {
         /// The arm.
         arm: u16,
     },
-    /// Bring the arm to rest and take no motion for it, because it will be disabled.
+    /// The arm will be disabled: decelerate it to rest and refuse motion.
     Park {
         /// The arm.
         arm: u16,
@@ -76,7 +76,7 @@ pub enum Request {
         /// Opening [m].
         opening: f64,
     },
-    /// The run is ending: bring everything to rest, take nothing more.
+    /// The run shuts down: decelerate all arms to rest and refuse further requests.
     Shutdown,
 }
 
@@ -87,7 +87,7 @@ pub struct Motion {
     pub id: u64,
     /// The joints that move: indices over all arms' joints.
     pub joints: Vec<u16>,
-    /// The curve, one joint each.
+    /// The trajectory of these joints.
     pub spline: Spline,
 }
 

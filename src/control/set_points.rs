@@ -1,17 +1,18 @@
-//! The setpoints of the last moments, and how far an arm is from them. A joint that follows with a delay is somewhere
-//! in the range of the setpoints of its `lag`; one that is outside is blocked, or moved from outside.
+//! The latest setpoints of an arm as ranges. A joint that follows with a delay is within the range of the setpoints of
+//! the last `lag` seconds; a joint outside of it is blocked, or is moved by an external force.
 
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};
 
-/// Parts that the window is kept in: its edge is exact to one of them.
+/// Number of parts of the window. The start of a range is exact to one part.
 const PARTS: usize = 16;
 
-/// The range of the setpoints in one part of the window.
+/// Range of the setpoints in one part of the window.
 #[derive(Debug, Clone, Copy)]
 struct Part {
-    /// Time of its first and of its last setpoint.
+    /// Time of its first setpoint.
     from: Mono,
+    /// Time of its last setpoint.
     to: Mono,
     low: Joints,
     high: Joints,
@@ -29,19 +30,19 @@ pub struct SetPoints {
 }
 
 impl SetPoints {
-    /// For an arm of `dof` joints, over `span` [s]: its lag and the age of its states.
+    /// Creates the window of an arm of `dof` joints, over `span` [s]: its lag and the age of its states.
     pub fn new(dof: usize, span: f64) -> Self {
         let none = Part { from: Mono::ZERO, to: Mono::ZERO, low: [0.0; MAX_DOF], high: [0.0; MAX_DOF] };
         let part = (span.clamp(0.0, 10.0) * 1e9 / (PARTS - 2) as f64) as u64;
         Self { dof: dof.min(MAX_DOF), part, parts: [none; PARTS + 1], newest: 0, count: 0 }
     }
 
-    /// Forgets all: another mode, or a new start.
+    /// Removes all setpoints: another mode, or a new start.
     pub fn clear(&mut self) {
         self.count = 0;
     }
 
-    /// Whether there are none.
+    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.count == 0
     }
@@ -69,13 +70,13 @@ impl SetPoints {
         }
     }
 
-    /// The range of the setpoints since `since`, with the one that was in force then. `None` when there are none.
+    /// Returns the range of the setpoints since a time, with the one in effect at that time. `None`: there are none.
     pub fn range(&self, since: Mono) -> Option<Range> {
         let mut range =
             self.parts.get(self.newest).filter(|_| self.count > 0).map(|p| Range { low: p.low, high: p.high })?;
         let (first, last) = self.parts.split_at_checked(self.newest)?;
         let mut newest = self.parts.get(self.newest)?;
-        // From the newest back: the ring is wrapped around once.
+        // From the newest to the oldest part, around the ring.
         let older = first.iter().rev().chain(last.iter().skip(1).rev());
         for part in older.take(self.count - 1) {
             if newest.to < since {
@@ -101,7 +102,7 @@ pub struct Range {
 }
 
 impl Range {
-    /// How far `value` is outside; 0 inside.
+    /// Returns the signed distance of a joint's value from the range; 0 inside.
     pub fn distance(&self, joint: usize, value: f64) -> f64 {
         match (self.low.get(joint), self.high.get(joint)) {
             (Some(low), _) if value < *low => value - low,

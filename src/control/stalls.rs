@@ -1,27 +1,27 @@
-//! Times in which the tick thread could not run. A state that could not be seen did not come late: the age of a state
-//! counts without them.
+//! Times in which the tick thread could not run. They do not count as age of a state: a newer one may have arrived
+//! meanwhile.
 
 use std::time::Duration;
 
 use crate::clock::Mono;
 
-/// Delays below this are ordinary wake-ups.
+/// Shorter delays are normal wake-up latency.
 const SHORTEST: Duration = Duration::from_millis(1);
-/// Delays that are remembered: each lasts at least [`SHORTEST`], and only the last tenths of a second matter.
+/// Number of delays kept: each is at least [`SHORTEST`], and only those of the last tenths of a second matter.
 const KEPT: usize = 16;
 
 /// The latest delays of the tick.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Stalls {
-    /// End and length of each.
+    /// End and length of each delay.
     kept: [(Mono, Duration); KEPT],
     next: usize,
-    /// End of the latest.
+    /// End of the latest delay.
     latest: Mono,
 }
 
 impl Stalls {
-    /// A tick woke at `woke`, this much after its deadline.
+    /// Takes a wake-up: its time, and its delay after the deadline.
     pub fn note(&mut self, woke: Mono, late: Duration) {
         if late < SHORTEST {
             return;
@@ -33,7 +33,7 @@ impl Stalls {
         self.latest = self.latest.max(woke);
     }
 
-    /// How much of the time from `from` to `until` was lost.
+    /// Returns the time between `from` and `until` in which the tick thread could not run.
     pub fn between(&self, from: Mono, until: Mono) -> Duration {
         if self.latest <= from {
             return Duration::ZERO;

@@ -1,4 +1,4 @@
-//! A task of a coordinator: something that wants joints to move. What differs from type to type is its body.
+//! A task of the coordinator: claims joints and commands them. The behaviour of its type is in its body.
 
 use super::config::TaskConfig;
 use super::request::Motion;
@@ -12,29 +12,29 @@ use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 pub struct Task {
     /// Its joints: indices over all arms' joints.
     pub joints: Vec<u16>,
-    /// The higher one wins.
+    /// The higher priority wins a joint.
     pub priority: i32,
-    /// What it does just now.
+    /// Current state.
     pub state: TaskState,
-    /// Why.
+    /// Reason for the state.
     pub reason: Reason,
-    /// How the claims are meant.
+    /// Meaning of the claims.
     pub demand: Demand,
-    /// What it wants in this tick.
+    /// Claims of this tick.
     pub claims: Vec<Claim>,
-    /// Whether all it wanted in the last tick went out to the arms.
+    /// Whether all claims of the last tick were commanded.
     pub granted: bool,
     index: u16,
     auto_start: bool,
     takes: &'static [TargetKind],
-    /// The demand while it is active.
+    /// Demand of its type while it is active.
     demands: Demand,
     motion: Option<Box<Motion>>,
     body: Box<dyn TaskBody>,
 }
 
 impl Task {
-    /// The task with this index among those of its coordinator, idle.
+    /// Creates an idle task with this index among those of its coordinator.
     pub fn new(index: u16, config: &TaskConfig, spec: &TaskSpec, body: Box<dyn TaskBody>) -> Self {
         Self {
             joints: config.joints.clone(),
@@ -53,17 +53,17 @@ impl Task {
         }
     }
 
-    /// Whether it does something.
+    /// Returns whether it executes or decelerates.
     pub fn is_active(&self) -> bool {
         matches!(self.state, TaskState::Executing | TaskState::Cancelling)
     }
 
-    /// The target with which it begins when the run starts it.
+    /// Returns the target with which it starts automatically, if any.
     pub fn first_target(&self) -> Option<Target<'static>> {
         if self.auto_start { self.body.first_target() } else { None }
     }
 
-    /// Refuses a target that no task could take in this form.
+    /// Rejects a target that no task of this kind can take.
     pub fn check(&self, target: &Target<'_>) -> Result<(), Outcome> {
         match target {
             Target::Trajectory(motion) => {
@@ -82,21 +82,21 @@ impl Task {
         }
     }
 
-    /// Hands a target to the body. Returns whether the task begins with it.
+    /// Passes a target to the body. Returns whether the task becomes active with it.
     pub fn accept(&mut self, now: Mono, dt: f64, views: &[JointView], target: &Target<'_>) -> Result<bool, Outcome> {
         if !self.takes.contains(&target.kind()) {
             return Err(Outcome::WrongTask(self.index));
         }
         let (cx, body, _) = self.parts(now, dt, views);
         body.accept(&cx, target)?;
-        // A target while it decelerates after a cancel: it continues from there.
+        // A target during the deceleration after a cancel: continues from the present motion.
         let begins = self.state != TaskState::Executing;
         self.state = TaskState::Executing;
         self.reason = Reason::None;
         Ok(begins)
     }
 
-    /// Keeps the motion of an accepted trajectory. Returns the one before, to be freed elsewhere.
+    /// Keeps the motion of an accepted trajectory. Returns the previous one, to be freed on another thread.
     pub fn keep(&mut self, motion: Box<Motion>) -> Option<Box<Motion>> {
         self.motion.replace(motion)
     }
@@ -120,7 +120,7 @@ impl Task {
         (cx, self.body.as_mut(), &mut self.claims)
     }
 
-    /// Fills in the claims of this tick. Returns a finished motion, to be freed elsewhere.
+    /// Fills in the claims of this tick. Returns a finished motion, to be freed on another thread.
     pub fn compute(&mut self, now: Mono, dt: f64, views: &[JointView]) -> Option<Box<Motion>> {
         self.claims.clear();
         self.demand = Demand::Nothing;
@@ -141,13 +141,13 @@ impl Task {
         }
     }
 
-    /// Nothing reached an arm since the tick of `at`: it continues from what was commanded then, from rest.
+    /// No command reached an arm since the tick of `at`: continues from the command of that tick, from rest.
     pub fn rewind(&mut self, at: Mono, now: Mono) {
         self.granted = false;
         self.body.rewind(at, now);
     }
 
-    /// Ends what it does: the limiter brings its joints to rest. Returns its motion, to be freed elsewhere.
+    /// Ends the task: the limiter decelerates its joints to rest. Returns its motion, to be freed on another thread.
     pub fn end(&mut self, state: TaskState, reason: Reason) -> Option<Box<Motion>> {
         self.state = state;
         self.reason = reason;
@@ -169,8 +169,8 @@ impl Task {
         }
     }
 
-    /// A cancel. Returns the motion that ended with it, to be freed elsewhere, or `None` when there was nothing to
-    /// cancel.
+    /// Cancels the task. Returns the motion that ended with it, to be freed on another thread; `None` if the task was
+    /// not active.
     pub fn cancel(&mut self) -> Option<Option<Box<Motion>>> {
         match self.state {
             TaskState::Cancelling => Some(None),
@@ -186,7 +186,7 @@ impl Task {
         }
     }
 
-    /// What the status shows.
+    /// Returns what the status shows.
     pub fn view(&self) -> TaskView {
         let mut view = TaskView { state: self.state, reason: self.reason, ..TaskView::default() };
         self.body.describe(&mut view);

@@ -1,14 +1,14 @@
-//! What a type of task brings to the coordinator: a body that takes targets and claims joints, tick by tick.
+//! The part of a task that differs from type to type: a body that takes targets and claims joints in every tick.
 //!
-//! A body runs on the real-time thread: it never allocates, locks, logs, does I/O or panics. It holds plain data only;
-//! the coordinator keeps the motion of a trajectory and frees it elsewhere.
+//! A body runs on the real-time thread: it never allocates, locks, logs, does I/O or panics. It holds plain data only.
+//! The coordinator keeps the motion of a trajectory and frees it on another thread.
 
 use super::request::{Goal, Motion};
 use crate::clock::Mono;
 use crate::joint::Joints;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 
-/// What a task sees of a joint.
+/// State and limits of a joint, as a task sees them.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct JointView {
     /// Measured position [rad].
@@ -19,9 +19,9 @@ pub struct JointView {
     pub commanded: f64,
     /// Last commanded velocity [rad/s].
     pub commanded_velocity: f64,
-    /// Lowest position that is commanded [rad].
+    /// Lowest commanded position [rad].
     pub lower: f64,
-    /// Highest position that is commanded [rad].
+    /// Highest commanded position [rad].
     pub upper: f64,
     /// Acceleration limit [rad/s²].
     pub acceleration: f64,
@@ -29,11 +29,11 @@ pub struct JointView {
     pub velocity_limit: f64,
     /// Jerk limit [rad/s³].
     pub jerk: f64,
-    /// How far the joint is outside the range of its setpoints of the last `lag` seconds [rad].
+    /// Distance of the joint from the range of its setpoints of the last `lag` seconds [rad].
     pub tracking_error: f64,
 }
 
-/// What a body sees when the coordinator calls it.
+/// Context of a call of a body.
 #[derive(Debug, Clone, Copy)]
 pub struct Context<'a> {
     /// The tick's time.
@@ -46,7 +46,7 @@ pub struct Context<'a> {
     pub joints: &'a [u16],
     /// Whether the task is active: executing or decelerating.
     pub active: bool,
-    /// Whether all that the task claimed in the last tick went out to the arms.
+    /// Whether all claims of the last tick were commanded.
     pub granted: bool,
     /// The motion of the last [`Target::Trajectory`], until the task ends.
     pub motion: Option<&'a Motion>,
@@ -55,13 +55,13 @@ pub struct Context<'a> {
 }
 
 impl Context<'_> {
-    /// A joint's view; zeros for an index that does not exist.
+    /// Returns the view of a joint; zeros for an index that does not exist.
     pub fn joint(&self, joint: u16) -> JointView {
         self.views.get(joint as usize).copied().unwrap_or_default()
     }
 }
 
-/// How a task's claims are meant.
+/// Meaning of a task's claims.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Demand {
     /// The task claims nothing.
@@ -73,7 +73,7 @@ pub enum Demand {
     Velocities,
 }
 
-/// One joint that a task wants, and what it should do.
+/// Request of a task to one joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Claim {
     /// Index over all arms' joints.
@@ -82,7 +82,7 @@ pub struct Claim {
     pub value: f64,
 }
 
-/// What a client sends to a task.
+/// Target that a client sends to a task.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Target<'a> {
     /// A motion to execute.
@@ -96,7 +96,7 @@ pub enum Target<'a> {
 }
 
 impl Target<'_> {
-    /// Its kind.
+    /// Returns its kind.
     pub fn kind(&self) -> TargetKind {
         match self {
             Self::Trajectory(_) => TargetKind::Trajectory,
@@ -108,7 +108,7 @@ impl Target<'_> {
     }
 }
 
-/// The kinds of targets. Each has its rpc method.
+/// Kinds of targets. Each has its own rpc method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TargetKind {
     /// A trajectory.
@@ -127,7 +127,7 @@ impl TargetKind {
     /// All kinds.
     pub const ALL: [Self; 5] = [Self::Trajectory, Self::Positions, Self::Velocities, Self::Pose, Self::Twist];
 
-    /// The rpc method that sends one.
+    /// Returns the rpc method that sends one.
     pub fn method(self) -> &'static str {
         match self {
             Self::Trajectory => "execute",
@@ -144,64 +144,65 @@ impl TargetKind {
 pub enum Step {
     /// It continues.
     Continue,
-    /// It continues, and shows this reason from now on.
+    /// It continues, and reports this reason from now on.
     ContinueFor(Reason),
-    /// It has ended. The coordinator brings its joints to rest.
+    /// It has ended. The coordinator decelerates its joints to rest.
     End(TaskState, Reason),
 }
 
 /// What a task does on a cancel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnCancel {
-    /// It ends; the coordinator brings its joints to rest.
+    /// It ends; the coordinator decelerates its joints to rest.
     End,
-    /// It decelerates on its own, along its path, and ends then.
+    /// It decelerates along its path, then ends.
     Decelerate,
 }
 
-/// What a task does when a stronger task takes one of its joints.
+/// What a task does when a task of higher priority takes one of its joints.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OnLoss {
     /// It ends.
     End,
-    /// It continues with the other joints, and claims this one again with its next target at the earliest.
+    /// It continues with the other joints, and does not claim this one before its next target.
     Continue,
 }
 
-/// The part of a task that differs from type to type. `dimos::control::conformance` checks the rules.
+/// Behaviour of a task type. `dimos::control::conformance` checks the rules.
 pub trait TaskBody: std::fmt::Debug + Send {
-    /// Takes a target, or refuses it with the outcome that the client gets. Only kinds that the type takes arrive.
+    /// Takes a target, or rejects it with the outcome for the client. Called with the kinds of targets of the type
+    /// only.
     fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome>;
 
-    /// Claims the joints for this tick: each at most once, of the task's joints only. Called while the task is active.
+    /// Claims joints of the task for this tick, each at most once. Called while the task is active.
     fn compute(&mut self, cx: &Context<'_>, claims: &mut Vec<Claim>) -> Step;
 
-    /// The task has ended, for whatever reason: forgets its target.
+    /// The task has ended: discards its target.
     fn end(&mut self);
 
-    /// A client cancels the task while it executes.
+    /// A client cancels the executing task.
     fn cancel(&mut self) -> OnCancel {
         OnCancel::End
     }
 
-    /// A stronger task took `joint` of the task's `joints`.
+    /// A task of higher priority took `joint` of the task's `joints`.
     fn lose(&mut self, joints: &[u16], joint: u16) -> OnLoss {
         let _ = (joints, joint);
         OnLoss::End
     }
 
-    /// Nothing reached an arm since the tick of `at`: continues from what was commanded then, from rest. The next tick
-    /// is not granted, so that a body which integrates from [`JointView::commanded`] then needs no more than that.
+    /// No command reached an arm since the tick of `at`: continues from the command of that tick, from rest. The next
+    /// tick is not granted: a body that integrates from [`JointView::commanded`] then needs nothing else.
     fn rewind(&mut self, at: Mono, now: Mono) {
         let _ = (at, now);
     }
 
-    /// The target with which the task begins when the blueprint says `auto_start`; without one it waits for a client.
+    /// Returns the target with which a task with `auto_start` begins; `None`: it waits for a client.
     fn first_target(&self) -> Option<Target<'static>> {
         None
     }
 
-    /// Adds what the status shows besides state and reason: motion, progress, what limits the end effector.
+    /// Adds to the status: motion, progress, the limit that slows the end effector.
     fn describe(&self, view: &mut TaskView) {
         let _ = view;
     }

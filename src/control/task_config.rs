@@ -1,4 +1,4 @@
-//! A task of a coordinator's configuration, and its form in a log.
+//! Configuration of a task, and its form in a log.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -16,9 +16,9 @@ pub struct TaskConfig {
     pub kind: TaskKind,
     /// Its joints: indices over all arms' joints, in the blueprint's order.
     pub joints: Vec<u16>,
-    /// The higher one wins a joint.
+    /// The higher priority wins a joint.
     pub priority: i32,
-    /// Whether it starts with the run.
+    /// Whether it starts when all arms are ready.
     pub auto_start: bool,
 }
 
@@ -29,17 +29,17 @@ pub struct TaskKind {
     pub name: String,
     /// The parameters of the type, defaults filled in.
     pub params: Value,
-    /// The robot whose end effector it moves, where the type moves one.
+    /// The robot whose end effector it moves, if the type moves one.
     pub robot: Option<Box<TaskKinematics>>,
 }
 
 impl TaskKind {
-    /// A type that moves joints.
+    /// Creates the kind of a type that moves joints.
     pub fn new(name: &str, params: &impl Serialize) -> Self {
         Self { name: name.to_owned(), params: to_value(params), robot: None }
     }
 
-    /// The same for the end effector of a robot.
+    /// Adds the robot whose end effector it moves.
     #[must_use]
     pub fn of_robot(mut self, robot: TaskKinematics) -> Self {
         self.robot = Some(Box::new(robot));
@@ -84,7 +84,7 @@ impl TryFrom<Stored> for TaskConfig {
     }
 }
 
-/// Takes the robot out of the parameters, among which logs before this form have it.
+/// Removes the robot from the parameters, which contain it in older logs.
 fn among(params: &mut Value) -> Result<Option<Box<TaskKinematics>>, serde_json::Error> {
     let Some(params) = params.as_object_mut().filter(|params| params.contains_key("kinematics")) else {
         return Ok(None);

@@ -1,4 +1,4 @@
-//! The robot whose end effector a task moves: as the task's parameters name it, and compiled for the tick.
+//! The robot whose end effector a task moves: its parameters in the blueprint, and its kinematics for the tick.
 
 use std::collections::BTreeMap;
 
@@ -18,7 +18,7 @@ pub struct RobotParams {
     pub package_paths: BTreeMap<String, String>,
     /// Arguments of the xacro file.
     pub xacro_args: BTreeMap<String, Text>,
-    /// The link that is moved.
+    /// The link that the task moves.
     pub end_effector_link: Option<String>,
     /// The coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
     pub joint_prefix: Option<String>,
@@ -33,15 +33,16 @@ pub struct TaskKinematics {
     pub kinematics: Kinematics,
     /// The end effector: index of its link.
     pub link: usize,
-    /// Where the model's root is in the frame that poses are given in.
-    pub root: Place,
-    /// The base whose axes twists are along, in the frame of the model's root: quaternion x, y, z, w.
+    /// Pose of the model's root in the frame of the task's poses.
+    pub root: FramePose,
+    /// Orientation of the base, along whose axes twists are given, in the frame of the model's root: quaternion x, y,
+    /// z, w.
     pub base: [f64; 4],
 }
 
-/// A frame in another.
+/// Pose of a frame in another frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Place {
+pub struct FramePose {
     /// x, y, z [m].
     pub position: [f64; 3],
     /// Quaternion x, y, z, w.
@@ -51,24 +52,26 @@ pub struct Place {
 /// The quaternion of no rotation.
 pub const NO_ROTATION: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
 
-impl Place {
-    /// The same frame.
+impl FramePose {
+    /// Identity.
     pub const SAME: Self = Self { position: [0.0; 3], orientation: NO_ROTATION };
 }
 
 impl TaskKinematics {
-    /// A robot with nothing around it: poses and twists are in the frame of its root.
+    /// Creates the kinematics of a robot whose poses and twists are in the frame of its root.
     pub fn new(kinematics: Kinematics, link: usize) -> Self {
-        Self { kinematics, link, root: Place::SAME, base: NO_ROTATION }
+        Self { kinematics, link, root: FramePose::SAME, base: NO_ROTATION }
     }
 
-    /// Says what of it cannot be worked with, for a task with this number of joints.
+    /// Checks that a task with this number of joints can use it. The error names the problem.
     pub fn check(&self, joints: usize) -> Result<(), String> {
         let turned = |q: &[f64; 4]| (0.9..1.1).contains(&q.iter().map(|v| v * v).sum::<f64>());
         match () {
-            () if self.kinematics.dof() != joints => Err("its kinematics have other joints".to_owned()),
+            () if self.kinematics.dof() != joints => Err("its kinematics have a different number of joints".to_owned()),
             () if self.link >= self.kinematics.links() => Err("its end effector does not exist".to_owned()),
-            () if !turned(&self.base) || !turned(&self.root.orientation) => Err("a frame is not one".to_owned()),
+            () if !turned(&self.base) || !turned(&self.root.orientation) => {
+                Err("the quaternion of a frame does not have length 1".to_owned())
+            }
             () => Ok(()),
         }
     }

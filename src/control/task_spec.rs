@@ -1,5 +1,5 @@
-//! The table of task types: one row per type, made by the folder of the type. A blueprint's `tasks` are checked against
-//! it, and a run's and a replay's tasks are built from it.
+//! The table of task types: one row per type, defined in the folder of the type. The `tasks` of a blueprint are checked
+//! against it, and the tasks of runs and replays are built from it.
 
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Serialize;
@@ -19,28 +19,28 @@ use crate::yaml::{self, Lost, Missing, NodeId, Tree};
 pub struct TaskSpec {
     /// `type` in a blueprint.
     pub name: &'static str,
-    /// What it does, as the end of a sentence: `executes trajectories`.
+    /// Purpose, as the end of a sentence: `executes trajectories`.
     pub about: &'static str,
     /// Its parameters.
     pub params: ParamsSpec,
-    /// The targets that it takes.
+    /// Kinds of targets that it takes.
     pub takes: &'static [TargetKind],
-    /// How its claims are meant.
+    /// Meaning of its claims.
     pub demand: Demand,
     /// Whether it moves an end effector: [`RobotParams`](super::task_robot::RobotParams) are among its parameters then,
     /// and `build` gets the robot's kinematics.
     pub robot: bool,
-    /// Builds a body from parameters that were read, or says what of them does not fit the task.
+    /// Builds a body from its parameters. The error describes a parameter that does not fit the task.
     pub build: fn(&TaskSetup<'_>) -> Result<Box<dyn TaskBody>, BuildError>,
 }
 
 impl TaskSpec {
-    /// Whether it takes this kind of target.
+    /// Returns whether it takes this kind of target.
     pub fn takes(&self, kind: TargetKind) -> bool {
         self.takes.contains(&kind)
     }
 
-    /// The modes of which an arm needs one for it.
+    /// Returns the control modes of which an arm needs at least one.
     pub fn modes(&self) -> &'static [ControlMode] {
         match self.demand {
             Demand::Nothing => &[],
@@ -53,8 +53,8 @@ impl TaskSpec {
 /// The parameters of a task type: how they are read from a blueprint, their defaults, and their JSON Schema.
 #[derive(Debug, Clone, Copy)]
 pub struct ParamsSpec {
-    /// Reads a group of a blueprint, reports every mistake in it into the tree's diagnostics, and returns it with
-    /// defaults filled in, and what could not be read.
+    /// Reads a group of a blueprint, adds every mistake in it to the tree's diagnostics, and returns the parameters
+    /// with defaults filled in, and the keys that could not be read.
     pub read: fn(&mut Tree, NodeId) -> (Option<Value>, Lost),
     /// The defaults.
     pub default: fn() -> Value,
@@ -65,7 +65,7 @@ pub struct ParamsSpec {
 }
 
 impl ParamsSpec {
-    /// Parameters of type `T`, which should `deny_unknown_fields` and have a default for each.
+    /// Creates the parameters of type `T`, which must `deny_unknown_fields` and have a default for each field.
     pub const fn of<T: Serialize + DeserializeOwned + Default + JsonSchema>() -> Self {
         Self {
             read: |tree, node| {
@@ -79,24 +79,24 @@ impl ParamsSpec {
     }
 }
 
-/// Parameters as JSON. Plain structs always encode; anything else is refused when the task is built.
+/// Returns parameters as JSON. Plain structs always encode; others are rejected when the task is built.
 pub(super) fn to_value(params: &impl Serialize) -> Value {
     serde_json::to_value(params).unwrap_or_default()
 }
 
-/// What a body is built from.
+/// Input for building a body.
 #[derive(Debug, Clone, Copy)]
 pub struct TaskSetup<'a> {
     /// The task's joints: indices over all arms' joints.
     pub joints: &'a [u16],
     /// The parameters.
     pub params: &'a Value,
-    /// The robot whose end effector the task moves, where its type says so.
+    /// The robot whose end effector the task moves, if its type moves one.
     pub robot: Option<&'a TaskKinematics>,
 }
 
 impl TaskSetup<'_> {
-    /// The parameters as the type's own.
+    /// Returns the parameters as the type's struct.
     pub fn params<T: DeserializeOwned>(&self) -> Result<T, BuildError> {
         T::deserialize(self.params).map_err(|e| BuildError::new("", e.to_string()))
     }
@@ -106,21 +106,21 @@ impl TaskSetup<'_> {
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("{what}")]
 pub struct BuildError {
-    /// The key that is wrong; empty: the whole.
+    /// The wrong key; empty: the parameters as a whole.
     pub key: &'static str,
-    /// What is wrong.
+    /// The problem.
     pub what: String,
-    /// What to do.
+    /// The hint.
     pub hint: Option<String>,
 }
 
 impl BuildError {
-    /// An error at a key.
+    /// Creates an error at a key.
     pub fn new(key: &'static str, what: impl Into<String>) -> Self {
         Self { key, what: what.into(), hint: None }
     }
 
-    /// The same error with what to do.
+    /// Adds a hint.
     #[must_use]
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
@@ -135,33 +135,33 @@ pub struct TaskTable {
 }
 
 impl TaskTable {
-    /// The built-in types.
+    /// Returns the table of the built-in types.
     pub const fn builtin() -> Self {
         Self { more: Vec::new() }
     }
 
-    /// The built-in types and `more`, which win over rows of the same name.
+    /// Returns the built-in types and `more`, which replace rows of the same name.
     pub fn with(more: &[TaskSpec]) -> Self {
         Self { more: more.to_vec() }
     }
 
-    /// All rows, in table order.
+    /// Returns all rows, in table order.
     pub fn rows(&self) -> impl Iterator<Item = &TaskSpec> {
         let replaced = move |row: &&TaskSpec| !self.more.iter().any(|m| m.name == row.name);
         TABLE.iter().filter(replaced).chain(&self.more)
     }
 
-    /// The row of a name.
+    /// Returns the row with this name.
     pub fn get(&self, name: &str) -> Option<&TaskSpec> {
         self.rows().find(|row| row.name == name)
     }
 
-    /// All names, in table order.
+    /// Returns all names, in table order.
     pub fn names(&self) -> Vec<&'static str> {
         self.rows().map(|row| row.name).collect()
     }
 
-    /// Builds the tasks of a coordinator. An error says which task, and what is wrong with it.
+    /// Builds the tasks of a coordinator. The error names the task and the problem.
     pub fn build(&self, tasks: &[TaskConfig]) -> Result<Vec<Task>, String> {
         let task = |(index, task): (usize, &TaskConfig)| {
             let made = self.body(task).map(|(spec, body)| Task::new(index as u16, task, spec, body));

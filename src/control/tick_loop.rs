@@ -1,6 +1,6 @@
-//! The thread that runs the coordinator: sleeps until each absolute deadline, reads the state slots, ticks, fills
-//! the command slots, wakes the device threads, and only then reports. Nothing here allocates, locks, logs
-//! or waits for anyone.
+//! The thread that runs the coordinator: sleeps until each absolute deadline, reads the state slots, ticks, fills the
+//! command slots, wakes the device threads, then reports. It neither allocates, locks nor logs, and waits for no other
+//! thread.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
@@ -18,40 +18,40 @@ use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
 use crate::telemetry::{ArmSample, Event, Outcome, Sample, TaskView, TickSample};
 
-/// What the tick thread shares with those who watch it.
+/// State of the tick thread for its observers.
 #[derive(Debug, Default)]
 pub struct Pulse {
     /// The thread's heartbeat.
     pub beat: Arc<Heartbeat>,
-    /// Ticks begun.
+    /// Number of ticks begun.
     pub begun: AtomicU64,
-    /// Ticks made.
+    /// Number of ticks completed.
     pub ticks: AtomicU64,
-    /// Ticks that began a period or more too late.
+    /// Number of ticks that began at least a period late.
     pub overruns: AtomicU64,
-    /// Whole periods skipped.
+    /// Number of periods skipped.
     pub skipped: AtomicU64,
-    /// Whether the thread runs under FIFO.
+    /// Whether the thread runs with SCHED_FIFO.
     pub fifo: AtomicBool,
-    /// Whether no arm is being moved by commands.
+    /// Whether no command moves an arm.
     pub at_rest: AtomicBool,
-    /// The joint state has subscribers: wake its publisher after every tick.
+    /// Set while the joint state has subscribers: every tick wakes its publisher.
     pub streaming: AtomicBool,
-    /// How many wait for what a tick brings: wake them after every tick.
+    /// Number of threads that wait for a tick: every tick wakes them.
     pub waiting: AtomicU32,
-    /// Set to end the thread after its present tick.
+    /// Set to end the thread after the current tick.
     pub stop: AtomicBool,
-    /// Samples that found the ring full.
+    /// Samples lost because the ring was full.
     pub dropped: AtomicU64,
-    /// Commands that replaced one that the device thread had not taken.
+    /// Commands that replaced one which the device thread had not read.
     pub overwritten: AtomicU32,
     /// Wake-up after the deadline.
     pub lateness: Histogram,
-    /// Wake-up to the last command passed on.
+    /// Time from wake-up to the last command written to its slot.
     pub compute: Histogram,
 }
 
-/// The tick's ends of everything it is connected with.
+/// The tick's ends of its slots and rings.
 pub struct TickPorts {
     /// Latest states, one per arm.
     pub states: Vec<SlotReader<ArmState>>,
@@ -59,37 +59,37 @@ pub struct TickPorts {
     pub commands: Vec<SlotWriter<ArmCommand>>,
     /// Wakes the device threads, one per arm.
     pub wakes: Vec<Wake>,
-    /// When the device threads mean to be awake, one per arm.
+    /// Planned wake-ups of the device threads, one per arm.
     pub dues: Vec<Arc<Due>>,
     /// Requests to the coordinator.
     pub requests: rtrb::Consumer<Envelope>,
-    /// What came of it: id and outcome.
+    /// Outcomes of requests, with their ids.
     pub replies: rtrb::Producer<(u64, Outcome)>,
     /// Wakes the thread that waits for replies.
     pub reply_wake: Wake,
-    /// Motions that are done.
+    /// Motions that ended.
     pub retired: rtrb::Producer<Box<Motion>>,
-    /// What is logged.
+    /// Samples for the log.
     pub samples: rtrb::Producer<Sample>,
     /// Latest samples for rpc, one per arm.
     pub arm_views: Vec<SlotWriter<ArmSample>>,
     /// Latest views for rpc, one per task.
     pub task_views: Vec<SlotWriter<TaskView>>,
-    /// Shared with the watchers.
+    /// Shared with its observers.
     pub pulse: Arc<Pulse>,
 }
 
-/// Called at the start of each tick. For tests and benchmarks, which delay, hang or end the thread with it.
+/// Called at the start of each tick. Tests and benchmarks use it to delay, hang or end the thread.
 pub type Probe = Box<dyn FnMut(u64) + Send>;
 
-/// How many whole periods a late wake-up lost: the tick then takes the last deadline before it for "now".
+/// Returns the number of whole periods lost by a late wake-up. The tick then uses the last deadline before it as "now".
 pub fn missed_periods(deadline: Mono, woke: Mono, period: Duration) -> u32 {
     let period = (period.as_nanos() as u64).max(1);
     (woke.0.saturating_sub(deadline.0) / period).min(u32::MAX as u64) as u32
 }
 
-/// The first deadline of the grid that is still ahead, and how many were skipped: never two ticks less than
-/// half a period apart, never a burst.
+/// Returns the next deadline of the grid and the number of skipped ones: two ticks are at least half a period apart,
+/// and there is never a burst.
 pub fn next_deadline(deadline: Mono, woke: Mono, period: Duration) -> (Mono, u32) {
     let period = (period.as_nanos() as u64).max(1);
     let next = deadline.0.saturating_add(period);
@@ -140,13 +140,13 @@ pub fn run(
             overwritten += u32::from(slot.write(command));
         }
         let done = clock.now();
-        // All wakes after all computing: a woken thread must not push the tick aside half-way.
+        // All wake-ups after the computation: a woken thread must not preempt the tick.
         ports.wakes.iter().for_each(Wake::raise);
         let compute_ns = done.0.saturating_sub(woke.0);
         pulse.beat.beat(done);
 
         for motion in output.retired.drain(..) {
-            // The ring is as long as all motions that can exist; one that finds no room is leaked rather than freed.
+            // The ring has room for all motions that can exist. One that does not fit is leaked, not freed.
             if let Err(rtrb::PushError::Full(motion)) = ports.retired.push(motion) {
                 std::mem::forget(motion);
             }
@@ -160,7 +160,7 @@ pub fn run(
             chunk.fill_from_iter(arms.chain(events).chain([Sample::Tick(timing)]));
             dropped = 0;
         } else {
-            // A tick is logged whole or not at all, and what is missing is counted.
+            // A tick is logged completely or not at all; lost samples are counted.
             dropped = dropped.saturating_add(wanted as u32);
             pulse.dropped.fetch_add(wanted as u64, Ordering::Relaxed);
         }
@@ -170,7 +170,7 @@ pub fn run(
         for (slot, view) in ports.task_views.iter_mut().zip(&output.tasks) {
             slot.write(view);
         }
-        // After the views: a client that gets an outcome finds its effect there.
+        // After the views: they show the effect of a request when its client gets the outcome.
         let mut replied = false;
         for event in &output.events {
             if let Event::Request(id, outcome) = event {

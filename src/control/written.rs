@@ -1,13 +1,13 @@
-//! What reached the wire. The device thread reports the newest command that it wrote; with the commands of the last
-//! ticks that is the setpoint the arm has. When nothing was written for more than two periods there is a gap: commands
-//! stay at what was written last, and motion continues from there.
+//! The setpoint that the arm has. The device thread reports the number of the newest command that it wrote; the
+//! commands of the last ticks are kept to look it up. If nothing was written for more than two periods, there is a gap:
+//! commands repeat the last written setpoint, and motion continues from there.
 
 use std::time::Duration;
 
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};
 
-/// Setpoints written later than this after the one before are a gap [periods].
+/// A longer time between two written setpoints is a gap [periods].
 const PERIODS: u32 = 2;
 
 /// A command as it was issued.
@@ -33,7 +33,7 @@ pub struct Written {
 }
 
 impl Written {
-    /// For a tick of this period and an arm that takes setpoints once in `write` at best.
+    /// Creates it for this period of the tick, and this shortest period of the arm's setpoints.
     pub fn new(tick: Duration, write: Duration) -> Self {
         let limit = PERIODS * tick.max(write);
         let kept = (limit.as_nanos() / tick.as_nanos().max(1)) as usize + 4;
@@ -42,7 +42,7 @@ impl Written {
         Self { issued: vec![none; kept.min(4096)], next: 0, last: none, limit: limit + Duration::from_micros(1) }
     }
 
-    /// A command leaves the tick.
+    /// Keeps a command that leaves the tick.
     pub fn issue(&mut self, issued: Issued) {
         if let Some(slot) = self.issued.get_mut(self.next) {
             *slot = issued;
@@ -50,7 +50,7 @@ impl Written {
         self.next = (self.next + 1) % self.issued.len().max(1);
     }
 
-    /// The device thread reports the newest command that it wrote.
+    /// Takes the number of the newest command that the device thread wrote.
     pub fn report(&mut self, seq: u64) {
         if seq != self.last.seq
             && let Some(found) = self.issued.iter().find(|issued| issued.seq == seq && seq != 0)
@@ -59,12 +59,12 @@ impl Written {
         }
     }
 
-    /// The newest command that was written.
+    /// Returns the newest written command.
     pub fn last(&self) -> &Issued {
         &self.last
     }
 
-    /// Whether more than two periods will have passed between the last written setpoint and one of `now`.
+    /// Returns whether more than two periods lie between the last written setpoint and one of `now`.
     pub fn gap(&self, now: Mono) -> bool {
         now.since(self.last.at) > self.limit
     }

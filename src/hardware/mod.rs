@@ -1,11 +1,11 @@
-//! Everything that talks to an arm: the adapter protocol, the table of adapters, the arms, one device thread each.
+//! Everything that talks to arms: the adapter trait, the adapter registry, the arms, and one device thread per arm.
 
+pub mod adapter;
+pub mod adapter_util;
 pub mod arms;
+pub mod check;
 pub mod conformance;
 pub mod device;
-pub mod fit;
-pub mod kit;
 pub mod registry;
 pub mod sim;
-pub mod spec;
 pub mod transport;

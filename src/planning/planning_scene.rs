@@ -200,7 +200,7 @@ impl PlannedRobot {
             if own.upper.min(upper) <= own.lower.max(lower) {
                 return Err(format!(
                     "{name} ranges from {:.3} to {:.3} rad in the model and from {lower:.3} to {upper:.3} rad in the \
-                     coordinator: nothing is in both",
+                     coordinator: the ranges do not overlap",
                     own.lower, own.upper
                 ));
             }

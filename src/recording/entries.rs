@@ -50,9 +50,17 @@ macro_rules! payloads {
             },
         }
 
-        fn decode(schema: &str, bytes: &[u8]) -> Payload {
-            let decoded = match schema {
-                $($name::SCHEMA => $name::decode(bytes).map(Payload::$name),)*
+        /// Returns how many fields of its messages are known here; `None`: the schema is unknown.
+        fn known_fields(schema: &str, text: &str) -> Option<usize> {
+            match schema {
+                $($name::SCHEMA => $name::shared_fields(text),)*
+                _ => None,
+            }
+        }
+
+        fn decode(schema: &str, fields: Option<usize>, bytes: &[u8]) -> Payload {
+            let decoded = match (schema, fields) {
+                $(($name::SCHEMA, Some(fields)) => $name::decode_first(bytes, fields).map(Payload::$name),)*
                 _ => return Payload::Unknown { schema: schema.into(), bytes: bytes.len() },
             };
             decoded.unwrap_or_else(|e| Payload::Damaged { schema: schema.into(), error: e.to_string() })
@@ -73,16 +81,16 @@ pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])>
 /// The channels of a log read so far.
 #[derive(Default)]
 pub(super) struct Channels {
-    /// Name and encoding of each schema.
-    schemas: HashMap<u16, (String, bool)>,
+    /// Name of each schema, and the number of its fields that are known here.
+    schemas: HashMap<u16, (String, Option<usize>)>,
     channels: HashMap<u16, KnownChannel>,
 }
 
 struct KnownChannel {
     topic: String,
     schema: String,
-    /// Whether its messages are CDR with a ROS 2 schema.
-    readable: bool,
+    /// Number of known fields of its messages; `None`: they are not CDR with a ROS 2 schema known here.
+    fields: Option<usize>,
 }
 
 impl Channels {
@@ -90,10 +98,12 @@ impl Channels {
     pub(super) fn learn(&mut self, opcode: u8, body: &[u8]) {
         match opcode {
             op::SCHEMA => {
-                if let Ok(Record::Schema { header, .. }) = parse_record(opcode, body)
+                if let Ok(Record::Schema { header, data }) = parse_record(opcode, body)
                     && header.name.len() <= MAX_NAME
                 {
-                    self.schemas.insert(header.id, (header.name, header.encoding == "ros2msg"));
+                    let text = std::str::from_utf8(&data).ok().filter(|_| header.encoding == "ros2msg");
+                    let fields = text.and_then(|text| known_fields(&header.name, text));
+                    self.schemas.insert(header.id, (header.name, fields));
                 }
             }
             op::CHANNEL => {
@@ -108,9 +118,9 @@ impl Channels {
     }
 
     fn add(&mut self, channel: Channel) {
-        let (schema, ros2) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
-        let readable = ros2 && channel.message_encoding == "cdr";
-        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, readable });
+        let (schema, fields) = self.schemas.get(&channel.schema_id).cloned().unwrap_or_default();
+        let fields = fields.filter(|_| channel.message_encoding == "cdr");
+        self.channels.insert(channel.id, KnownChannel { topic: channel.topic, schema, fields });
     }
 
     /// Takes a record; queues its message if it is selected.
@@ -132,11 +142,7 @@ impl Channels {
         if !chosen && channel.schema != Tick::SCHEMA {
             return;
         }
-        let data = if channel.readable {
-            decode(&channel.schema, bytes)
-        } else {
-            Payload::Unknown { schema: channel.schema.clone(), bytes: bytes.len() }
-        };
+        let data = decode(&channel.schema, channel.fields, bytes);
         if let Payload::Tick(tick) = &data {
             *lost += u64::from(tick.dropped);
         }

@@ -10,6 +10,7 @@
 mod arm_messages;
 pub mod cdr;
 pub mod disk_space;
+mod disk_sync;
 mod entries;
 pub mod files;
 pub mod log_writer;
@@ -25,3 +26,8 @@ mod worker;
 
 #[cfg(test)]
 mod tests;
+
+/// Key of the config version in a log's metadata.
+pub const CONFIG_VERSION_KEY: &str = "config_version";
+/// Name of the attachment with the coordinator's configuration.
+pub const COORDINATOR: &str = "coordinator.json";

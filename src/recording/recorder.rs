@@ -1,5 +1,5 @@
 //! The recorder thread: takes samples from the tick's ring and notes from other threads, logs them, and passes events
-//! on as text. It is the only thread that waits for the disk; no thread waits for it.
+//! on as text. It writes to the kernel's page cache; a thread beside it waits for the disk.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -65,6 +65,8 @@ pub enum Notice<'a> {
     Lost(u32),
     /// The log ends before the run. Reported once; events are still reported.
     Stopped(&'a RecordError),
+    /// The log is closed, but the disk did not store all of it in this time.
+    Unsynced(Duration),
 }
 
 /// Why there is no log, or why it ended early.

@@ -28,6 +28,8 @@ pub trait Message: Field + Serialize {
     const SCHEMA: &'static str;
     /// Returns its fields, one per line.
     fn fields() -> String;
+    /// Decodes its first `count` fields; the others have their defaults.
+    fn get_first(from: &mut Decoder<'_>, count: usize) -> Result<Self, CdrError>;
 
     /// Returns the schema text: its fields, then the definitions they need, in the format of the `ros2msg` encoding.
     fn schema_text() -> String {
@@ -43,6 +45,23 @@ pub trait Message: Field + Serialize {
     /// Decodes a message.
     fn decode(bytes: &[u8]) -> Result<Self, CdrError> {
         Self::get(&mut Decoder::new(bytes)?)
+    }
+
+    /// Decodes a message of which only the first `count` fields were written.
+    fn decode_first(bytes: &[u8], count: usize) -> Result<Self, CdrError> {
+        Self::get_first(&mut Decoder::new(bytes)?, count)
+    }
+
+    /// Returns how many fields messages of the schema `text` share with this type. Versions only append fields: `None`
+    /// if the schema differs in any other way.
+    fn shared_fields(text: &str) -> Option<usize> {
+        let lines = |text: &str| {
+            let own = text.lines().take_while(|line| !line.starts_with('=')).map(str::trim);
+            own.filter(|line| !line.is_empty() && !line.starts_with('#')).map(str::to_owned).collect::<Vec<_>>()
+        };
+        let (theirs, ours) = (lines(text), lines(&Self::fields()));
+        let same = theirs.iter().zip(&ours).all(|(a, b)| a == b);
+        same.then_some(theirs.len().min(ours.len()))
     }
 }
 
@@ -131,8 +150,7 @@ macro_rules! message {
             fn get(
                 from: &mut $crate::recording::cdr::Decoder<'_>,
             ) -> Result<Self, $crate::recording::cdr::CdrError> {
-                // Fields of a struct literal are evaluated in the order written: the wire's.
-                Ok(Self { $($field: $crate::recording::wire::Field::get(from)?,)* })
+                <Self as $crate::recording::wire::Message>::get_first(from, usize::MAX)
             }
             fn define(known: &mut $crate::recording::wire::Definitions) {
                 if known.iter().all(|(name, _)| *name != Self::ROS) {
@@ -152,6 +170,19 @@ macro_rules! message {
                     text.push_str(concat!(" ", stringify!($field), "\n"));
                 )*
                 text
+            }
+            fn get_first(
+                from: &mut $crate::recording::cdr::Decoder<'_>,
+                count: usize,
+            ) -> Result<Self, $crate::recording::cdr::CdrError> {
+                let mut fields = 0..count;
+                // Fields of a struct literal are evaluated in the order written: the wire's.
+                Ok(Self {
+                    $($field: match fields.next() {
+                        Some(_) => $crate::recording::wire::Field::get(from)?,
+                        None => Default::default(),
+                    },)*
+                })
             }
         }
     };

@@ -11,6 +11,7 @@ use std::time::Duration;
 use mcap::{McapError, McapResult};
 
 use super::disk_space;
+use super::disk_sync::DiskSync;
 use super::log_writer::LogWriter;
 use super::notes::NoteReceiver;
 use super::pending_executes::{Execute, PendingExecutes};
@@ -22,6 +23,8 @@ use crate::telemetry::{Event, Outcome, Sample, TickSample};
 
 /// Period of syncing the file to disk, against a loss of power.
 const SYNC_EVERY: Duration = Duration::from_secs(1);
+/// Longest wait for the disk at the end: a run ends soon after Ctrl-C, whatever its disk does.
+const LAST_SYNC: Duration = Duration::from_secs(2);
 /// Period of checking the disk's free space and the log file.
 const WATCH_EVERY: Duration = Duration::from_millis(500);
 
@@ -29,8 +32,9 @@ const WATCH_EVERY: Duration = Duration::from_millis(500);
 pub(super) struct Worker<W: Write + Seek, F> {
     path: PathBuf,
     log: Option<LogWriter<W>>,
-    /// A second handle of the file, for syncing.
+    /// A second handle of the file, for its free space.
     disk: Option<File>,
+    sync: Option<DiskSync>,
     synced: Mono,
     min_free: u64,
     watched: Mono,
@@ -66,11 +70,14 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
             Ok(log)
         };
         let path = config.path.clone().unwrap_or_default();
+        let sync = disk.as_ref().map(|file| file.try_clone().and_then(DiskSync::start));
+        let sync = sync.transpose().map_err(RecordError::Thread)?;
         let log = sink.map(begin).transpose().map_err(|e| write_error(&path, &e))?;
         Ok(Self {
             path,
             log,
             disk,
+            sync,
             synced: Mono::ZERO,
             min_free: config.min_free,
             watched: Mono::ZERO,
@@ -152,7 +159,7 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         }
         let Some(log) = &mut self.log else { return Ok(()) };
         if log.flush_if_due(now)? && now.since(self.synced) >= SYNC_EVERY {
-            self.disk.as_ref().map_or(Ok(()), File::sync_data)?;
+            self.sync.as_ref().map_or(Ok(()), DiskSync::request)?;
             self.synced = now;
         }
         self.stats.messages.store(log.written(), Ordering::Relaxed);
@@ -220,11 +227,19 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
         }
         self.watch();
         let Some(log) = self.log.take() else { return self.ended.map_or(Ok(()), Err) };
-        let closed = log.finish().map(drop).and_then(|()| Ok(self.disk.as_ref().map_or(Ok(()), File::sync_data)?));
-        closed.map_err(|e| {
-            self.stop_log(write_error(&self.path, &e));
-            write_error(&self.path, &e)
-        })
+        let sync = self.sync.take();
+        let synced = log.finish().and_then(|_| Ok(sync.map_or(Ok(true), |sync| sync.finish(LAST_SYNC))?));
+        match synced {
+            Ok(true) => Ok(()),
+            Ok(false) => {
+                (self.on_notice)(Notice::Unsynced(LAST_SYNC));
+                Ok(())
+            }
+            Err(e) => {
+                self.stop_log(write_error(&self.path, &e));
+                Err(write_error(&self.path, &e))
+            }
+        }
     }
 }
 
@@ -285,7 +300,7 @@ mod tests {
         let on_notice = move |n: Notice<'_>| match n {
             Notice::Stopped(e) => sink.lock().unwrap().push(e.to_string()),
             Notice::Event { described, .. } => sink.lock().unwrap().push(described.kind.to_owned()),
-            Notice::Lost(_) => {}
+            Notice::Lost(_) | Notice::Unsynced(_) => {}
         };
         let stats = Arc::new(RecorderStats::default());
         let disk = Full { inner: Cursor::new(Vec::new()), room: 4000 };

@@ -3,15 +3,14 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use serde::Deserialize;
 use thiserror::Error;
 
-use crate::control::config::{ArmConfig, CoordinatorConfig};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, FIRST_CONFIG_VERSION};
 use crate::joint::MAX_DOF;
 use crate::recording::replay::{LogInfo, LogReader, ReplayError, attachment};
+use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR};
 use crate::telemetry::describe::{ArmNames, Names};
-
-/// Name of the attachment with the coordinator's configuration.
-pub const COORDINATOR: &str = "coordinator.json";
 
 /// Why a log cannot be replayed.
 #[derive(Debug, Error)]
@@ -28,8 +27,25 @@ pub enum RecordedError {
         /// The log.
         path: PathBuf,
     },
+    /// Another version of the program wrote it: the same inputs give other commands now, or its configuration has
+    /// another form.
+    #[error(
+        "the log {path} was written by {writer} with config version {found}; this program (dimos {}) verifies config \
+         version {CONFIG_VERSION}\nhint: verify it with the program that wrote it; `dimos replay` without --verify plays it",
+        crate::VERSION
+    )]
+    Version {
+        /// The log.
+        path: PathBuf,
+        /// Its config version.
+        found: u32,
+        /// The program that wrote it.
+        writer: String,
+    },
     /// Its contents are inconsistent.
-    #[error("the log {path} cannot be replayed: {what}\nhint: another version of the program may have written it")]
+    #[error(
+        "the log {path} cannot be replayed: {what}\nhint: the log was modified, or a program with other task types wrote it"
+    )]
     Unfit {
         /// The log.
         path: PathBuf,
@@ -43,6 +59,8 @@ pub enum RecordedError {
 pub struct Recorded {
     /// The log.
     pub path: PathBuf,
+    /// Config version of the program that wrote it.
+    pub version: u32,
     /// Configuration of its coordinator.
     pub config: CoordinatorConfig,
     /// Names of arms, joints and tasks, in the order of the coordinator's indices.
@@ -57,18 +75,45 @@ impl Recorded {
         let info = LogReader::open(path)?.info().clone();
         let path = path.to_owned();
         let Some(json) = attachment(&path, COORDINATOR)? else { return Err(RecordedError::NoCoordinator { path }) };
+        let version = config_version(&info.metadata, &json);
         let read = serde_json::from_slice(&json).map_err(|e| format!("{COORDINATOR}: {e}"));
         let names = read.and_then(|config| Ok((names(&config, &info.metadata)?, config)));
         match names {
-            Ok((names, config)) => Ok(Self { path, config, names, info }),
+            Ok((names, config)) => Ok(Self { path, version, config, names, info }),
+            // A newer version may have changed the form of the configuration.
+            Err(_) if version > CONFIG_VERSION => Err(version_error(path, version, &info)),
             Err(what) => Err(RecordedError::Unfit { path, what }),
         }
+    }
+
+    /// Rejects a log whose config version differs from this program's: its ticks cannot be recomputed bit for bit.
+    pub fn check_version(&self) -> Result<(), RecordedError> {
+        if self.version == CONFIG_VERSION {
+            return Ok(());
+        }
+        Err(version_error(self.path.clone(), self.version, &self.info))
     }
 
     /// Returns the names of all joints, arm by arm.
     pub fn joints(&self) -> Vec<String> {
         self.names.arms.iter().flat_map(|arm| arm.joints.clone()).collect()
     }
+}
+
+/// Returns the config version of a log: from its metadata, in earlier logs from the configuration.
+fn config_version(metadata: &BTreeMap<String, String>, json: &[u8]) -> u32 {
+    #[derive(Deserialize)]
+    struct Versioned {
+        version: Option<u32>,
+    }
+    let in_configuration = || serde_json::from_slice::<Versioned>(json).ok()?.version;
+    let version = metadata.get(CONFIG_VERSION_KEY).and_then(|version| version.parse().ok());
+    version.or_else(in_configuration).unwrap_or(FIRST_CONFIG_VERSION)
+}
+
+fn version_error(path: PathBuf, found: u32, info: &LogInfo) -> RecordedError {
+    let writer = info.metadata.get("dimos_version").map_or("another program".into(), |v| format!("dimos {v}"));
+    RecordedError::Version { path, found, writer }
 }
 
 fn names(config: &CoordinatorConfig, metadata: &BTreeMap<String, String>) -> Result<Names, String> {

@@ -11,7 +11,6 @@ use super::compare::{Comparison, Difference};
 use super::inputs::{Assembler, Topic};
 use super::recorded::{Recorded, RecordedError};
 use crate::arm::ArmState;
-use crate::control::config::CONTROL_VERSION;
 use crate::control::coordinator::Coordinator;
 use crate::control::request::Envelope;
 use crate::control::task::Task;
@@ -52,17 +51,10 @@ pub struct Verification {
     pub length: f64,
 }
 
-/// Replays a log and compares. Its tasks are of the types of `table`; a log with any other type is rejected.
+/// Replays a log and compares. Rejects a log with another config version, or with a task type that `table` lacks.
 pub fn verify(path: &Path, table: &TaskTable) -> Result<Verification, RecordedError> {
     let recorded = Recorded::open(path)?;
-    if recorded.config.version != CONTROL_VERSION {
-        let what = format!(
-            "it was recorded with control version {}, this program has version {CONTROL_VERSION}: the same \
-             inputs give other commands (verify it with the program that recorded it)",
-            recorded.config.version
-        );
-        return Err(RecordedError::Unfit { path: path.to_owned(), what });
-    }
+    recorded.check_version()?;
     let tasks = table.build(&recorded.config.tasks);
     let tasks = tasks.map_err(|what| RecordedError::Unfit { path: path.to_owned(), what })?;
     let mut records = RecordReader::open(path)?;

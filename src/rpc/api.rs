@@ -22,6 +22,7 @@ use super::planner_line::PlannerLine;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::schema::MethodSchema;
 use super::streams::Streams;
+pub use super::world_api::*;
 
 /// Longest request line, newline included [bytes].
 pub const MAX_LINE: usize = 256 * 1024;

@@ -34,6 +34,7 @@ pub mod streams;
 mod subscription;
 mod urgent;
 mod wire;
+mod world_api;
 
 pub use api::{Backend, BoxFuture, Method, Reply, Request};
 pub use error::{Code, RpcError};

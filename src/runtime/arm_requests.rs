@@ -1,4 +1,4 @@
-//! What is asked of an arm as a whole: stop, reset, enable, disable; and of its gripper.
+//! Requests to an arm as a whole: stop, reset, enable, disable, gripper.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,8 +9,8 @@ use super::dispatch::log_of;
 use super::service::{Service, internal};
 use crate::arm::Link;
 use crate::control::request::Request;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::device::{Answer, Device};
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::STANDSTILL;
 use crate::message::Message;
 use crate::rpc::api::{self, Done, Reply};
@@ -20,19 +20,19 @@ use crate::telemetry::{ArmSample, Outcome, Phase};
 
 /// Timeout for a stopped arm to decelerate to rest and confirm.
 const STOP_LIMIT: Duration = Duration::from_secs(3);
-/// What a braking arm gets beside the time that its limits need: a few ticks, and its lag.
+/// Additional time for a braking arm besides what its limits need: a few ticks, and its lag.
 const REACTION: Duration = Duration::from_millis(250);
 /// Timeout for an arm at rest until no command is sent to it.
 const SETTLING_LIMIT: Duration = Duration::from_secs(1);
-/// How long a request to disable waits at most: clients wait 10 s for an answer, and the device needs some of that.
+/// Maximum wait of a request to disable: clients wait 10 s for a reply, of which the device needs a part.
 const BRAKING_LIMIT: Duration = Duration::from_secs(7);
-/// How long an order to a device may take.
+/// Timeout for an order to a device.
 const ORDER_LIMIT: Duration = Duration::from_secs(8);
 /// Maximum number of reports until an arm reports the effect of an order.
 const REPORTS: u32 = 3;
-/// How often an enabled arm is asked for again that is not ready yet.
+/// Period of the requests to an enabled arm that is not ready yet.
 const ASK_AGAIN: Duration = Duration::from_millis(100);
-/// How long an enabled arm gets to be ready.
+/// Timeout for an enabled arm to be ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
 
 impl Service {
@@ -55,7 +55,7 @@ impl Service {
         Ok(Reply::Stop(api::StopReply { arms }))
     }
 
-    /// How far an arm's stop has come; `None`: not yet known.
+    /// Returns the progress of an arm's stop; `None`: not known yet.
     pub(super) fn confirmation(&self, arm: usize) -> Option<api::Confirmation> {
         let (view, device) = (self.arm_view(arm)?, self.parts.devices.get(arm)?);
         if view.state.link != Link::Up {
@@ -69,7 +69,7 @@ impl Service {
         if !is_asked {
             return None;
         }
-        // In this order: a stop that is sent has been confirmed before, or never is.
+        // In this order: the confirmation of a sent stop is set before.
         if health.stop_sent.load(Ordering::Acquire) != asked {
             return None;
         }
@@ -88,14 +88,14 @@ impl Service {
                 Ok(()) | Err(AdapterError::NotConnected) => {}
                 Err(e) => return Err(refused(&id, "did not clear its error", &e)),
             }
-            // The tick must see the state after the clearing, and an arm that streams its state reports it in its next
+            // The tick must read the state after the reset; an arm that streams its state sends it with the next
             // report.
             self.next_tick().await;
             self.until(self.next_report(arm), || self.seen(arm, |view| view.state.error == 0)).await;
         }
         self.ask(Request::Reset { arm }).await?;
         let mut reply = self.phase_of(id, arm);
-        // What was wrong is read once more before the arm is enabled.
+        // The state is read once more before the arm is enabled.
         reply.note = cause.map(|cause| format!("was held: {cause}"));
         Ok(Reply::ArmReset(reply))
     }
@@ -119,15 +119,15 @@ impl Service {
         let view = self.arm_view(arm as usize).ok_or_else(internal)?;
         let outcome = match view.phase {
             Phase::Ready => return Ok(Reply::ArmEnable(self.phase_of(id, arm))),
-            // A stop or a fault overtook it.
+            // A stop or a fault came first.
             Phase::Held => Outcome::ArmLatched(arm, view.cause),
             phase => Outcome::ArmNotReady(arm, phase, view.cause),
         };
         self.refusal(&outcome).map_or_else(|| Err(internal()), Err)
     }
 
-    /// Makes the arms ready that a start has enabled, and waits until they are and the others are seen; not for ever:
-    /// the banner and `status` say how far each came.
+    /// Makes the arms ready that the start has enabled, and waits for them and for the first state of the others, up to
+    /// a timeout. The banner and `status` show the result.
     pub async fn first_ready(&self) {
         let arms = || self.parts.blueprint.arms.iter().map(|arm| arm.auto_enable).enumerate();
         let settled = |(arm, enabled): (usize, bool)| match self.phase(arm) {
@@ -138,7 +138,8 @@ impl Service {
         while Instant::now() < limit {
             for (arm, _) in arms().filter(|(_, enabled)| *enabled) {
                 if !matches!(self.phase(arm), Phase::Activating | Phase::Ready | Phase::Held) {
-                    // Whether it is taken shows in the arm's phase. On a busy host its state may not be fresh just now.
+                    // The arm's phase shows whether it was accepted. On a busy host its state may be stale for a
+                    // moment.
                     let ready = Request::Ready { arm: arm as u16 };
                     let log = log_of(&ready);
                     let _ = self.parts.dispatcher.send(ready, log);
@@ -151,7 +152,7 @@ impl Service {
         }
     }
 
-    /// Switches an arm's motors off: when it is at rest, or `now`.
+    /// Disables an arm's motors: once it is at rest, or `now`.
     pub(super) async fn disable(&self, id: String, now: bool) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&id)?;
         let limit = Instant::now() + self.braking_limit(arm);
@@ -173,11 +174,11 @@ impl Service {
         Ok(Reply::ArmDisable(reply))
     }
 
-    /// Waits until an arm is at rest, or refuses when it still moves at the limit.
+    /// Waits until an arm is at rest; an error if it still moves at the timeout.
     async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
         let device = self.device(arm)?;
         let late = || Instant::now() >= limit;
-        // Without a command the arm is being stopped, or this run did not move it. The motors wait for that stop.
+        // Without a command the arm is being stopped, or this run did not move it. The motors stay on until that stop.
         let stopped = |seq| device.health().stop_sent.load(Ordering::Acquire) == seq;
         let rests = || {
             self.arm_view(arm as usize)
@@ -191,7 +192,7 @@ impl Service {
         rested.unwrap_or_else(|| Err(self.speed(arm))).map_err(|speed| still_moves(id, speed))
     }
 
-    /// Commands a gripper, and waits for what the arm answers to this order.
+    /// Commands a gripper, and waits for the arm's answer to this order.
     pub(super) async fn gripper(&self, call: api::Gripper) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         if self.arm_view(arm as usize).is_some_and(|v| v.state.gripper.is_none()) {
@@ -218,18 +219,18 @@ impl Service {
         }
     }
 
-    /// `Some`, once an arm is seen in a condition.
+    /// Returns `Some` once an arm is in a condition.
     fn seen(&self, arm: u16, is: impl Fn(&ArmSample) -> bool) -> Option<()> {
         self.arm_view(arm as usize).is_some_and(|view| is(&view)).then_some(())
     }
 
-    /// When an arm has reported again, if it reports as often as it should.
+    /// Returns the time by which an arm must have reported again.
     fn next_report(&self, arm: u16) -> Instant {
         let own = self.parts.config.arms.get(arm as usize).map(|arm| arm.read_period);
         Instant::now() + REPORTS * own.unwrap_or_default().max(self.period())
     }
 
-    /// How long an arm gets to brake: twice as long as its fastest joint needs at its limit of acceleration.
+    /// Returns the time for an arm to brake: twice what its fastest joint needs at its acceleration limit.
     fn braking_limit(&self, arm: u16) -> Duration {
         let config = self.parts.config.arms.get(arm as usize);
         let view = self.arm_view(arm as usize);
@@ -238,19 +239,19 @@ impl Service {
         });
         let fastest = joints.max_by(|a, b| a.0.abs().total_cmp(&b.0.abs()));
         let braking = fastest.map_or(0.0, |(velocity, acceleration)| 2.0 * velocity.abs() / acceleration);
-        // What the ticks and the arm's lag add; and the client is to hear of it while it waits.
+        // Plus ticks and lag, but less than the client waits for its reply.
         let braking = Duration::try_from_secs_f64(braking).unwrap_or(BRAKING_LIMIT);
         (braking + REACTION).min(BRAKING_LIMIT)
     }
 
-    /// Velocity of an arm's fastest joint [rad/s]; zero where the arm cannot be seen.
+    /// Returns the velocity of an arm's fastest joint [rad/s]; 0 without a state.
     fn speed(&self, arm: u16) -> f64 {
         let view = self.arm_view(arm as usize).filter(|view| view.state.link == Link::Up);
         let joints = view.iter().flat_map(|view| view.state.velocity.iter().take(view.state.dof));
         joints.map(|v| v.abs()).fold(0.0, f64::max)
     }
 
-    /// An arm's phase after the tick that was seen last.
+    /// Returns an arm's phase after the latest tick.
     fn phase_of(&self, arm: String, index: u16) -> api::ArmReply {
         api::ArmReply { arm, phase: self.phase(index as usize).name().to_owned(), note: None }
     }
@@ -269,7 +270,7 @@ fn still_moves(arm: &str, speed: f64) -> RpcError {
         .data(serde_json::json!({"arm": arm, "speed": speed}))
 }
 
-/// Waits for a device without holding up the others who talk to the run.
+/// Waits for a device without blocking other clients of the run.
 async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
     let waited = tokio::task::spawn_blocking(move || answer.wait(ORDER_LIMIT)).await;
     waited.unwrap_or_else(|e| Err(AdapterError::Io(e.to_string())))

@@ -8,27 +8,27 @@ use super::device_lock::{self, DeviceLock};
 use crate::arm::{ArmCommand, ArmState};
 use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
 use crate::clock::MonotonicClock;
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place, SIM};
-use crate::hardware::spec::AdapterError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, SIM};
 use crate::joint::JointLimits;
 use crate::message::Message;
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
 
-/// An adapter must know within this time whether its device answers; a little is added for the machine.
+/// Timeout for an adapter to connect, with some margin for this computer.
 const CONNECT_LIMIT: Duration = Duration::from_millis(3_500);
-/// How long an arm gets to enable.
+/// Timeout for enabling an arm.
 const ENABLE_LIMIT: Duration = Duration::from_secs(10);
-/// How long all arms together get to be released.
+/// Timeout for releasing all arms.
 const RELEASE_LIMIT: Duration = Duration::from_secs(2);
 
-/// The arms of a run. Dropped, they are released.
+/// The arms of a run. Released when dropped.
 pub struct Arms {
     /// Their device threads, in the blueprint's order.
     pub devices: Vec<Arc<Device>>,
     disable: Vec<bool>,
-    // Emulators end after the threads that talk to them, locks last.
+    // Dropped after the device threads; the locks last.
     _emulators: Vec<Box<dyn Emulator>>,
     _locks: Vec<DeviceLock>,
 }
@@ -36,23 +36,23 @@ pub struct Arms {
 /// The tick's ends of the slots.
 #[derive(Default)]
 pub struct Slots {
-    /// States in.
+    /// States.
     pub states: Vec<SlotReader<ArmState>>,
-    /// Commands out.
+    /// Commands.
     pub commands: Vec<SlotWriter<ArmCommand>>,
 }
 
-/// What came of connecting.
+/// Result of connecting.
 pub struct BroughtUp {
     /// The arms.
     pub arms: Arms,
     /// The tick's ends of the slots.
     pub slots: Slots,
-    /// What each arm said of itself, and its effective limits.
+    /// Information that each arm reported, and its effective limits.
     pub connected: Vec<(Connected, JointLimits)>,
 }
 
-/// Connects all arms at once, or none: on the first that fails, all others are let go again.
+/// Connects all arms in parallel. If one fails, the others are released again.
 pub fn bring_up(
     blueprint: &Blueprint,
     beat: &Arc<Heartbeat>,
@@ -96,7 +96,7 @@ pub fn bring_up(
         match brought {
             Ok(pair) => {
                 if let Some(device) = arms.devices.get(connected.len()) {
-                    // Taken before any command: the thread handles its orders in turn.
+                    // Handled before any command: the thread takes its orders in turn.
                     drop(device.set_limits(pair.1.clone()));
                 }
                 connected.push(pair);
@@ -107,7 +107,7 @@ pub fn bring_up(
     Ok(BroughtUp { arms, slots, connected })
 }
 
-/// Locks the device or starts its emulator; answers what the adapter is made from.
+/// Locks the device or starts its emulator. Returns the adapter's configuration.
 fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     let mut config = AdapterConfig {
         hardware_id: arm.hardware_id.clone(),
@@ -117,13 +117,13 @@ fn configure(arm: &Arm, arms: &mut Arms) -> Result<AdapterConfig, StartError> {
     };
     match arm.adapter.emulate {
         Some(emulate) if arm.address == SIM => {
-            let emulator = emulate(&config, &Place::InProcess).map_err(|e| unfit(arm, &e))?;
+            let emulator = emulate(&config, &EmulatorAddress::InProcess).map_err(|e| unfit(arm, &e))?;
             config.address = emulator.address();
             arms._emulators.push(emulator);
         }
         _ if arm.address.is_empty() || arm.address == SIM => {}
         _ => {
-            // The blueprint was checked; an address that is not in full is as good as it gets.
+            // The blueprint was checked: an address that cannot be completed stays as it is.
             let address = (arm.adapter.address.check)(&arm.address).unwrap_or_else(|_| arm.address.clone());
             let lock = device_lock::take(&arm.adapter_type, &address).map_err(|e| StartError::Hardware {
                 arm: arm.hardware_id.clone(),
@@ -157,7 +157,7 @@ fn hardware(arm: &Arm, error: &AdapterError) -> StartError {
     StartError::Hardware { arm: id.clone(), what, hint }
 }
 
-/// The arm's own limits, narrowed by the blueprint, with defaults where neither says anything.
+/// Returns the arm's own limits, narrowed by the blueprint, with defaults for missing ones.
 fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartError> {
     let mut limits = own.clone().with_defaults();
     let narrow = |list: &mut Vec<f64>, j: usize, value: Option<f64>, higher: bool| {
@@ -202,7 +202,7 @@ fn effective_limits(arm: &Arm, own: &JointLimits) -> Result<JointLimits, StartEr
 }
 
 impl Arms {
-    /// Enables the given arms, all at once; answers the first that could not be.
+    /// Enables the given arms in parallel. Returns the first error.
     pub fn enable(&self, blueprint: &Blueprint, which: impl Iterator<Item = usize>) -> Result<(), StartError> {
         let answers: Vec<_> = which.filter_map(|i| Some((i, self.devices.get(i)?.activate()))).collect();
         for (i, answer) in answers {
@@ -218,7 +218,7 @@ impl Arms {
         Ok(())
     }
 
-    /// Ends commanded motion, disables what is to be disabled at exit, disconnects. Answers what went wrong.
+    /// Ends commanded motion, disables arms with `on_exit: disable`, disconnects. Returns the problems.
     pub fn release(&mut self) -> Vec<String> {
         let answers: Vec<_> = self.devices.iter().zip(&self.disable).map(|(d, disable)| d.finish(*disable)).collect();
         let limit = Instant::now() + RELEASE_LIMIT;

@@ -1,5 +1,5 @@
-//! A planner in its own process, attached to a run: it registers over the run's socket, answers what the run asks,
-//! and when the run goes away it tries again until it is back.
+//! A planner in its own process, attached to a run: registers over the run's socket, answers the run's requests, and
+//! reconnects when the run is back.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -18,21 +18,21 @@ use crate::planning::planning_scene::PlanningScene;
 use crate::rpc::api::{RegisterPlanner, RegisteredRobot};
 use crate::rpc::planner_end::{NoLine, PlannerEnd};
 
-/// First pause before a run that is gone is tried again; each is twice as long as the one before.
+/// First pause before a reconnect; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(200);
-/// The longest pause.
+/// Longest pause.
 const LONGEST_PAUSE: Duration = Duration::from_secs(3);
 
-/// What becomes of the line to the run.
+/// Change of the connection to the run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Turn {
-    /// The run is back, and the planner attached to it again.
+    /// The run is back, and the planner is attached again.
     Back,
-    /// The run is gone, or refuses the planner since it is back: why. The planner keeps trying.
+    /// The run is gone, or rejects the planner, for this reason. The planner keeps trying.
     Fault(String),
 }
 
-/// A planner that is attached. Ends when it is dropped.
+/// An attached planner. Shuts down when dropped.
 pub struct AttachedPlanner {
     robots: Vec<RegisteredRobot>,
     stop: Option<oneshot::Sender<()>>,
@@ -40,8 +40,8 @@ pub struct AttachedPlanner {
 }
 
 impl AttachedPlanner {
-    /// Reads the robots' descriptions and attaches to the run of that socket, as `name`. `report` receives its
-    /// later changes of state, on a thread of the planner.
+    /// Reads the robots' descriptions and attaches to the run at this socket, as `name`. `report` receives later
+    /// changes of the connection, on a thread of the planner.
     pub fn start(
         name: &str,
         config: &PlannerConfig,
@@ -63,7 +63,7 @@ impl AttachedPlanner {
                     _ = stopped => {}
                 }
             });
-            // A large file that is still being read delays no shutdown.
+            // Reading a large file does not delay the shutdown.
             runtime.shutdown_background();
         });
         let thread = thread.map_err(|e| StartError::other(e, "see ulimit -u"))?;
@@ -74,7 +74,7 @@ impl AttachedPlanner {
         }
     }
 
-    /// The robots that it plans for.
+    /// Returns the robots that it plans for.
     pub fn robots(&self) -> &[RegisteredRobot] {
         &self.robots
     }
@@ -98,13 +98,14 @@ struct Process {
 }
 
 impl Process {
-    /// Attaches, says so, and answers for as long as it is let.
+    /// Attaches, reports it, and answers requests until the connection ends.
     async fn live(self, setup: PlanningScene, ready: &Sender<Result<(), StartError>>, mut report: impl FnMut(Turn)) {
         let begun = async {
             let end = PlannerEnd::register(&self.socket, &self.registration).await.map_err(refused)?;
             let limits = &end.registered.limits;
             let port = PlannerPort::start(&self.config, setup, limits, None).map_err(|what| {
-                let hint = "the model's limits and the run's must have room in common: is it the model of this arm?";
+                let hint =
+                    "the limits of the model and of the run must overlap; check that the model belongs to this arm";
                 StartError::other(what, hint)
             })?;
             Ok((end, Arc::new(port)))
@@ -122,11 +123,11 @@ impl Process {
                 async move { answer_travelling(&port, asked).await }
             });
             let lost = lost.await;
-            // Its numbers mean nothing to the run that comes next.
-            port.desk.forget();
+            // Numbers of plans are not valid in the next run.
+            port.thread.forget();
             report(Turn::Fault(format!("the run is gone ({lost})")));
             end = self.again(&limits, &mut report).await;
-            port.desk.forget();
+            port.thread.forget();
             report(Turn::Back);
         }
     }

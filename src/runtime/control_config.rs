@@ -1,14 +1,14 @@
-//! What the coordinator and the log are made from: names and limits of a blueprint, and what its arms said.
+//! The coordinator's configuration: names and limits of a blueprint, and what its arms report.
 
 use crate::blueprint::Blueprint;
-use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::task::Task;
 use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::device;
 use crate::joint::{JointLimits, MAX_DOF};
 use crate::telemetry::describe::{ArmNames, Names};
 
-/// Names of arms, joints and tasks, in the order of their indices.
+/// Returns the names of arms, joints and tasks, in the order of their indices.
 pub(super) fn names_of(blueprint: &Blueprint) -> Names {
     Names {
         arms: blueprint
@@ -39,7 +39,7 @@ pub(super) fn tasks(blueprint: &Blueprint) -> Result<(Vec<TaskConfig>, Vec<Task>
     Ok((configs, tasks))
 }
 
-/// Arms with their effective limits, and tasks.
+/// Returns the configuration of arms with their effective limits, and of tasks.
 pub(super) fn coordinator_config(
     blueprint: &Blueprint,
     connected: &[(device::Connected, JointLimits)],
@@ -47,7 +47,7 @@ pub(super) fn coordinator_config(
 ) -> CoordinatorConfig {
     let arms = blueprint.arms.iter().zip(connected);
     CoordinatorConfig {
-        version: CONTROL_VERSION,
+        version: CONFIG_VERSION,
         rate: blueprint.coordinator.tick_rate,
         arms: arms
             .map(|(arm, (said, limits))| ArmConfig {

@@ -1,5 +1,5 @@
-//! One program per device: a name in the kernel for each address that the device's own resolves to, taken before a byte
-//! is sent. It belongs to the machine, not to a user or a folder, and dies with the process.
+//! One program per device: an abstract socket name for each address that the device's address resolves to, bound before
+//! a byte is sent. It is valid for all users of this computer, and ends with the process.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -8,23 +8,26 @@ use std::os::fd::AsFd;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::sync::mpsc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, connect, socket_with, sockopt};
 
 /// Longest name of a socket in the kernel, without its leading zero [bytes].
 const MAX_NAME: usize = 107;
-/// How long the look-up of a host may take.
+/// Timeout for the lookup of a host name.
 const LOOK_UP_LIMIT: Duration = Duration::from_secs(3);
+/// How long a process that takes a name may need from binding its socket to listening.
+const HOLDER_LIMIT: Duration = Duration::from_millis(500);
 
 /// A lock on devices, held for the lifetime of this value.
 #[derive(Debug)]
 pub struct DeviceLock(#[expect(dead_code, reason = "the names are ours while the sockets are open")] Vec<UnixListener>);
 
-/// Why a device is not ours.
+/// Why a device cannot be locked.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceTaken {
-    /// Another process has it.
+    /// Another process holds it.
     #[error("{adapter} at {address} is in use by process {pid}")]
     By {
         /// The adapter.
@@ -34,54 +37,77 @@ pub enum DeviceTaken {
         /// The process.
         pid: String,
     },
-    /// The name cannot be taken.
+    /// The name cannot be bound.
     #[error("cannot lock {adapter} at {address}: {error}")]
     Io {
         /// The adapter.
         adapter: String,
         /// The device's address.
         address: String,
-        /// Why.
+        /// The error.
         error: io::Error,
     },
 }
 
-/// Takes the device at an address, which is given in full, or says who has it. Looks names of hosts up.
+/// Locks the device at a complete address; the error names the process that holds it. Resolves host names.
 pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
     let names = places(address).into_iter().map(|place| name(adapter, &place));
     let mut taken = Vec::new();
     for name in names {
-        let bound = SocketAddr::from_abstract_name(&name).and_then(|at| UnixListener::bind_addr(&at));
         let (adapter, address) = (adapter.to_owned(), address.to_owned());
-        taken.push(bound.map_err(|error| match error.kind() {
-            io::ErrorKind::AddrInUse => {
-                let pid = holder(&name).map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
+        taken.push(take_name(&name).map_err(|refused| match refused {
+            Refused::Taken(pid) => {
+                let pid = pid.map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
                 DeviceTaken::By { adapter, address, pid }
             }
-            _ => DeviceTaken::Io { adapter, address, error },
+            Refused::Io(error) => DeviceTaken::Io { adapter, address, error },
         })?);
     }
     Ok(DeviceLock(taken))
 }
 
-/// Returns the pid that holds the name, taken from the socket's peer credentials. Never blocks.
-fn holder(name: &str) -> Option<i32> {
-    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
-    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).ok()?;
-    connect(socket.as_fd(), &SocketAddrUnix::new_abstract_name(name.as_bytes()).ok()?).ok()?;
-    Some(sockopt::socket_peercred(&socket).ok()?.pid.as_raw_nonzero().get())
+/// Why a name cannot be taken.
+enum Refused {
+    /// A process has it; its pid where the kernel knows it.
+    Taken(Option<i32>),
+    /// The kernel refused.
+    Io(io::Error),
 }
 
-/// Where a device is, the same for every spelling of its address: the addresses that its host resolves to, each with
-/// the first port; the device file behind a link. At least one.
+/// Takes the name, or returns who has it.
+fn take_name(name: &str) -> Result<UnixListener, Refused> {
+    let at = SocketAddr::from_abstract_name(name).map_err(Refused::Io)?;
+    let deadline = Instant::now() + HOLDER_LIMIT;
+    loop {
+        match UnixListener::bind_addr(&at) {
+            Err(error) if error.kind() == io::ErrorKind::AddrInUse => match holder(name) {
+                // The holder has bound its socket and does not listen yet, or has just ended: the next try shows which.
+                Err(Errno::CONNREFUSED) if Instant::now() < deadline => std::thread::sleep(Duration::from_millis(1)),
+                pid => return Err(Refused::Taken(pid.ok())),
+            },
+            bound => return bound.map_err(Refused::Io),
+        }
+    }
+}
+
+/// Returns the pid that holds the name, taken from the socket's peer credentials. Never blocks.
+fn holder(name: &str) -> Result<i32, Errno> {
+    let flags = SocketFlags::NONBLOCK | SocketFlags::CLOEXEC;
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    connect(socket.as_fd(), &SocketAddrUnix::new_abstract_name(name.as_bytes())?)?;
+    Ok(sockopt::socket_peercred(&socket)?.pid.as_raw_nonzero().get())
+}
+
+/// Returns canonical addresses of a device, the same for every spelling: the addresses of its host, each with the first
+/// port, or the device file behind a link. At least one.
 fn places(address: &str) -> BTreeSet<String> {
     let text = address.trim();
     if text.starts_with("memory:") {
-        // A bus in memory belongs to one process: others have their own of the same number.
+        // A bus in memory belongs to its process: others have their own with the same number.
         return BTreeSet::from([format!("{text} of process {}", std::process::id())]);
     }
     if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
-        // The part after an `@` is how to talk to it.
+        // The part after an `@` is the bit rate.
         let path = path.split_once('@').map_or(path, |(path, _)| path);
         let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
         return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), real.display())]);
@@ -101,7 +127,7 @@ fn places(address: &str) -> BTreeSet<String> {
     ips.into_iter().map(|ip| SocketIp::new(canonical(ip), port).to_string()).collect()
 }
 
-/// The host and the first port of `HOST:PORT` or `[HOST]:PORT`; what follows are more ports of the same device.
+/// Returns host and first port of `HOST:PORT` or `[HOST]:PORT`; further ports belong to the same device.
 fn host_and_port(text: &str) -> Option<(&str, u16)> {
     let (host, ports) = match text.strip_prefix('[') {
         Some(rest) => rest.split_once("]:")?,
@@ -111,7 +137,7 @@ fn host_and_port(text: &str) -> Option<(&str, u16)> {
     Some((host, port))
 }
 
-/// One spelling of an address: IPv4 where it is one in other clothes, the loopback for "this host".
+/// Returns the canonical form of an address: IPv4 for IPv4-mapped ones, the loopback address for "this host".
 fn canonical(ip: IpAddr) -> IpAddr {
     match ip.to_canonical() {
         IpAddr::V4(v4) if v4.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
@@ -120,9 +146,9 @@ fn canonical(ip: IpAddr) -> IpAddr {
     }
 }
 
-/// All addresses of a host name; none where it is not known in time.
+/// Returns all addresses of a host name; none if it is unknown or the lookup times out.
 fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
-    // The system's resolver has no deadline, so it runs on its own thread, which is abandoned when it is late.
+    // The system's resolver has no deadline, so it runs on its own thread, which is abandoned at the timeout.
     let (sender, found) = mpsc::channel();
     let target = (host.to_owned(), port);
     let asked = std::thread::Builder::new().name("resolve".into()).spawn(move || {
@@ -132,10 +158,10 @@ fn look_up(host: &str, port: u16) -> Vec<IpAddr> {
     asked.ok().and_then(|_| found.recv_timeout(LOOK_UP_LIMIT).ok()).unwrap_or_default()
 }
 
-/// The name in the kernel.
+/// Returns the socket name.
 fn name(adapter: &str, place: &str) -> String {
     let name = format!("dimos/device/{adapter}/{place}");
-    // Hosts may have names longer than that; they differ at their beginning, ports at their end.
+    // Longer names are cut in the middle: hosts differ at the beginning, ports at the end.
     match name.char_indices().nth(MAX_NAME / 2) {
         Some((half, _)) if name.len() > MAX_NAME => {
             let tail = name.char_indices().rev().nth(MAX_NAME / 4).map_or(half, |(at, _)| at);
@@ -163,6 +189,22 @@ mod tests {
         assert!(take("other", &at("127.0.0.1")).is_ok());
         drop(held);
         assert!(take("test", &at("127.0.0.1")).is_ok());
+    }
+
+    #[test]
+    fn a_holder_that_does_not_listen_yet_is_named() {
+        let (port, name) = (std::process::id(), name("starting", &format!("127.0.0.1:{}", std::process::id())));
+        let flags = SocketFlags::CLOEXEC;
+        let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None).unwrap();
+        rustix::net::bind(&socket, &SocketAddrUnix::new_abstract_name(name.as_bytes()).unwrap()).unwrap();
+        let late = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(50));
+            rustix::net::listen(&socket, 8).map(|()| socket).unwrap()
+        });
+        let refused = take("starting", &format!("127.0.0.1:{port}")).unwrap_err().to_string();
+        assert!(refused.contains(&format!("in use by process {port}")), "{refused}");
+        drop(late.join().unwrap());
+        assert!(take("starting", &format!("127.0.0.1:{port}")).is_ok(), "the holder has ended");
     }
 
     #[test]

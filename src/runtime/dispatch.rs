@@ -1,5 +1,5 @@
-//! The way into the tick and out of it, for everyone else: requests go into its ring and are logged, outcomes come
-//! back, finished motions are freed, the joint state is published.
+//! Sends requests to the tick and receives their outcomes: requests are put into its ring and logged; the outcome
+//! thread delivers outcomes, frees finished motions and publishes the joint state.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -20,13 +20,13 @@ use crate::telemetry::Outcome;
 use crate::telemetry::describe::Severity;
 use crate::trajectory::JointTrajectory;
 
-/// Room for requests on their way to the tick.
+/// Capacity of the ring of requests.
 pub const REQUEST_RING: usize = 256;
-/// Part of it that is kept for what ends motion, however much else is asked.
+/// Part of it that is reserved for requests that end motion.
 const RESERVED: usize = 32;
-/// How long the tick gets to answer.
+/// Timeout for an outcome.
 const ANSWER_LIMIT: Duration = Duration::from_secs(3);
-/// How often finished motions are looked for when nothing else happens.
+/// Maximum time between two checks for finished motions.
 const SWEEP: Duration = Duration::from_millis(100);
 
 /// Sends requests to the tick. Never used by a real-time thread.
@@ -39,7 +39,7 @@ pub struct Dispatcher {
 
 /// Why a request got no outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum NotTold {
+pub enum SendError {
     /// Too many requests are waiting.
     #[error("too many requests at once")]
     Full,
@@ -49,18 +49,18 @@ pub enum NotTold {
 }
 
 impl Dispatcher {
-    /// A dispatcher in front of a ring.
+    /// Creates a dispatcher for a ring.
     pub fn new(requests: rtrb::Producer<Envelope>, notes: Notes) -> Self {
         Self { requests: Mutex::new(requests), waiting: Mutex::default(), next_id: AtomicU64::new(1), notes }
     }
 
-    /// A number for a motion or a request, given once.
-    pub fn number(&self) -> u64 {
+    /// Returns a unique number for a motion or a request.
+    pub fn next_id(&self) -> u64 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
     /// Sends a request; the answer comes with the tick that handles it. `log` is its log entry.
-    pub fn send(&self, request: Request, log: Value) -> Result<oneshot::Receiver<Outcome>, NotTold> {
+    pub fn send(&self, request: Request, log: Value) -> Result<oneshot::Receiver<Outcome>, SendError> {
         self.push(request, |id, stamp| Note::Request { id, stamp, json: log.to_string() })
     }
 
@@ -70,7 +70,7 @@ impl Dispatcher {
         task: u16,
         motion: Box<Motion>,
         trajectory: Arc<JointTrajectory>,
-    ) -> Result<Outcome, NotTold> {
+    ) -> Result<Outcome, SendError> {
         let number = motion.id;
         let note = |id, stamp| Note::Execute { id, stamp, task, motion: number, trajectory };
         answer(self.push(Request::Execute { task, motion }, note)?).await
@@ -80,28 +80,28 @@ impl Dispatcher {
         &self,
         request: Request,
         note: impl FnOnce(u64, Mono) -> Note,
-    ) -> Result<oneshot::Receiver<Outcome>, NotTold> {
+    ) -> Result<oneshot::Receiver<Outcome>, SendError> {
         let ends_motion = matches!(request, Request::Stop { .. } | Request::Cancel { .. } | Request::Shutdown);
-        let id = self.number();
+        let id = self.next_id();
         let (sender, receiver) = oneshot::channel();
         // Made before the lock: a stop never waits for the text of another request.
         let note = note(id, MonotonicClock.now());
         let mut ring = lock(&self.requests);
         if ring.slots() <= if ends_motion { 0 } else { RESERVED } {
-            return Err(NotTold::Full);
+            return Err(SendError::Full);
         }
         lock(&self.waiting).insert(id, sender);
-        // The recorder counts what it has no room for; only a run that is ending has no recorder.
+        // The recorder counts notes that do not fit; without a recorder the run is shutting down.
         let _ = self.notes.send(note);
         if ring.push(Envelope { id, request }).is_err() {
             lock(&self.waiting).remove(&id);
-            return Err(NotTold::Full);
+            return Err(SendError::Full);
         }
         Ok(receiver)
     }
 
     /// Sends a request and waits for its outcome.
-    pub async fn ask(&self, request: Request, log: Value) -> Result<Outcome, NotTold> {
+    pub async fn ask(&self, request: Request, log: Value) -> Result<Outcome, SendError> {
         answer(self.send(request, log)?).await
     }
 
@@ -112,16 +112,16 @@ impl Dispatcher {
 
     fn answered(&self, id: u64, outcome: Outcome) {
         if let Some(sender) = lock(&self.waiting).remove(&id) {
-            // The client may have gone.
+            // The client may have disconnected.
             let _ = sender.send(outcome);
         }
     }
 }
 
-async fn answer(answer: oneshot::Receiver<Outcome>) -> Result<Outcome, NotTold> {
+async fn answer(answer: oneshot::Receiver<Outcome>) -> Result<Outcome, SendError> {
     match tokio::time::timeout(ANSWER_LIMIT, answer).await {
         Ok(Ok(outcome)) => Ok(outcome),
-        _ => Err(NotTold::NoAnswer),
+        _ => Err(SendError::NoAnswer),
     }
 }
 
@@ -147,15 +147,16 @@ pub fn log_of(request: &Request) -> Value {
     }
 }
 
-/// The thread behind the dispatcher. Ends when it is dropped.
-pub struct Courier {
+/// The thread that receives outcomes. Ends when dropped.
+pub struct OutcomeThread {
     stop: Arc<AtomicBool>,
     wake: Wake,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Courier {
-    /// Starts the thread `courier`. `publish` is called after every tick that woke it (`true`), and now and then.
+impl OutcomeThread {
+    /// Starts the thread `outcomes`. `publish` is called after every wake-up by a tick (`true`), and at least every 100
+    /// ms.
     pub fn start(
         dispatcher: Arc<Dispatcher>,
         wake: Wake,
@@ -165,8 +166,8 @@ impl Courier {
     ) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopping, waiting) = (stop.clone(), wake.clone());
-        let thread = std::thread::Builder::new().name("courier".into()).spawn(move || {
-            // It confirms operators' stops; without this right it competes like any other thread.
+        let thread = std::thread::Builder::new().name("outcomes".into()).spawn(move || {
+            // It confirms operators' stops. Without this right it has normal priority.
             let _ = host::set_fifo(host::STOP_PRIORITY);
             while !stopping.load(Ordering::Acquire) {
                 let woken = waiting.wait(SWEEP);
@@ -181,7 +182,7 @@ impl Courier {
     }
 }
 
-impl Drop for Courier {
+impl Drop for OutcomeThread {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
         self.wake.raise();

@@ -1,4 +1,4 @@
-//! A run as the program that started it sees it: what can be asked over rpc, as methods that wait for the answer.
+//! Handle of a run for the program that started it: the rpc methods as blocking calls.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,52 +15,52 @@ use crate::rpc::{Code, RpcError};
 /// Poll period while waiting for a motion.
 const INTERVAL: Duration = Duration::from_millis(10);
 
-/// A way to talk to a run of this process. Clones talk to the same run, from any thread.
+/// Handle of a run in this process. Clones refer to the same run, from any thread.
 ///
-/// Units are SI: rad, rad/s, m, s. A refusal has a [`Code`] for programs, a sentence, and a hint for people; when the
-/// run has ended everything but `status` and `state` is refused with [`Code::ShuttingDown`]. Methods wait for their
-/// answer, so they belong on threads of one's own and not in async code, which they would hold up.
+/// Units are SI: rad, rad/s, m, s. An error has a [`Code`] for programs, a sentence, and a hint. After the end of the
+/// run all methods except `status` and `state` return [`Code::ShuttingDown`]. Methods block until their reply: do not
+/// call them in async code.
 #[derive(Clone)]
 pub struct Handle {
     pub(super) service: Arc<Service>,
 }
 
 impl Handle {
-    /// The run's name.
+    /// Returns the run's name.
     pub fn name(&self) -> &str {
         &self.service.parts.run
     }
 
-    /// Everything about the run: arms, tasks, timing, recorder.
+    /// Returns the status of arms, tasks, timing and recorder.
     pub fn status(&self) -> StatusReport {
         self.service.status()
     }
 
-    /// The latest joint states and commands.
+    /// Returns the latest joint states and commands.
     pub fn state(&self) -> StateReport {
         self.service.state()
     }
 
-    /// Moves an arm from where it is to joint positions [rad], directly: not collision-checked. `speed` is a fraction
-    /// of the velocity and acceleration limits, 0.1–1. Returns when the motion begins; [`wait`](Self::wait) waits for
-    /// its end. Refused where a limit is in the way, the arm is not ready, or its task is executing already.
+    /// Moves an arm from its present position to joint positions [rad], directly: not collision-checked. `speed` is a
+    /// fraction of the velocity and acceleration limits, 0.1–1. Returns when the motion begins; [`wait`](Self::wait)
+    /// waits for its end. An error if a limit is exceeded, the arm is not ready, or its task is executing already.
     pub fn move_arm(&self, arm: &str, target: &[f64], speed: f64) -> Result<MoveReply, RpcError> {
         self.call(Move { arm: arm.to_owned(), target: target.to_vec(), speed })
     }
 
-    /// Follows a trajectory, by the task whose joints cover it. Returns when the motion begins. Refused where it does
-    /// not start where the arm is, or breaks a limit.
+    /// Executes a trajectory with the task that covers its joints. Returns when the motion begins. An error if it does
+    /// not start at the arm's position, or exceeds a limit.
     pub fn execute(&self, trajectory: Trajectory) -> Result<ExecuteReply, RpcError> {
         self.call(Execute { trajectory, task: None })
     }
 
-    /// How a motion goes, or how it ended.
+    /// Returns the progress of a motion, or how it ended.
     pub fn motion(&self, motion: u64) -> Result<MotionReport, RpcError> {
         self.service.motion(motion)
     }
 
-    /// Waits for the end of a motion. Its `state` is `COMPLETED` when the arm has arrived; else `error` says why not.
-    /// After replanning around an obstacle: the report of the motion that continued.
+    /// Waits for the end of a motion. Its `state` is `COMPLETED` if the arm arrived, otherwise `error` has the reason.
+    /// After replanning around an obstacle, returns the report of the motion that continued.
     pub fn wait(&self, motion: u64) -> Result<MotionReport, RpcError> {
         let mut motion = motion;
         loop {
@@ -77,33 +77,33 @@ impl Handle {
         }
     }
 
-    /// Ends all motions by decelerating within limits.
+    /// Cancels all motions: decelerates within limits.
     pub fn cancel(&self) -> Result<CancelReply, RpcError> {
         self.call(Cancel::default())
     }
 
     /// Holds all arms at once, latched: tasks are cancelled, and nothing moves an arm until it is reset and enabled.
-    /// An operational stop, no safety function.
+    /// An operational stop, not a safety function.
     pub fn stop_arms(&self) -> Result<StopReply, RpcError> {
         self.call(Stop { arm: None })
     }
 
-    /// The same for one arm.
+    /// Holds one arm at once, latched.
     pub fn stop_arm(&self, arm: &str) -> Result<StopReply, RpcError> {
         self.call(Stop { arm: Some(arm.to_owned()) })
     }
 
-    /// Clears a latched hold or a fault of an arm. Moves nothing, enables nothing. Refused while the cause is present.
+    /// Clears a latched hold or a fault of an arm. Moves and enables nothing. An error while the cause persists.
     pub fn reset(&self, arm: &str) -> Result<ArmReply, RpcError> {
         self.call(ArmReset { arm: arm.to_owned() })
     }
 
-    /// Enables an arm's motors and makes it ready for motion, where it is.
+    /// Enables an arm's motors and makes it ready for motion, without moving it.
     pub fn enable(&self, arm: &str) -> Result<ArmReply, RpcError> {
         self.call(ArmEnable { arm: arm.to_owned() })
     }
 
-    /// Brings an arm to rest and disables its motors; refused while it still moves. An arm without brakes falls.
+    /// Decelerates an arm to rest and disables its motors; an error if it still moves. An arm without brakes drops.
     pub fn disable(&self, arm: &str) -> Result<ArmReply, RpcError> {
         self.call(ArmDisable { arm: arm.to_owned(), now: false })
     }
@@ -118,23 +118,25 @@ impl Handle {
         self.call(Gripper { arm: arm.to_owned(), position }).map(drop)
     }
 
-    /// The next target of a servo task [rad], one value per joint of the task; to be repeated within its timeout.
+    /// Sends the next target of a servo task [rad], one value per joint of the task; repeat it within the task's
+    /// timeout.
     pub fn servo(&self, task: &str, positions: &[f64]) -> Result<(), RpcError> {
         self.call(Servo { task: task.to_owned(), positions: positions.to_vec() }).map(drop)
     }
 
-    /// The next target of a velocity task [rad/s], one value per joint of the task; to be repeated within its timeout.
+    /// Sends the next target of a velocity task [rad/s], one value per joint of the task; repeat it within the task's
+    /// timeout.
     pub fn velocity(&self, task: &str, velocities: &[f64]) -> Result<(), RpcError> {
         self.call(Velocity { task: task.to_owned(), velocities: velocities.to_vec() }).map(drop)
     }
 
-    /// Any method of [`api`](crate::rpc::api), checked and answered as over the socket.
+    /// Calls any method of [`api`](crate::rpc::api), with the checks of the socket.
     pub fn call<M: Method>(&self, params: M) -> Result<M::Reply, RpcError> {
         let answers = self.call_together(std::slice::from_ref(&params));
         answers.into_iter().next().unwrap_or_else(|| Err(in_process::defect("no answer")))
     }
 
-    /// Asks several things at once: they reach the tick together, but for a tick now and then.
+    /// Calls a method several times at once: the requests usually reach the same tick.
     pub fn call_together<M: Method>(&self, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
         in_process::call(&self.service, requests)
     }

@@ -1,5 +1,4 @@
-//! What rpc offers, for the program that holds the run: the same requests and answers, without a socket and without
-//! JSON.
+//! Rpc calls within the program that holds the run: the same requests and replies, without socket and JSON.
 
 use std::future::poll_fn;
 use std::sync::{Arc, LazyLock};
@@ -12,11 +11,11 @@ use crate::rpc::api::{Backend, METHODS, Method, Reply, Request};
 use crate::rpc::server::CALL_LIMIT;
 use crate::rpc::{Code, RpcError};
 
-/// What all calls of this process wait with. It has no threads: each call runs on the thread that makes it.
+/// The runtime of all calls in this process. It has no threads: each call runs on the calling thread.
 static RUNTIME: LazyLock<std::io::Result<Runtime>> =
     LazyLock::new(|| Builder::new_current_thread().enable_time().build());
 
-/// Asks all of it at once and waits for all answers, which come in the order of the requests.
+/// Sends all requests at once and waits for all replies. Returns them in the order of the requests.
 pub fn call<M: Method>(service: &Arc<Service>, requests: &[M]) -> Vec<Result<M::Reply, RpcError>> {
     let requests: Vec<_> = requests.iter().map(typed).collect();
     let failed: Vec<_> = requests.iter().map(|_| Err(defect("no answer"))).collect();
@@ -24,13 +23,13 @@ pub fn call<M: Method>(service: &Arc<Service>, requests: &[M]) -> Vec<Result<M::
     answers.into_iter().map(|answer| answer.and_then(reply::<M>)).collect()
 }
 
-/// Waits for something on this thread; `None` where the system refuses what that takes.
+/// Waits for a future on this thread; `None` if the runtime cannot be created.
 pub fn wait_for<T: Send>(something: impl Future<Output = T> + Send) -> Option<T> {
     let runtime = RUNTIME.as_ref().ok()?;
     if Handle::try_current().is_err() {
         return Some(runtime.block_on(something));
     }
-    // On a thread of an async program, which cannot wait for a second one.
+    // A thread of an async runtime cannot block on a second one.
     std::thread::scope(|scope| scope.spawn(|| runtime.block_on(something)).join().ok())
 }
 
@@ -57,7 +56,7 @@ fn late(_: tokio::time::error::Elapsed) -> Result<Reply, RpcError> {
     Err(RpcError::new(Code::NoAnswer, what).hint("the request may still take effect"))
 }
 
-/// The request as the service takes it, checked like one that came over the socket.
+/// Converts a request for the service, with the checks of the socket.
 fn typed<M: Method>(request: &M) -> Result<Request, RpcError> {
     request.check().map_err(|what| RpcError::new(Code::InvalidParams, format!("params of {:?}: {what}", M::NAME)))?;
     request.to_request().ok_or_else(|| RpcError::unknown(Code::UnknownMethod, "method", M::NAME, METHODS))
@@ -67,7 +66,7 @@ fn reply<M: Method>(reply: Reply) -> Result<M::Reply, RpcError> {
     M::from_reply(reply).ok_or_else(|| defect("the answer is that to another request"))
 }
 
-/// What cannot happen, happened.
+/// Error for a state that cannot occur.
 pub fn defect(what: &str) -> RpcError {
     RpcError::new(Code::Internal, format!("a defect of the program: {what}"))
 }

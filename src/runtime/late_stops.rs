@@ -1,5 +1,5 @@
-//! Stops that could not be sent because an arm could not be reached: the client was informed, and is notified when the
-//! device thread delivers them after all.
+//! Stops that could not be sent because an arm was not connected: when the device thread delivers one later, the log
+//! and the subscribers are notified.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -15,9 +15,9 @@ use crate::telemetry::describe::{Described, Severity};
 /// The stops of a run that were not sent.
 #[derive(Debug, Default)]
 pub(super) struct LateStops {
-    /// Whether there are any: checked with every tick.
+    /// Whether there are any; checked after every tick.
     any: AtomicBool,
-    /// By arm: the number of the last stop that had been sent.
+    /// By arm: the number of the last sent stop.
     sent_before: Mutex<BTreeMap<usize, u32>>,
 }
 
@@ -27,7 +27,7 @@ impl LateStops {
         self.any.store(true, Ordering::Release);
     }
 
-    /// Whether an arm's stop still waits for its connection.
+    /// Returns whether an arm's stop still waits for the connection.
     pub fn is_waiting(&self, arm: usize) -> bool {
         self.any.load(Ordering::Acquire) && lock(&self.sent_before).contains_key(&arm)
     }
@@ -41,7 +41,7 @@ impl Service {
         }
     }
 
-    /// Reports the stops that were delivered since this was called last.
+    /// Reports the stops that were delivered since the last call.
     pub fn report_late_stops(&self, wall: WallOffset) {
         if !self.late_stops.any.load(Ordering::Acquire) {
             return;

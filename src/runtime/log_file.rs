@@ -1,4 +1,4 @@
-//! Where a run is logged, and what the log begins with.
+//! Path, attachments and metadata of a run's log.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -12,10 +12,10 @@ use crate::message::Message;
 use crate::recording::log_writer::LogAttachment;
 use crate::recording::notes::Notes;
 use crate::recording::recorder::Note;
-use crate::recording::{disk_space, files};
+use crate::recording::{CONFIG_VERSION_KEY, COORDINATOR, disk_space, files};
 use crate::telemetry::describe::{Names, Severity};
 
-/// The log of a run, where it has one; refused where there is no room for it.
+/// Returns the path of the log, if there is one. An error if the disk lacks space for it.
 pub(super) fn log_path(
     blueprint: &Blueprint,
     options: &Options,
@@ -53,8 +53,8 @@ pub(super) fn retain(blueprint: &Blueprint, log: &Option<PathBuf>) {
     }
 }
 
-/// The blueprint as read and as resolved, and what the coordinator was made from: with these and its messages a log
-/// can be run again.
+/// Returns the blueprint with its sources, and the coordinator's configuration: with these and its messages a log can
+/// be replayed.
 pub(super) fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> Vec<LogAttachment> {
     let yaml = |name: String, text: &str| LogAttachment {
         name,
@@ -64,7 +64,7 @@ pub(super) fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> 
     let mut all = vec![yaml("blueprint.yaml".to_owned(), &blueprint.source_yaml)];
     all.extend(blueprint.sources.iter().map(|(name, text)| yaml(format!("source/{name}"), text)));
     all.push(LogAttachment {
-        name: "coordinator.json".to_owned(),
+        name: COORDINATOR.to_owned(),
         media_type: "application/json".to_owned(),
         // Plain structs with string keys always encode.
         data: serde_json::to_vec_pretty(config).unwrap_or_default(),
@@ -72,12 +72,13 @@ pub(super) fn attachments(blueprint: &Blueprint, config: &CoordinatorConfig) -> 
     all
 }
 
-/// More about the run, for the log's reader.
-pub(super) fn metadata(blueprint: &Blueprint) -> BTreeMap<String, String> {
+/// Returns further metadata for readers of the log.
+pub(super) fn metadata(blueprint: &Blueprint, config: &CoordinatorConfig) -> BTreeMap<String, String> {
     BTreeMap::from([
         ("blueprint".to_owned(), blueprint.name.clone()),
         ("tick_rate".to_owned(), blueprint.coordinator.tick_rate.to_string()),
         ("dimos_version".to_owned(), crate::VERSION.to_owned()),
+        (CONFIG_VERSION_KEY.to_owned(), config.version.to_string()),
         ("simulated".to_owned(), blueprint.arms.iter().any(|a| a.simulated).to_string()),
     ])
 }
@@ -95,7 +96,7 @@ pub(super) fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: d
         _ => tracing::warn!("{text}"),
     }
     let stamp = MonotonicClock.now();
-    // Only a run that is ending has no recorder.
+    // Without a recorder the run is shutting down.
     let _ = notes.send(Note::ArmText { arm: arm as u16, text: text.clone() });
     let _ = notes.send(Note::Log { severity, stamp, text });
 }

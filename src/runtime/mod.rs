@@ -1,5 +1,5 @@
-//! The composition root: a resolved blueprint becomes threads, and they are stopped in order. The only place that
-//! knows every module.
+//! The composition root: starts the threads of a resolved blueprint, and stops them in order. The only module that uses
+//! all others.
 //!
 //! ```text
 //! start: claim the name ─▶ lock the devices ─▶ emulators ─▶ connect all ─▶ tick, recorder ─▶ enable ─▶ rpc
@@ -17,13 +17,13 @@ mod handle;
 mod in_process;
 mod late_stops;
 mod log_file;
+mod log_throttle;
 mod motion_requests;
 mod motions;
 mod plan_requests;
 mod planner_link;
 mod planner_port;
 mod recheck;
-mod repeats;
 mod replan;
 mod reports;
 mod service;
@@ -58,7 +58,7 @@ use crate::rpc::place::RunFolder;
 use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
 use arms::Arms;
-use dispatch::{Courier, Dispatcher};
+use dispatch::{Dispatcher, OutcomeThread};
 use tick::Tick;
 use watchdog::Watchdog;
 
@@ -67,33 +67,33 @@ const REST_LIMIT: Duration = Duration::from_secs(2);
 /// An arm counts as at rest after this time at standstill: a reversal also has zero velocity for an instant.
 const STILL_FOR: Duration = Duration::from_millis(50);
 
-/// Where a run is logged.
+/// Destination of the log.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum Record {
-    /// As the blueprint says.
+    /// As set in the blueprint.
     #[default]
     AsBlueprint,
-    /// To this file.
+    /// This file.
     To(PathBuf),
-    /// Not at all.
+    /// No log.
     Off,
 }
 
-/// What a blueprint leaves open.
+/// Options of a run besides its blueprint.
 pub struct Options {
-    /// Name of the run; without it the blueprint's.
+    /// Name of the run; default: the blueprint's.
     pub name: Option<String>,
-    /// Where it is logged.
+    /// Destination of the log.
     pub record: Record,
-    /// Where the socket is.
+    /// Run directory, for the socket.
     pub folder: RunFolder,
-    /// Called at each tick; for tests and benchmarks.
+    /// Called at the start of each tick, for tests and benchmarks.
     pub probe: Option<Probe>,
-    /// What answers the planner's requests in the place of this program's own planner.
+    /// Answers planning requests instead of the built-in planner.
     pub solver: Option<Solver>,
-    /// Whether idle states of the processor are held off.
+    /// Whether deep idle states of the processor are disabled.
     pub hold_latency: bool,
-    /// Receives start, heartbeat and end of the run: systemd, for a run that is a service.
+    /// Receives start, heartbeat and end of the run, e.g. systemd.
     pub service_manager: Option<ServiceManager>,
 }
 
@@ -111,39 +111,39 @@ impl Default for Options {
     }
 }
 
-/// Why a run did not start. Everything that had been started is stopped again.
+/// Why a run did not start. Everything started before was stopped again.
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
-    /// An arm cannot be reached, or is not what it should be.
+    /// An arm cannot be reached, or differs from the blueprint.
     #[error("{arm}: {what}")]
     Hardware {
         /// The arm.
         arm: String,
-        /// What is wrong.
+        /// The problem.
         what: String,
-        /// What to do.
+        /// The hint.
         hint: String,
     },
-    /// The blueprint has mistakes.
+    /// The blueprint has errors.
     #[error("{what}")]
     Blueprint {
-        /// All of them, each at its place, for people.
+        /// All of them as text, each with its location.
         what: String,
-        /// What to do.
+        /// The hint.
         hint: String,
     },
-    /// Something else is in the way.
+    /// Any other error.
     #[error("{what}")]
     Other {
-        /// What is wrong.
+        /// The problem.
         what: String,
-        /// What to do.
+        /// The hint.
         hint: String,
     },
 }
 
 impl StartError {
-    /// What to do about it.
+    /// Returns the hint.
     pub fn hint(&self) -> &str {
         match self {
             Self::Hardware { hint, .. } | Self::Blueprint { hint, .. } | Self::Other { hint, .. } => hint,
@@ -158,30 +158,30 @@ impl StartError {
 /// Why a run ends.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Ending {
-    /// A signal came: its number.
+    /// A signal, with its number.
     Signal(i32),
-    /// Its time is over.
+    /// The duration was reached.
     Duration,
-    /// It was asked to, over rpc.
+    /// A shutdown request over rpc.
     Asked,
-    /// Its log ended, and why.
+    /// The log ended, with the reason.
     Log(String),
-    /// Something broke.
+    /// A fault.
     Fault(String),
 }
 
-/// What is to be said of a run that has ended.
+/// Result of a run that has ended.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Ended {
-    /// What did not go as it should while stopping.
+    /// Problems during the shutdown.
     pub troubles: Vec<String>,
     /// The log, if one was written.
     pub log: Option<PathBuf>,
-    /// Why the log ended before the run, if it did.
+    /// Why the log ended before the run, if so.
     pub log_cut: Option<String>,
 }
 
-/// A run that is up. Everything it can be asked is a method of its [`Handle`], and so of the run itself.
+/// A live run. All requests are methods of its [`Handle`], and thus of the run itself.
 ///
 /// ```
 /// use dimos::runtime::{Record, Run};
@@ -199,7 +199,7 @@ pub struct Run {
     tick: Tick,
     watchdog: Watchdog,
     dispatcher: Arc<Dispatcher>,
-    courier: Option<Courier>,
+    outcomes: Option<OutcomeThread>,
     recorder: Option<Recorder>,
     server: Option<Server>,
     handle: Handle,
@@ -225,28 +225,28 @@ impl Drop for Run {
 }
 
 impl Run {
-    /// Its socket, if it has one.
+    /// Returns its socket, if it has one.
     pub fn socket(&self) -> Option<&std::path::Path> {
         self.server.as_ref().map(Server::socket)
     }
 
-    /// A way to talk to it, for other threads.
+    /// Returns a handle for other threads.
     pub fn handle(&self) -> Handle {
         self.handle.clone()
     }
 
-    /// What its coordinator was made from: effective limits among others.
+    /// Returns the coordinator's configuration, with the effective limits.
     pub fn config(&self) -> &CoordinatorConfig {
         &self.handle.service.parts.config
     }
 
-    /// Lets other threads end it.
+    /// Returns a sender with which other threads can end the run.
     pub fn endings(&self) -> Sender<Ending> {
         self.endings.0.clone()
     }
 
-    /// Waits until it is ended ([`endings`](Self::endings), `dimos down`, a fault), at most `limit`.
-    /// It is still up then, until it is stopped.
+    /// Waits for its end ([`endings`](Self::endings), `dimos down`, a fault), at most `limit`. The run stays up until
+    /// [`stop`](Self::stop).
     pub fn wait_for_end(&self, limit: Option<Duration>) -> Ending {
         let received = match limit {
             Some(limit) => self.endings.1.recv_timeout(limit),
@@ -255,14 +255,14 @@ impl Run {
         received.unwrap_or(Ending::Duration)
     }
 
-    /// Stops it, in order: nothing is skipped, whatever breaks on the way. A run that is dropped is stopped as well.
+    /// Shuts the run down in order. Continues after errors. Dropping a run does the same.
     pub fn stop(mut self) -> Ended {
         self.stop_in_order()
     }
 
     fn stop_in_order(&mut self) -> Ended {
-        // What is left in the fields goes when the run is dropped, the arms before the server: who sees that the run is
-        // gone finds its log closed and its devices free.
+        // The remaining fields are dropped with the run, the arms before the server: when the run has disappeared, its
+        // log is closed and its devices are free.
         let Some(recorder) = self.recorder.take() else { return Ended::default() };
         let mut ended = Ended { log: recorder.path().map(PathBuf::from), ..Ended::default() };
         if let Some(manager) = &self.manager {
@@ -275,7 +275,7 @@ impl Run {
             ended.troubles.push("the tick thread does not end; it is left behind".to_owned());
         }
         ended.troubles.extend(self.arms.release());
-        self.courier = None;
+        self.outcomes = None;
         if let Err(e) = recorder.finish() {
             ended.log_cut = e.to_string().lines().next().map(str::to_owned);
         }
@@ -289,7 +289,7 @@ impl Run {
         let (mut taken, mut still_since) = (false, Instant::now());
         let look = || {
             taken = taken || answer.try_recv().is_ok();
-            // That nothing is commanded to move is half of it: an arm that lags, or that was let go of, still moves.
+            // Commands at rest are not enough: an arm that lags, or whose motors are off, may still move.
             if !(taken && pulse.at_rest.load(Ordering::Acquire) && service.at_standstill()) {
                 still_since = Instant::now();
             }

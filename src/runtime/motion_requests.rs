@@ -1,4 +1,4 @@
-//! Motions that are asked for: found their task, checked against every limit, handed to the tick.
+//! Requests for motions: finds the task, checks every limit, passes the motion to the tick.
 
 use std::sync::Arc;
 
@@ -16,16 +16,16 @@ use crate::sync::lock;
 use crate::telemetry::Outcome;
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
-/// Trajectories may exceed a velocity or acceleration by this factor: rounding in files.
+/// Trajectories may exceed a velocity or acceleration limit by this factor, for rounding in files.
 const SLACK: f64 = 1.001;
-/// A trajectory begins and ends at rest: slower than this [rad/s].
+/// Maximum velocity at the first and last point of a trajectory [rad/s].
 const REST: f64 = 1e-3;
 
-/// The plan that a motion carries out, and whether it is planned again: see [`Carried::replan`].
+/// The plan that a motion executes, and whether it is planned again: see [`Carried::replan`].
 pub(super) type Carries = (u64, Option<Option<api::Presence>>);
 
 impl Service {
-    /// A trajectory task that covers these joints.
+    /// Returns a trajectory task that covers these joints.
     pub(super) fn trajectory_task(&self, joints: &[u16]) -> Result<u16, RpcError> {
         let tasks = self.parts.blueprint.tasks.iter().enumerate();
         let fitting = |(_, t): &(usize, &crate::blueprint::Task)| {
@@ -50,7 +50,7 @@ impl Service {
         let Some(view) = self.arm_view(arm as usize).filter(|v| v.state.seq > 0) else {
             return self.refusal(&Outcome::StartStateUnavailable(arm)).map_or_else(|| Err(internal()), Err);
         };
-        // Where positions are being commanded, the motion continues from the command, not from the sag below it.
+        // In position mode the motion continues from the last command: the measured position sags below it.
         let from_command = view.command.mode.is_some_and(|m| m.is_position());
         let start = if from_command { view.command.values } else { view.state.position };
         let start = start.get(..config.dof).unwrap_or_default().to_vec();
@@ -80,7 +80,7 @@ impl Service {
         self.execute_as(call, None).await.map(Reply::Execute)
     }
 
-    /// Follows a trajectory, as the motion of a plan where it comes from one.
+    /// Executes a trajectory, as the motion of a plan if it comes from one.
     pub(super) async fn execute_as(
         &self,
         call: api::Execute,
@@ -104,7 +104,7 @@ impl Service {
         Ok(api::ExecuteReply { motion: number, task: self.parts.names.task(task), duration })
     }
 
-    /// Hands a trajectory to its task. Everything about it is checked before anything moves.
+    /// Passes a trajectory to its task. Checks all of it before anything moves.
     pub(super) async fn begin(
         &self,
         task: u16,
@@ -115,7 +115,7 @@ impl Service {
         let spline = Spline::new(&trajectory).map_err(|e| RpcError::new(Code::InvalidTrajectory, e.to_string()))?;
         self.check_rest(&joints, &trajectory)?;
         self.check_limits(&joints, &spline)?;
-        let number = self.parts.dispatcher.number();
+        let number = self.parts.dispatcher.next_id();
         let goal = (0..joints.len()).map(|k| spline.goal(k)).collect();
         let plan = plan.map(|(plan, replan)| Carried { plan, spline: Arc::new(spline.clone()), replan });
         let planned = Planned {
@@ -136,7 +136,7 @@ impl Service {
         result.map(|_| number)
     }
 
-    /// An arm is at rest before a trajectory and after it, so the trajectory must begin and end at rest.
+    /// Checks that a trajectory begins and ends at rest, as the arm does.
     fn check_rest(&self, joints: &[u16], trajectory: &JointTrajectory) -> Result<(), RpcError> {
         let ends = [("start", trajectory.points.first()), ("end", trajectory.points.last())];
         for (which, point) in ends.into_iter().filter_map(|(which, point)| Some((which, point?))) {
@@ -153,7 +153,7 @@ impl Service {
         Ok(())
     }
 
-    /// F36: a trajectory that breaks a limit is refused before it begins, with the joint and the amount.
+    /// F36: rejects a trajectory that exceeds a limit before it begins, with the joint and the amount.
     pub(super) fn check_limits(&self, joints: &[u16], spline: &Spline) -> Result<(), RpcError> {
         for (k, &joint) in joints.iter().enumerate() {
             let Some((arm, j)) = self.locate(joint) else { continue };

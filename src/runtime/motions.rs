@@ -1,4 +1,4 @@
-//! Remembers the motions of a run: what was planned, and how it ended.
+//! The latest motions of a run: their plans and their ends.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -7,62 +7,62 @@ use crate::rpc::api::Presence;
 use crate::telemetry::{Reason, TaskState};
 use crate::trajectory::Spline;
 
-/// Maximum number of remembered motions.
+/// Maximum number of motions kept.
 const REMEMBERED: usize = 256;
 
 /// A motion as it was sent to the coordinator.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Planned {
-    /// The task that carries it out.
+    /// The task that executes it.
     pub task: u16,
-    /// Its joints, over all arms.
+    /// Its joints: indices over all arms' joints.
     pub joints: Vec<u16>,
-    /// Where they should end [rad].
+    /// Goal positions [rad].
     pub goal: Vec<f64>,
-    /// How long it should take [s].
+    /// Planned duration [s].
     pub duration: f64,
-    /// The plan that it carries out, and its curve; for motions that were planned.
+    /// The plan that it executes, and its trajectory, for planned motions.
     pub plan: Option<Carried>,
-    /// What came into its way, in a sentence.
+    /// The obstacle that blocked it, as a sentence.
     pub blocked: Option<String>,
-    /// What follows, where it is planned again.
+    /// What follows if it is planned again.
     pub next: Option<Next>,
 }
 
-/// What a planned motion carries out.
+/// What a planned motion executes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Carried {
     /// The plan.
     pub plan: u64,
-    /// Its curve.
+    /// Its trajectory.
     pub spline: Arc<Spline>,
-    /// Where it is planned again when something gets in its way: the connection that wants it, if it is one.
+    /// If it is planned again when blocked: the connection that requested this, if any.
     pub replan: Option<Option<Presence>>,
 }
 
-/// What follows a motion that had to end before something.
+/// What follows a blocked motion.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next {
     /// It is being planned again.
     Planning,
     /// The motion that continues.
     Motion(u64),
-    /// There is none: why.
+    /// There is none, for this reason.
     None(String),
 }
 
-/// A planned motion under way.
+/// A planned motion that is being executed.
 #[derive(Debug, Clone)]
 pub struct UnderWay {
     /// Its number.
     pub number: u64,
-    /// The task that carries it out.
+    /// The task that executes it.
     pub task: u16,
-    /// Its joints, over all arms.
+    /// Its joints: indices over all arms' joints.
     pub joints: Vec<u16>,
     /// The plan.
     pub plan: u64,
-    /// Its curve.
+    /// Its trajectory.
     pub spline: Arc<Spline>,
     /// As [`Carried::replan`].
     pub replan: Option<Option<Presence>>,
@@ -73,9 +73,9 @@ pub struct UnderWay {
 pub struct End {
     /// The task's state.
     pub state: TaskState,
-    /// Why.
+    /// Reason for the state.
     pub reason: Reason,
-    /// Where its joints were [rad].
+    /// Positions of its joints [rad].
     pub actual: Vec<f64>,
 }
 
@@ -84,7 +84,7 @@ pub struct End {
 pub struct Motions(BTreeMap<u64, (Planned, Option<End>)>);
 
 impl Motions {
-    /// Notes a motion that is about to be sent.
+    /// Adds a motion that is about to be sent.
     pub fn plan(&mut self, number: u64, planned: Planned) {
         while self.0.len() >= REMEMBERED {
             self.0.pop_first();
@@ -92,12 +92,13 @@ impl Motions {
         self.0.insert(number, (planned, None));
     }
 
-    /// It was refused.
+    /// Removes a motion that was refused.
     pub fn forget(&mut self, number: u64) {
         self.0.remove(&number);
     }
 
-    /// A task changed its state. `positions`: of all joints, now [rad]. Motions of a task end in their order.
+    /// Takes a change of a task's state. `positions`: present positions of all joints [rad]. Motions of a task end in
+    /// order.
     pub fn task_changed(&mut self, task: u16, state: TaskState, reason: Reason, positions: &[f64]) {
         if !matches!(state, TaskState::Completed | TaskState::Aborted | TaskState::Fault) {
             return;
@@ -109,7 +110,7 @@ impl Motions {
         }
     }
 
-    /// The planned motions that are under way.
+    /// Returns the planned motions that are being executed.
     pub fn under_way(&self) -> Vec<UnderWay> {
         let going = self.0.iter().filter(|(_, (_, end))| end.is_none());
         let planned = going.filter_map(|(number, (planned, _))| {
@@ -120,7 +121,7 @@ impl Motions {
         planned.collect()
     }
 
-    /// Something came into a motion's way. `true`: it is planned again from here on.
+    /// Marks a motion as blocked. Returns whether it is to be planned again.
     pub fn blocked(&mut self, number: u64, text: String, in_time: bool) -> bool {
         let Some((planned, _)) = self.0.get_mut(&number) else { return false };
         planned.blocked = Some(text);
@@ -129,19 +130,19 @@ impl Motions {
         again
     }
 
-    /// What came of planning a motion again.
+    /// Sets the result of planning a motion again.
     pub fn went_on(&mut self, number: u64, next: Result<u64, String>) {
         if let Some((planned, _)) = self.0.get_mut(&number) {
             planned.next = Some(next.map_or_else(Next::None, Next::Motion));
         }
     }
 
-    /// Whether a motion is being planned again.
+    /// Returns whether a motion is being planned again.
     pub fn is_replanning(&self, number: u64) -> bool {
         self.0.get(&number).is_some_and(|(planned, _)| planned.next == Some(Next::Planning))
     }
 
-    /// Motions of a task are not planned again.
+    /// Stops planning the motions of a task again.
     pub fn end_replanning(&mut self, task: u16) {
         for (planned, _) in self.0.values_mut().filter(|(planned, _)| planned.task == task) {
             if let Some(carried) = &mut planned.plan {
@@ -153,7 +154,7 @@ impl Motions {
         }
     }
 
-    /// A motion, and how it ended if it did.
+    /// Returns a motion, and its end if it has ended.
     pub fn get(&self, number: u64) -> Option<&(Planned, Option<End>)> {
         self.0.get(&number)
     }

@@ -15,18 +15,18 @@ use crate::planning::planning_scene::{PlannedRobot, PlanningScene};
 use crate::rpc::api::{self, Moment, PlanSummary, ReleasedPlan};
 use crate::rpc::{Code, RpcError};
 
-/// The longest time to find out whether a plan is still free; then it is not carried out.
+/// Timeout for checking whether a plan is still collision-free; after that it is not executed.
 const REVIEW_LIMIT: Duration = Duration::from_secs(2);
 
 impl PlannerPort {
     pub(super) fn begin_plan(&self, plan: &api::Plan, moment: &Moment) -> Result<api::PlanReply, RpcError> {
         self.measured(moment);
-        let setup = self.desk.setup();
+        let setup = self.thread.setup();
         let goals = plan.goals.iter().map(|goal| goal_of(setup, goal)).collect::<Result<Vec<_>, _>>()?;
         let positions = all_positions(setup, moment)?;
         let request = PlanRequest { goals, positions, speed: plan.speed, seed: plan.seed };
         let id = moment.plan;
-        self.desk.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
+        self.thread.begin(id, request, plan.timeout.map(Duration::from_secs_f64)).map_err(|why| {
             let error = RpcError::new(Code::Planning, why.to_string());
             match why {
                 BeginError::Busy => error.hint("wait for it, or `dimos cancel`"),
@@ -38,7 +38,7 @@ impl PlannerPort {
 
     pub(super) fn preview(&self, plan: Option<u64>) -> Result<api::PreviewReply, RpcError> {
         let (job, found) = found(self, plan)?;
-        let setup = self.desk.now();
+        let setup = self.thread.now();
         let mut end_effectors = BTreeMap::new();
         let mut first = 0;
         for &index in &found.robots {
@@ -58,34 +58,34 @@ impl PlannerPort {
         Ok(api::PreviewReply { plan: job.id, summary, trajectory: travelling(&found), end_effectors })
     }
 
-    /// A plan for the coordinator to execute, if it is still free.
+    /// Returns a plan for the coordinator to execute, if it is still collision-free.
     pub(super) async fn release(&self, plan: Option<u64>, moment: &Moment) -> Result<ReleasedPlan, RpcError> {
         let (job, found) = found(self, plan)?;
-        let setup = self.desk.setup();
+        let setup = self.thread.setup();
         // Several robots move in one trajectory: one task must have the joints of all.
         let tasks: Vec<_> = found.robots.iter().filter_map(|&r| setup.robots.get(r)?.config.task.as_ref()).collect();
         let task = tasks.first().filter(|task| tasks.len() == found.robots.len() && tasks.iter().all(|t| t == *task));
         let task = task.map(|task| (*task).clone());
         self.measured(moment);
-        let version = self.desk.version();
+        let version = self.thread.version();
         self.still_free(&job, &found, moment).await?;
         self.remember(job.id, found.clone(), version);
         Ok(ReleasedPlan { plan: job.id, trajectory: travelling(&found), task })
     }
 
-    /// The world may have changed since a plan was made, or a robot that it does not move may have moved.
+    /// Checks a plan again: the world may have changed, or a robot that it does not move may have moved.
     async fn still_free(&self, job: &Job, found: &Arc<PlannedMotion>, moment: &Moment) -> Result<(), RpcError> {
-        let positions = all_positions(self.desk.setup(), moment)?;
+        let positions = all_positions(self.thread.setup(), moment)?;
         let stop = Stop::new(Some(Instant::now() + REVIEW_LIMIT), None);
-        apart(self.desk.revalidate(found.clone(), positions, stop)).await?.map_err(|failure| {
+        apart(self.thread.revalidate(found.clone(), positions, stop)).await?.map_err(|failure| {
             let what = format!("plan {} is no longer free: {}", job.id, failure.what);
             RpcError::new(Code::PlanOutdated, what).hint("plan again: the world is not as it was")
         })
     }
 
-    /// What the planner is and does. How a motion goes is for the run to know.
+    /// Returns the planner's report. The run adds the progress of a motion.
     pub(super) fn report(&self) -> api::PlannerReport {
-        let (state, error) = match &self.desk.newest(false) {
+        let (state, error) = match &self.thread.newest(false) {
             Some(Job { progress: Progress::Planning(_), .. }) => ("PLANNING", None),
             Some(Job { progress: Progress::Failed(failure, _), .. }) if !failure.cancelled => {
                 ("FAULT", Some(failure.what.clone()))
@@ -105,20 +105,20 @@ impl PlannerPort {
             named_poses: robot.config.named_poses.clone(),
         };
         let mut always_touching: BTreeMap<String, Vec<[String; 2]>> = BTreeMap::new();
-        for (name, pair) in &self.desk.setup().always_touching {
+        for (name, pair) in &self.thread.setup().always_touching {
             always_touching.entry(name.clone()).or_default().push(pair.clone());
         }
         api::PlannerReport {
             state: state.to_owned(),
             error,
-            robots: self.desk.setup().robots.iter().map(robot).collect(),
-            plan: self.desk.newest(true).map(|job| job.id),
+            robots: self.thread.setup().robots.iter().map(robot).collect(),
+            plan: self.thread.newest(true).map(|job| job.id),
             always_touching,
         }
     }
 }
 
-/// Where every robot is [rad], in the setup's order.
+/// Returns the positions of every robot [rad], in the order of the scene.
 pub(super) fn all_positions(setup: &PlanningScene, moment: &Moment) -> Result<Vec<Vec<f64>>, RpcError> {
     let configs = setup.robots.iter().map(|robot| &robot.config);
     configs.map(|robot| positions_of(&robot.name, &robot.coordinator_joints, moment)).collect()
@@ -151,8 +151,8 @@ fn goal_of(setup: &PlanningScene, goal: &api::PlanGoal) -> Result<(usize, Goal),
 
 pub(super) fn job(port: &PlannerPort, plan: Option<u64>) -> Result<Job, RpcError> {
     let job = match plan {
-        Some(id) => port.desk.job(id),
-        None => port.desk.newest(true),
+        Some(id) => port.thread.job(id),
+        None => port.thread.newest(true),
     };
     job.ok_or_else(|| match plan {
         Some(id) => RpcError::new(Code::UnknownPlan, format!("there is no plan {id}, or it is too long ago"))
@@ -223,7 +223,7 @@ fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
     api::PaddingGivenUp { near, link, other, distance: *distance }
 }
 
-/// The trajectory as rpc has it.
+/// Converts a trajectory to its rpc type.
 fn travelling(found: &PlannedMotion) -> api::Trajectory {
     let point = |point: &crate::trajectory::TrajectoryPoint| api::Point {
         time_from_start: point.time_from_start,

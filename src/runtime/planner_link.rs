@@ -1,5 +1,5 @@
-//! A run and its planner, which is in the same process or attached from another: what the run adds to a request, how
-//! long it waits, and what it does itself. The tick knows nothing of any of this.
+//! Routes requests to the run's planner, which is in this process or attached from another: adds the current state of
+//! the run, limits the waiting time, and executes plans. The tick is not involved.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,23 +23,23 @@ use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::describe::Names;
 
-/// A state older than this is no place to plan from.
+/// Maximum age of a state to plan from.
 const FRESH: Duration = Duration::from_secs(1);
-/// How long an attached planner may take to answer what costs it nothing.
+/// Timeout for a reply of an attached planner that needs no computation.
 const QUICK: Duration = Duration::from_secs(3);
-/// The same where it reads files or checks a motion.
+/// Timeout for a reply for which it reads files or checks a motion.
 const LONG: Duration = Duration::from_secs(9);
-/// How long `status` waits for it.
+/// Timeout for its part of `status`.
 const GLANCE: Duration = Duration::from_millis(500);
 
-/// A planner in its own process.
+/// A planner in another process.
 pub(super) struct Attached {
     name: String,
     robots: Vec<api::RegisteredRobot>,
     line: Arc<PlannerLine>,
 }
 
-/// Where a run's planner is.
+/// The planner of a run.
 pub(super) enum Planner<'a> {
     Own(&'a PlannerPort),
     Attached(Arc<Attached>),
@@ -56,7 +56,7 @@ impl Planner<'_> {
         }
     }
 
-    /// What is in the way of a planned motion under way.
+    /// Returns what blocks a planned motion that is being executed.
     pub(super) async fn recheck(
         &self,
         call: &Recheck,
@@ -112,7 +112,7 @@ impl Service {
             }
             Call::Planner(_) => self.planner_report(&planner, limit).await.map(Reply::Planner),
             Call::Plan(ref plan) => {
-                let (number, plan) = (self.parts.dispatcher.number(), plan.clone());
+                let (number, plan) = (self.parts.dispatcher.next_id(), plan.clone());
                 let begun = planner.answer(call, self.moment(number), limit).await?;
                 self.remember_request(number, plan);
                 Ok(begun)
@@ -121,7 +121,7 @@ impl Service {
                 let moment =
                     if matches!(call, Call::Attach(_) | Call::Detach(_)) { self.moment(0) } else { Moment::default() };
                 let changed = planner.answer(call, moment, limit).await;
-                // Also where it was refused, or not answered in time: it may have happened all the same.
+                // Also after an error or a timeout: the change may have been made.
                 self.recheck(&planner).await;
                 changed
             }
@@ -136,12 +136,12 @@ impl Service {
         replan: Option<Option<api::Presence>>,
     ) -> Result<Reply, RpcError> {
         let ReleasedPlan { plan, trajectory, task } = released;
-        // What comes from another process is checked like what comes from any client.
+        // Data from another process is checked like that of any client.
         let execute = api::Execute { trajectory, task };
         api::Method::check(&execute).map_err(|what| RpcError::new(Code::InvalidTrajectory, what))?;
         let begun = self.execute_as(execute, Some((plan, replan))).await?;
         *lock(&self.executed) = Some((plan, begun.motion));
-        // The world may have changed since the plan was found free.
+        // The world may have changed since the plan was checked.
         let under_way = lock(&self.motions).under_way().into_iter().find(|motion| motion.number == begun.motion);
         if let Some(motion) = under_way {
             self.recheck_motion(planner, &motion).await;
@@ -149,14 +149,14 @@ impl Service {
         Ok(Reply::ExecutePlan(begun))
     }
 
-    /// Ends planning, where something is being planned.
+    /// Cancels planning. Returns whether a request was being planned.
     pub(super) async fn cancel_planning(&self) -> bool {
         let Ok(planner) = self.planner() else { return false };
         let cancelled = planner.answer(Call::Cancel(api::Cancel::default()), Moment::default(), QUICK).await;
         matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
     }
 
-    /// The number of a plan, the newest without one, and the coordinator's joints that it moves.
+    /// Returns a plan's number, by default the newest, and the coordinator's joints that it moves.
     pub(super) async fn plan_and_its_joints(&self, plan: Option<u64>) -> Result<(u64, Vec<String>), RpcError> {
         let planner = self.planner()?;
         let answer = |call| planner.answer(call, Moment::default(), QUICK);
@@ -176,7 +176,7 @@ impl Service {
         }
     }
 
-    /// What the planner is and does, and how its last motion goes.
+    /// Returns the planner's report, with the progress of its last motion.
     async fn planner_report(&self, planner: &Planner<'_>, limit: Duration) -> Result<PlannerReport, RpcError> {
         let Reply::Planner(mut report) =
             planner.answer(Call::Planner(api::Planner {}), Moment::default(), limit).await?
@@ -195,7 +195,7 @@ impl Service {
         Ok(report)
     }
 
-    /// The planner in `status`; none where there is none.
+    /// Returns the planner's part of `status`, if there is a planner.
     pub(super) async fn planner_status(&self) -> Option<PlannerStatus> {
         let own = |e: &RpcError| PlannerStatus {
             state: "FAULT".into(),
@@ -222,7 +222,7 @@ impl Service {
         Some(status)
     }
 
-    /// Lets a process at the other end of a connection be this run's planner.
+    /// Registers the process at the other end of a connection as this run's planner.
     pub(super) fn register(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
         let has = |whose: String| {
             RpcError::new(Code::HasPlanner, format!("run {} has a planner already: {whose}", self.parts.run))
@@ -248,7 +248,7 @@ impl Service {
         Ok(Registered { run: self.parts.run.clone(), limits })
     }
 
-    /// Whether this run has the joints of a robot, and the task that moves them.
+    /// Checks that this run has the joints of a robot and the task that moves them.
     fn fits(&self, robot: &api::RegisteredRobot) -> Result<(), RpcError> {
         let all: Vec<&String> = self.parts.names.arms.iter().flat_map(|arm| &arm.joints).collect();
         let index = |name: &String| {
@@ -269,7 +269,7 @@ impl Service {
         }
     }
 
-    /// What a planner needs to know of this run now.
+    /// Returns the current state of the run, for a planner.
     pub(super) fn moment(&self, plan: u64) -> Moment {
         let (now, mut positions, mut grippers) = (self.now(), BTreeMap::new(), BTreeMap::new());
         for (index, arm) in self.parts.names.arms.iter().enumerate() {
@@ -291,7 +291,7 @@ impl Service {
     }
 }
 
-/// How far and how fast each joint may be commanded, as [`Service::begin`] checks it.
+/// Returns the position, velocity, acceleration and jerk limits of each joint, as [`Service::begin`] checks them.
 pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTreeMap<String, CommandLimits> {
     let mut all = BTreeMap::new();
     for (arm, named) in config.arms.iter().zip(&names.arms) {
@@ -309,7 +309,7 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
     all
 }
 
-/// A planner in its own process: answers requests of a run in their encoded form.
+/// Answers an encoded request of a run, in the process of an attached planner.
 pub(super) async fn answer_travelling(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
     let encoded = |e: serde_json::Error| RpcError::new(Code::Internal, e.to_string());
     if asked.method == RECHECK {

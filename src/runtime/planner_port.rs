@@ -1,5 +1,5 @@
-//! A planner that answers: its desk, and what is known of it beside. It knows nothing of the run but what comes with a
-//! request, so that it answers the same in the run's process and in one of its own.
+//! Answers the planner's methods: the planner thread, the objects of the world, the executed plans. All it needs of the
+//! run comes with a request, so it works in the run's process and in its own.
 
 use std::collections::BTreeMap;
 use std::sync::Mutex;
@@ -22,7 +22,7 @@ use crate::sync::lock;
 
 /// A planner.
 pub struct PlannerPort {
-    pub(super) desk: PlannerThread,
+    pub(super) thread: PlannerThread,
     /// The objects of the world, as they were given.
     pub(super) objects: Mutex<BTreeMap<String, WorldObject>>,
     /// The plans that were executed, by number.
@@ -30,8 +30,8 @@ pub struct PlannerPort {
 }
 
 impl PlannerPort {
-    /// Starts the planner's thread, for robots within the limits of the coordinator. `solver` answers requests in the
-    /// place of this program's own.
+    /// Starts the planner thread, for robots within the limits of the coordinator. `solver` replaces the built-in
+    /// planner.
     pub fn start(
         config: &PlannerConfig,
         setup: PlanningScene,
@@ -46,18 +46,18 @@ impl PlannerPort {
         };
         let setup = setup.within(&limits.iter().map(|(joint, l)| (joint.clone(), bound(l))).collect())?;
         let objects = config.objects.iter().map(|object| (object.name.clone(), typed(object))).collect();
-        let desk = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
-        let desk = desk.map_err(|e| format!("no planner thread: {e}"))?;
-        Ok(Self { desk, objects: Mutex::new(objects), released: Mutex::default() })
+        let thread = PlannerThread::with(setup, config.timeout, solver.unwrap_or_else(|| std::sync::Arc::new(solve)));
+        let thread = thread.map_err(|e| format!("no planner thread: {e}"))?;
+        Ok(Self { thread, objects: Mutex::new(objects), released: Mutex::default() })
     }
 
-    /// Takes note of where the joints are that are not planned.
+    /// Takes the positions of the joints that are not planned.
     pub(super) fn measured(&self, moment: &Moment) {
         let (positions, grippers) = (moment.positions.clone(), moment.grippers.clone());
-        self.desk.measured(&Measured { positions, grippers });
+        self.thread.measured(&Measured { positions, grippers });
     }
 
-    /// Answers one of the planner's methods, but for `execute_plan`: see [`release`](Self::release).
+    /// Answers one of the planner's methods, except `execute_plan`: see [`release`](Self::release).
     pub async fn answer(&self, call: Call, moment: &Moment) -> Result<Reply, RpcError> {
         match call {
             Call::Plan(plan) => self.begin_plan(&plan, moment).map(Reply::Plan),
@@ -67,7 +67,7 @@ impl PlannerPort {
             Call::Preview(preview) => self.preview(preview.plan).map(Reply::Preview),
             Call::Planner(_) => Ok(Reply::Planner(self.report())),
             Call::Cancel(_) => {
-                Ok(Reply::Cancel(CancelReply { planning: self.desk.cancel(), ..CancelReply::default() }))
+                Ok(Reply::Cancel(CancelReply { planning: self.thread.cancel(), ..CancelReply::default() }))
             }
             Call::World(_) => {
                 let objects = lock(&self.objects).values().cloned().collect();
@@ -83,7 +83,7 @@ impl PlannerPort {
     }
 }
 
-/// A planner's robots, as a run needs to know them.
+/// Returns the robots of a planner, for its registration at a run.
 pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
     let robot = |robot: &crate::planning::planning_scene::PlannedRobot| RegisteredRobot {
         name: robot.config.name.clone(),
@@ -93,7 +93,7 @@ pub fn registered(setup: &PlanningScene) -> Vec<RegisteredRobot> {
     setup.robots.iter().map(robot).collect()
 }
 
-/// Where a robot's joints are [rad].
+/// Returns the positions of a robot's joints [rad].
 pub(super) fn positions_of(robot: &str, joints: &[String], moment: &Moment) -> Result<Vec<f64>, RpcError> {
     let position = |joint| moment.positions.get(joint).copied();
     joints.iter().map(position).collect::<Option<_>>().ok_or_else(|| {
@@ -102,8 +102,8 @@ pub(super) fn positions_of(robot: &str, joints: &[String], moment: &Moment) -> R
     })
 }
 
-/// Does work of the planner on its own thread: neither what it reads nor a panic in it may keep other requests
-/// waiting, `stop` least of all.
+/// Runs work of the planner on another thread: neither reading files nor a panic may delay other requests, above all
+/// `stop`.
 pub(super) async fn apart<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, RpcError> {
     let failed = |_| RpcError::new(Code::Internal, "the planner failed at this request: a defect of the program");
     tokio::task::spawn_blocking(work).await.map_err(failed)

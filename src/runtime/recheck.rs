@@ -1,5 +1,6 @@
-//! Planned motions under way in a world that changes: after every change the rest of each is checked again. One that
-//! would come too close to something slows down along its path before it; where that is too late its arms are held.
+//! Checks planned motions during their execution: after every change of the world, the rest of each is checked again. A
+//! motion that would come too close to an obstacle decelerates along its path before it; if it is too late for that,
+//! its arms are held.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -18,16 +19,16 @@ use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 use crate::telemetry::TaskState;
 
-/// The longest time to find out whether the rest of a motion is free; then it is cancelled.
+/// Timeout for checking the rest of a motion; after that the motion is cancelled.
 const LIMIT: Duration = Duration::from_secs(1);
-/// Plans that were carried out and may be under way.
+/// Maximum number of executed plans kept.
 const RELEASED: usize = 64;
 
-/// A plan that was executed, and the version of the world in which its motion was found free.
+/// A plan that was executed, and the version of the world for which its motion was checked.
 pub(super) type Released = (Arc<PlannedMotion>, u64);
 
 impl PlannerPort {
-    /// Remembers a plan that is executed: it may be queried meanwhile.
+    /// Keeps a plan that is executed, for later checks.
     pub(super) fn remember(&self, plan: u64, found: Arc<PlannedMotion>, version: u64) {
         let mut released = lock(&self.released);
         while released.len() >= RELEASED {
@@ -36,18 +37,18 @@ impl PlannerPort {
         released.insert(plan, (found, version));
     }
 
-    /// What is in the way of a motion under way. In a world that did not change since the last time, nothing is.
+    /// Returns what blocks the rest of a motion. Skips the check if the world has not changed since the last one.
     pub(super) async fn recheck(&self, call: &Recheck, moment: &Moment) -> Result<RecheckReply, RpcError> {
         let unknown = || RpcError::new(Code::UnknownPlan, format!("the planner does not know plan {}", call.plan));
         let (found, verified) = lock(&self.released).get(&call.plan).cloned().ok_or_else(unknown)?;
         self.measured(moment);
-        let version = self.desk.version();
+        let version = self.thread.version();
         if version == verified {
             return Ok(RecheckReply::default());
         }
-        let positions = all_positions(self.desk.setup(), moment)?;
+        let positions = all_positions(self.thread.setup(), moment)?;
         let stop = Stop::new(Some(Instant::now() + LIMIT), None);
-        let blocked = apart(self.desk.look_ahead(found, positions, call.elapsed, stop)).await?;
+        let blocked = apart(self.thread.look_ahead(found, positions, call.elapsed, stop)).await?;
         let blocked = blocked.map_err(|failure| RpcError::new(Code::PlanOutdated, failure.what))?;
         if blocked.is_none()
             && let Some(released) = lock(&self.released).get_mut(&call.plan)
@@ -60,7 +61,7 @@ impl PlannerPort {
 }
 
 impl Service {
-    /// Checks what remains of every planned motion under way.
+    /// Checks the rest of every planned motion that is being executed.
     pub(super) async fn recheck(&self, planner: &Planner<'_>) {
         let under_way = lock(&self.motions).under_way();
         for motion in under_way {
@@ -68,12 +69,12 @@ impl Service {
         }
     }
 
-    /// How far a motion is [s]; `None`: it has ended, or is slowing down already.
+    /// Returns the progress of a motion [s]; `None`: it has ended, or decelerates already.
     fn elapsed(&self, motion: &UnderWay) -> Option<f64> {
         let view = self.task_view(motion.task as usize);
         match view.state {
             TaskState::Executing if view.motion == motion.number => Some(view.elapsed),
-            // The tick has taken it, and shows it with its next turn.
+            // The tick has accepted it, and shows it after the next tick.
             _ if view.motion < motion.number => Some(0.0),
             _ => None,
         }
@@ -85,7 +86,7 @@ impl Service {
         let (free_until, what) = match planner.recheck(&asked, self.moment(0), LIMIT + LIMIT / 2).await {
             Ok(RecheckReply { blocked: None }) => return,
             Ok(RecheckReply { blocked: Some(blocked) }) => (blocked.free_until, blocked.what),
-            // What is not known to be free is not driven through.
+            // A motion that could not be checked must not continue.
             Err(e) => (f64::INFINITY, e.message),
         };
         let Some(elapsed) = self.elapsed(motion) else { return };
@@ -117,7 +118,7 @@ impl Service {
         }
     }
 
-    /// The acceleration limit of a joint [rad/s²].
+    /// Returns the acceleration limit of a joint [rad/s²].
     fn acceleration(&self, joint: u16) -> f64 {
         let located = self.locate(joint);
         let limit = located.and_then(|(arm, j)| self.parts.config.arms.get(arm)?.limits.acceleration_max.get(j));

@@ -1,6 +1,5 @@
-//! Around what got in the way: a planned motion that had to end before an obstacle is planned again from where it
-//! rests, to the goal that was asked for, and continues as another motion. It runs on its own thread: it waits for the
-//! arm and for the planner.
+//! Replanning: a planned motion that was stopped before an obstacle is planned again from there to its goal, and
+//! continues as another motion. Runs on its own thread, which waits for the arm and the planner.
 
 use std::time::{Duration, Instant};
 
@@ -14,13 +13,13 @@ use crate::telemetry::{Phase, TaskState};
 
 /// Timeout for the arm to decelerate to rest.
 const REST: Duration = Duration::from_secs(10);
-/// How often is looked whether it rests, or whether there is a plan.
+/// Poll period while waiting for the arm and the planner.
 const INTERVAL: Duration = Duration::from_millis(10);
-/// Requests for plans that are remembered.
+/// Maximum number of requests for plans kept.
 const REMEMBERED: usize = 64;
 
 impl Service {
-    /// Remembers what a plan was asked for.
+    /// Keeps the request of a plan.
     pub(super) fn remember_request(&self, plan: u64, request: Plan) {
         let mut requests = lock(&self.plan_requests);
         while requests.len() >= REMEMBERED {
@@ -29,7 +28,7 @@ impl Service {
         requests.insert(plan, request);
     }
 
-    /// Begins to plan a motion that was ended again.
+    /// Begins to plan a blocked motion again.
     pub(super) fn go_around(&self, motion: &UnderWay) {
         let (number, motion) = (motion.number, motion.clone());
         let Some(me) = self.me.upgrade() else { return };
@@ -76,7 +75,7 @@ impl Service {
         }
     }
 
-    /// Waits until the motion has ended and its arms rest.
+    /// Waits until the motion has ended and its arms are at rest.
     async fn rested(&self, motion: &UnderWay) -> Result<(), RpcError> {
         let began = Instant::now();
         loop {
@@ -98,7 +97,7 @@ impl Service {
         }
     }
 
-    /// Returns whether it was not ended meanwhile: by `cancel`, by a stop, or by the end of the lease.
+    /// Returns whether it may continue: no `cancel`, no stop, no end of the lease meanwhile.
     fn may_go_on(&self, motion: &UnderWay) -> Result<(), RpcError> {
         let ended = |what: &str| Err(RpcError::new(Code::ShuttingDown, what));
         if self.is_closed() {

@@ -18,7 +18,7 @@ use crate::telemetry::describe::{Described, Severity, bound_text, cause_text, ou
 use crate::telemetry::{Cause, Outcome, Reason, TaskState};
 
 impl Service {
-    /// Reply to `status`.
+    /// Returns the reply to `status`.
     pub fn status(&self) -> StatusReport {
         let (parts, pulse) = (&self.parts, &self.parts.pulse);
         let started = parts.wall.wall(self.now()) as i64 - self.started.elapsed().as_nanos() as i64;
@@ -107,7 +107,7 @@ impl Service {
         })
     }
 
-    /// Lowest and highest position of an arm's joints [rad].
+    /// Returns the lowest and highest position of an arm's joints [rad].
     fn position_limits(&self, arm: usize) -> Vec<[f64; 2]> {
         let Some(config) = self.parts.config.arms.get(arm) else { return Vec::new() };
         let limits = &config.limits;
@@ -135,12 +135,12 @@ impl Service {
         (*reason != Reason::None).then(|| reason_text(reason, &self.parts.names))
     }
 
-    /// Age of a state [ms].
+    /// Returns the age of a state [ms].
     fn age_ms(&self, state: &ArmState) -> Option<f64> {
         (state.seq > 0).then(|| self.now().seconds_since(state.stamp) * 1e3)
     }
 
-    /// Reply to `state`.
+    /// Returns the reply to `state`.
     pub fn state(&self) -> StateReport {
         let arms = self.parts.blueprint.arms.iter().enumerate().filter_map(|(i, arm)| {
             let view = self.arm_view(i)?;
@@ -174,7 +174,7 @@ impl Service {
         self.parts.wall.wall(self.now()) as f64 * 1e-9
     }
 
-    /// Reply to `motion`.
+    /// Returns the reply to `motion`.
     pub fn motion(&self, number: u64) -> Result<MotionReport, RpcError> {
         let motions = lock(&self.motions);
         let Some((planned, end)) = motions.get(number) else {
@@ -189,8 +189,8 @@ impl Service {
         let over = !matches!(view.state, TaskState::Executing | TaskState::Cancelling);
         let end = match end {
             Some(end) => Some(end.clone()),
-            // The task is done; that it is known where the arm ended takes the recorder a moment, or, if the recorder
-            // fell behind, does not come at all. Where the arm is now is where it ended.
+            // The task has ended, but the recorder has not reported the end yet; if it fell behind, it never will. The
+            // arm's present position is its end.
             None if view.motion == number && over => {
                 let at = self.positions();
                 let actual = planned.joints.iter().map(|j| at.get(*j as usize).copied().unwrap_or(f64::NAN)).collect();
@@ -205,7 +205,7 @@ impl Service {
         };
         report.state = end.state.name().to_owned();
         report.done = true;
-        // That it was cancelled or held is how it ended; what was in its way is why.
+        // Cancelled or held is the state; the obstacle is the reason.
         let was_stopped = matches!(end.reason, Reason::Cancelled | Reason::ArmHeld(..));
         let blocked = planned.blocked.clone().filter(|_| was_stopped);
         report.error = blocked.or_else(|| self.reason(&end.reason));
@@ -228,7 +228,7 @@ impl Service {
         Ok(report)
     }
 
-    /// A refusal by the tick in words; `None`: it was taken on.
+    /// Returns a refusal by the tick as an error; `None`: it was accepted.
     pub(super) fn refusal(&self, outcome: &Outcome) -> Option<RpcError> {
         let code = Code::of(outcome)?;
         let names = &self.parts.names;
@@ -256,12 +256,12 @@ impl Service {
         })
     }
 
-    /// Publishes the joint state of the last tick to those who listen, if there was a tick since the last time.
+    /// Publishes the joint state of the last tick to subscribers, unless that was done already.
     pub fn publish(&self, ticked: bool) {
         let listened_to = self.parts.streams.has_joint_state_readers();
         let wanted = listened_to && self.parts.blueprint.coordinator.publish_joint_state;
         self.parts.pulse.streaming.store(wanted, Relaxed);
-        // The tick wakes us for replies too, and one that we came late for shows the tick after it.
+        // The tick also wakes this thread for replies; a late wake-up publishes the newest tick.
         let ticks = self.parts.pulse.ticks.load(Relaxed);
         if !(wanted && ticked) || self.published.swap(ticks, Relaxed) == ticks {
             return;
@@ -290,7 +290,7 @@ impl Service {
 
     /// Logs an event and publishes it to subscribers.
     pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
-        if let Some(line) = self.repeats.line(described, Instant::now()) {
+        if let Some(line) = self.log_throttle.line(described, Instant::now()) {
             match described.severity {
                 Severity::Info => tracing::debug!("{line}"),
                 Severity::Warn => tracing::warn!("{line}"),
@@ -320,6 +320,6 @@ fn percentiles(f: Figures) -> Percentiles {
 
 fn rfc3339(wall_ns: i64) -> String {
     let time = jiff::Timestamp::from_nanosecond(i128::from(wall_ns)).unwrap_or_default();
-    // Whole seconds are enough for people.
+    // Whole seconds suffice for display.
     jiff::Timestamp::from_second(time.as_second()).unwrap_or_default().to_string()
 }

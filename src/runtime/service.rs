@@ -1,5 +1,4 @@
-//! What a run does for those who talk to it: every rpc method, on top of requests to the tick and orders to the
-//! device threads.
+//! The service of a run: answers every rpc method with requests to the tick and orders to the device threads.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -9,12 +8,12 @@ use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use super::Ending;
-use super::dispatch::{Dispatcher, NotTold, log_of};
+use super::dispatch::{Dispatcher, SendError, log_of};
 use super::late_stops::LateStops;
+use super::log_throttle::LogThrottle;
 use super::motions::Motions;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
-use super::repeats::Repeats;
 use super::waiting::Progress;
 use crate::arm::{ArmState, Link};
 use crate::blueprint::Blueprint;
@@ -37,7 +36,7 @@ use crate::sync::lock;
 use crate::telemetry::describe::{ArmNames, Names};
 use crate::telemetry::{ArmSample, Event, Outcome, Phase, TaskView};
 
-/// What a service is made from.
+/// Parts of a service.
 pub struct ServiceParts {
     pub run: String,
     pub blueprint: Blueprint,
@@ -57,24 +56,24 @@ pub struct ServiceParts {
     pub planner: Option<PlannerPort>,
 }
 
-/// The run, for those who talk to it.
+/// The run, for its clients.
 pub struct Service {
     pub(super) parts: ServiceParts,
     pub(super) started: Instant,
     pub(super) motions: Mutex<Motions>,
     pub(super) recorder: OnceLock<Arc<RecorderStats>>,
-    pub(super) repeats: Repeats,
+    pub(super) log_throttle: LogThrottle,
     pub(super) late_stops: LateStops,
     pub(super) progress: Progress,
-    /// One gripper order at a time and arm, so that each has its own answer.
+    /// One gripper order per arm at a time, so that each gets its own answer.
     pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
-    /// Ticks done when the joint state was published last.
+    /// Number of ticks when the joint state was last published.
     pub(super) published: AtomicU64,
-    /// The planner that is attached, or was.
+    /// The attached planner, also after it disconnected.
     pub(super) attached: Mutex<Option<Arc<Attached>>>,
-    /// The plan that was carried out last, and its motion.
+    /// The last executed plan, and its motion.
     pub(super) executed: Mutex<Option<(u64, u64)>>,
-    /// What plans were asked for, by their number.
+    /// Requests of plans, by the plans' numbers.
     pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
     pub(super) me: Weak<Self>,
     closed: AtomicBool,
@@ -90,7 +89,7 @@ impl Service {
             started: Instant::now(),
             motions: Mutex::default(),
             recorder: OnceLock::new(),
-            repeats: Repeats::default(),
+            log_throttle: LogThrottle::default(),
             late_stops: LateStops::default(),
             published: AtomicU64::new(0),
             attached: Mutex::default(),
@@ -102,37 +101,37 @@ impl Service {
         }
     }
 
-    /// The recorder's figures, once there is one.
+    /// Sets the recorder's statistics.
     pub fn set_recorder(&self, stats: Arc<RecorderStats>) {
         let _ = self.recorder.set(stats);
     }
 
-    /// Keeps a run's name where no server does.
+    /// Keeps the lock on the run's name if there is no server.
     pub fn keep(&self, claim: Claim) {
         *lock(&self.claim) = Some(claim);
     }
 
-    /// From here on nothing new is taken.
+    /// Rejects new requests from now on.
     pub fn close(&self) {
         self.closed.store(true, Ordering::Release);
     }
 
-    /// Whether the run is ending.
+    /// Returns whether the run is shutting down.
     pub fn is_closed(&self) -> bool {
         self.closed.load(Ordering::Acquire)
     }
 
-    /// Length of a tick's period.
+    /// Returns the period of the tick.
     pub fn period(&self) -> Duration {
         self.parts.config.period()
     }
 
-    /// Phase of an arm after the last tick.
+    /// Returns the phase of an arm after the last tick.
     pub fn phase(&self, arm: usize) -> Phase {
         self.arm_view(arm).map_or(Phase::Unknown, |s| s.phase)
     }
 
-    /// The latest sample of an arm.
+    /// Returns the latest sample of an arm.
     pub(super) fn arm_view(&self, arm: usize) -> Option<ArmSample> {
         lock(&self.parts.arm_views).get_mut(arm).map(SlotReader::read)
     }
@@ -159,6 +158,10 @@ impl Service {
                 self.tell(tick, described, wall);
             }
             Notice::Lost(count) => tracing::warn!("the recorder fell behind: {count} samples are missing in the log"),
+            Notice::Unsynced(after) => tracing::warn!(
+                "the log is closed, but its disk has not stored all of it after {} s; keep the power on",
+                after.as_secs()
+            ),
             Notice::Stopped(error) => {
                 tracing::error!("{error}");
                 let first = error.to_string().lines().next().unwrap_or_default().to_owned();
@@ -167,7 +170,7 @@ impl Service {
         }
     }
 
-    /// Measured positions of all joints [rad].
+    /// Returns the measured positions of all joints [rad].
     pub(super) fn positions(&self) -> Vec<f64> {
         let dofs = self.parts.config.arms.iter().map(|a| a.dof);
         let mut all = Vec::new();
@@ -193,7 +196,7 @@ impl Service {
         }
     }
 
-    /// Indices of an arm's joints over all arms.
+    /// Returns the indices of an arm's joints over all arms.
     pub(super) fn joints_of_arm(&self, arm: u16) -> std::ops::Range<u16> {
         let dofs = || self.parts.config.arms.iter().map(|a| a.dof as u16);
         let first = dofs().take(arm as usize).sum();
@@ -205,18 +208,18 @@ impl Service {
         self.outcome(self.parts.dispatcher.ask(request, log).await)
     }
 
-    /// What the tick answered, or its refusal.
-    pub(super) fn outcome(&self, answer: Result<Outcome, NotTold>) -> Result<Outcome, RpcError> {
+    /// Returns the outcome of a request, or an error if there is none.
+    pub(super) fn outcome(&self, answer: Result<Outcome, SendError>) -> Result<Outcome, RpcError> {
         let outcome = answer.map_err(|e| match e {
-            NotTold::Full => RpcError::new(Code::NoAnswer, e.to_string()).hint("send fewer requests at once"),
-            NotTold::NoAnswer => {
+            SendError::Full => RpcError::new(Code::NoAnswer, e.to_string()).hint("send fewer requests at once"),
+            SendError::NoAnswer => {
                 RpcError::new(Code::NoAnswer, e.to_string()).hint("`dimos status` shows whether the run is alive")
             }
         })?;
         self.refusal(&outcome).map_or(Ok(outcome), Err)
     }
 
-    /// The arm of a joint, and its index there.
+    /// Returns the arm of a joint, and the joint's index in the arm.
     pub(super) fn locate(&self, joint: u16) -> Option<(usize, usize)> {
         let mut left = joint as usize;
         for (i, arm) in self.parts.config.arms.iter().enumerate() {
@@ -240,7 +243,7 @@ impl Service {
                 tasks.insert(config.name.clone(), outcome.name().to_owned());
             }
         }
-        // Behind what moves: a planner in another process may take its time.
+        // Last: a planner in another process may be slow.
         let planning = call.task.is_none() && self.cancel_planning().await;
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
     }
@@ -321,7 +324,7 @@ impl Backend for Service {
     }
 
     fn prepare_urgent_thread(&self) {
-        // Where it is not granted, the thread competes like any other; it is idle otherwise, so its turn comes soon.
+        // Without this right the thread has normal priority; it is mostly idle, so it is scheduled soon.
         let _ = host::set_fifo(host::STOP_PRIORITY);
     }
 

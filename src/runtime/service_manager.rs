@@ -1,5 +1,5 @@
-//! The service manager (systemd), where there is one: informed when the run is up and when it ends; its watchdog is fed
-//! only while the tick beats.
+//! Notifies the service manager (systemd), if there is one, of the start and end of the run, and feeds its watchdog
+//! while the tick is alive.
 //!
 //! It receives datagrams on the socket that `NOTIFY_SOCKET` names: `READY=1`, `WATCHDOG=1` and the like.
 
@@ -10,7 +10,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::time::{Duration, Instant};
 
-/// The way to the service manager. What cannot be delivered is dropped: nothing here waits or fails.
+/// Connection to the service manager. Messages that cannot be delivered are dropped: no call blocks or fails.
 #[derive(Debug)]
 pub struct ServiceManager {
     socket: UnixDatagram,
@@ -19,7 +19,7 @@ pub struct ServiceManager {
 }
 
 impl ServiceManager {
-    /// The one that started this process, as `NOTIFY_SOCKET` says; `None` where there is none.
+    /// Returns the one that started this process, from `NOTIFY_SOCKET`; `None` if there is none.
     pub fn from_env() -> Option<Self> {
         let variable = |name| std::env::var(name).ok().and_then(|value| value.parse::<u64>().ok());
         let ours = variable("WATCHDOG_PID").is_none_or(|pid| pid == u64::from(std::process::id()));
@@ -27,7 +27,7 @@ impl ServiceManager {
         Self::at(std::env::var_os("NOTIFY_SOCKET")?, watchdog).ok()
     }
 
-    /// One that listens at an address (a path, or `@` and an abstract name), with the given watchdog interval.
+    /// Creates one that listens at an address (a path, or `@` and an abstract name), with this watchdog interval.
     pub fn at(address: OsString, watchdog: Option<Duration>) -> io::Result<Self> {
         let address = match address.as_bytes().strip_prefix(b"@") {
             Some(name) => SocketAddr::from_abstract_name(name)?,
@@ -38,22 +38,22 @@ impl ServiceManager {
         Ok(Self { socket, address, watchdog })
     }
 
-    /// The run is up; `status` is for people.
+    /// Reports that the run is up, with a status line.
     pub fn ready(&self, status: &str) {
         self.tell(&format!("READY=1\nSTATUS={}", one_line(status)));
     }
 
-    /// What the run is about, for people.
+    /// Reports a status line.
     pub fn status(&self, status: &str) {
         self.tell(&format!("STATUS={}", one_line(status)));
     }
 
-    /// The run ends.
+    /// Reports that the run shuts down.
     pub fn stopping(&self) {
         self.tell("STOPPING=1\nSTATUS=decelerating, then releasing the arms");
     }
 
-    /// What the watchdog does each time it found that the tick beats: a sign of life, twice as often as asked for.
+    /// Returns the watchdog's work at each check that finds the tick alive: a ping, twice per requested interval.
     pub fn signs_of_life(&self) -> io::Result<impl FnMut() + Send + 'static> {
         let of_its_own =
             Self { socket: self.socket.try_clone()?, address: self.address.clone(), watchdog: self.watchdog };

@@ -1,9 +1,9 @@
-//! How a run comes up, in stages. Each stage owns what it has started, and what it owns is released when it is dropped:
-//! a start that fails leaves nothing behind, wherever it fails.
+//! The start of a run, in stages. Each stage owns what it has started and releases it when dropped: a start that fails
+//! leaves nothing behind, at any stage.
 //!
 //! ```text
-//! Prepared ─────────▶ Connected ───────────▶ Run ──────────────────────────────▶ enabled ─▶ listening
-//! name, log, models   devices, arms' limits  recorder, courier, tick, watchdog   motors     socket
+//! Prepared ─────────▶ Connected ───────────▶ Run ───────────────────────────────▶ enabled ─▶ listening
+//! name, log, models   devices, arms' limits  recorder, outcomes, tick, watchdog   motors     socket
 //! ```
 
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex};
 
 use super::arms::{self, Arms, BroughtUp, Slots};
 use super::control_config::{coordinator_config, names_of, tasks};
-use super::dispatch::{Courier, Dispatcher};
+use super::dispatch::{Dispatcher, OutcomeThread};
 use super::log_file::{attachments, log_path, metadata, no_log, retain, tell_device_note};
 use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
@@ -41,9 +41,9 @@ use crate::telemetry::Sample;
 use crate::telemetry::describe::Names;
 
 impl Run {
-    /// Starts a run. When this fails, everything that had been started is stopped again and nothing has moved.
+    /// Starts a run. On failure everything is stopped again, and nothing has moved.
     pub fn start(blueprint: &Blueprint, options: Options) -> Result<Self, StartError> {
-        // Should what follows fail, the run ends before its name is free.
+        // If a later stage fails, the run ends before its name is released.
         let (claim, mut run) = Prepared::new(blueprint, options)?.connect()?.start()?;
         run.enable(blueprint)?;
         if blueprint.rpc.enabled {
@@ -69,7 +69,7 @@ impl Run {
     }
 }
 
-/// A run whose name is taken and whose blueprint holds together. No arm was touched.
+/// A run with its name claimed and its blueprint checked. No arm was contacted.
 struct Prepared<'a> {
     blueprint: &'a Blueprint,
     options: Options,
@@ -110,7 +110,7 @@ impl<'a> Prepared<'a> {
         let planner = self.blueprint.planner.as_ref().zip(self.robots.take()).map(|(planner, setup)| {
             let limits = command_limits(&self.names, &config);
             PlannerPort::start(planner, setup, &limits, self.options.solver.take()).map_err(|what| {
-                let hint = "the model's limits, the arm's, and `limits` in the blueprint must have room in common";
+                let hint = "the model's limits, the arm's, and `limits` in the blueprint must overlap";
                 StartError::other(what, hint)
             })
         });
@@ -120,7 +120,7 @@ impl<'a> Prepared<'a> {
     }
 }
 
-/// A run whose arms are connected. Fields are dropped in this order: the arms go before the name.
+/// A run with connected arms. Fields are dropped in this order: the arms before the name.
 struct Connected<'a> {
     arms: Arms,
     slots: Slots,
@@ -134,9 +134,9 @@ struct Connected<'a> {
 }
 
 impl Connected<'_> {
-    /// Starts the threads; each that was started ends when the next one cannot be.
+    /// Starts the threads. If one cannot be started, the previous ones end.
     fn start(self) -> Result<(Claim, Run), StartError> {
-        // Dropped in reverse: the arms before the name.
+        // Dropped in reverse order: the arms before the name.
         let Self { prepared, arms, slots, connected, config, planner, pulse, notes, noted } = self;
         let (ports, ends) = wires(&config, slots, &arms, pulse.clone())?;
         let dispatcher = Arc::new(Dispatcher::new(ends.requests, notes));
@@ -162,8 +162,8 @@ impl Connected<'_> {
         let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
         let recorder = start_recorder(&prepared, &config, ends.samples, noted, &service)?;
         let publish = publisher(service.clone(), prepared.wall);
-        let courier = Courier::start(dispatcher.clone(), ends.reply_wake, ends.replies, ends.retired, publish);
-        let courier = courier.map_err(no_thread("courier"))?;
+        let outcomes = OutcomeThread::start(dispatcher.clone(), ends.reply_wake, ends.replies, ends.retired, publish);
+        let outcomes = outcomes.map_err(no_thread("outcomes"))?;
         let Options { probe, service_manager: manager, .. } = prepared.options;
         let tick = Tick::start(&config, prepared.tasks, ports, probe, endings.clone()).map_err(no_thread("tick"))?;
         let watchdog = start_watchdog(&pulse, &config, &endings, manager.as_ref())?;
@@ -173,7 +173,7 @@ impl Connected<'_> {
             tick,
             watchdog,
             dispatcher,
-            courier: Some(courier),
+            outcomes: Some(outcomes),
             recorder: Some(recorder),
             server: None,
             handle: Handle { service },
@@ -199,7 +199,7 @@ fn start_recorder(
         names: prepared.names.clone(),
         frame_id: blueprint.coordinator.joint_state_frame_id.clone(),
         attachments: attachments(blueprint, config),
-        metadata: metadata(blueprint),
+        metadata: metadata(blueprint, config),
         wall,
         min_free: blueprint.recording.min_free.0,
     };
@@ -211,7 +211,7 @@ fn start_recorder(
     Ok(recorder)
 }
 
-/// What the courier does whenever it is woken.
+/// Returns the work of the outcome thread at each wake-up.
 fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send + 'static {
     move |woken| {
         service.progress.made();
@@ -239,7 +239,7 @@ fn wrong_model(what: String) -> StartError {
     StartError::Blueprint { what, hint: "`dimos model check FILE` shows all that is wrong with a model".to_owned() }
 }
 
-/// The planner's robots, with what must be said of them.
+/// Loads the planner's robots and logs warnings about them.
 pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError> {
     let setup = PlanningScene::load(config).map_err(wrong_model)?;
     for (robot, [a, b]) in &setup.always_touching {
@@ -250,7 +250,7 @@ pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError
     Ok(setup)
 }
 
-/// What the watchdog does at each look that finds the tick alive.
+/// Returns the watchdog's work at each check that finds the tick alive.
 fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
     match manager.map(ServiceManager::signs_of_life) {
         Some(Ok(alive)) => Box::new(alive),
@@ -262,7 +262,7 @@ fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
     }
 }
 
-/// A run in a line.
+/// Returns a line about the run.
 fn in_short(report: &StatusReport) -> String {
     let arms: Vec<String> = report.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
     let simulated = if report.simulated { ", SIMULATED" } else { "" };

@@ -1,4 +1,4 @@
-//! Streams of targets: one request each, on its way to its task.
+//! Targets of streams: one request each.
 
 use super::planner_port::isometry;
 use super::service::Service;
@@ -8,7 +8,7 @@ use crate::rpc::api::{self, Done};
 use crate::rpc::{Code, RpcError};
 
 impl Service {
-    /// The next target of a servo (`positions`) or velocity task.
+    /// Sends the next target of a servo (`positions`) or velocity task.
     pub(super) async fn stream(&self, task: String, values: Vec<f64>, positions: bool) -> Result<(), RpcError> {
         let index = self.task_index(&task)?;
         let width = self.parts.config.tasks[index as usize].joints.len();
@@ -25,13 +25,13 @@ impl Service {
         Ok(())
     }
 
-    /// The next target of an `eef_twist` task.
+    /// Sends the next target of an `eef_twist` task.
     pub(super) async fn twist(&self, call: &api::Twist) -> Result<Done, RpcError> {
         let tool = call.frame == api::TwistFrame::Tool;
         self.steer(&call.task, Goal::Twist { linear: call.linear, angular: call.angular, tool }).await
     }
 
-    /// The next target of a `cartesian_ik` task.
+    /// Sends the next target of a `cartesian_ik` task.
     pub(super) async fn pose(&self, call: &api::Pose) -> Result<Done, RpcError> {
         let turn = isometry(&call.spec()).rotation;
         self.steer(&call.task, Goal::Pose { position: call.xyz, orientation: turn.coords.into() }).await

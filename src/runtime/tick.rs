@@ -1,4 +1,4 @@
-//! The tick's thread as a run has it: started, watched, ended.
+//! Starts, monitors and ends the tick thread of a run.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -15,12 +15,12 @@ use crate::control::task::Task;
 use crate::control::tick_loop::{self, Probe, Pulse, TickPorts};
 use crate::rt::host;
 
-/// How long the thread gets to end.
+/// Timeout for the thread to end.
 const END_LIMIT: Duration = Duration::from_millis(300);
-/// How often is looked whether it has.
+/// Poll period while waiting for that.
 const LOOK_EVERY: Duration = Duration::from_millis(1);
 
-/// The running tick. Ends when it is dropped.
+/// The running tick. Ends when dropped.
 pub(super) struct Tick {
     pulse: Arc<Pulse>,
     period: Duration,
@@ -50,14 +50,14 @@ impl Tick {
         Ok(Self { pulse, period, thread: Some(thread) })
     }
 
-    /// Whether it runs and its heartbeat is not late.
+    /// Returns whether it runs and its heartbeat is recent.
     pub fn is_alive(&self) -> bool {
         let silence = self.pulse.beat.silence(MonotonicClock.now());
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
             && silence.is_none_or(|silence| silence < watchdog::silence_limit(self.period))
     }
 
-    /// Ends it after its present tick. `false`: it hangs, and is left behind.
+    /// Ends it after the current tick. Returns `false` if it hangs and was abandoned.
     pub fn end(&mut self) -> bool {
         self.pulse.stop.store(true, Ordering::Release);
         let limit = if self.is_alive() { END_LIMIT.max(2 * self.period) } else { Duration::ZERO };

@@ -12,18 +12,18 @@ use crate::control::tick_loop::Pulse;
 /// Maximum wait for a tick.
 const TICK_LIMIT: Duration = Duration::from_secs(1);
 
-/// Counts ticks and answers of arms, and wakes those who wait for them.
+/// Counts ticks and answers of arms, and wakes the requests that wait for them.
 #[derive(Debug, Default)]
 pub(super) struct Progress(watch::Sender<u64>);
 
 impl Progress {
-    /// A tick is done, or an arm has answered.
+    /// Counts a tick, or an answer of an arm.
     pub fn made(&self) {
         self.0.send_modify(|count| *count = count.wrapping_add(1));
     }
 }
 
-/// A request that waits: while this exists, the tick wakes the courier.
+/// A waiting request: while this exists, every tick wakes the outcome thread.
 struct Waiting<'a>(&'a Pulse);
 
 impl<'a> Waiting<'a> {
@@ -40,8 +40,8 @@ impl Drop for Waiting<'_> {
 }
 
 impl Service {
-    /// Waits until `look` finds something: it is called now, and after every tick and every answer of an arm. Where no
-    /// tick comes, several times a second all the same. `None`: nothing was found until `limit`.
+    /// Waits until `look` returns `Some`. Calls it now, after every tick and every answer of an arm, and at least
+    /// several times a second. Returns `None` at the `limit`.
     pub(super) async fn until<T>(&self, limit: Instant, mut look: impl FnMut() -> Option<T>) -> Option<T> {
         let mut progress = self.progress.0.subscribe();
         let _waiting = Waiting::begin(&self.parts.pulse);
@@ -55,7 +55,7 @@ impl Service {
         }
     }
 
-    /// Waits for the end of a tick that begins from now on: it reads what the arms have reported up to now.
+    /// Waits for the end of the next tick to begin: it reads all that the arms have reported so far.
     pub(super) async fn next_tick(&self) {
         let pulse = &self.parts.pulse;
         let begun = pulse.begun.load(Ordering::SeqCst);

@@ -1,5 +1,5 @@
-//! Sees that the tick is alive: the checker is not the checked. The device threads hold their arms on their own
-//! when the tick falls silent; the watchdog ends the run.
+//! Checks that the tick is alive, from another thread. If the tick hangs, the device threads hold their arms on their
+//! own; the watchdog ends the run.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,23 +12,23 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::host;
 
-/// How often it looks: each look costs a wake-up of the processor.
+/// Period of the check: each one costs a wake-up of the processor.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 
-/// A tick silent for this time counts as hung: long enough for a machine that stalls, short enough to end a run
+/// Time without a tick after which it counts as hung: longer than stalls of the computer, short enough to end a run
 /// within a second.
 pub fn silence_limit(period: Duration) -> Duration {
     (5 * period).max(Duration::from_millis(400))
 }
 
-/// The running watchdog. Ends when it is dropped.
+/// The running watchdog. Ends when dropped.
 pub struct Watchdog {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Watchdog {
-    /// Starts the thread `watchdog`. `alive` is called at each look that finds a new beat, and must not wait.
+    /// Starts the thread `watchdog`. `alive` is called at each check that finds a new tick, and must not block.
     pub fn start(
         beat: Arc<Heartbeat>,
         period: Duration,
@@ -45,8 +45,8 @@ impl Watchdog {
                 std::thread::park_timeout(LOOK_EVERY);
                 let now = MonotonicClock.now();
                 let beat = beat.last();
-                // A process that was stopped and continued finds its tick silent, but the tick has had no chance to
-                // beat: only time counts in which this thread could look.
+                // After SIGSTOP and SIGCONT there was no tick, but the tick could not run: only time counts in which
+                // this thread could run.
                 let passed = now.since(looked).min(2 * LOOK_EVERY);
                 silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };
                 if beat != last {
@@ -63,7 +63,7 @@ impl Watchdog {
         Ok(Self { stop, thread: Some(thread) })
     }
 
-    /// From here on silence is meant.
+    /// Ends the check: no further ticks are expected.
     pub fn stand_down(&self) {
         self.stop.store(true, Ordering::Release);
     }

@@ -17,7 +17,7 @@ use crate::telemetry::{ArmSample, Cause, Outcome, Phase, Sample, TaskView, TickS
 /// Capacity of the recorder's ring [s].
 const RING_SECONDS: f64 = 5.0;
 
-/// The ends that are not the tick's.
+/// The ends for the other threads.
 pub(super) struct Ends {
     pub requests: rtrb::Producer<Envelope>,
     pub replies: rtrb::Consumer<(u64, Outcome)>,
@@ -28,7 +28,7 @@ pub(super) struct Ends {
     pub task_views: Vec<SlotReader<TaskView>>,
 }
 
-/// Makes them all. What a device thread answers to a command wakes the same thread as a reply of the tick.
+/// Creates all of them. Answers of a device thread wake the same thread as replies of the tick.
 pub(super) fn wires(
     config: &CoordinatorConfig,
     slots: Slots,
@@ -70,7 +70,7 @@ pub(super) fn wires(
     Ok((ports, Ends { requests, replies, reply_wake, retired, samples, arm_views, task_views }))
 }
 
-/// Touches every page of the ring, so that no page fault comes while it is filled for the first time.
+/// Touches every page of the ring, so that filling it for the first time causes no page fault.
 fn touch(producer: &mut rtrb::Producer<Sample>, consumer: &mut rtrb::Consumer<Sample>) {
     while producer.push(Sample::Tick(TickSample::default())).is_ok() {}
     if let Ok(chunk) = consumer.read_chunk(consumer.slots()) {

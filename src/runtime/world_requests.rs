@@ -1,5 +1,5 @@
-//! The planner's world, over rpc: objects that come, go, move, are held. [`PlannerPort::objects`] has them as given,
-//! the planner thread's world as shapes; the two change together.
+//! Requests that change the planner's world: add, move, remove, attach, detach. [`PlannerPort::objects`] has the
+//! objects as given, the planner thread's world has their shapes; both change together.
 
 use std::path::PathBuf;
 
@@ -19,7 +19,7 @@ use crate::sync::lock;
 impl PlannerPort {
     pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<Done, RpcError> {
         self.measured(moment);
-        let setup = &*self.desk.now();
+        let setup = &*self.thread.now();
         let index = robot_index(setup, &call.robot)?;
         let robot = setup.robots.get(index).ok_or_else(internal)?;
         let mut object = named(self, &call.name)?;
@@ -39,13 +39,13 @@ impl PlannerPort {
                 touch_links: call.touch_links.clone(),
                 padding: object.padding,
             });
-            // What cannot be held stays where it was: nothing vanishes from the world by a mistake.
+            // An object that cannot be attached stays: no error removes an object from the world.
             if taken.is_err() {
                 world.add(stood)?;
             }
             taken
         };
-        self.desk.world(held).map_err(|e| wrong(e.to_string()))?;
+        self.thread.world(held).map_err(|e| wrong(e.to_string()))?;
         object.pose = spec(&at);
         object.held_by = Some([call.robot.clone(), link]);
         lock(&self.objects).insert(call.name.clone(), object);
@@ -58,7 +58,7 @@ impl PlannerPort {
             return Err(wrong(format!("no robot holds {name}")));
         };
         self.measured(moment);
-        let setup = &*self.desk.now();
+        let setup = &*self.thread.now();
         let robot = setup.robots.get(robot_index(setup, &robot)?).ok_or_else(internal)?;
         let at = link_pose(robot, &link, moment)? * isometry(&object.pose);
         let let_go = |world: &mut World| {
@@ -68,20 +68,20 @@ impl PlannerPort {
                 .map(|solid| Solid { frame: frame(&at), ..solid })
                 .try_for_each(|solid| world.add(Obstacle { name: name.to_owned(), solid, padding: held.padding }))
         };
-        self.desk.world(let_go).map_err(|e| wrong(e.to_string()))?;
+        self.thread.world(let_go).map_err(|e| wrong(e.to_string()))?;
         object.pose = spec(&at);
         lock(&self.objects).insert(name.to_owned(), object);
         Ok(Done {})
     }
 
-    /// Puts an object into the world. Its file is read beside everything else: it may be large.
+    /// Adds an object to the world. Reads its file on another thread: it may be large.
     pub(super) async fn put(&self, object: WorldObject) -> Result<Done, RpcError> {
         not_held(self, &object.name)?;
         let config = configured(&object, isometry(&object.pose));
         let made = apart(move || obstacle(&config)).await?.map_err(wrong)?;
-        // Somebody may have attached it meanwhile.
+        // Another client may have attached it meanwhile.
         not_held(self, &object.name)?;
-        self.desk.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
+        self.thread.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
         lock(&self.objects).insert(object.name.clone(), object);
         Ok(Done {})
     }
@@ -89,7 +89,7 @@ impl PlannerPort {
     pub(super) fn move_to(&self, call: &api::WorldMove) -> Result<Done, RpcError> {
         let mut object = named(self, &call.name)?;
         let at = frame(&isometry(&call.pose));
-        self.desk.world(|world| world.move_to(&call.name, at)).map_err(|e| wrong(e.to_string()))?;
+        self.thread.world(|world| world.move_to(&call.name, at)).map_err(|e| wrong(e.to_string()))?;
         object.pose = call.pose;
         lock(&self.objects).insert(call.name.clone(), object);
         Ok(Done {})
@@ -102,14 +102,14 @@ impl PlannerPort {
             None => gone.extend(lock(&self.objects).values().filter(|o| o.held_by.is_none()).map(|o| o.name.clone())),
         }
         for name in gone {
-            self.desk.world(|world| world.remove(&name)).map_err(|e| wrong(e.to_string()))?;
+            self.thread.world(|world| world.remove(&name)).map_err(|e| wrong(e.to_string()))?;
             lock(&self.objects).remove(&name);
         }
         Ok(Done {})
     }
 }
 
-/// Where a robot's link is now, in the frame `map`.
+/// Returns the present pose of a robot's link in the frame `map`.
 fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isometry3<f64>, RpcError> {
     let index = link_index(robot, link)?;
     let kinematics = &robot.body.kinematics;
@@ -134,14 +134,14 @@ fn link_index(robot: &PlannedRobot, link: &str) -> Result<usize, RpcError> {
     robot.model.link_index(link).ok_or_else(unknown)
 }
 
-/// An object that no robot holds.
+/// Returns an object that no robot holds.
 fn named(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
     not_held(port, name)?;
     known(port, name)
 }
 
 fn known(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
-    // Not in one expression: its lock would be held while the refusal takes it again.
+    // Not in one expression: the lock would still be held when the error path locks again.
     let object = lock(&port.objects).get(name).cloned();
     object.ok_or_else(|| unknown_object(port, name))
 }
@@ -167,7 +167,7 @@ fn configured(object: &WorldObject, pose: Isometry3<f64>) -> ObjectConfig {
     ObjectConfig { name: object.name.clone(), shape, pose, padding: object.padding }
 }
 
-/// An object of the blueprint, as rpc has it.
+/// Converts an object of the blueprint to its rpc type.
 pub(super) fn typed(object: &ObjectConfig) -> WorldObject {
     let shape = match &object.shape {
         ObjectShape::Box(size) => ShapeSpec::Box(*size),

@@ -112,7 +112,7 @@ fn a_wrong_value_gives_one_report() {
         }
         let range = tree.node(node).unwrap().range.clone();
         let block = text[range.clone()].contains('\n');
-        // A block is replaced where it stands, indented below its key.
+        // A block is replaced in place, indented below its key.
         let changed = format!("{}.nan{}", &text[..range.start], &text[range.end..]);
         one_report(&changed, range.start, &format!("{path} replaced (block: {block})"));
         tried += 1;

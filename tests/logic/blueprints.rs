@@ -47,7 +47,7 @@ fn shipped_blueprints_have_no_mistakes() {
     }
 }
 
-/// What the options' types cannot say, the arms in the box say: each at its place, like any other mistake.
+/// Mistakes in options that only the built-in arms can find, each located like any other.
 #[test]
 #[cfg(feature = "can")]
 fn options_that_do_not_fit_are_told_where_they_stand() {
@@ -338,14 +338,14 @@ tasks:
         (own("end_effector_link: flange, joint_prefix: arm_, timeout: -1"), "out of range", "-1"),
         (own("end_effector_link: flange, joint_prefix: arm_, max_linear_velocity: 0"), "out of range", "0"),
         (own("end_effector_link: flange, speed: 1"), "speed", "speed"),
-        (task("params: {model_path: 'builtin:nobody', end_effector_link: x}"), "cannot be used", "builtin:nobody"),
+        (task("params: {model_path: 'builtin:missing', end_effector_link: x}"), "cannot be used", "builtin:missing"),
         (task("params: {model_path: gone.urdf, end_effector_link: x}"), "cannot be used", "gone.urdf"),
     ] {
-        let told = load_text(&entry, false);
-        let text = told.render(false);
-        assert!(told.errors() >= 1 && text.contains(said), "{entry}\n{text}");
+        let loaded = load_text(&entry, false);
+        let text = loaded.render(false);
+        assert!(loaded.errors() >= 1 && text.contains(said), "{entry}\n{text}");
         assert!(text.contains("cart:4:") || text.contains(":4:"), "{text}");
-        let first = told.reports().into_iter().find(|r| r.message.contains(said)).unwrap();
+        let first = loaded.reports().into_iter().find(|r| r.message.contains(said)).unwrap();
         if let Some((line, column)) = place.split_once(':').filter(|(line, _)| *line == "4") {
             assert!(first.line == Some(line.parse().unwrap()), "{text}");
             assert!(column.is_empty() || first.column == Some(column.parse().unwrap()), "{text}");

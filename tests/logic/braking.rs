@@ -1,5 +1,6 @@
-//! A thousand planned motions that something gets in the way of, without real time: each is cancelled as a run cancels
-//! it, brakes along its path in the coordinator's ticks, and keeps the padding from where it was until it rests.
+//! Planned motions with an obstacle that appears in their way, without real time: each is cancelled as a run cancels
+//! it, brakes along its path in the coordinator's ticks, and keeps the padding until it is at rest. `DIMOS_BRAKING` is
+//! the number of motions (200), `SEED` repeats a run.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -7,7 +8,7 @@ use std::time::Duration;
 use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::Mono;
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution, Stop};
-use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
@@ -21,7 +22,6 @@ use dimos::runtime::Run;
 use dimos::telemetry::TaskState;
 use dimos::trajectory::{Cursor, Sample, Spline};
 
-const CASES: usize = 1000;
 /// Obstacles that are put into the way of one motion.
 const EACH: usize = 20;
 const PERIOD: Duration = Duration::from_millis(10);
@@ -50,21 +50,21 @@ fn config() -> CoordinatorConfig {
         priority: 10,
         auto_start: false,
     };
-    CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
+    CoordinatorConfig { version: CONFIG_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
 }
 
-/// The coordinator on a clock that is set forward, with an arm that does what it is told, a period later.
+/// The coordinator on a virtual clock, with an arm that follows each command one period later.
 struct Virtual {
     coordinator: Coordinator,
     arm: ArmState,
     now: Mono,
     inbox: VecDeque<Envelope>,
-    /// What the task showed after the last tick: its state, and how far its motion is [s].
+    /// State of the task after the last tick, and the elapsed time of its motion [s].
     task: (TaskState, f64),
 }
 
 impl Virtual {
-    /// Executing a motion from where it starts.
+    /// Returns a run that executes a motion from its start.
     fn executing(found: &PlannedMotion) -> Self {
         let start: Vec<f64> = found.path[0].clone();
         let arm = ArmState {
@@ -130,24 +130,24 @@ fn at(found: &PlannedMotion, time: f64) -> Vec<f64> {
     samples.iter().map(|sample| sample.position).collect()
 }
 
-/// A motion from somewhere to somewhere, where there is one.
+/// Plans a motion between two random free configurations, if there is one.
 fn motion(setup: &PlanningScene, checker: &mut ExactChecker, random: &mut Random) -> Option<PlannedMotion> {
-    let mut somewhere = || {
+    let mut random_free = || {
         (0..1000).find_map(|_| {
             let inside = |l: &dimos::robot::model::Limits| random.between(l.lower.max(-2.5), l.upper.min(2.5));
             let q: Vec<f64> = setup.robots[0].limits.iter().map(inside).collect();
             checker.is_free(&q).then_some(q)
         })
     };
-    let (start, goal) = (somewhere()?, somewhere()?);
+    let (start, goal) = (random_free()?, random_free()?);
     let (speed, seed) = (random.between(0.2, 1.0), random.bits());
     let request = pipeline::PlanRequest { goals: vec![(0, Goal::Joints(goal))], positions: vec![start], speed, seed };
     let stop = Stop::new(Some(std::time::Instant::now() + Duration::from_secs(2)), None);
     solve(setup, &setup.world, &request, &stop).ok().filter(|found| found.trajectory.duration() > 0.5)
 }
 
-/// Something at a link of the arm, as it is at a configuration.
-fn something(setup: &PlanningScene, q: &[f64], random: &mut Random) -> ObjectConfig {
+/// Returns a random obstacle near a link of the arm in a configuration.
+fn random_obstacle(setup: &PlanningScene, q: &[f64], random: &mut Random) -> ObjectConfig {
     let robot = &setup.robots[0];
     let kinematics = &robot.body.kinematics;
     let mut frames = kinematics.frames();
@@ -164,14 +164,14 @@ fn something(setup: &PlanningScene, q: &[f64], random: &mut Random) -> ObjectCon
     ObjectConfig { name: "late".into(), shape, pose, padding: 0.0 }
 }
 
-/// The distance of the arm from the thing at a configuration, where it is less than the padding [m].
+/// Returns the distance of the arm from the obstacle in a configuration, if it is less than the padding [m].
 fn too_close(judge: &ExactChecker, q: &[f64]) -> Option<f64> {
     let mut judge = judge.clone();
     let near = judge.closer_than_padding(q).into_iter().find(|(_, contact)| contact.other == "late");
     near.map(|(_, contact)| contact.distance)
 }
 
-/// The planner's robots, as a run narrows them to what its arm may be commanded.
+/// Returns the planner's scene, with the limits that a run sets for its arm.
 fn setup() -> PlanningScene {
     let loaded = Run::from_name("yourarm-planner").unwrap().check();
     let setup = PlanningScene::load(loaded.blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
@@ -193,7 +193,7 @@ fn planned_motions_keep_the_jerk_limit_in_what_is_commanded() {
             run.step();
             commanded.push(run.position());
         }
-        // Steps of the acceleration, from one tick to the next; the last tick is on its way to the hold.
+        // Steps of the acceleration between ticks; the last tick already belongs to the hold.
         for four in commanded[..commanded.len() - 1].windows(4) {
             for (j, a) in four[0].iter().enumerate() {
                 let [b, c, d] = [1, 2, 3].map(|k: usize| four[k][j]);
@@ -205,21 +205,22 @@ fn planned_motions_keep_the_jerk_limit_in_what_is_commanded() {
 }
 
 #[test]
-fn a_thousand_motions_brake_before_what_gets_in_their_way() {
-    let seed = std::env::var("SEED").ok().and_then(|s| s.parse().ok()).unwrap_or(9);
+fn cancelled_motions_brake_before_an_obstacle_in_their_way() {
+    let number = |variable, otherwise| std::env::var(variable).ok().and_then(|s| s.parse().ok()).unwrap_or(otherwise);
+    let (seed, cases) = (number("SEED", 9), number("DIMOS_BRAKING", 200) as usize);
     println!("SEED={seed}");
     let mut random = Random::new(seed);
     let setup = setup();
     assert!(setup.padding > 0.0);
     let mut checker = ExactChecker::new(setup.world.snapshot(), Resolution::default());
     let (mut held, mut too_late, mut beside, mut nearest) = (0, 0, 0, f64::INFINITY);
-    while held < CASES {
+    while held < cases {
         let Some(found) = motion(&setup, &mut checker, &mut random) else { continue };
         let (spline, duration) = (Spline::new(&found.trajectory).unwrap(), found.trajectory.duration());
         for _ in 0..EACH {
             let moment = random.between(0.0, 0.8 * duration);
             let ahead = random.between((moment + 0.3).min(duration), duration);
-            let thing = something(&setup, &at(&found, ahead), &mut random);
+            let thing = random_obstacle(&setup, &at(&found, ahead), &mut random);
             let mut world = setup.world.clone();
             world.add(obstacle(&thing).unwrap()).unwrap();
             let seen = look_ahead(&setup, &world, &found, &found.path[..1], moment, &Stop::never()).unwrap();
@@ -255,7 +256,7 @@ fn a_thousand_motions_brake_before_what_gets_in_their_way() {
             assert!(close.is_none(), "case {held} of SEED={seed}: rests {close:?} m from {thing:?}, {blocked:?}");
             nearest = f64::min(nearest, blocked.free_until - run.task.1);
             held += 1;
-            if held == CASES {
+            if held == cases {
                 break;
             }
         }

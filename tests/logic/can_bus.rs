@@ -2,7 +2,7 @@
 
 use std::os::fd::AsFd;
 
-use dimos::hardware::spec::AdapterError;
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::transport::can::bus::{Bus, RECEIVE_QUEUE};
 use dimos::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble, open};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -98,7 +98,7 @@ fn a_queue_that_nobody_empties_is_bounded_and_says_so() {
         |(i, event): (usize, &CanEvent)| *event == CanEvent::Frame(CanFrame::new(1, &(i as u32).to_be_bytes()));
     assert!(got.iter().enumerate().take(RECEIVE_QUEUE - 1).all(in_order));
     arm.send(&[frame(2, 2)]).unwrap();
-    assert_eq!(frames(&mut *port), [frame(2, 2)], "and goes on");
+    assert_eq!(frames(&mut *port), [frame(2, 2)], "and continues");
 }
 
 #[test]
@@ -157,7 +157,7 @@ fn an_interface_that_went_down_breaks_its_ports_for_good() {
     bus.withhold(8);
     old.send(&[frame(1, 1)]).unwrap();
     bus.set_up(false);
-    assert!(readable(&*old), "whoever waits hears of it");
+    assert!(readable(&*old), "a waiting thread wakes up");
     let broken = AdapterError::Io(format!("the connection to arm at {} broke: the interface went down", bus.address()));
     assert_eq!(old.receive(), Err(broken.clone()));
     assert_eq!(old.send(&[frame(1, 1)]), Err(broken.clone()));

@@ -115,19 +115,19 @@ fn a_pose_is_reached_smoothly_within_a_millimetre_and_a_tenth_of_a_degree() {
         assert!(farthest < line.length() + 1e-3, "overshoot: {farthest} of {}", line.length());
         assert!(astray < 5e-3, "off the straight line by {astray}");
         assert!(fastest < 0.25 * 1.01, "{fastest}");
-        assert_eq!(rig.speed(0), 0.0, "it stands still there");
+        assert_eq!(rig.speed(0), 0.0, "it is at rest there");
         assert_eq!(rig.tasks[0].state, TaskState::Executing);
         reached += 1;
     }
     assert_eq!(reached, 20);
 }
 
-/// Poses are given where the robot's base stands, not in the model's own frame.
+/// Poses are relative to the robot's base, not to the model's root frame.
 #[test]
 fn poses_are_in_the_frame_that_the_root_is_placed_in() {
     let turn = DQuat::from_rotation_z(PI / 2.0);
     let root = DAffine3::from_rotation_translation(turn, DVec3::new(1.0, 2.0, 0.5));
-    let place = Place { position: root.translation.to_array(), orientation: turn.to_array() };
+    let place = FramePose { position: root.translation.to_array(), orientation: turn.to_array() };
     let mut rig = rig_at(&HOME, TaskKinematics { root: place, ..robot() }, &CartesianParams::default());
     let mut goal = HOME;
     goal[0] += 0.2;
@@ -192,7 +192,7 @@ fn a_stream_that_stops_decelerates_into_a_hold() {
         assert!(rig.speed(0) > 0.1, "it moves");
         rig.run_until(1.0, |rig| rig.tasks[task as usize].state == TaskState::Idle);
         assert_eq!(rig.tasks[task as usize].reason, Reason::Timeout);
-        assert!(rig.told(Event::Task(task, TaskState::Executing, Reason::Timeout)), "it says why it slows down");
+        assert!(rig.reported(Event::Task(task, TaskState::Executing, Reason::Timeout)), "it reports why it slows down");
         assert_eq!(rig.speed(0), 0.0);
         let held = rig.commanded(0);
         rig.run_for(1.0);
@@ -325,7 +325,7 @@ fn losing_a_joint_ends_the_motion_and_a_stream_takes_over_a_moving_arm() {
     assert_eq!(rig.tasks[1].state, TaskState::Aborted);
     assert!(matches!(rig.tasks[1].reason, Reason::Preempted(2, 5)), "{:?}", rig.tasks[1]);
     rig.run_for(1.5);
-    // Over a trajectory of lower priority, in motion: it goes on from there without a step back.
+    // Over a trajectory of lower priority, in motion: it continues from there without a step back.
     let q = rig.commanded(0);
     let to: Vec<f64> = q.iter().map(|q| q - 0.3).collect();
     assert_eq!(rig.execute(3, motion(2, &[0, 1, 2, 3, 4, 5], &[(0.0, &q), (0.6, &to)])), Outcome::Accepted);
@@ -370,7 +370,7 @@ fn a_stop_ends_it_and_a_velocity_task_hands_the_arm_over() {
         rig.velocity(4, &[0.3, 0.0, 0.0, 0.0, 0.0, 0.0]);
         rig.tick();
     }
-    // Another mode: it waits until the arm stands still, and begins there.
+    // Another mode: it waits until the arm is at rest, and begins there.
     stream(&mut rig, TWISTS, twist([0.0, 0.1, 0.0], [0.0; 3]), 1.5, |_| {});
     assert_eq!(rig.tasks[1].state, TaskState::Executing);
     assert!(rig.speed(0) > 0.05);

@@ -1,13 +1,13 @@
-//! The conformance suite must be able to fail: adapters that are wrong in one way each, and the check that says so.
+//! The conformance suite must be able to fail: adapters with one mistake each, and the check that finds it.
 
 use std::os::fd::BorrowedFd;
 
 use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::adapter::*;
 use dimos::hardware::arms::{mock, xarm, yourarm};
-use dimos::hardware::conformance::gently::{Motion, move_gently, refusal};
+use dimos::hardware::conformance::first_motion::{Motion, refusal, run_first_motion};
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits};
 
 use crate::support::counting;
@@ -18,7 +18,7 @@ type Inner = Box<dyn ManipulatorAdapter>;
 const DEGREES: u8 = 0;
 const WRONG_SIGN: u8 = 1;
 const SWAPPED_JOINTS: u8 = 2;
-const DEAF_TO_STOP: u8 = 3;
+const IGNORES_STOP: u8 = 3;
 const MOVES_ON_ACTIVATION: u8 = 4;
 const ENABLES_ON_CONNECT: u8 = 5;
 const HIDES_ERRORS: u8 = 6;
@@ -28,21 +28,21 @@ const ZERO_VELOCITIES: u8 = 9;
 const FAILS_WITHOUT_SENSOR: u8 = 10;
 const DROPS_POWER_ON_LEAVING: u8 = 11;
 const HIDES_SILENCE: u8 = 12;
-const STAMPS_ANEW: u8 = 13;
+const RESTAMPS_STATES: u8 = 13;
 const CLEARS_ERRORS_ON_CONNECT: u8 = 14;
 const STOP_DROPS_POWER: u8 = 15;
 const CONFIRMS_ALWAYS: u8 = 16;
 const STOP_CLEARS_ERRORS: u8 = 17;
 const STOP_IS_FINAL: u8 = 18;
 const MOVES_ON_RECONNECTING: u8 = 19;
-const OLD_NEWS_AFTER_CONNECT: u8 = 20;
+const STALE_STATE_AFTER_CONNECT: u8 = 20;
 const WRONG_SIGN_BOTH_WAYS: u8 = 21;
 const IGNORES_MODEL: u8 = 22;
 const CANNOT_STOP_AFTER_RECONNECTING: u8 = 23;
 const VELOCITIES_IN_DEGREES: u8 = 24;
-const OBEYS_WITHOUT_POWER: u8 = 25;
+const MOVES_WITHOUT_POWER: u8 = 25;
 const ALLOCATES_FOR_NEWS: u8 = 26;
-const GRIPPER_GOES_ON: u8 = 27;
+const GRIPPER_IGNORES_STOP: u8 = 27;
 const STOP_LOCKS_GRIPPER: u8 = 28;
 const NO_MISTAKE: u8 = 255;
 
@@ -76,7 +76,7 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
         ..yourarm::SPEC
     };
 
-    /// Around an arm that sends its state by itself.
+    /// Around an arm that streams its state.
     const PUSHED: AdapterSpec = AdapterSpec {
         name: "wrong",
         create: |config: &AdapterConfig| Ok(Box::new(Self::around((xarm::SPEC.create)(config)?))),
@@ -107,7 +107,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         }
         result?;
         self.connections += 1;
-        self.repeat = MISTAKE == OLD_NEWS_AFTER_CONNECT;
+        self.repeat = MISTAKE == STALE_STATE_AFTER_CONNECT;
         match MISTAKE {
             ENABLES_ON_CONNECT => self.inner.write_enable(true),
             CLEARS_ERRORS_ON_CONNECT => self.inner.write_clear_errors(),
@@ -177,7 +177,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_IN_DEGREES) {
             *velocity = velocity.map(f64::to_degrees);
         }
-        if MISTAKE == STAMPS_ANEW {
+        if MISTAKE == RESTAMPS_STATES {
             reading.stamp = Some(MonotonicClock.now());
         }
         self.last = Some(*reading);
@@ -209,7 +209,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             return self.inner.write_joint_positions(&positions, velocity);
         }
         let result = self.inner.write_joint_positions(positions, velocity);
-        if MISTAKE == OBEYS_WITHOUT_POWER { Ok(()) } else { result }
+        if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
     }
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
         self.inner.write_joint_velocities(velocities)
@@ -217,13 +217,13 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.stopped = true;
         match MISTAKE {
-            DEAF_TO_STOP if self.inner.is_connected() => Ok(Stop::Confirmed),
+            IGNORES_STOP if self.inner.is_connected() => Ok(Stop::Confirmed),
             CANNOT_STOP_AFTER_RECONNECTING if self.connections > 1 => Ok(Stop::Confirmed),
             CONFIRMS_ALWAYS => self.inner.write_stop().or(Ok(Stop::Confirmed)),
             STOP_DROPS_POWER => self.inner.write_enable(false).map(|()| Stop::Confirmed),
             STOP_CLEARS_ERRORS => self.inner.write_clear_errors().map(|()| Stop::Confirmed),
             // The arm's own stop holds the gripper too; this one does not.
-            GRIPPER_GOES_ON | STOP_LOCKS_GRIPPER => {
+            GRIPPER_IGNORES_STOP | STOP_LOCKS_GRIPPER => {
                 let stop = self.inner.write_stop()?;
                 let gripper = self.inner.gripper().ok_or(AdapterError::Unsupported)?;
                 gripper.write_gripper_position(self.gripper).map(|()| stop)
@@ -249,12 +249,12 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())
     }
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
         self.inner.gripper().and_then(|gripper| gripper.get_gripper_range())
     }
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
         match MISTAKE {
-            GRIPPER_GOES_ON if self.stopped => return Ok(()),
+            GRIPPER_IGNORES_STOP if self.stopped => return Ok(()),
             STOP_LOCKS_GRIPPER if self.stopped => return Err(AdapterError::Rejected("stopped".into())),
             _ => self.gripper = position,
         }
@@ -274,7 +274,7 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<DEGREES>::SPEC, "planned_moves_arrive"),
         (Wrong::<WRONG_SIGN>::SPEC, "planned_moves_arrive"),
         (Wrong::<SWAPPED_JOINTS>::SPEC, "set_points_are_followed"),
-        (Wrong::<DEAF_TO_STOP>::SPEC, "stop_ends_motion"),
+        (Wrong::<IGNORES_STOP>::SPEC, "stop_ends_motion"),
         (Wrong::<MOVES_ON_ACTIVATION>::SPEC, "activation_holds"),
         (Wrong::<ENABLES_ON_CONNECT>::SPEC, "connecting_changes_nothing"),
         (Wrong::<HIDES_ERRORS>::SPEC, "errors_have_code_and_text"),
@@ -286,27 +286,27 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<WRONG_SIGN_BOTH_WAYS>::WIRED, "joints_are_the_arms_own"),
         (Wrong::<IGNORES_MODEL>::WIRED, "wrong_model_is_refused"),
         (Wrong::<HIDES_SILENCE>::WIRED, "silence_is_noticed"),
-        (Wrong::<STAMPS_ANEW>::WIRED, "frozen_state_is_noticed"),
-        (Wrong::<STAMPS_ANEW>::SPEC, "frozen_state_is_noticed"),
-        (Wrong::<DEAF_TO_STOP>::WIRED, "stop_ends_motion"),
-        (Wrong::<DEAF_TO_STOP>::SPEC, "stop_ends_velocity"),
-        (Wrong::<DEAF_TO_STOP>::WIRED, "stop_ends_velocity"),
+        (Wrong::<RESTAMPS_STATES>::WIRED, "frozen_state_is_noticed"),
+        (Wrong::<RESTAMPS_STATES>::SPEC, "frozen_state_is_noticed"),
+        (Wrong::<IGNORES_STOP>::WIRED, "stop_ends_motion"),
+        (Wrong::<IGNORES_STOP>::SPEC, "stop_ends_velocity"),
+        (Wrong::<IGNORES_STOP>::WIRED, "stop_ends_velocity"),
         (Wrong::<STOP_DROPS_POWER>::SPEC, "stop_ends_streaming"),
         (Wrong::<STOP_CLEARS_ERRORS>::WIRED, "stop_in_error_is_harmless"),
         (Wrong::<STOP_IS_FINAL>::WIRED, "stop_is_no_fault"),
-        (Wrong::<GRIPPER_GOES_ON>::WIRED, "stop_holds_the_gripper"),
+        (Wrong::<GRIPPER_IGNORES_STOP>::WIRED, "stop_holds_the_gripper"),
         (Wrong::<STOP_LOCKS_GRIPPER>::SPEC, "stop_holds_the_gripper"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "cut_when_disabled"),
         (Wrong::<CLAIMS_TO_BE_CONNECTED>::WIRED, "cut_when_enabled"),
-        (Wrong::<OLD_NEWS_AFTER_CONNECT>::WIRED, "cut_when_enabled"),
+        (Wrong::<STALE_STATE_AFTER_CONNECT>::WIRED, "cut_when_enabled"),
         (Wrong::<MOVES_ON_RECONNECTING>::WIRED, "cut_when_enabled"),
         (Wrong::<MOVES_ON_RECONNECTING>::WIRED, "cut_while_streaming"),
         (Wrong::<CANNOT_STOP_AFTER_RECONNECTING>::SPEC, "cut_in_motion"),
         (Wrong::<CLEARS_ERRORS_ON_CONNECT>::WIRED, "cut_in_error"),
         (Wrong::<ENABLES_ON_CONNECT>::WIRED, "power_cut"),
         (Wrong::<CONFIRMS_ALWAYS>::WIRED, "stop_into_the_void"),
-        (Wrong::<OBEYS_WITHOUT_POWER>::SPEC, "disabled_arms_do_not_move"),
-        (Wrong::<OBEYS_WITHOUT_POWER>::FALLING, "disabled_arms_do_not_move"),
+        (Wrong::<MOVES_WITHOUT_POWER>::SPEC, "disabled_arms_do_not_move"),
+        (Wrong::<MOVES_WITHOUT_POWER>::FALLING, "disabled_arms_do_not_move"),
         (Wrong::<ALLOCATES_FOR_NEWS>::PUSHED, "reads_do_not_allocate"),
     ];
     std::thread::scope(|scope| {
@@ -345,7 +345,7 @@ fn moved_gently(row: &AdapterSpec, looks: u32) -> (Motion, Inner) {
     adapter.connect().unwrap();
     let mut left = looks;
     let interrupted = std::cell::Cell::new(false);
-    let motion = move_gently(&mut *adapter, &|| interrupted.get(), &mut |_| {
+    let motion = run_first_motion(&mut *adapter, &|| interrupted.get(), &mut |_| {
         left -= 1;
         interrupted.set(left == 0);
     });
@@ -359,7 +359,7 @@ fn the_small_slow_motion_ends_where_something_is_odd() {
         (Wrong::<WRONG_SIGN>::SPEC, "joint 2 was sent by +2.00° and moves the other way"),
         (Wrong::<SWAPPED_JOINTS>::SPEC, "joint 3 moved by"),
         (Wrong::<MOVES_ON_ACTIVATION>::SPEC, "moved by 0.5"),
-        (Wrong::<DEAF_TO_STOP>::SPEC, "in spite of a stop"),
+        (Wrong::<IGNORES_STOP>::SPEC, "in spite of a stop"),
         (Wrong::<STOP_DROPS_POWER>::SPEC, "the motors went off"),
         (Wrong::<VELOCITIES_IN_DEGREES>::SPEC, "are they in rad/s"),
         (Wrong::<STOP_IS_FINAL>::SPEC, "stopped"),
@@ -371,7 +371,7 @@ fn the_small_slow_motion_ends_where_something_is_odd() {
                 let odd = motion.odd.unwrap_or_else(|| panic!("{says}: nothing was odd in {:?}", motion.ways));
                 assert!(odd.contains(says), "{odd}");
                 println!("{odd}");
-                // Whatever it was, the arm stands.
+                // In every case the arm is at rest.
                 let mut before = [0.0; 6];
                 let mut after = [0.0; 6];
                 adapter.read_joint_positions(&mut before).unwrap();

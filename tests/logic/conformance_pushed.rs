@@ -1,4 +1,4 @@
-//! The part of the conformance suite that is for devices which send their state by themselves: an arm that does it
+//! The part of the conformance suite that is for devices that stream their state: an arm that does it
 //! right, and arms that do it wrong in one way each.
 
 use std::io::{Read, Write};
@@ -8,10 +8,10 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
+use dimos::hardware::adapter::*;
 use dimos::hardware::arms::mock;
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits};
 
 /// What is wrong with an adapter.

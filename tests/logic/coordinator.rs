@@ -132,7 +132,7 @@ fn a_trajectory_that_takes_over_from_a_velocity_does_not_fault() {
         rig.tick();
     }
     let start = rig.arms[0].q[0];
-    // By the time the arm stands still it is 0.25 rad further, too far from the trajectory's start.
+    // By the time the arm is at rest it is 0.25 rad further, too far from the trajectory's start.
     assert_eq!(rig.execute(1, sweep(1, 0..6, start, 1.5, 2.0)), Outcome::Accepted);
     rig.run_for(1.0);
     assert_eq!(rig.phase(0), Phase::Ready, "{:?}", rig.events);
@@ -198,9 +198,13 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
         rig.run_for(1.0);
         assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
         assert_eq!(rig.phase(0), Phase::Held);
-        assert!(rig.told(Event::Task(0, TaskState::Aborted, Reason::ArmHeld(0, Cause::Operator))));
+        assert!(rig.reported(Event::Task(0, TaskState::Aborted, Reason::ArmHeld(0, Cause::Operator))));
         rig.run_for(2.0);
-        assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, 1), "at rest it is left alone, stopped once");
+        assert_eq!(
+            (rig.commands[0].mode, rig.arms[0].stops),
+            (None, 1),
+            "at rest it gets no more commands, stopped once"
+        );
         let rest = rig.arms[0].q[0];
         let here = |rig: &Rig, what: &str| {
             let moved = (rig.arms[0].q[0] - rest).abs();
@@ -224,7 +228,7 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
             here(&rig, "enable");
         }
         assert_eq!(rig.phase(0), Phase::Ready);
-        assert_eq!(rig.events.len(), before + 1, "told of Ready, and of nothing else");
+        assert_eq!(rig.events.len(), before + 1, "one event, Ready");
     }
 }
 

@@ -1,5 +1,5 @@
-//! A stop that an arm does not take at once is asked for again, whoever wants it: the tick, or the device thread
-//! by itself because the tick fell silent.
+//! A stop that an arm does not take at once is retried, whether the tick requested it or the device thread did
+//! because no tick came.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Link, Supervision};
 use dimos::clock::{Clock, MonotonicClock};
+use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
-use dimos::hardware::spec::{AdapterError, ManipulatorAdapter};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::joint::ControlMode;
 use dimos::rt::heartbeat::Heartbeat;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
@@ -32,7 +32,7 @@ fn bench(native_rate: f64) -> Bench {
     bench_of(Box::new(mock.clone()), mock, native_rate)
 }
 
-/// A device thread with this adapter; `mock` is it, or stands idle.
+/// A device thread with this adapter; `mock` is that adapter, or unused.
 fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
     let beat = Arc::new(Heartbeat::default());
     let (state_writer, states) = slot(ArmState::default());
@@ -91,7 +91,7 @@ fn a_stop_that_fails_is_sent_again_and_confirmed() {
     bench.mock.fail("write_stop", AdapterError::Timeout("no answer".into()));
     bench.mock.fail("write_stop", AdapterError::Rejected("busy".into()));
     bench.tick(|c| (c.mode, c.stop_seq) = (None, 1));
-    // No tick comes any more: the thread goes on by itself.
+    // No more ticks come: the thread continues on its own.
     bench.until("the stop", |b| b.device.health().stop_confirmed.load(Relaxed) == 1);
     assert_eq!(bench.stops(), 3);
     bench.end();
@@ -170,7 +170,7 @@ fn a_change_of_mode_that_a_moving_arm_refuses_is_asked_for_again_and_is_no_fault
 fn a_gripper_that_goes_on_after_a_stop_is_held() {
     let options = serde_json::json!({ "gripper": "xarm" });
     let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
-    let emulator = XArmEmulator::start(&config, &Place::InProcess).unwrap();
+    let emulator = XArmEmulator::start(&config, &EmulatorAddress::InProcess).unwrap();
     config.address = emulator.address();
     let mut bench = bench_of((xarm::SPEC.create)(&config).unwrap(), MockAdapter::new(6), 250.0);
     let send = |bench: &mut Bench, opening: f64| {
@@ -190,7 +190,7 @@ fn a_gripper_that_goes_on_after_a_stop_is_held() {
             std::thread::sleep(Duration::from_millis(1200));
             let held = emulator.gripper();
             std::thread::sleep(Duration::from_millis(300));
-            assert!(held < 0.0849, "stopped at {at_the_stop} m, it went on to {held} m");
+            assert!(held < 0.0849, "stopped at {at_the_stop} m, it continued to {held} m");
             assert!((emulator.gripper() - held).abs() < 1e-6, "held");
             return bench.end();
         }

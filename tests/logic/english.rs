@@ -161,7 +161,9 @@ fn files() -> Vec<PathBuf> {
     while let Some(path) = folders.pop() {
         if path.is_dir() {
             let entries = fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path());
-            folders.extend(entries.filter(|path| !path.ends_with(FIXTURES) && !path.ends_with(file!())));
+            folders.extend(entries.filter(|path| {
+                !path.ends_with(FIXTURES) && !path.ends_with("node_modules") && !path.ends_with(file!())
+            }));
         } else {
             files.push(path);
         }

@@ -355,6 +355,6 @@ fn the_path_tolerance_aborts_before_the_guard_latches() {
     rig.arms[0].blocked = true;
     rig.run_until(3.0, |rig| rig.tasks[0].state != TaskState::Executing);
     assert!(matches!(rig.tasks[0].reason, Reason::PathTolerance(_, by) if by.abs() > 0.1), "{:?}", rig.tasks[0]);
-    assert!(!rig.told(Event::Arm(0, Phase::Held, Cause::Operator)));
+    assert!(!rig.reported(Event::Arm(0, Phase::Held, Cause::Operator)));
     assert_eq!(rig.commands[0].mode, Some(ControlMode::ServoPosition));
 }

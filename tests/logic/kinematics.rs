@@ -32,7 +32,7 @@ fn frames_and_jacobians_are_pinocchios() {
         let kinematics = Kinematics::whole(&model).unwrap();
         let mut random = Random::new(8);
         let configurations: Vec<Vec<f64>> = (0..20).map(|_| random_q(&kinematics, &mut random)).collect();
-        // Pinocchio is told where followers stand.
+        // Pinocchio gets the positions of mimic joints.
         let all = |q: &Vec<f64>| -> HashMap<String, f64> {
             let named = kinematics.names().iter().cloned().zip(q.iter().copied()).collect();
             let positions = model.positions(&named);
@@ -40,8 +40,8 @@ fn frames_and_jacobians_are_pinocchios() {
             moving.map(|(j, p)| (j.name.clone(), p)).collect()
         };
         let links: Vec<&str> = model.links.iter().map(|l| l.name.as_str()).collect();
-        let told: Vec<_> = configurations.iter().map(all).collect();
-        let question = json!({ "urdf": path, "links": links, "configurations": told });
+        let expanded: Vec<_> = configurations.iter().map(all).collect();
+        let question = json!({ "urdf": path, "links": links, "configurations": expanded });
         let Some(answers) = ask_python("kinematics.py", "pinocchio", &question) else { return };
         let (mut frames, mut columns) = (kinematics.frames(), vec![[0.0; 6]; kinematics.dof()]);
         for (q, answer) in configurations.iter().zip(answers.as_array().unwrap()) {

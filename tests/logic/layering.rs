@@ -222,7 +222,7 @@ fn one_arm_does_not_use_another() {
             }
         }
     }
-    fail_on(&found, "each arm stands alone");
+    fail_on(&found, "arms do not use each other");
 }
 
 #[test]
@@ -243,7 +243,7 @@ fn one_task_type_does_not_use_another_and_the_coordinator_uses_none() {
             }
         }
     }
-    fail_on(&found, "each task type stands alone, and only the table knows all");
+    fail_on(&found, "task types do not use each other; only the table has all");
 }
 
 /// Words of a line of code.

@@ -27,6 +27,7 @@ mod kinematics;
 mod layering;
 mod model;
 mod no_alloc;
+mod older_logs;
 mod pages;
 mod planning;
 mod planning_timing;

@@ -1,4 +1,4 @@
-//! Robot descriptions: the vendors' in `../shared`, those in the box, and the verbs that show them.
+//! Robot descriptions: the vendors' in `../shared`, the built-in ones, and the verbs that show them.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -292,8 +292,11 @@ fn joints_are_found_for_a_pose_and_what_is_missing_is_said() {
     let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3"]);
     assert!(far.code == 1 && far.err.contains("no IK solution after") && far.err.contains("mm"), "{}", far.err);
     let far = dimos(&["ik", "builtin:yourarm", "--pose", "2", "0", "0.3", "--json"]);
-    let told: serde_json::Value = serde_json::from_str(&far.out).unwrap();
-    assert!(far.code == 1 && told["reached"] == false && told["position_error"].as_f64().unwrap() > 1.0, "{told}");
+    let report: serde_json::Value = serde_json::from_str(&far.out).unwrap();
+    assert!(
+        far.code == 1 && report["reached"] == false && report["position_error"].as_f64().unwrap() > 1.0,
+        "{report}"
+    );
     for wrong in [
         &["ik", "builtin:yourarm"][..],
         &["ik", "builtin:yourarm", "--pose", "0.3", "0", "0.3", "--quat", "0", "0", "0", "2"],

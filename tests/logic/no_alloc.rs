@@ -1,5 +1,5 @@
-//! Nothing in the control path takes or gives back memory: an allocator that counts, on the threads that ask for
-//! it, every allocation, reallocation and release.
+//! The control path neither allocates nor frees memory. The allocator counts every allocation, reallocation and release
+//! of the threads that ask for it.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,10 +12,10 @@ use dimos::control::coordinator::Coordinator;
 use dimos::control::request::{Envelope, Goal, Request};
 use dimos::control::task_spec::TaskTable;
 use dimos::control::tick_loop::{self, Pulse, TickPorts};
+use dimos::hardware::adapter::*;
 use dimos::hardware::arms::mock::SPEC;
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::AdapterConfig;
-use dimos::hardware::spec::*;
 use dimos::joint::{ControlMode, JointLimits, joints_of};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
@@ -28,7 +28,7 @@ use crate::support::counting::{watch, watched_calls};
 use crate::support::rig::*;
 
 #[test]
-fn the_count_sees_what_is_taken_grown_and_given_back() {
+fn the_counter_sees_allocation_growth_and_release() {
     watch(true);
     let mut list = std::hint::black_box(Vec::with_capacity(1));
     list.push(1u8);
@@ -39,7 +39,7 @@ fn the_count_sees_what_is_taken_grown_and_given_back() {
 }
 
 #[test]
-fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() {
+fn ticks_with_every_task_type_do_not_allocate() {
     let model = load(&Source::new("builtin:yourarm")).into_model().unwrap();
     let (kinematics, link) = (Kinematics::whole(&model).unwrap(), model.link_index("flange").unwrap());
     let robot = TaskKinematics::new(kinematics, link);
@@ -62,7 +62,7 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
     let pose = Goal::Pose { position: [0.3, 0.1, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
     let nowhere = Goal::Pose { position: [0.3, f64::NAN, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
     let twist = Goal::Twist { linear: [0.1, 0.0, 0.2], angular: [0.1, 0.0, 0.0], tool: true };
-    for k in 0..100_000u64 {
+    for k in 0..20_000u64 {
         let (left, right) = (rig.arms[0].q[0].clamp(-1.9, 1.9), rig.arms[1].q[0].clamp(-1.9, 1.9));
         let to = if (k / 500).is_multiple_of(2) { 0.4 } else { -0.4 };
         if k % 97 == 0 {
@@ -115,17 +115,17 @@ fn a_hundred_thousand_ticks_with_every_task_type_take_and_give_back_no_memory() 
         rig.events.clear();
         rig.retired.clear();
     }
-    assert!(seen.iter().all(|n| *n >= 50), "something hardly happened: {seen:?}");
+    assert!(seen.iter().all(|n| *n >= 10), "something hardly happened: {seen:?}");
     assert_eq!(watched_calls(), 0);
 }
 
 /// The thread that ticks: rings, slots, wakes and the histogram, beside the coordinator.
 #[test]
-fn the_tick_loop_takes_and_gives_back_no_memory() {
+fn the_tick_loop_does_not_allocate() {
     const TICKS: u64 = 1_000;
     let tasks = vec![task("t", trajectory(), 0..6, 10), task("v", velocity(), 0..6, 20)];
     let config = CoordinatorConfig {
-        version: dimos::control::config::CONTROL_VERSION,
+        version: dimos::control::config::CONFIG_VERSION,
         rate: 1000.0,
         arms: vec![arm("arm", 6)],
         tasks,
@@ -307,7 +307,7 @@ impl ManipulatorAdapter for Watched {
 }
 
 #[test]
-fn a_device_thread_in_health_takes_and_gives_back_no_memory() {
+fn a_healthy_device_thread_does_not_allocate() {
     let config = AdapterConfig {
         hardware_id: "arm".into(),
         address: String::new(),

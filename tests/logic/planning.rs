@@ -114,7 +114,7 @@ fn what_cannot_be_planned_is_said() {
     let looked = checker.checks();
     assert_eq!(plan(&mut checker, start, &[goal.to_vec()], &settings, &cancelled), Err(PlanError::Cancelled));
     assert!(checker.checks() - looked <= 4, "{} checks after it was cancelled", checker.checks() - looked);
-    // Neither do shortening and timing go on.
+    // Shortcutting and timing end too.
     let long: Vec<Vec<f64>> = (0..40).map(|k| start.iter().map(|x| x + 0.01 * f64::from(k % 7)).collect()).collect();
     let looked = checker.checks();
     shorten(&mut checker, &long, &ShortcutSettings::default(), 0, &cancelled);

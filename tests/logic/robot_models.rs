@@ -1,5 +1,5 @@
 //! Robot models in blueprints, with the real binary: every key of a planner's robot does what it says, and what a
-//! description gets wrong is said where it stands.
+//! description gets wrong is reported at its line.
 
 use serde_json::Value;
 
@@ -212,7 +212,7 @@ fn links_that_always_touch_are_named_by_every_verb() {
     let run = home.run("lab.yaml --no-record");
     assert!(run.err().contains(pair) || run.out().contains(pair), "{}{}", run.out(), run.err());
     home.dimos("down").with(0);
-    // Told that they may touch, nobody mentions it again.
+    // Allowed to touch, they are not reported again.
     home.write("lab.yaml", &BLUEPRINT.replace("[[arm, finger_right]]", "[[arm, finger_right], [finger_left, arm]]"));
     let shown = home.dimos("check lab.yaml").with(0);
     assert!(!shown.out.contains("touch"), "{}", shown.out);
@@ -264,7 +264,7 @@ fn mistakes_around_a_description_stand_at_the_keys_that_name_it() {
     home.dimos("check lab.yaml --set planner.robots.rig.xacro_args.rech=1").with(0).says(&["did you mean `reach`?"]);
 }
 
-/// What a description may get wrong: each mistake is said where it stands, and what has no meaning here is passed over.
+/// What a description may get wrong: each mistake is reported at its line, and what has no meaning here is ignored.
 #[test]
 fn model_check_knows_every_feature_of_a_description() {
     let home = Home::new();

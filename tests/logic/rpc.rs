@@ -154,7 +154,7 @@ fn a_defect_of_the_backend_ends_one_connection_only() {
 }
 
 #[test]
-fn a_request_that_is_never_answered_is_given_up() {
+fn an_unanswered_request_times_out() {
     let folder = tempfile::tempdir().unwrap();
     let (server, _) = start(folder.path(), "test", FakeBackend::default());
     let mut raw = Raw::connect(&server);
@@ -216,7 +216,7 @@ fn a_slow_reader_loses_its_own_messages_only_and_is_told() {
         let message = quick.next_message().unwrap();
         assert_eq!((message.data["tick"].as_u64(), message.lost), (Some(tick), 0));
     }
-    // The slow one reads now: what it got and what it is told to have lost is everything, in order.
+    // The slow reader reads now: what it got and what it reports as lost is everything, in order.
     let (mut expected, mut lost) = (0, 0);
     while expected < BURST {
         let message = slow.next_message().unwrap();
@@ -340,7 +340,7 @@ fn a_name_is_taken_once_and_given_back_at_the_end() {
 fn what_dead_runs_left_is_removed() {
     let folder = tempfile::tempdir().unwrap();
     let place = RunFolder::at(folder.path());
-    // As after `kill -9`: the socket and the lock file stay, nobody holds the lock.
+    // As after `kill -9`: the socket and the lock file stay, no process holds the lock.
     let leave = |name: &str, lock: bool| {
         drop(UnixListener::bind(folder.path().join(format!("{name}.sock"))).unwrap());
         if lock {

@@ -60,7 +60,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     let steps = |run: &mut VirtualRun, n: usize| (0..n).for_each(|_| run.step());
     run.step();
     run.ask(Request::Ready { arm: 0 });
-    steps(&mut run, 120); // the servo task starts by itself, and times out
+    steps(&mut run, 120); // the servo task starts automatically, and times out
     go(&mut run, 0.5);
     go(&mut run, 0.6); // refused: it is executing already
     steps(&mut run, 30);
@@ -102,7 +102,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     steps(&mut run, 25);
     run.states[0].error = 31;
     steps(&mut run, 40);
-    run.ask(Request::Reset { arm: 0 }); // refused: the fault still stands
+    run.ask(Request::Reset { arm: 0 }); // refused: the fault persists
     run.states[0].position[2] = f64::NAN;
     run.step();
     run.states[0].position[2] = 0.1;
@@ -266,7 +266,7 @@ fn what_is_missing_ends_the_verification_there() {
     reproducible(&copy);
 }
 
-/// Whatever a file says, it is told that something is wrong with it, or that nothing is.
+/// Every file ends with a verdict, whatever is in it.
 #[test]
 fn damaged_messages_break_nothing() {
     let folder = tempfile::tempdir().unwrap();

@@ -5,7 +5,7 @@
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use dimos::hardware::spec::AdapterError;
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::transport::can::socket::SEND_QUEUE;
 use dimos::hardware::transport::can::{
     CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble, SlcanPty, open as open_at,
@@ -35,7 +35,7 @@ fn readable(port: &dyn CanPort, timeout: Duration) -> bool {
     poll(&mut [PollFd::from_borrowed_fd(fd.as_fd(), PollFlags::IN)], Some(&timeout)).unwrap() > 0
 }
 
-/// So many events, and none behind them.
+/// Returns exactly this number of events.
 fn events(port: &mut Port, count: usize) -> Vec<CanEvent> {
     let mut events = Vec::new();
     while events.len() < count {
@@ -85,7 +85,7 @@ fn filters_are_the_kernels() {
         let got: Vec<_> = frames(&mut some, 3).iter().map(|frame| frame.id).collect();
         assert_eq!(got, [0x2A1, 0x251, 0x2AF]);
         assert_eq!(frames(&mut all, 5).len(), 5);
-        // Extended identifiers and remote requests are for nobody here, whatever their lower bits.
+        // Extended identifiers and remote requests match no filter, whatever their lower bits.
         sh("cansend vcan0 000002A1#11; cansend vcan0 2A1#R; cansend vcan0 2A1#22");
         assert_eq!(frames(&mut some, 1), [CanFrame::new(0x2A1, &[0x22])]);
         assert_eq!(frames(&mut all, 1), [CanFrame::new(0x2A1, &[0x22])]);
@@ -126,7 +126,7 @@ fn a_queue_that_nobody_empties_takes_fewer_frames() {
         sh("tc qdisc change dev can0 root plug release_indefinite");
         assert_eq!(frames(&mut arm, taken), sent[..taken]);
         assert_eq!(port.waiting(), 0);
-        assert_eq!(port.send(&sent[50..52]), Ok(2), "and goes on");
+        assert_eq!(port.send(&sent[50..52]), Ok(2), "and continues");
         assert_eq!(frames(&mut arm, 2), sent[50..52]);
 
         sh("tc qdisc change dev can0 root plug limit 100000; tc qdisc change dev can0 root plug block");
@@ -157,7 +157,7 @@ fn followed_until_transmitted(name: &str, peer: &str) {
     let rest = std::iter::from_fn(|| arm.receive().unwrap()).count();
     assert!(rest < SEND_QUEUE, "{rest}");
     for _ in 0..100 {
-        assert_eq!(port.send(&sent[..4]), Ok(4), "and goes on");
+        assert_eq!(port.send(&sent[..4]), Ok(4), "and continues");
         let began = Instant::now();
         while port.waiting() > 0 && began.elapsed() < WAIT {
             assert_eq!(port.receive(), Ok(None));
@@ -222,7 +222,7 @@ fn an_interface_that_goes_down_breaks_its_ports_for_good() {
         let (mut reader, mut writer) = (open("vcan0", &[]), open("vcan0", &[]));
         assert!(!readable(&*reader, Duration::ZERO));
         sh("ip link set vcan0 down");
-        assert!(readable(&*reader, WAIT), "whoever waits hears of it");
+        assert!(readable(&*reader, WAIT), "a waiting thread wakes up");
         assert_eq!(reader.receive(), Err(gone("the interface went down")));
         assert_eq!(writer.send(&numbered(1)), Err(gone("the interface went down")));
         assert!(
@@ -393,19 +393,19 @@ fn the_kernel_tells_what_a_controller_reports() {
         let pty = Pty::open().unwrap();
         sh(&format!("slcan_attach -s8 -o -n can0 {}; ip link set can0 up", pty.path()));
         let mut port = open("can0", &[CanFilter { id: 1, mask: 0x7FF }]);
-        let mut told = |line: &str| {
+        let mut report = |line: &str| {
             pty.write(line.as_bytes()).unwrap();
             match events(&mut port, 1)[..] {
                 [CanEvent::Trouble(trouble)] => trouble,
                 ref other => panic!("{line:?}: {other:?}"),
             }
         };
-        assert_eq!(told("sw097003\r"), CanTrouble::Other(0x204), "a warning, with its counters");
-        assert_eq!(told("sp003129\r"), CanTrouble::Passive);
-        assert_eq!(told("e1a\r"), CanTrouble::NoAcknowledge);
-        assert_eq!(told("e1o\r"), CanTrouble::Overflow);
-        assert_eq!(told("sa000000\r"), CanTrouble::Restarted);
-        assert_eq!(told("sb000256\r"), CanTrouble::BusOff);
+        assert_eq!(report("sw097003\r"), CanTrouble::Other(0x204), "a warning, with its counters");
+        assert_eq!(report("sp003129\r"), CanTrouble::Passive);
+        assert_eq!(report("e1a\r"), CanTrouble::NoAcknowledge);
+        assert_eq!(report("e1o\r"), CanTrouble::Overflow);
+        assert_eq!(report("sa000000\r"), CanTrouble::Restarted);
+        assert_eq!(report("sb000256\r"), CanTrouble::BusOff);
         assert_eq!(port.send(&numbered(2)), Ok(2), "swallowed without a word");
         assert!(refusal("can0").contains("it has no carrier: its controller is bus-off"));
         sh("ip link set can0 down; ip link set can0 up");

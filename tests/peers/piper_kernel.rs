@@ -7,12 +7,12 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use dimos::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter};
 use dimos::hardware::arms::piper::GripperKind;
 use dimos::hardware::arms::piper::adapter::PiperAdapter;
 use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
-use dimos::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter};
 use dimos::joint::ControlMode;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
@@ -23,7 +23,7 @@ use crate::support::uml::{Guest, in_guest, sh};
 const WAIT: Duration = Duration::from_secs(20);
 
 fn emulator(interface: &str, options: &SimOptions) -> PiperEmulator {
-    PiperEmulator::with(options, GripperKind::Small, &Place::Can(interface.into())).unwrap()
+    PiperEmulator::with(options, GripperKind::Small, &EmulatorAddress::Can(interface.into())).unwrap()
 }
 
 fn adapter(interface: &str) -> PiperAdapter {
@@ -176,7 +176,7 @@ fn two_arms_on_two_interfaces_do_not_hear_each_other() {
     });
 }
 
-/// Streams the arm's pose as a device thread does, until the arm is not as ordered any more: the mode, or the motors.
+/// Streams the arm's pose as a device thread does, until its mode or motors differ from what was commanded.
 fn stream_until_changed(arm: &mut PiperAdapter, reading: &mut JointReading) {
     let pose = reading.position;
     until("a sign of the change", || {
@@ -225,7 +225,7 @@ fn interfere(test: &str, kinds: &[&str], pauses: &[u32], feedback_hz: f64) {
             // Of the frames that change a mode or switch motors, there are the SDK's only.
             let orders = trace.iter().filter(|(_, f)| matches!(f.id, 0x150 | 0x151 | 0x471)).count();
             assert_eq!(orders, if *kind == "pose" { 1 } else { 2 }, "{kind} {pause}: {trace:x?}");
-            println!("{kind}, {pause} ms apart: seen, left alone");
+            println!("{kind}, {pause} ms apart: seen, not changed");
             if *kind == "pose" {
                 let there = |joints: &[f64]| emulator.joints().1.iter().all(|v| v.abs() < 1e-3) && joints[1] > 0.0;
                 until("the SDK's pose", || there(&emulator.joints().0));
@@ -264,7 +264,7 @@ fn has_sdk() -> bool {
     has
 }
 
-/// The vendor's SDK opens its sockets without local loopback: on one interface its commands would reach nobody here.
+/// The vendor's SDK opens its sockets without local loopback: on one interface its commands would not arrive.
 #[test]
 fn the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces() {
     if !has_sdk() {

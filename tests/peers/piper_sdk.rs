@@ -1,4 +1,4 @@
-//! The vendor's own SDK (piper_sdk, in a Python process of its own) against the emulator, over slcan on a
+//! The vendor's own SDK (piper_sdk, in its own Python process) against the emulator, over slcan on a
 //! pseudo-terminal: the same program that talks to an arm reads the emulator's state and moves it.
 
 use std::path::Path;
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use dimos::hardware::arms::piper::GripperKind;
 use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
-use dimos::hardware::registry::{Emulator, Place};
+use dimos::hardware::registry::{Emulator, EmulatorAddress};
 
 /// The longest that the SDK's script may take.
-const PATIENCE: Duration = Duration::from_secs(90);
+const TIMEOUT: Duration = Duration::from_secs(90);
 /// The SDK is Python: it keeps up with this many states a second, also on a busy machine [Hz].
 const RATE: f64 = 50.0;
 
@@ -32,7 +32,7 @@ fn python(name: &str, arguments: &[&str]) -> Option<String> {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + TIMEOUT;
     while child.try_wait().unwrap().is_none() {
         if Instant::now() > end {
             let _ = child.kill();
@@ -48,7 +48,7 @@ fn python(name: &str, arguments: &[&str]) -> Option<String> {
 #[test]
 fn the_vendors_sdk_reads_the_emulator_and_moves_it() {
     let options = SimOptions { feedback_hz: RATE, firmware: "S-V1.6-3".into(), ..SimOptions::default() };
-    let emulator = PiperEmulator::with(&options, GripperKind::Small, &Place::Pty).unwrap();
+    let emulator = PiperEmulator::with(&options, GripperKind::Small, &EmulatorAddress::Pty).unwrap();
     let address = emulator.address();
     let path = address.strip_prefix("slcan:").unwrap().split('@').next().unwrap();
     emulator.record();

@@ -1,4 +1,4 @@
-//! The vendor's own client, in a process of its own, against our emulator at the arm's own ports: it connects,
+//! The vendor's own client, in its own process, against our emulator at the arm's own ports: it connects,
 //! enables, moves, reads, sets velocities, uses the gripper and the force/torque sensor, sees errors and clears them.
 
 use std::net::{IpAddr, Ipv4Addr};
@@ -7,7 +7,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use dimos::hardware::arms::xarm::emulator::XArmEmulator;
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use serde_json::json;
 
@@ -23,7 +23,7 @@ fn skip(what: &str) {
 fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmulator, String)> {
     let ip = IpAddr::V4(Ipv4Addr::new(127, 0, 6, last));
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof, options };
-    match XArmEmulator::start(&config, &Place::Bind(ip)) {
+    match XArmEmulator::start(&config, &EmulatorAddress::Bind(ip)) {
         Ok(emulator) => {
             assert_eq!(emulator.address(), format!("{ip}:502:30000"));
             Some((emulator, ip.to_string()))

@@ -41,7 +41,7 @@ fn a_run_in_another_process_moves_the_emulated_arm() {
 }
 
 #[test]
-fn a_scripted_fault_strikes() {
+fn a_scripted_fault_occurs() {
     let (home, address) = (Home::new(), loopback(2));
     home.write("faults.yaml", "- {at: 0.5, kind: error_code, code: 3}\n");
     let emulator = emulate(&home, &format!("yourarm --bind {address} --fault faults.yaml --fault at=1e5,kind=estop"));
@@ -57,14 +57,14 @@ fn a_scripted_fault_strikes() {
     assert_eq!(error.0, 3);
     adapter.disconnect();
     emulator.until("the client is gone");
-    let told = emulator.end(Signal::TERM).with(143).err;
+    let trace = emulator.end(Signal::TERM).with(143).err;
     let at = |what: &str| {
-        let line = told.lines().find(|line| line.ends_with(what)).unwrap_or_else(|| panic!("{what}: {told}"));
+        let line = trace.lines().find(|line| line.ends_with(what)).unwrap_or_else(|| panic!("{what}: {trace}"));
         line.split_whitespace().find_map(|word| word.parse::<f64>().ok()).unwrap()
     };
     let (came, struck) = (at(" s  a client connected"), at(" s  the fault error_code begins"));
-    assert!(struck >= came + 0.5 && at(" s  the client is gone") >= struck, "{told}");
-    assert!(!told.contains("estop"), "{told}");
+    assert!(struck >= came + 0.5 && at(" s  the client is gone") >= struck, "{trace}");
+    assert!(!trace.contains("estop"), "{trace}");
 }
 
 #[test]

@@ -7,9 +7,8 @@ use std::process::{Command, Stdio};
 use rustix::process::Signal;
 use serde_json::Value;
 
+use crate::support::crates::{CHECKOUT, programs, share_builds, without_cargo_settings};
 use crate::support::program::{Home, Started, UP};
-
-const CHECKOUT: &str = env!("CARGO_MANIFEST_DIR");
 
 /// All files below a folder with their texts, by path.
 fn files(folder: &Path) -> Vec<(PathBuf, String)> {
@@ -26,29 +25,23 @@ fn files(folder: &Path) -> Vec<(PathBuf, String)> {
     all
 }
 
-/// Builds and tests the crate in a folder, with the libraries of this checkout as they were built for it; fails on any
-/// warning. Answers the folder of its programs.
+/// Builds and tests the crate in a folder; fails on any warning. Returns the folder of its programs.
 fn cargo_test(folder: &Path) -> PathBuf {
-    fs::copy(Path::new(CHECKOUT).join("Cargo.lock"), folder.join("Cargo.lock")).unwrap();
-    let programs = Path::new(env!("CARGO_BIN_EXE_dimos")).parent().unwrap();
-    let output = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()))
-        .args(["test", "--offline", "--quiet"])
-        .current_dir(folder)
-        .env("CARGO_TARGET_DIR", programs.parent().unwrap())
-        .stdin(Stdio::null())
-        .output()
-        .unwrap();
+    share_builds(folder);
+    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or("cargo".into()));
+    command.args(["test", "--quiet"]).current_dir(folder).stdin(Stdio::null());
+    let output = without_cargo_settings(&mut command).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
     println!("{text}");
     assert!(output.status.success(), "cargo test in {}", folder.display());
-    // Places in its own files have relative paths; warnings of dimos are told elsewhere.
+    // Only warnings in the crate's own files have relative paths.
     let own = |line: &str| ["--> src/", "--> tests/"].iter().any(|start| line.trim_start().starts_with(start));
     assert!(!text.lines().any(own), "it does not compile without warnings");
-    programs.to_owned()
+    programs()
 }
 
 #[test]
-fn a_crate_of_its_own_is_built_tested_and_run() {
+fn a_new_crate_builds_passes_its_tests_and_runs() {
     let home = Home::new();
     let made = home.dimos("adapter new acme-arm --dof 7 --transport tcp").with(0);
     let next: Vec<&str> = made.out.lines().skip_while(|line| *line != "next:").skip(1).collect();
@@ -66,7 +59,7 @@ fn a_crate_of_its_own_is_built_tested_and_run() {
     let mut rows = rows.as_array().unwrap().iter();
     let row = rows.clone().find(|row| row["name"] == "acme_arm").expect("its row");
     assert_eq!((&row["dof"]["max"], &row["transport"]), (&7.into(), &"tcp".into()));
-    assert!(rows.any(|row| row["name"] == "yourarm"), "the arms in the box are there too");
+    assert!(rows.any(|row| row["name"] == "yourarm"), "the built-in arms are there too");
 
     acme("run coordinator-acme-arm --sim --duration 1s --no-record", &folder);
     // Elsewhere the program has its blueprint all the same.
@@ -86,7 +79,7 @@ fn plans_and_moves(home: &Home, program: &Path) {
     let checked = acme("model check builtin:acme_arm");
     assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
     let tip = acme("model fk builtin:acme_arm 0 0 0 0 0 0 0 --link flange --json").json();
-    assert!((tip["xyz"][2].as_f64().unwrap() - 1.1).abs() < 1e-9, "it stands straight up: {tip}");
+    assert!((tip["xyz"][2].as_f64().unwrap() - 1.1).abs() < 1e-9, "it points straight up: {tip}");
     let checked = acme("check acme-arm-planner");
     assert!(!format!("{}{}", checked.out, checked.err).contains("warning"), "{}{}", checked.out, checked.err);
 
@@ -188,7 +181,7 @@ fn add(folder: &Path, line: &Value) -> String {
 }
 
 #[test]
-fn arms_in_the_tree_are_built_and_tested() {
+fn arms_in_the_tree_build_and_conform() {
     let home = Home::new();
     let tree = home.path().join("tree");
     checkout(&tree);
@@ -216,7 +209,7 @@ fn arms_in_the_tree_are_built_and_tested() {
 }
 
 #[test]
-fn nothing_is_written_over_and_nothing_half() {
+fn no_file_is_overwritten_or_left_half_written() {
     let home = Home::new();
     let tree = home.path().join("tree");
     checkout(&tree);

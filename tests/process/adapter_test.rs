@@ -1,4 +1,4 @@
-//! `dimos adapter test` with the real binary, against emulators that note every byte they are sent.
+//! `dimos adapter test` with the real binary, against emulators that record every request.
 
 use std::io::{Read as _, Write as _};
 
@@ -15,7 +15,7 @@ use crate::support::program::Home;
 /// Pose at power-up [deg], as it goes over the wire.
 const START: [f32; 6] = [0.0, -17.188734, 34.37747, 0.0, 45.836624, 0.0];
 
-/// An arm at an address, as far as the program can tell.
+/// An emulator that the program takes for a real arm.
 fn arm(options: &SimOptions) -> (YourArmEmulator, String) {
     let emulator = YourArmEmulator::with(options).unwrap();
     emulator.record();
@@ -119,7 +119,7 @@ fn the_lag_of_an_arm_is_measured() {
     assert!(!emulator.enabled());
 }
 
-/// An arm in memory is not asked for: there is nothing to be hurt.
+/// A mock arm needs no confirmation: nothing can be damaged.
 #[test]
 fn the_lag_of_a_mock_is_measured_without_a_question() {
     let ended = Home::new().dimos("adapter test mock --dof 1 --only row --lag").with(0);
@@ -127,7 +127,7 @@ fn the_lag_of_a_mock_is_measured_without_a_question() {
 }
 
 #[test]
-fn nobody_to_ask_no_motion() {
+fn without_a_terminal_nothing_moves() {
     let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
     let line = format!("adapter test yourarm --address {address} --only row --allow-motion");
@@ -198,9 +198,9 @@ fn code(test: &mut std::process::Child) -> Option<i32> {
     status.unwrap().code()
 }
 
-/// Much can happen to an arm while a question waits for its answer.
+/// The arm may change while a question waits for its answer.
 #[test]
-fn what_speaks_against_the_motion_is_looked_for_again_after_the_question() {
+fn the_arm_is_checked_again_after_the_question() {
     let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
     let (mut test, mut terminal) = asked(&home, &address);
@@ -214,9 +214,9 @@ fn what_speaks_against_the_motion_is_looked_for_again_after_the_question() {
     assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
 }
 
-/// Reading a line goes on after a signal: the question must not.
+/// Reading a line continues after a signal; the question must end.
 #[test]
-fn an_interruption_at_the_question_is_a_no() {
+fn an_interrupt_at_the_question_means_no() {
     let (emulator, address) = arm(&SimOptions::default());
     let home = Home::new();
     let (mut test, _terminal) = asked(&home, &address);
@@ -241,7 +241,7 @@ fn a_closed_terminal_stops_the_arm() {
 }
 
 #[test]
-fn what_was_found_is_shown_even_if_its_file_cannot_be_written() {
+fn results_are_printed_even_if_the_report_cannot_be_written() {
     let home = Home::new();
     let ended = home.dimos("adapter test mock --only row --report nowhere/report.md").with(1);
     assert!(ended.says(&["--report nowhere/report.md"]).out.contains("row_is_complete"));
@@ -273,7 +273,7 @@ fn a_pose_too_near_a_limit_is_refused() {
 }
 
 #[test]
-fn what_is_wrong_is_said_with_its_exit_code() {
+fn mistakes_are_reported_with_their_exit_code() {
     let home = Home::new();
     let dimos = |line: &str| home.dimos(line);
     dimos("adapter test yourarm").with(2).says(&["needs --address", "--address sim"]);

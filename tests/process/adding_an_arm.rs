@@ -1,10 +1,10 @@
 //! `docs/adding-an-arm.md`, executed from its beginning to its end.
 //!
-//! Blocks and what becomes of them: `console`: the lines after `$ ` are run by a shell, what stands below each is what
-//! they must say, loosely (`…`: anything). `console up=TERMINAL`: the same, and the last command goes on in that
-//! terminal until the next such block. `rust in=FILE`, `xml in=FILE`: these lines stand in FILE. `diff in=FILE`: the
-//! change is made there. `yaml file=NAME`, `python …`, `xml …`: the file is written. `checkout=NAME`: a copy of this
-//! checkout. `needs=ARM`: only where the table has that arm.
+//! Blocks and what becomes of them: `console`: the lines after `$ ` are run by a shell, the lines below each are what
+//! they must print, loosely (`…`: anything). `console up=TERMINAL`: the same, and the last command keeps running in
+//! that terminal until the next such block. `rust in=FILE`, `xml in=FILE`: FILE contains these lines. `diff in=FILE`:
+//! the change is made there. `yaml file=NAME`, `python …`, `xml …`: the file is written. `checkout=NAME`: a copy of
+//! this checkout. `needs=ARM`: only where the table has that arm.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -15,11 +15,12 @@ use dimos::hardware::registry;
 use rustix::process::{Pid, Signal, kill_process_group};
 use std::os::unix::process::CommandExt;
 
+use crate::support::crates::{programs, share_builds, without_cargo_settings};
 use crate::support::program::{Home, Started};
 
 const PAGE: &str = include_str!("../../docs/adding-an-arm.md");
 /// The longest that a command may take: the first builds all of dimos for another crate, on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(1500);
+const TIMEOUT: Duration = Duration::from_secs(1500);
 
 /// A fenced block.
 struct Block {
@@ -54,7 +55,7 @@ fn blocks(page: &str) -> Vec<Block> {
 }
 
 /// Whether a text says what is expected: its lines in that order, `…` for anything within a line, and for any lines
-/// where it stands alone.
+/// when alone on its line.
 fn says(text: &str, expected: &[&str]) -> Result<(), String> {
     let mut lines = text.lines();
     let mut anything = false;
@@ -92,21 +93,20 @@ fn like(line: &str, pattern: &str) -> bool {
     rest.ends_with(last)
 }
 
-/// Somebody who follows the page.
+/// A reader who follows the page.
 struct Reader {
     home: Home,
     /// Where the shell is.
     folder: PathBuf,
     path: String,
-    /// The commands that go on, in which terminals.
+    /// The running commands, with their terminals.
     up: Vec<(Started, String, String)>,
 }
 
 impl Reader {
     fn new() -> Self {
         let home = Home::new();
-        let program = Path::new(env!("CARGO_BIN_EXE_dimos")).parent().unwrap();
-        let path = format!("{}:{}", program.display(), std::env::var("PATH").unwrap());
+        let path = format!("{}:{}", programs().display(), std::env::var("PATH").unwrap());
         Self { folder: home.path().to_owned(), home, path, up: Vec::new() }
     }
 
@@ -119,12 +119,8 @@ impl Reader {
         let (cargo, rustup) = (real("CARGO_HOME", ".cargo"), real("RUSTUP_HOME", ".rustup"));
         self.home.settle(command.args(["-o", "pipefail", "-c", line]));
         command.env("PATH", &self.path).env("CARGO_HOME", cargo).env("RUSTUP_HOME", rustup);
-        // What cargo has told this test is not for the crates that it builds.
-        for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("CARGO_") && name != "CARGO_HOME") {
-            command.env_remove(name);
-        }
-        command.env("CARGO_HOME", real("CARGO_HOME", ".cargo")).env("CARGO_NET_OFFLINE", "true");
-        command.env("DIMOS", env!("CARGO_MANIFEST_DIR")).env("NO_COLOR", "1").env_remove("RUSTFLAGS");
+        without_cargo_settings(&mut command);
+        command.env("DIMOS", env!("CARGO_MANIFEST_DIR")).env("NO_COLOR", "1");
         command.current_dir(&self.folder).stdin(Stdio::null());
         command
     }
@@ -133,7 +129,10 @@ impl Reader {
         if let Some(folder) = command.strip_prefix("cd ") {
             self.folder = self.folder.join(folder);
             assert!(self.folder.is_dir(), "{command}");
-            return share_builds(&self.folder);
+            if self.folder.join("Cargo.toml").is_file() {
+                share_builds(&self.folder);
+            }
+            return;
         }
         if let Some(path) = command.strip_prefix("export PATH=") {
             self.path = path.replace("$PWD", self.folder.to_str().unwrap()).replace("$PATH", &self.path);
@@ -142,7 +141,7 @@ impl Reader {
         let began = Instant::now();
         let started = Started::of(&mut self.shell(command));
         while !started.over() {
-            assert!(began.elapsed() < PATIENCE, "{command}: does not end\n{}{}", started.out(), started.err());
+            assert!(began.elapsed() < TIMEOUT, "{command}: does not end\n{}{}", started.out(), started.err());
             std::thread::sleep(Duration::from_millis(10));
         }
         let ended = started.wait();
@@ -154,14 +153,14 @@ impl Reader {
         }
     }
 
-    /// Starts what goes on until the next such command.
+    /// Starts a command that runs until the next one in its terminal.
     fn up(&mut self, terminal: &str, command: &str, expected: &[&str]) {
         self.down(|other| other == terminal);
         let began = Instant::now();
         let started = Started::of(self.shell(&format!("exec {command}")).process_group(0));
         loop {
             let text = format!("{}{}", started.out(), started.err());
-            // A computer that stood still for a moment is no matter of the page.
+            // Stalls of this computer are not part of the page.
             let text: String = text.split_inclusive('\n').filter(|line| !line.contains(" WARN overrun: ")).collect();
             match says(&text, expected) {
                 Ok(()) => break,
@@ -169,7 +168,7 @@ impl Reader {
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        println!("$ {command}  [goes on]");
+        println!("$ {command}  [keeps running]");
         self.up.push((started, command.to_owned(), terminal.to_owned()));
     }
 
@@ -181,15 +180,6 @@ impl Reader {
             let ended = started.wait();
             assert!(matches!(ended.code, Some(0 | 130)), "{command}: {:?}\n{}{}", ended.code, ended.out, ended.err);
         }
-    }
-}
-
-/// A crate is built where dimos is, with its versions, so that nothing is compiled twice.
-fn share_builds(folder: &Path) {
-    if folder.join("Cargo.toml").is_file() && !folder.join("target").exists() {
-        std::fs::copy(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.lock"), folder.join("Cargo.lock")).unwrap();
-        let built = Path::new(env!("CARGO_BIN_EXE_dimos")).ancestors().nth(2).unwrap();
-        std::os::unix::fs::symlink(built, folder.join("target")).unwrap();
     }
 }
 
@@ -213,8 +203,8 @@ fn commands(text: &str) -> Vec<(&str, Vec<&str>)> {
     commands
 }
 
-/// Lines of a block that stand in a file, in that order; `…` for lines between.
-fn stands_in(file: &Path, block: &str) {
+/// Checks that a file contains the lines of a block, in that order; `…` for lines between.
+fn contains_lines(file: &Path, block: &str) {
     let text = std::fs::read_to_string(file).unwrap();
     let mut rest = text.as_str();
     for part in block.split("…\n") {
@@ -234,7 +224,7 @@ fn change(file: &Path, block: &str) {
 }
 
 #[test]
-fn the_page_is_true_from_beginning_to_end() {
+fn every_command_of_the_page_works() {
     // Several checkouts may be tested at once on one computer: each has an address of its own.
     let id = std::process::id();
     let address = format!("127.{}.{}.{}", 16 + (id >> 16) % 32, (id >> 8) % 256, 1 + id % 254);
@@ -258,7 +248,7 @@ fn the_page_is_true_from_beginning_to_end() {
                 commands.iter().for_each(|(command, expected)| reader.run(command, expected));
                 last.iter().for_each(|(terminal, (command, expected))| reader.up(terminal, command, expected));
             }
-            ("rust" | "xml", Some(file), _) => stands_in(&reader.folder.join(file), &block.text),
+            ("rust" | "xml", Some(file), _) => contains_lines(&reader.folder.join(file), &block.text),
             ("diff", Some(file), _) => change(&reader.folder.join(file), &block.text),
             ("yaml" | "python" | "xml", _, Some(file)) => {
                 std::fs::write(reader.folder.join(file), &block.text).unwrap()
@@ -274,7 +264,7 @@ fn the_page_is_true_from_beginning_to_end() {
 
 #[test]
 fn the_table_has_every_method_of_the_trait() {
-    let spec = include_str!("../../src/hardware/spec.rs");
+    let spec = include_str!("../../src/hardware/adapter.rs");
     let body = spec.split("pub trait ManipulatorAdapter").nth(1).unwrap();
     let methods: Vec<&str> =
         body.lines().filter_map(|line| line.strip_prefix("    fn ")?.split(['(', '<']).next()).collect();

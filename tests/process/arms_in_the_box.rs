@@ -1,4 +1,4 @@
-//! The blueprints of the arms in the box, as a user starts them: with `--sim` each moves, grips, records and stops.
+//! The blueprints of the built-in arms, as a user starts them: with `--sim` each moves, grips, records and stops.
 
 use rustix::process::Signal;
 use serde_json::Value;
@@ -14,7 +14,7 @@ struct Arm {
     gripper: Option<f64>,
 }
 
-/// Runs a blueprint: everything that it promises, and what its log tells of it.
+/// Runs a blueprint: everything that it promises, and what its log contains.
 fn exercise(blueprint: &str, arms: &[Arm]) {
     let home = Home::new();
     home.dimos(&format!("check {blueprint} --sim")).with(0);
@@ -136,7 +136,7 @@ fn every_shipped_blueprint_is_without_mistakes_and_starts() {
 
 #[test]
 #[cfg(feature = "can")]
-fn a_piper_that_cannot_be_reached_or_leads_is_told_in_one_line() {
+fn a_piper_that_cannot_be_reached_or_leads_is_reported_in_one_line() {
     let home = Home::new();
     let nowhere = "run coordinator-piper --no-record --set hardware.arm.address=nosuchcan7";
     home.dimos(nowhere).with(3).says(&["nosuchcan7", "hint: "]);
@@ -149,7 +149,7 @@ fn a_piper_that_cannot_be_reached_or_leads_is_told_in_one_line() {
 }
 
 #[test]
-fn a_piper_in_its_e_stop_is_told_with_one_hint_and_not_said_to_hold() {
+fn a_piper_in_its_e_stop_is_reported_with_one_hint_and_not_as_held() {
     let home = Home::new();
     let piper = |faults: &str| {
         format!(
@@ -218,7 +218,7 @@ fn what_is_wrong_with_an_xarm_is_one_line_and_exit_3() {
 fn an_xarm_that_is_disabled_is_not_at_fault() {
     let home = Home::new();
     let run = home.run("coordinator-xarm6 --sim --no-record");
-    // Its controller tells five times a second which motors are on.
+    // Its controller reports five times a second which motors are on.
     assert_eq!(home.dimos("arm disable arm").with(0).out, "arm: disabled\n");
     assert_eq!(home.status()["arms"][0]["cause"], Value::Null);
     assert_eq!(home.dimos("arm enable arm").with(0).out, "arm: ready\n");

@@ -1,4 +1,4 @@
-//! A planned motion under way and a world that changes: the arm comes to rest before what is in its way, in whole runs.
+//! A planned motion under way and a world that changes: the arm stops before the obstacle, in whole runs.
 //! Judged from the positions of the emulated joints and a collision checker of its own.
 
 use std::time::{Duration, Instant};
@@ -14,14 +14,14 @@ use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Builder, Record, Run};
 
 /// Far more than anything here takes, on a machine that is busy with other things too.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 const PADDING: f64 = 0.003;
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 
 fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
     let began = Instant::now();
     while !holds() {
-        assert!(began.elapsed() < PATIENCE, "never: {what}");
+        assert!(began.elapsed() < TIMEOUT, "never: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -78,7 +78,7 @@ impl Cell {
         WorldObject { name: name.into(), shape: ShapeSpec::Sphere(0.03), pose, padding: 0.0, held_by: None }
     }
 
-    /// The distance of the arm, as it truly stands, from what is around it and the objects [m].
+    /// Returns the distance of the arm's true pose from the world and the objects [m].
     fn clearance(&self, objects: &[WorldObject]) -> f64 {
         self.clearance_at(&self.joints(), objects)
     }

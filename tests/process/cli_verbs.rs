@@ -110,7 +110,7 @@ pose     xyz 0.1000 0.2000 0.3000 m, rpy 0.0000 0.0000 0.0000 rad
     {
         assert!(status.contains(part), "{part:?} is not in\n{status}");
     }
-    assert!(!status.contains('\x1b'), "no colour where nobody looks");
+    assert!(!status.contains('\x1b'), "no colour without a terminal");
 }
 
 #[test]
@@ -165,7 +165,7 @@ fn a_motion_that_ends_elsewhere_is_a_failure() {
     let _run = start(&home.runs(), "test", FakeBackend { aborts: true, ..Default::default() });
     let ended = home.run("move arm 0.3 -0.2").with(1);
     assert!(ended.err.contains("error: motion 7: ABORTED: arm_joint1 was 0.2000 rad off the path"), "{}", ended.err);
-    assert!(ended.out.contains("arm_joint2"), "where it ended is told all the same");
+    assert!(ended.out.contains("arm_joint2"), "where it ended is printed all the same");
 }
 
 #[test]
@@ -243,7 +243,7 @@ fn mistakes_in_a_trajectory_file_are_located() {
         ("a.csv", "", "a.csv:1:1: the file is empty"),
         ("a.csv", "t,j\n0,0\n1,1\n", "a.csv:1:1: the first column must be `time`"),
         ("a.csv", "time,j,j\n0,0,0\n1,1,1\n", "a.csv:1:8: "),
-        ("a.csv", "time\n0\n1\n", "a.csv:1:1: there is no joint"),
+        ("a.csv", "time\n0\n1\n", "a.csv:1:1: no joint columns"),
         ("a.csv", "time,a,b,a_vel\n0,0,0,0\n", "a.csv:1:1: velocities of 1 of 2 joints"),
         ("a.csv", "time,j\n0,0\n1,  x\n", "a.csv:3:5: \"x\" is not a finite number"),
         ("a.csv", "time,j\n0,0\n1,inf\n", "a.csv:3:3: \"inf\""),

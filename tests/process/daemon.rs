@@ -18,17 +18,17 @@ const RUN: &str = "coordinator-mock";
 
 /// A run in the background. It is killed when it is dropped, whatever a test does.
 struct Daemon {
-    told: Value,
+    report: Value,
     pid: Pid,
 }
 
 impl Daemon {
     #[track_caller]
     fn start(home: &Home, arguments: &str) -> Self {
-        // Ends by itself, should this test be killed.
-        let told = home.dimos(&format!("run -d --json --duration 2m {arguments}")).with(0).json();
-        let pid = Pid::from_raw(i32::try_from(told["pid"].as_i64().unwrap()).unwrap()).unwrap();
-        Self { told, pid }
+        // Ends on its own if this test is killed.
+        let report = home.dimos(&format!("run -d --json --duration 2m {arguments}")).with(0).json();
+        let pid = Pid::from_raw(i32::try_from(report["pid"].as_i64().unwrap()).unwrap()).unwrap();
+        Self { report, pid }
     }
 
     fn kill(&self) {
@@ -36,14 +36,14 @@ impl Daemon {
     }
 
     fn text_log(&self) -> PathBuf {
-        self.told["text_log"].as_str().unwrap().into()
+        self.report["text_log"].as_str().unwrap().into()
     }
 
     fn proc(&self, what: &str) -> PathBuf {
         format!("/proc/{}/{what}", self.pid.as_raw_nonzero()).into()
     }
 
-    fn lives(&self) -> bool {
+    fn is_alive(&self) -> bool {
         let stat = std::fs::read_to_string(self.proc("stat")).unwrap_or_default();
         stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with('Z'))
     }
@@ -51,7 +51,7 @@ impl Daemon {
 
 impl Drop for Daemon {
     fn drop(&mut self) {
-        if self.lives() {
+        if self.is_alive() {
             self.kill();
         }
     }
@@ -67,19 +67,19 @@ fn it_returns_when_the_arms_are_up_and_tells_run_pid_and_logs() {
     let daemon = Daemon::start(&home, RUN);
     let status = home.status();
     assert_eq!(status["arms"][0]["phase"], "ready");
-    for (told, is) in [("run", &status["run"]), ("pid", &status["pid"]), ("log", &status["log"])] {
-        assert_eq!(&daemon.told[told], is);
+    for (report, is) in [("run", &status["run"]), ("pid", &status["pid"]), ("log", &status["log"])] {
+        assert_eq!(&daemon.report[report], is);
     }
     assert!(text(&daemon.text_log()).contains("run coordinator-mock"));
-    let told = home.dimos(&format!("run -d --duration 2m --no-record {RUN} --name plain")).with(0);
+    let report = home.dimos(&format!("run -d --duration 2m --no-record {RUN} --name plain")).with(0);
     for part in ["run       plain", "pid       ", "arm       arm: ready", "log       none", "text log  "] {
-        assert!(told.out.contains(part), "no {part:?} in\n{}", told.out);
+        assert!(report.out.contains(part), "no {part:?} in\n{}", report.out);
     }
-    told.says(&["dimos down plain"]);
+    report.says(&["dimos down plain"]);
     home.dimos("down plain").with(0).says(&["plain ended"]);
     home.dimos(&format!("move --run {RUN} arm 0.1 0 0 0 0 0 0 --speed 1")).with(0);
     home.dimos("down").with(0).says(&["coordinator-mock ended; log: "]);
-    assert!(!daemon.lives(), "down waits until the process has ended");
+    assert!(!daemon.is_alive(), "down waits until the process has ended");
     assert!(text(&daemon.text_log()).contains("shutdown requested"));
 }
 
@@ -90,7 +90,7 @@ fn it_survives_its_terminal() {
     let stat = text(&daemon.proc("stat"));
     let fields: Vec<&str> = stat.rsplit_once(") ").unwrap().1.split(' ').collect();
     // state, parent, group, session, terminal
-    assert_eq!(fields[3], daemon.pid.as_raw_nonzero().to_string(), "a session of its own: {stat}");
+    assert_eq!(fields[3], daemon.pid.as_raw_nonzero().to_string(), "its own session: {stat}");
     assert_eq!(fields[4], "0", "no terminal: {stat}");
     let open = |fd| std::fs::read_link(daemon.proc(&format!("fd/{fd}"))).unwrap();
     assert_eq!(open(0), Path::new("/dev/null"));
@@ -105,8 +105,8 @@ fn what_keeps_it_from_coming_up_is_told_with_its_exit_code() {
     home.dimos(&format!("run -d {RUN} --set coordinator.tick_rate=-1")).with(2).says(&["tick_rate"]);
     home.dimos(&format!("run -d {RUN} --name ../x")).with(1).says(&["cannot be the name of a run"]);
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-    let nobody = format!("run -d coordinator-yourarm --set hardware.arm.address={port}");
-    let ended = home.dimos(&nobody).with(3).says(&["error: arm: ", "hint: "]);
+    let unreachable = format!("run -d coordinator-yourarm --set hardware.arm.address={port}");
+    let ended = home.dimos(&unreachable).with(3).says(&["error: arm: ", "hint: "]);
     assert_eq!(ended.out, "");
     let left = std::fs::read_dir(home.path().join("state/dimos")).unwrap().count();
     assert_eq!(left, 0, "nothing is left of them");
@@ -144,7 +144,7 @@ fn it_ends_when_nobody_waits_for_it_any_more() {
 fn logs_shows_and_follows_the_text_of_the_living_and_the_dead() {
     let home = Home::new();
     home.dimos("logs").with(1).says(&["no run is live"]);
-    home.dimos("logs nobody").with(2).says(&["no record of a run named nobody"]);
+    home.dimos("logs missing").with(2).says(&["no record of a run named missing"]);
     let daemon = Daemon::start(&home, RUN);
     assert_eq!(home.dimos("logs").with(0).out, text(&daemon.text_log()));
     let following = home.start("logs -f");
@@ -169,7 +169,7 @@ fn a_crashed_run_is_shown_with_its_last_words_until_it_is_started_again() {
     let daemon = Daemon::start(&home, RUN);
     let other = home.run(&format!("{RUN} --name other"));
     daemon.kill();
-    eventually("it is gone", || !daemon.lives());
+    eventually("it is gone", || !daemon.is_alive());
     let words = "Run `dimos down` for a controlled stop.";
     let shown = home.dimos("status").with(0).out;
     assert!(shown.contains("run other") && shown.contains("crashed") && shown.contains(words), "{shown}");
@@ -198,11 +198,11 @@ fn a_panic_is_in_the_text_log() {
          tasks:\n  - {name: traj_arm, type: trajectory, joint_names: {hardware: arm}}\n",
     );
     let daemon = Daemon::start(&home, "panics.yaml");
-    eventually("the panic is told", || text(&daemon.text_log()).contains("panicked at"));
+    eventually("the panic is in the text log", || text(&daemon.text_log()).contains("panicked at"));
     let _ = home.dimos("down");
 }
 
-/// A service manager that hears what a run tells it.
+/// A service manager that receives the notifications of a run.
 struct Manager {
     socket: UnixDatagram,
     address: PathBuf,
@@ -212,7 +212,7 @@ impl Manager {
     fn new(home: &Home) -> Self {
         let address = home.path().join("notify");
         let socket = UnixDatagram::bind(&address).unwrap();
-        socket.set_read_timeout(Some(program::PATIENCE)).unwrap();
+        socket.set_read_timeout(Some(program::TIMEOUT)).unwrap();
         Self { socket, address }
     }
 
@@ -239,7 +239,7 @@ impl Manager {
         let began = Instant::now();
         let mut all = Vec::new();
         while !all.last().is_some_and(|m: &String| m.starts_with(start)) {
-            assert!(began.elapsed() < program::PATIENCE, "no {start:?} in {all:?}");
+            assert!(began.elapsed() < program::TIMEOUT, "no {start:?} in {all:?}");
             all.push(self.heard());
         }
         all

@@ -277,7 +277,7 @@ fn a_wrong_blueprint_connects_nothing() {
     assert!(checked.out.contains("no mistakes"), "{}", checked.out);
     home.dimos("run wrong.yaml --check").with(2);
     home.dimos("run coordinator-youram").with(2).says(&["hint: ", "coordinator-yourarm"]);
-    assert!(arm.accept().is_err(), "nobody knocked");
+    assert!(arm.accept().is_err(), "no connection arrived");
     assert!(home.logs().is_empty());
 }
 

@@ -7,7 +7,7 @@ use dimos::rpc::client::Client;
 use dimos::rpc::report::ArmReport;
 use rustix::process::Signal;
 
-use crate::support::program::{Home, PATIENCE, Started, eventually};
+use crate::support::program::{Home, Started, TIMEOUT, eventually};
 use crate::support::terminal::Terminal;
 
 /// An arm with an emulator, and a task that lets the keyboard move its joints.
@@ -57,7 +57,7 @@ impl Rig {
     fn hold(&mut self, terminal: &Terminal, key: &str, joint: usize, by: f64) {
         let (from, began) = (self.joint(joint).0, Instant::now());
         while (self.joint(joint).0 - from) / by < 1.0 {
-            assert!(began.elapsed() < PATIENCE, "{key:?} does not move joint {joint}:\n{}", terminal.text());
+            assert!(began.elapsed() < TIMEOUT, "{key:?} does not move joint {joint}:\n{}", terminal.text());
             terminal.keys(key);
             std::thread::sleep(HOLD);
         }
@@ -132,7 +132,7 @@ fn the_end_effector_moves_along_the_axes_of_its_keys() {
     {
         let (from, began) = (pose().xyz, Instant::now());
         while (pose().xyz[axis] - from[axis]) * sign < 0.015 {
-            assert!(began.elapsed() < PATIENCE, "{key:?} does not move it:\n{}", terminal.text());
+            assert!(began.elapsed() < TIMEOUT, "{key:?} does not move it:\n{}", terminal.text());
             terminal.keys(key);
             std::thread::sleep(HOLD);
         }
@@ -145,7 +145,7 @@ fn the_end_effector_moves_along_the_axes_of_its_keys() {
     // Turning leaves the place as it is.
     let (from, began) = (pose(), Instant::now());
     while (pose().rpy[2] - from.rpy[2]).abs() < 0.05 {
-        assert!(began.elapsed() < PATIENCE, "it does not turn:\n{}", terminal.text());
+        assert!(began.elapsed() < TIMEOUT, "it does not turn:\n{}", terminal.text());
         terminal.keys("y");
         std::thread::sleep(HOLD);
     }
@@ -201,7 +201,7 @@ fn the_screen_shows_the_arm_in_80_columns_and_in_few() {
         |text: &str| ["ready", "arm_joint6", "task velocity_arm", "add to"].iter().all(|part| text.contains(part));
     let began = Instant::now();
     while !fits(&terminal.text()) || terminal.text().contains('#') {
-        assert!(began.elapsed() < PATIENCE, "{}", terminal.text());
+        assert!(began.elapsed() < TIMEOUT, "{}", terminal.text());
         std::thread::sleep(HOLD);
     }
     eventually("what is good is green", || terminal.has_colour());
@@ -272,9 +272,9 @@ fn the_latched_stop_holds_the_arm_until_somebody_resets_it() {
     terminal.keys("++++");
     terminal.until("arm is held");
     assert!((rig.joint(0).0 - held).abs() < 5e-3);
-    // The lease is free, so that whoever stands beside the arm can make it ready again.
+    // The lease is free, so that an operator at the arm can make it ready again.
     let mut free = 0;
-    eventually("every refused key is answered: nobody holds the lease for a while", || {
+    eventually("every refused key is answered: no client holds the lease for a while", || {
         free = if rig.arm().commander.is_none() { free + 1 } else { 0 };
         free >= 20
     });
@@ -292,7 +292,7 @@ fn where_the_terminal_tells_that_keys_go_up_that_counts() {
     let terminal = Terminal::new(80, 24);
     let jog = terminal.start(&rig.home, "jog arm --joints");
     terminal.until("at rest");
-    // `=` goes up, by the kitty keyboard protocol: from here on a motion lives until its key goes up.
+    // `=` goes up, by the kitty keyboard protocol: from here on a motion lasts until its key goes up.
     terminal.keys("=\x1b[61;1:3u");
     terminal.until("moves while a key is down");
     let from = rig.joint(0).0;

@@ -1,5 +1,5 @@
-//! One commander at a time, with the real binary: who may move an arm, who is refused and told why, and what becomes
-//! of an arm whose commander is gone.
+//! One commander at a time, with the real binary: which client may move an arm, who is refused and why, and what
+//! becomes of an arm whose commander is gone.
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::Shutdown as Half;
@@ -99,7 +99,7 @@ fn the_stream_of_a_commander_that_is_gone_goes_stale_and_its_trajectory_goes_on(
     eventually("the arm moves", || !is_at_rest(&mut watcher));
     drop(killed);
     eventually("the lease is free", || commander(&mut watcher).is_none());
-    eventually("the arm comes to rest", || is_at_rest(&mut watcher));
+    eventually("the arm is at rest", || is_at_rest(&mut watcher));
     let status = watcher.call(Status {}).unwrap();
     assert_eq!(status.arms[0].phase, "ready", "a stream that ends is no fault");
     home.dimos("cancel --task velocity_arm").with(0);

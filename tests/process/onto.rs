@@ -223,7 +223,7 @@ fn other_joints_and_real_arms_are_refused_before_anything_is_connected() {
     let real = "replay recorded.mcap --onto coordinator-yourarm --set hardware.arm.address=127.0.0.1:9 --no-record";
     let (_, err) = home.run(real, 2);
     assert!(err.contains("are real arms") && err.contains("--allow-motion"), "{err}");
-    // Allowed, it is tried: nobody answers there.
+    // Allowed, it is tried; no arm answers there.
     home.run(&format!("{real} --allow-motion"), 3);
     home.run("replay recorded.mcap --allow-motion", 2);
     home.run("replay nothing.mcap --onto mock6.yaml", 2);

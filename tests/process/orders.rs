@@ -4,8 +4,8 @@
 use std::sync::LazyLock;
 use std::time::{Duration, Instant};
 
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::registry::AdapterSpec;
-use dimos::hardware::spec::AdapterError;
 use dimos::rpc::Code;
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Record, Run};

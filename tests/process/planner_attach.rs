@@ -1,5 +1,5 @@
-//! A planner that attaches to a running coordinator, with the real binary in two processes: every verb goes on
-//! addressing one run, whoever of the two goes away is told of by the other, and the coordinator never waits.
+//! A planner that attaches to a running coordinator, with the real binary in two processes: every verb still
+//! addresses one run, each process reports the end of the other, and the coordinator never waits.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
@@ -9,9 +9,9 @@ use dimos::rpc::api::{Lease, Status};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
-use crate::support::program::{Home, PATIENCE, Started, eventually};
+use crate::support::program::{Home, Started, TIMEOUT, eventually};
 
-/// An ideal arm in memory. `OPTIONS` stands for what a test makes of it.
+/// An ideal arm in memory. `OPTIONS` is replaced by each test.
 const COORDINATOR: &str = "
 name: cell
 hardware:
@@ -87,7 +87,7 @@ fn every_verb_goes_on_addressing_one_run() {
     home.dimos("plan arm --named hme").with(2).says(&["did you mean `home`?"]);
     home.dimos("execute --plan 4711").with(1).says(&["UNKNOWN_PLAN"]);
 
-    // The run says who plans for it; the planner is no run of its own.
+    // The run says who plans for it; the planner is not a run.
     let status = home.status();
     let expected = json!({"state": "COMPLETED", "error": null, "robots": ["arm"],
         "attached": {"name": "lab", "pid": planner.pid()}});
@@ -102,7 +102,7 @@ fn every_verb_goes_on_addressing_one_run() {
             .says(&["run cell has a planner already: lab (pid ", "hint: "]);
     }
 
-    // Who holds the lease may carry out a plan, and nobody else: the planner's process has no part in it.
+    // Only the lease holder may execute a plan: the planner's process has no part in it.
     let mut holder = home.client();
     holder.call(Lease { arm: Some("arm".into()) }).unwrap();
     home.dimos("plan arm 0.5 -0.3 0.6 0 0.8 0").with(0);
@@ -112,9 +112,9 @@ fn every_verb_goes_on_addressing_one_run() {
     is_at(&home, &[0.5, -0.3, 0.6, 0.0, 0.8, 0.0]);
     drop(holder);
 
-    // It ends, and the run goes on; a move that relied on it is not made without it.
+    // It ends, and the run continues; a move that relied on it is not made without it.
     home.dimos("down lab").with(0).says(&["planner lab ended"]);
-    planner.wait().with(143).says(&["planner lab ended; run cell goes on without it"]);
+    planner.wait().with(143).says(&["planner lab ended; run cell continues without it"]);
     for verb in ["plan arm --named home", "preview", "execute", "world list", "move arm 0 0 0 0 0 0"] {
         home.dimos(verb).with(1).says(&["NO_PLANNER", "the planner that was attached to this run has gone", "hint: "]);
     }
@@ -210,7 +210,7 @@ fn f23_a_planner_process_that_hangs_or_dies_holds_up_nobody() {
     let mut flood: Vec<Started> = (0..4).map(|_| home.start("world list")).collect();
     home.dimos("stop").with(0);
     flood.drain(..).for_each(|asked| drop(asked.wait().with(1).says(&["NO_ANSWER"])));
-    assert!(began.elapsed() < PATIENCE, "{:?}", began.elapsed());
+    assert!(began.elapsed() < TIMEOUT, "{:?}", began.elapsed());
     planner.signal(Signal::CONT);
     home.dimos("world list").with(0);
     home.dimos("arm reset arm").with(0);
@@ -259,7 +259,7 @@ hardware: [{hardware_id: arm, adapter_type: yourarm, address: sim}]
     let insisting = home.start("run other.yaml --attach cell");
     insisting.until(ATTACHED);
     insisting.end(Signal::TERM).with(143);
-    // A run of its own, beside the one that it could attach to.
+    // A second run, beside the one that it could attach to.
     let alone = home.run("lab.yaml --no-record --standalone");
     assert_eq!(home.runs().runs().unwrap().len(), 2);
     alone.end(Signal::TERM).with(143);
@@ -292,8 +292,8 @@ tasks: [{name: traj_b, type: trajectory, joint_names: {hardware: b}}]
     let _run = home.run("cell.yaml --no-record");
     home.dimos("run lab.yaml")
         .with(1)
-        .says(&["arm_joint1 goes from -2.967 to 2.967 rad in the model", "nothing is in both"]);
-    home.dimos("run lab.yaml --standalone --name x").with(1).says(&["nothing is in both"]);
+        .says(&["arm_joint1 ranges from -2.967 to 2.967 rad in the model", "the ranges do not overlap"]);
+    home.dimos("run lab.yaml --standalone --name x").with(1).says(&["the ranges do not overlap"]);
 }
 
 #[test]

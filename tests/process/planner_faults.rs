@@ -23,7 +23,7 @@ const BLUEPRINT: &str = include_str!("../support/lab.yaml");
 /// Seeds of requests that break the solver of these tests.
 const PANICS: u64 = 13;
 const HANGS: u64 = 14;
-/// What depends on how busy the machine is may be missed so often, less one.
+/// Attempts for what depends on how busy the machine is.
 const TRIES: usize = 3;
 
 fn to(angle: f64, seed: u64) -> Plan {
@@ -79,7 +79,7 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
         ticks as f64 > 0.9 * due && ended.state == "COMPLETED"
     });
     assert!(undisturbed);
-    // The next request has a thread of its own, beside the one that hangs.
+    // The next request has a new thread, beside the one that hangs.
     let (plan, state, error) = planned(&run, Plan { timeout: Some(20.0), ..to(2.0, 0) });
     assert_eq!(state, "PLANNED", "{error}");
     let begun = run.call(ExecutePlan { plan: Some(plan), ..Default::default() }).unwrap();

@@ -125,7 +125,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
     for (arguments, code, words) in table.iter().filter(|(arguments, ..)| *arguments != "preview") {
         home.dimos(arguments).with(*code).says(words);
     }
-    // The arm stands in something that was put there later.
+    // The arm is inside an obstacle that was added later.
     home.dimos("world add ball --sphere 0.1 --at 0.24 0 0.36").with(0);
     let stuck = ["the start collides: link \"arm/", "obstacle \"ball\"", "hint: "];
     home.dimos("plan arm 0.5 -0.3 0.6 0 0.8 0").with(1).says(&stuck);
@@ -276,8 +276,8 @@ fn the_world_is_changed_while_it_runs() {
         ("world add bad --mesh none.stl --at 0 0 1", 2, &["none.stl: "]),
         ("world add bad --cloud no.ply --at 0 0 1", 2, &["no.ply: not a PLY point cloud"]),
         ("world add bad --cloud /dev/zero --at 0 0 1", 2, &["/dev/zero: not a file"]),
-        ("world move nobody --at 0 0 1", 1, &["UNKNOWN_OBJECT"]),
-        ("world remove nobody", 1, &["UNKNOWN_OBJECT"]),
+        ("world move missing --at 0 0 1", 1, &["UNKNOWN_OBJECT"]),
+        ("world remove missing", 1, &["UNKNOWN_OBJECT"]),
         ("world detach box", 2, &["no robot holds box"]),
         ("world attach box amr", 1, &["did you mean `arm`?"]),
         ("world attach box arm --link fingr", 2, &["no link named `fingr`"]),
@@ -375,26 +375,32 @@ fn mistakes_of_a_blueprint_are_found_by_check_where_they_are() {
     }
 }
 
-#[test]
-fn every_planner_blueprint_in_the_box_moves_its_arms_home() {
-    let boxed: &[(&str, &[(&str, &str)])] = &[
-        ("yourarm-planner", &[("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")]),
-        ("xarm6-planner", &[("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")]),
-        ("xarm7-planner", &[("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")]),
-        ("piper-planner", &[("arm", "0.3 0.1 0.2 --rpy 0 2 0")]),
-        ("dual-yourarm-planner", &[("left", "0.35 0.4 0.3 --rpy 3.14 0 0"), ("right", "0.35 -0.4 0.3 --rpy 3.14 0 0")]),
-    ];
-    for (blueprint, arms) in boxed {
-        let home = Home::new();
-        home.dimos(&format!("check {blueprint} --sim")).with(0);
-        let _run = home.run(&format!("{blueprint} --sim --no-record"));
-        for (arm, pose) in *arms {
-            home.dimos(&format!("move {arm} --pose {pose}")).with(0);
-            let planned = home.dimos(&format!("move {arm} --named home --speed 1"));
-            planned.with(0).says(&["planned, collision-checked"]);
-        }
-        home.dimos("down").with(0);
+/// Starts a shipped planner blueprint, moves each arm to a pose, and home again.
+fn moves_to_a_pose_and_home(blueprint: &str, arms: &[(&str, &str)]) {
+    let home = Home::new();
+    let _run = home.run(&format!("{blueprint} --sim --no-record"));
+    for (arm, pose) in arms {
+        home.dimos(&format!("move {arm} --pose {pose} --speed 1")).with(0);
+        home.dimos(&format!("move {arm} --named home --speed 1")).with(0).says(&["planned, collision-checked"]);
     }
+}
+
+macro_rules! shipped {
+    ($($test:ident: $blueprint:literal, $arms:expr;)*) => { $(
+        #[test]
+        fn $test() {
+            moves_to_a_pose_and_home($blueprint, &$arms);
+        }
+    )* };
+}
+
+shipped! {
+    yourarm_planner: "yourarm-planner", [("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")];
+    xarm6_planner: "xarm6-planner", [("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")];
+    xarm7_planner: "xarm7-planner", [("arm", "0.35 0.1 0.3 --rpy 3.14 0 0")];
+    piper_planner: "piper-planner", [("arm", "0.3 0.1 0.2 --rpy 0 2 0")];
+    dual_yourarm_planner: "dual-yourarm-planner",
+        [("left", "0.35 0.4 0.3 --rpy 3.14 0 0"), ("right", "0.35 -0.4 0.3 --rpy 3.14 0 0")];
 }
 
 #[test]
@@ -431,7 +437,7 @@ fn two_arms_move_in_one_plan_and_keep_clear_of_each_other() {
     let report = planned(both(across(-1.3), across(1.3)));
     let why = report.error.unwrap_or_default();
     assert!(report.state == "FAILED" && why.contains("left/link") && why.contains("right/link"), "{why}");
-    // A plan for one arm minds where the other one stands by now.
+    // A plan for one arm avoids the current pose of the other.
     home.dimos("plan left -1.3 0 0 0 0 0").with(0);
     home.dimos("move right 1.3 0 0 0 0 0 --direct --speed 1").with(0);
     home.dimos("execute").with(1).says(&["PLAN_OUTDATED", "left/link", "right/link"]);

@@ -14,7 +14,7 @@ use std::time::Duration;
 use dimos::hardware::arms::remote::SPEC;
 use dimos::hardware::arms::xarm::emulator::XArmEmulator;
 use dimos::hardware::conformance::{Check, Outcome, checks, run};
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;
 
@@ -46,7 +46,7 @@ fn has_python() -> bool {
     found
 }
 
-/// The shim around a class of `tests/python`, which stands at `at`.
+/// The shim around a class of `tests/python`, at the address `at`.
 fn shim_of(python: &str, class: &str, home: &Home, at: &str, arguments: &[&str]) -> Command {
     let mut command = Command::new(python);
     command.args([&in_tree("assets/python/dimos_shim.py"), class, "--at", at]);
@@ -61,7 +61,7 @@ fn shim(home: &Home, at: &str, arguments: &[&str], environment: &[(&str, &str)])
     Started::of(command.args(arguments).envs(environment.iter().copied()))
 }
 
-/// Where a shim stands in a test.
+/// The address of a shim in a test.
 fn socket(home: &Home) -> String {
     format!("unix:{}/arm.sock", home.path().display())
 }
@@ -187,7 +187,7 @@ fn a_run_moves_reads_and_stops_an_arm_behind_the_shim() {
     home.write("other.yaml", &std::fs::read_to_string(home.path().join("remote.yaml")).unwrap());
     home.dimos("stop --json").with(0);
     run.end(Signal::INT).with(130);
-    // It goes on serving: the next run needs no new shim.
+    // It still serves: the next run needs no new shim.
     let again = home.run("remote.yaml");
     assert!(home.positions("arm")[0] > 0.2);
     again.end(Signal::INT).with(130);
@@ -201,7 +201,7 @@ fn a_shim_that_is_killed_in_motion_is_told_and_the_arm_latched() {
     run.until("closed the connection");
     eventually("it is latched", || home.status()["arms"][0]["phase"] != "ready");
     home.dimos("move arm 0 0 0 0 0 0").with(1);
-    // A new shim takes the dead one's place, and the run finds it by itself; but nothing moves without `enable`.
+    // A new shim takes the dead one's place, and the run reconnects automatically, but nothing moves without `enable`.
     let again = served(&home, &[]);
     eventually("the link is up again", || home.status()["arms"][0]["link"] == "up");
     assert!(home.positions("arm")[0].abs() < 0.01, "a new simulated arm, at rest");
@@ -275,7 +275,7 @@ fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
     }
     let (ip, options) = (IpAddr::V4(Ipv4Addr::new(127, 0, 7, 2)), serde_json::json!({}));
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
-    let emulator = match XArmEmulator::start(&config, &Place::Bind(ip)) {
+    let emulator = match XArmEmulator::start(&config, &EmulatorAddress::Bind(ip)) {
         Ok(emulator) => emulator,
         Err(error) if error.to_string().contains(":502: ") => return skip("port 502"),
         Err(error) => panic!("{error}"),
@@ -298,7 +298,7 @@ fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
     home.dimos("move arm 2.0 -0.5 -0.9 0.1 1.3 -0.1 --speed 0.2 --no-wait").with(0);
     eventually("it moves", || emulator.joints().0[0] > 0.5);
     home.dimos("stop --json").with(0);
-    eventually("it stands", || emulator.joints().1.iter().all(|v| v.abs() < 1e-3));
+    eventually("it is at rest", || emulator.joints().1.iter().all(|v| v.abs() < 1e-3));
     let stopped = emulator.joints().0[0];
     assert!(stopped < 1.9, "{stopped}");
     run.end(Signal::INT).with(130);
@@ -316,7 +316,7 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     for (trouble, parts) in [
         ("nan", &["error: arm: ", "read_joint_positions() answers nan for joint 3"][..]),
         ("short", &["error: arm: ", "read_joint_positions() answers 5 values for 6 joints"]),
-        ("read_enabled", &["cannot be enabled: enabled, but the motors do not come on"]),
+        ("read_enabled", &["cannot be enabled: the motors did not come on within 1 s"]),
     ] {
         let home = Home::new();
         let _shim = served(&home, &[("TROUBLE", trouble)]);
@@ -340,7 +340,7 @@ fn troubles_of_the_adapter_are_told_before_anything_moves() {
     fails(&socket(&home), &[("TROUBLE", "infinite")], "read_joint_velocities() answers -inf for joint 2");
 }
 
-/// A client that speaks the protocol by itself.
+/// A client that speaks the protocol itself.
 struct Client(BufReader<UnixStream>, u32);
 
 impl Client {
@@ -391,7 +391,7 @@ fn who_knocks_at_the_shim_or_talks_nonsense_to_it_leaves_no_arm_in_motion() {
         drop(UnixStream::connect(home.path().join("arm.sock")).unwrap());
     }
     let cycle = client.ask(r#""cycle""#);
-    assert!(cycle.contains("read_joint_positions"), "it goes on: {cycle}");
+    assert!(cycle.contains("read_joint_positions"), "it continues: {cycle}");
     // Others that knock are no sign of life of the client.
     let knocking = std::thread::scope(|scope| {
         let knock = || {

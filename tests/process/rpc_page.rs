@@ -11,7 +11,7 @@ use dimos::rpc::report::TaskReport;
 use dimos::rpc::streams::Stream;
 use serde_json::Value;
 
-use crate::support::program::{Home, PATIENCE, eventually};
+use crate::support::program::{Home, TIMEOUT, eventually};
 
 const PAGE: &str = include_str!("../../docs/rpc.md");
 
@@ -43,7 +43,7 @@ fn read(block: &str) -> Vec<Step> {
     texts.into_iter().map(|(who, sent, text)| Step { who, sent, message: parse(&text) }).collect()
 }
 
-/// The same keys and types, at every depth; a list is like its first element, and null stands for anything. Words by
+/// The same keys and types, at every depth; a list is like its first element, and null matches anything. Words by
 /// which programs decide are the same.
 fn differs(shown: &Value, real: &Value, at: &str) -> Option<String> {
     match (shown, real) {
@@ -78,7 +78,7 @@ struct Player(BufReader<UnixStream>);
 impl Player {
     fn connect(home: &Home) -> Self {
         let stream = UnixStream::connect(home.path().join("run/dimos/streams.sock")).unwrap();
-        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         Self(BufReader::new(stream))
     }
 

@@ -41,7 +41,7 @@ fn watching_the_state_goes_on_until_nobody_reads() {
     assert!(states.windows(2).all(|s| s[0]["tick"].as_u64() <= s[1]["tick"].as_u64()), "{states:?}");
     assert!(states[0]["tick"] != states[4]["tick"]);
     drop(lines);
-    assert!(watch.wait().unwrap().success(), "nobody reads any more");
+    assert!(watch.wait().unwrap().success(), "its reader has gone");
 
     let tables = home.start("state --watch --rate 50");
     eventually("tables follow each other", || tables.out().matches("JOINT").count() > 3);

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 
+use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::registry::AdapterSpec;
-use dimos::hardware::spec::AdapterError;
 use dimos::joint::JointLimits;
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Builder, Options, Record, Run, StartError};
@@ -32,7 +32,7 @@ const SPEC: AdapterSpec = AdapterSpec {
 };
 
 /// Threads of a run begin with one of these.
-const THREADS: &[&str] = &["tick", "courier", "recorder", "watchdog", "device/", "planner", "rpc", "replan"];
+const THREADS: &[&str] = &["tick", "outcomes", "recorder", "watchdog", "device/", "planner", "rpc", "replan"];
 
 /// The arms are the same in all of these tests.
 static ALONE: Mutex<()> = Mutex::new(());
@@ -109,7 +109,7 @@ planner:
     }
 }
 
-/// The threads of runs in this process; those of other tests cannot be told apart, where there are such.
+/// The threads of runs in this process; those of other tests in the same process cannot be distinguished.
 fn threads() -> Vec<String> {
     if std::env::var_os("NEXTEST").is_none() {
         return Vec::new();
@@ -123,7 +123,7 @@ fn threads() -> Vec<String> {
 fn a_log_that_cannot_be_made() {
     let bench = Bench::new();
     fs::write(bench.path("old.mcap"), "somebody's").unwrap();
-    bench.fails(|| bench.run("old.mcap").start(), "cannot be made");
+    bench.fails(|| bench.run("old.mcap").start(), "cannot create the log");
     assert_eq!(fs::read(bench.path("old.mcap")).unwrap(), b"somebody's");
 }
 

@@ -12,7 +12,7 @@ use std::time::Duration;
 use dimos::hardware::arms::yourarm;
 use dimos::hardware::arms::yourarm::emulator::wire::Request;
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place, Registry};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress, Registry};
 use dimos::rpc::Code;
 use dimos::rpc::api::{
     ArmEnable, ArmReset, Confirmation, Execute, Point, Servo, State, Status, Stop, Trajectory, Velocity,
@@ -44,7 +44,7 @@ fn raw(home: &Home) -> UnixStream {
     UnixStream::connect(home.path().join("run/dimos/streams.sock")).unwrap()
 }
 
-/// A trajectory of so many points that begins where the arm is not.
+/// A trajectory with this number of points that does not begin at the arm's position.
 fn elsewhere(points: usize) -> Trajectory {
     let joint_names = (1..=6).map(|j| format!("arm_joint{j}")).collect();
     let point = |i: usize| Point {
@@ -117,7 +117,7 @@ fn connections_that_are_in_use_stay_when_others_make_room() {
         messages.read_line(&mut line).unwrap();
         assert!(line.contains("\"stream\""), "{line}");
     }
-    // The one that was closed to make room is told why.
+    // The connection that was closed to make room gets the reason.
     let first = refusal(idle[0].call(State {}));
     assert_eq!(first.code, Code::TooManyConnections);
     assert!(first.message.contains("make room"), "{first:?}");
@@ -136,7 +136,7 @@ fn a_connection_that_was_silent_goes_on_where_it_was() {
     let us = Some(Some(std::process::id() as i32));
     for _ in 0..3 {
         client.call(State {}).unwrap();
-        eventually("its thread is not needed any more", || threads() == 0);
+        eventually("its thread has ended", || threads() == 0);
         // What it is asked now is answered by the thread that takes stops; the lease is still its own.
         assert_eq!(client.call(Status {}).unwrap().arms[0].commander.as_ref().map(|c| c.pid), us);
         assert_eq!(client.call(Stop { arm: None }).unwrap().arms["arm"], Confirmation::Confirmed);
@@ -284,7 +284,7 @@ fn a_stop_that_arrives_after_the_reconnect_is_reported() {
     let ip = IpAddr::from([127, 78, (std::process::id() >> 8) as u8, std::process::id() as u8 | 1]);
     let power_on = || {
         let config = AdapterConfig { hardware_id: "arm".into(), address: ip.to_string(), dof: 6, options: json!({}) };
-        (yourarm::SPEC.emulate.unwrap())(&config, &Place::Bind(ip)).unwrap()
+        (yourarm::SPEC.emulate.unwrap())(&config, &EmulatorAddress::Bind(ip)).unwrap()
     };
     let arm = power_on();
     let run = home.run(&format!("coordinator-yourarm --no-record --set hardware.arm.address={ip}"));
@@ -374,11 +374,11 @@ fn refused_executes_are_not_logged_whole() {
     }
     run.end(rustix::process::Signal::TERM);
     let log = home.logs().pop().unwrap();
-    let told =
+    let replies =
         home.dimos(&format!("replay {} --json --rate 1000000 --topics /dimos/requests", log.display())).with(0).out;
-    let refusals: Vec<Value> = told.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let refusals: Vec<Value> = replies.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     assert!(refusals.len() >= 40, "every refusal is in the log");
-    assert!(told.len() < 40 * 1000, "{} bytes for 40 refusals", told.len());
+    assert!(replies.len() < 40 * 1000, "{} bytes for 40 refusals", replies.len());
     home.dimos(&format!("replay {} --verify", log.display())).with(0);
 }
 
@@ -421,7 +421,7 @@ tasks:
     assert!(last.abs() < 0.01, "the motors went off at {last} rad/s");
 }
 
-/// An arm that says that it moves, whatever it is told.
+/// An arm that always reports motion.
 static RUNAWAY: LazyLock<MockAdapter> = LazyLock::new(|| MockAdapter::new(7).positions(&[0.1; 7]));
 
 #[test]

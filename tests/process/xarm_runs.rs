@@ -6,7 +6,7 @@ use std::net::TcpStream;
 use std::time::Duration;
 
 use dimos::hardware::arms::xarm::emulator::{Received, XArmEmulator};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use serde_json::{Value, json};
 
@@ -15,7 +15,7 @@ use crate::support::program::{Home, Started, eventually};
 
 fn emulator(options: Value) -> XArmEmulator {
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
-    XArmEmulator::start(&config, &Place::InProcess).unwrap()
+    XArmEmulator::start(&config, &EmulatorAddress::InProcess).unwrap()
 }
 
 fn run(home: &Home, emulator: &XArmEmulator, more: &str) -> Started {
@@ -55,7 +55,7 @@ fn ours(emulator: &XArmEmulator) -> Vec<Received> {
     trace.into_iter().skip(theirs).filter(|r| r.protocol == 3 && orders.contains(&r.register)).collect()
 }
 
-/// Set points that were on their way already are refused by the controller.
+/// Setpoints already on their way are refused by the controller.
 fn only_refused_set_points(received: &[Received]) -> bool {
     received.len() <= 2 && received.iter().all(|r| r.register == 29 && r.status & 0x58 != 0)
 }
@@ -78,7 +78,7 @@ fn an_arm_that_another_client_takes_over_is_left_to_it() {
         let there = || emulator.joints().0.iter().zip(&goal[..6]).all(|(q, goal)| (q - goal).abs() < 1e-3);
         eventually("the client's goal", there);
         eventually("the hold", || phase(&home) == ("held".into(), "mode_changed".into()));
-        // A stop that somebody asks for goes to the arm; the end of the run by itself sends nothing.
+        // A requested stop goes to the arm; the end of the run alone sends nothing.
         run.end(rustix::process::Signal::INT);
         let ours = ours(&emulator);
         assert!(there() && emulator.enabled() && only_refused_set_points(&ours), "{spacing} ms: {ours:?}");

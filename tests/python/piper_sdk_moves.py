@@ -8,14 +8,14 @@ import time
 
 from piper_sdk import C_PiperInterface_V2
 
-PATIENCE = 30.0  # [s] for anything that must happen
+TIMEOUT = 30.0  # [s] for anything that must happen
 
 
 def until(what, holds):
-    end = time.monotonic() + PATIENCE
+    end = time.monotonic() + TIMEOUT
     while not holds():
         if time.monotonic() > end:
-            sys.exit(f"not within {PATIENCE} s: {what}")
+            sys.exit(f"not within {TIMEOUT} s: {what}")
         time.sleep(0.01)
 
 
@@ -42,7 +42,7 @@ def enabled():
 
 
 def move(target, speed):
-    """Sends the target again and again, as the vendor's demos do, until the arm is there."""
+    """Repeats the target, as the vendor's demos do, until the arm is there."""
 
     def there():
         piper.MotionCtrl_2(0x01, 0x01, speed, 0x00)
@@ -57,7 +57,7 @@ kind = "slcan" if sys.argv[1].startswith("/") else "socketcan"
 piper.CreateCanBus(sys.argv[1], bustype=kind, judge_flag=False)
 piper.ConnectPort(piper_init=True)
 
-# What it is and how it stands.
+# Identity and state.
 until("the state", lambda: near(joints(), [5730, 34377, -40107, 2865, 22918, -5730], 1))
 until("the pose", lambda: near(pose(), [119145, 13734, 363413, -167006, 77515, -159832], 60))
 

@@ -1,4 +1,4 @@
-"""Tries assets/python/dimos_client.py against a live run of tests/process/python_client.rs; fails at what is not as it says."""
+"""Tries assets/python/dimos_client.py against a live run of tests/process/python_client.rs; fails at the first difference from its page."""
 
 import itertools
 import math
@@ -77,9 +77,9 @@ def follows_a_policy(robot, watcher):
     report = robot.follow("servo_arm", policy, rate=50, duration=4)
     print(f"50 Hz: {report}")
     assert report.sent == len(asked) and report.sent + report.missed in range(199, 202), report
-    watcher.status()  # what was told so far is here now
-    told = [m["data"] for m in watcher._queues[seen] if m["data"].get("task") == "servo_arm"]
-    assert [event["text"] for event in told] == ["task servo_arm is EXECUTING"], told
+    watcher.status()  # afterwards all events so far have arrived
+    events = [m["data"] for m in watcher._queues[seen] if m["data"].get("task") == "servo_arm"]
+    assert [event["text"] for event in events] == ["task servo_arm is EXECUTING"], events
     refused(dimos.Refused, "UNKNOWN_TASK", lambda: robot.follow("servo", lambda s, t: [0.0], duration=1))
     robot.servo("servo_arm", [1.0])
     refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
@@ -102,7 +102,7 @@ def moves_the_end_effector(robot):
     robot.pose("pose_arm", [0.35, 0, 0.3])
     refused(dimos.Refused, "INVALID_PARAMS", robot.settle)
     deadline = time.monotonic() + 60
-    while True:  # until it stands there
+    while True:  # until it is at rest there
         robot.pose("pose_arm", [0.35, 0.05, 0.4], rpy=[3.1, 0, 0.2])
         robot.settle()
         time.sleep(0.05)

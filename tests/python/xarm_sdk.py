@@ -48,7 +48,7 @@ def session(host):
     check((arm.axis, arm.device_type) == (6, 6), f"{arm.axis} axes, type {arm.device_type}")
     check(arm.get_robot_sn()[1].startswith("XI1305"), "serial number")
     start = arm.get_servo_angle()[1][:6]
-    check(start[1] < -0.5, f"it stands where it was put, in rad: {start}")
+    check(start[1] < -0.5, f"it is at its initial position, in rad: {start}")
 
     # Planned moves: joints, then the tool in a line.
     enable(arm, 0)
@@ -79,7 +79,7 @@ def session(host):
     ok(arm.set_servo_angle_j(goal), "set_servo_angle_j")
     until("the last setpoint", lambda: near(arm.get_servo_angle()[1], goal, 2e-3))
 
-    # Velocities, which end by themselves.
+    # Velocities, which time out.
     enable(arm, 4)
     for _ in range(30):
         ok(arm.vc_set_joint_velocity([0, 0, 0, 0, 0, 0.2], duration=0.2), "vc_set_joint_velocity")

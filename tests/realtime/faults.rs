@@ -116,7 +116,7 @@ fn begin_long_move(home: &Home, arm: &YourArmEmulator) {
 }
 
 #[test]
-fn f01_an_arm_that_blocks_for_5_s_hurts_only_itself() {
+fn f01_an_arm_that_blocks_for_5_s_affects_no_other() {
     let home = Home::new();
     let arms = [arm(), arm(), arm()];
     let mut yaml = "name: three\nhardware:\n".to_owned();
@@ -148,14 +148,14 @@ fn f01_an_arm_that_blocks_for_5_s_hurts_only_itself() {
         assert_eq!((&status["arms"][i]["phase"], &status["tasks"][i]["state"]), (&"ready".into(), &"EXECUTING".into()));
     }
     eventually("the arm is back", || home.status()["arms"][1]["link"] == "up");
-    assert_eq!(home.status()["arms"][1]["phase"], "held", "it does not resume by itself");
+    assert_eq!(home.status()["arms"][1]["phase"], "held", "it does not resume automatically");
     home.dimos("move b 0 -0.3 0.6 0 0.8 0").with(1).says(&["ARM_LATCHED"]);
     home.dimos("arm reset b").with(0);
     home.dimos("arm enable b").with(0);
     home.dimos("move b 0 -0.3 0.6 0 0.8 0 --speed 1").with(0);
     let ended = run.end(Signal::INT).with(130);
-    let told = ended.err.lines().filter(|l| l.contains("WARN b: ")).count();
-    assert!(told <= 2, "reads fail, and writes fail:\n{}", ended.err);
+    let warnings = ended.err.lines().filter(|l| l.contains("WARN b: ")).count();
+    assert!(warnings <= 2, "reads fail, and writes fail:\n{}", ended.err);
 
     let (log, _) = played(&home, "log.mcap", "/dimos/tick,/arm_status/b");
     let deadline = |m: &Value| Mono(m["data"]["deadline_ns"].as_u64().unwrap());
@@ -177,7 +177,7 @@ fn f01_an_arm_that_blocks_for_5_s_hurts_only_itself() {
 }
 
 #[test]
-fn f02_a_read_error_keeps_the_last_state_and_is_told_once() {
+fn f02_a_read_error_keeps_the_last_state_and_is_reported_once() {
     let home = Home::new();
     let yaml = "
 name: errors
@@ -233,7 +233,7 @@ fn f08_the_wire_never_asks_for_more_than_the_limits() {
     target[0] += 0.5;
     let _ = client.call(Servo { task: "servo".into(), positions: target });
     eventually("it is held", || home.status()["arms"][0]["phase"] == "held");
-    eventually("it stands", || arm.joints().1.iter().all(|v| v.abs() < 1e-3));
+    eventually("it is at rest", || arm.joints().1.iter().all(|v| v.abs() < 1e-3));
     let trace = arm.trace();
     let (speed, change) = wire_extremes(&trace);
     println!("F08 of the limits: velocity {speed:.6}, acceleration {change:.6} in {} commands", trace.len());
@@ -302,7 +302,7 @@ fn f20_a_process_that_was_stopped_does_not_catch_up() {
     run.signal(Signal::CONT);
     eventually("it is held", || home.status()["arms"][0]["phase"] == "held");
     assert_eq!(home.status()["tasks"][0]["state"], "ABORTED");
-    eventually("it stands", || arm.joints().1.iter().all(|v| v.abs() < 1e-3));
+    eventually("it is at rest", || arm.joints().1.iter().all(|v| v.abs() < 1e-3));
     let points = set_points(&arm.trace());
     let late = points.iter().filter(|(at, _)| *at >= resumed).count();
     let burst = points.windows(2).filter(|w| ms(w[0].0, w[1].0) < 1.0).count();
@@ -315,7 +315,7 @@ fn f20_a_process_that_was_stopped_does_not_catch_up() {
     home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --speed 1").with(0);
 }
 
-/// Not a test by itself: the process in which the tick breaks. Otherwise it is what `dimos run` does.
+/// Not a test: a child process that does what `dimos run` does, until its tick breaks.
 #[test]
 fn child_whose_tick_breaks() {
     let Ok(how) = std::env::var("DIMOS_TEST_CHILD") else { return };
@@ -350,7 +350,7 @@ fn child_whose_tick_breaks() {
     std::process::exit(exit as i32);
 }
 
-/// Breaks the tick in mid-motion. Times until the arm was told to stop, and until the process was gone [ms].
+/// Breaks the tick in mid-motion. Returns the times until the stop command and until the end of the process [ms].
 fn break_the_tick(how: &str, says: &str) -> (f64, f64) {
     let home = Home::new();
     let arm = arm();
@@ -366,9 +366,9 @@ fn break_the_tick(how: &str, says: &str) -> (f64, f64) {
     let gone = now();
     let broke = ended.out.split("broke=").nth(1).and_then(|s| s.lines().next()?.parse().ok()).map(Mono).unwrap();
     let trace = arm.trace();
-    let stop = trace.iter().find(|r| r.request == Request::Stop && r.at >= broke).expect("it was told to stop");
+    let stop = trace.iter().find(|r| r.request == Request::Stop && r.at >= broke).expect("a stop command");
     assert!(!trace.iter().any(|r| r.at > stop.at && r.request.moves()), "nothing moves it after that");
-    // Its motors were switched off only when it stood.
+    // Its motors were switched off only at rest.
     let off = trace.iter().find(|r| r.request == Request::Enable(false)).expect("the blueprint's arm has brakes");
     assert!(ms(stop.at, off.at) > 30.0, "{} ms", ms(stop.at, off.at));
     (ms(broke, stop.at), ms(broke, gone))
@@ -398,7 +398,7 @@ fn f22_a_tick_that_hangs_leaves_the_arm_held_and_ends_the_run() {
 
 #[test]
 fn f24_what_was_logged_before_kill_9_can_be_read() {
-    const KILLS: usize = 20;
+    const KILLS: usize = 10;
     let mut random = Random::new();
     let mut losses = Vec::new();
     for kill in 0..KILLS {
@@ -413,11 +413,11 @@ fn f24_what_was_logged_before_kill_9_can_be_read() {
         run.signal(Signal::KILL);
         assert_eq!(run.wait().signal, Some(9));
         let (log, replayed) = played(&home, "log.mcap", "/dimos/tick");
-        assert_eq!(replayed.code, Some(3), "kill {kill}: a cut file is told\n{}", replayed.err);
+        assert_eq!(replayed.code, Some(3), "kill {kill}: a truncated file is reported\n{}", replayed.err);
         let last = Mono(log.last().unwrap_or(&Value::Null)["data"]["deadline_ns"].as_u64().unwrap_or_default());
         // The arm's own record says until when there was something to log.
         losses.push(ms(last, set_points(&arm.trace()).last().unwrap().0));
-        // What the killed run left behind is in nobody's way; that it crashed is remembered.
+        // What the killed run left behind blocks no other run; the crash is reported.
         assert!(home.runs().runs().unwrap().is_empty());
         assert_eq!(home.status()["crashed"], true);
     }
@@ -438,9 +438,9 @@ fn f27_signals_in_mid_motion_end_in_a_controlled_stop() {
         begin_long_move(&home, &arm);
         let asked = now();
         run.signal(signal);
-        eventually("it stands", || arm.joints().1.iter().all(|v| v.abs() < 0.01));
+        eventually("it is at rest", || arm.joints().1.iter().all(|v| v.abs() < 0.01));
         let still = ms(asked, now());
-        // Impatience changes nothing.
+        // A second signal changes nothing.
         run.signal(signal);
         let ended = run.wait().with(code);
         let gone = ms(asked, now());
@@ -466,7 +466,7 @@ fn f28_a_terminal_that_hangs_up_ends_the_run_controlled() {
 }
 
 #[test]
-fn f29_a_device_has_one_program() {
+fn f29_a_device_has_one_client() {
     let home = Home::new();
     let arm = arm();
     let first = home.run(&format!("{} --no-record", at(&arm)));
@@ -485,14 +485,14 @@ fn f29_a_device_has_one_program() {
         let second = home.dimos(&format!("run {RUN} --name second --set hardware.arm.address={address}"));
         second.with(3).says(&["in use by process", &first.pid().to_string(), "hint: "]);
     }
-    // Nor does it help to be somebody else: a user with other folders.
+    // A user with other folders is refused too.
     Home::new().dimos(&format!("run {}", at(&arm))).with(3).says(&["in use by process", &first.pid().to_string()]);
     assert_eq!((seen(Request::Hello), arm.refused_clients()), (0, 0), "no byte was sent");
     first.end(Signal::INT).with(130);
 
     arm.record();
     let (mut winners, mut losers) = (0, 0);
-    for _ in 0..30 {
+    for _ in 0..12 {
         let start = |name: &str| {
             let quiet = "--no-record --duration 60ms --set hardware.arm.auto_enable=false";
             home.start(&format!("run {} {quiet} --name {name}", at(&arm)))
@@ -509,7 +509,7 @@ fn f29_a_device_has_one_program() {
             }
         }
     }
-    println!("F29 30 raced pairs: {winners} ran, {losers} were refused");
+    println!("F29 12 raced pairs: {winners} ran, {losers} were refused");
     assert_eq!((seen(Request::Hello), arm.refused_clients()), (winners, 0), "never two at once");
-    assert!(losers >= 10, "the race was none");
+    assert!(losers >= 4, "the race was none");
 }

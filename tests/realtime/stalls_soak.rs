@@ -1,20 +1,20 @@
 //! `make soak`: runs with simulated arms, idle and moving at the same time, beside busy processes, with and without
-//! real-time rights: no arm is held. `DIMOS_SOAK` is for how long each is watched [s] (10; when it is given, a computer
-//! that stands still for
-//! 0.1 s is no excuse), `DIMOS_SOAK_BUSY` how many processes are busy (8),
-//! `DIMOS_SOAK_ALL=1` takes every shipped blueprint.
+//! real-time permission: no arm is held. Only a hold at which a processor ran no program at all for 100 ms (the host of
+//! a virtual machine did not schedule it) is not counted: it is printed, the arm is reset, and the soak continues.
+//! `DIMOS_SOAK` is the duration [s] (10), `DIMOS_SOAK_BUSY` the number of busy processes (8), `DIMOS_SOAK_ALL=1` takes
+//! every shipped blueprint.
 
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
-use dimos::rpc::api::{Execute, Point, State, Trajectory};
+use dimos::rpc::api::{ArmEnable, ArmReset, Execute, Point, State, Trajectory};
 use dimos::rpc::client::Client;
 use rustix::process::Signal;
 use rustix::thread::CapabilitySet;
 
 use crate::support::busy::Busy;
 use crate::support::program::{Home, Started, UP};
-use crate::support::wire::watch::Watch;
+use crate::support::wire::watch::{Delay, Watch};
 
 /// An arm behind another process.
 const REMOTE: &str = "
@@ -65,7 +65,7 @@ impl Soaked {
         self.run.as_ref().unwrap().until(UP);
     }
 
-    /// Swings every joint by 0.2 rad for so long [s].
+    /// Swings every joint by 0.2 rad for this time [s].
     fn move_all(&self, seconds: f64) -> Result<(), String> {
         let mut client: Client = self.home.client();
         for arm in client.call(State {}).unwrap().arms {
@@ -90,18 +90,47 @@ impl Soaked {
         Ok(())
     }
 
-    /// Ends it, and says what held an arm.
-    fn end(mut self, what: &str) -> Vec<String> {
+    /// Makes held arms ready again, so that the soak continues.
+    fn recover(&self) {
+        let mut client: Client = self.home.client();
+        for arm in self.home.status()["arms"].as_array().unwrap().iter().filter(|arm| arm["phase"] != "ready") {
+            let arm = arm["hardware_id"].as_str().unwrap();
+            // A refusal shows as the next hold.
+            let _ = client.call(ArmReset { arm: arm.into() });
+            let _ = client.call(ArmEnable { arm: arm.into() });
+        }
+    }
+
+    /// Shuts it down. Returns what held an arm, and when.
+    fn end(mut self, what: &str) -> Vec<Hold> {
         let status = self.home.status();
         assert!(self.realtime || status["realtime"][0]["granted"] == false, "{}", status["realtime"]);
-        let held = status["arms"].as_array().unwrap().iter().filter(|arm| arm["phase"] != "ready");
-        let mut found: Vec<String> = held
-            .map(|arm| format!("{} {what}: {} is {}: {}", self.name, arm["hardware_id"], arm["phase"], arm["cause"]))
-            .collect();
+        let name = format!("{} {what}", self.name);
         let ended = self.run.take().unwrap().end(Signal::INT);
-        let told = ended.err.lines().filter(|line| line.contains("is held"));
-        found.extend(told.map(|line| format!("{} {what}: {line}", self.name)));
-        found
+        let hold = |line: &str| {
+            let at: jiff::Timestamp = line.split(' ').next().unwrap().parse().unwrap();
+            Hold { at: at.into(), what: format!("{name}: {line}") }
+        };
+        ended.err.lines().filter(|line| line.contains("is held")).map(hold).collect()
+    }
+}
+
+/// An arm was held.
+struct Hold {
+    at: SystemTime,
+    what: String,
+}
+
+impl Hold {
+    /// A processor that runs nothing for this time must hold an arm.
+    const LIMIT: Duration = Duration::from_millis(100);
+    /// The last effects of a stall are logged this much later: states of a remote arm are valid for 200 ms, and the
+    /// text log is written by an ordinary thread.
+    const AFTER: Duration = Duration::from_secs(1);
+
+    /// Returns the stall that explains it.
+    fn cause<'s>(&self, stalls: &'s [Delay]) -> Option<&'s Delay> {
+        stalls.iter().find(|stall| stall.ended - stall.length <= self.at && self.at <= stall.ended + Self::AFTER)
     }
 }
 
@@ -130,55 +159,48 @@ fn blueprints() -> Vec<String> {
 /// How long one request moves an arm [s].
 const LONGEST_MOTION: f64 = 120.0;
 
-/// A computer that does not run a program for so long is too busy to judge anything on it: the cycle of a shim in
-/// Python is several such waits, one after the other.
-const STANDSTILL: Duration = Duration::from_millis(20);
-
-/// Watches runs once, of each blueprint one idle and one moving: how long this computer stood still meanwhile for a
-/// program like theirs, and what was held.
-fn watched(names: &[String], realtime: bool, time: f64) -> (Duration, Vec<String>) {
+/// Watches runs, of each blueprint one idle and one moving. Returns what was held.
+fn watched(names: &[String], realtime: bool, time: f64) -> Vec<Hold> {
     let start = |moving| names.iter().map(move |name| (moving, Soaked::start(name, realtime)));
     let runs: Vec<(bool, Soaked)> = start(false).chain(start(true)).collect();
     runs.iter().for_each(|(_, run)| run.up());
     let _busy = Busy::start(number("DIMOS_SOAK_BUSY", 8.0) as usize);
-    // A shim is an ordinary program, whatever its run is.
-    let watch = Watch::start(realtime && !names.iter().any(|name| name == "remote"));
-    let (began, mut found) = (Instant::now(), Vec::new());
+    let began = Instant::now();
     loop {
-        // One motion after the other, with a moment of rest between them: a request holds a few minutes at most.
         let left = time - began.elapsed().as_secs_f64();
-        let moving = runs.iter().filter(|(moving, _)| *moving && left > 4.0);
-        found.extend(moving.filter_map(|(_, run)| run.move_all(left.min(LONGEST_MOTION)).err()));
-        std::thread::sleep(Duration::from_secs_f64(left.clamp(0.0, LONGEST_MOTION + 1.0)));
-        if left <= LONGEST_MOTION + 1.0 || !found.is_empty() {
+        if left <= 4.0 {
             break;
         }
+        for (_, run) in runs.iter().filter(|(moving, _)| *moving) {
+            // A hold in this moment refuses the motion; it counts.
+            let _ = run.move_all(left.min(LONGEST_MOTION)).inspect_err(|refused| println!("{refused}"));
+        }
+        std::thread::sleep(Duration::from_secs_f64(left.min(LONGEST_MOTION + 1.0)));
+        runs.iter().for_each(|(_, run)| run.recover());
     }
-    let stalled = watch.stood_still();
-    found.extend(runs.into_iter().flat_map(|(moving, run)| run.end(if moving { "moving" } else { "idle" })));
-    (stalled, found)
+    runs.into_iter().flat_map(|(moving, run)| run.end(if moving { "moving" } else { "idle" })).collect()
 }
 
 fn soak(realtime: bool) {
+    let host = Watch::of_processors();
     let time = number("DIMOS_SOAK", 10.0);
-    let mut failures = Vec::new();
-    let strict = std::env::var_os("DIMOS_SOAK").is_some();
     // A few at a time: all of them share two cores with the busy ones.
-    for names in blueprints().chunks(3) {
-        let mut found = Vec::new();
-        for _ in 0..3 {
-            let (stalled, held) = watched(names, realtime, time);
-            found = held;
-            // Nobody promises anything where not even a run's own threads get a processor.
-            if found.is_empty() || strict || stalled < STANDSTILL {
-                break;
-            }
-            println!("not judged: this computer was stalled for {stalled:?}: {found:?}");
-            found.clear();
-        }
-        failures.extend(found);
+    let holds: Vec<Hold> = blueprints().chunks(3).flat_map(|names| watched(names, realtime, time)).collect();
+    let stalls = host.delays(Hold::LIMIT);
+    for stall in &stalls {
+        let ended = jiff::Timestamp::try_from(stall.ended).unwrap();
+        println!("a processor ran nothing for {:?} until {ended}", stall.length);
     }
-    assert!(failures.is_empty(), "{} holds:\n{}", failures.len(), failures.join("\n"));
+    let (explained, failures): (Vec<_>, Vec<_>) = holds.iter().partition(|hold| hold.cause(&stalls).is_some());
+    for hold in explained {
+        println!("not counted, a processor ran nothing for {:?}: {}", hold.cause(&stalls).unwrap().length, hold.what);
+    }
+    let shorter = host.delays(Duration::ZERO);
+    for hold in &failures {
+        let near = shorter.iter().filter(|delay| hold.cause(std::slice::from_ref(delay)).is_some());
+        println!("longest delay of a processor before: {:?}: {}", near.map(|d| d.length).max(), hold.what);
+    }
+    assert!(failures.is_empty(), "{} holds, see above", failures.len());
 }
 
 #[test]

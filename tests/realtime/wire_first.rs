@@ -10,7 +10,7 @@ use crate::support::wire;
 use crate::support::wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, World, XARM, YOURARM, furthest};
 use crate::support::wire::judge::position;
 
-/// How far a first setpoint may be from where the arm is [rad]: what a moved joint is told by, too.
+/// Largest distance of a first setpoint from the arm's pose [rad]; a joint further away counts as moved.
 const BESIDE: f64 = 0.02;
 
 fn arms() -> Vec<Arm> {
@@ -30,7 +30,7 @@ fn pose(arm: &Arm) -> Vec<f64> {
     low.iter().zip(high).map(|(a, b)| a + 0.8 * (b - a)).collect()
 }
 
-/// Tries something with all arms side by side, and tells all that went wrong.
+/// Runs a case with all arms side by side, and reports all failures.
 fn each(arms: Vec<Arm>, trial: fn(Arm) -> Vec<String>) {
     let failures: Vec<String> = std::thread::scope(|scope| {
         let threads: Vec<_> = arms.into_iter().map(|arm| (arm, scope.spawn(move || trial(arm)))).collect();
@@ -69,7 +69,7 @@ fn zeros_at_the_start_are_no_pose() {
                 Ok(bed) => strays(|| bed.truth(), &start, Duration::from_millis(1500)),
                 Err((why, world)) => {
                     println!("{} {zeros} s: {why}", arm.name);
-                    // A Piper's adapter refuses the first zero by itself.
+                    // A Piper's adapter itself refuses the first zero.
                     if zeros < 1.0 && arm.name != "piper" {
                         failures.push(format!("zeros for {zeros} s: it does not start: {why}"));
                     }
@@ -87,11 +87,11 @@ fn zeros_at_the_start_are_no_pose() {
     });
 }
 
-fn beside_the_truth(delivered: &[wire::Told]) -> Result<(), String> {
+fn beside_the_truth(delivered: &[wire::WireCommand]) -> Result<(), String> {
     let far = delivered.iter().filter_map(|t| Some((t, furthest(position(&t.what)?, t.truth.as_ref()?))));
     match far.max_by(|a, b| a.1.total_cmp(&b.1)) {
-        Some((told, by)) if by > BESIDE => {
-            Err(format!("a setpoint {by:.4} rad from the true pose: {:?} at {:?}", told.what, told.truth))
+        Some((command, by)) if by > BESIDE => {
+            Err(format!("a setpoint {by:.4} rad from the true pose: {:?} at {:?}", command.what, command.truth))
         }
         _ => Ok(()),
     }
@@ -197,8 +197,8 @@ fn enabled_again_after_a_stop_an_arm_does_not_step() {
             bed.ready();
             std::thread::sleep(Duration::from_millis(300));
             let mut before = last.clone();
-            for told in bed.gate.sent() {
-                let Some(now) = position(&told.what) else { continue };
+            for command in bed.gate.sent() {
+                let Some(now) = position(&command.what) else { continue };
                 for (j, (a, b)) in before.iter().zip(now).enumerate() {
                     let most = bed.bounds.velocity[j] * PERIOD + arm.rounding;
                     let from_the_arm = here.get(j).map_or(f64::INFINITY, |q| (b - q).abs());

@@ -1,7 +1,7 @@
-//! What an arm is told when the wire to it stalls at full speed, judged on the wire: five arms, every kind of stall,
+//! Commands to an arm whose wire stalls at full speed, judged on the wire: five arms, every kind of stall,
 //! from 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and
-//! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and tells what went over the wire where
-//! something is wrong.
+//! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and prints what went over the wire at a
+//! failure.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +19,7 @@ use crate::support::wire::{Stall, now};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Wire(Stall),
-    /// The arm's controller: it reads nothing and says nothing, then goes on.
+    /// The arm's controller: it neither reads nor sends, then continues.
     Controller,
 }
 
@@ -32,9 +32,9 @@ const KINDS: [Kind; 6] = [
     Kind::Controller,
 ];
 const TIMES: [u64; 5] = [20, 60, 90, 300, 3000];
-/// A case that this computer spoilt by standing still for longer is tried again, so often at most.
+/// A failed case during which this computer ran no program for longer was not judged, and is repeated.
 const SPOILT: Duration = Duration::from_millis(4);
-const TRIES: usize = 3;
+const TRIES: usize = 5;
 
 fn arms() -> Vec<Arm> {
     let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC)];
@@ -42,7 +42,7 @@ fn arms() -> Vec<Arm> {
     all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect()
 }
 
-/// The cases of an arm: `n` tells arms apart, so that together they have more than each.
+/// The cases of arm number `n`; all arms together cover more cases than each.
 fn cases(n: usize) -> Vec<(Kind, Duration)> {
     let full = std::env::var("DIMOS_WIRE").is_ok_and(|v| v == "full");
     let all =
@@ -54,24 +54,25 @@ fn cases(n: usize) -> Vec<(Kind, Duration)> {
     some.map(|(_, kind, _, ms)| (*kind, Duration::from_millis(*ms))).collect()
 }
 
-/// Runs the cases of all arms, the arms side by side, and tells all that went wrong.
+/// Runs the cases of all arms, the arms side by side, and reports all failures.
 fn judge_all(arms: &[Arm], case: fn(&Bed, Kind, Duration) -> Vec<String>) {
-    let watch = Watch::start(true);
+    let (realtime, ordinary) = (Watch::of_emulators(), Watch::of_programs());
     let failures: Vec<String> = std::thread::scope(|scope| {
         let threads: Vec<_> = arms
             .iter()
             .enumerate()
             .map(|(n, arm)| {
-                let watch = &watch;
+                // The kernel passes on the bytes of a pseudo-terminal in an ordinary thread.
+                let watch = if arm.name == serial::SPEC.name { &ordinary } else { &realtime };
                 scope.spawn(move || {
                     let bed = Bed::new(*arm, &Setup::default());
                     let mut failures = Vec::new();
                     for (kind, time) in cases(n) {
                         let mut found = Vec::new();
                         for _ in 0..TRIES {
-                            watch.stood_still();
+                            let began = Instant::now();
                             found = catch_unwind(AssertUnwindSafe(|| case(&bed, kind, time))).unwrap_or_else(said);
-                            if found.is_empty() || watch.stood_still() < SPOILT {
+                            if found.is_empty() || watch.longest_since(began) < SPOILT {
                                 break;
                             }
                         }
@@ -138,8 +139,8 @@ fn position_case(bed: &Bed, kind: Kind, time: Duration) -> Vec<String> {
     let failures: Vec<String> = verdicts.into_iter().filter_map(Result::err).collect();
     if !failures.is_empty() && std::env::var_os("DIMOS_WIRE_ARM").is_some() {
         let near = |at: dimos::clock::Mono| (-0.05..time.as_secs_f64() + 0.1).contains(&at.seconds_since(began));
-        for told in delivered.iter().filter(|told| near(told.at)) {
-            println!("{:8.1} ms {:?} {:?}", told.at.seconds_since(began) * 1e3, told.what, told.truth);
+        for command in delivered.iter().filter(|command| near(command.at)) {
+            println!("{:8.1} ms {:?} {:?}", command.at.seconds_since(began) * 1e3, command.what, command.truth);
         }
     }
     failures

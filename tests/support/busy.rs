@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 pub struct Busy(Vec<Child>);
 
 impl Busy {
-    /// Starts so many.
+    /// Starts this number of processes.
     pub fn start(count: usize) -> Self {
         let one = |_| {
             let mut shell = Command::new("sh");

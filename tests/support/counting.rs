@@ -13,7 +13,7 @@ thread_local! {
 }
 
 fn count(allocates: bool) {
-    // A thread that is ending has no cells any more.
+    // The cells of an ending thread are gone.
     let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + u64::from(allocates)));
     let watched = WATCHED.try_with(Cell::get).unwrap_or(false);
     let _ = WATCHED_CALLS.try_with(|n| n.set(n.get() + u64::from(watched)));

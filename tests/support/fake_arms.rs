@@ -1,8 +1,8 @@
 //! Adapter rows for tests about blueprints: they say what they can do, and do nothing.
 
-use dimos::hardware::fit::Fit;
+use dimos::hardware::adapter::AdapterError;
+use dimos::hardware::check::Checked;
 use dimos::hardware::registry::{AdapterSpec, AddressForm, Level, OptionsSpec, Registry};
-use dimos::hardware::spec::AdapterError;
 use dimos::joint::{ControlMode, JointLimits};
 use schemars::JsonSchema;
 use serde::Deserialize;
@@ -60,7 +60,7 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     holds_when_disabled: true,
     gripper: true,
     options: OptionsSpec::of::<NetOptions>(),
-    fit: |config| Ok(Fit { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
+    check: |config| Ok(Checked { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
     create: |_| Err(AdapterError::Rejected(NOT_HERE.to_owned())),
     emulate: Some(|_, _| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
 };

@@ -1,4 +1,4 @@
-//! A tiny web server on the loopback that gives one file, and can be told to misbehave.
+//! A web server on the loopback interface that serves one file and misbehaves on request.
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
@@ -9,7 +9,7 @@ use std::time::Duration;
 /// What it does with its connections, one after the other; after the last, as it should.
 #[derive(Debug, Clone, Copy)]
 pub enum Misdeed {
-    /// Sends so many bytes of what was asked for, then hangs up.
+    /// Sends this number of bytes of the range, then closes the connection.
     Cut(usize),
     /// Answers with this status and no file.
     Status(u16),
@@ -31,14 +31,14 @@ impl FileServer {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
         let (ranges, over) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
-        let (told, end, misdeeds) = (ranges.clone(), over.clone(), misdeeds.to_vec());
+        let (seen, end, misdeeds) = (ranges.clone(), over.clone(), misdeeds.to_vec());
         std::thread::spawn(move || {
             let mut misdeeds = misdeeds.into_iter();
             for client in listener.incoming() {
                 if end.load(Ordering::Relaxed) {
                     return;
                 }
-                let _ = serve(client.unwrap(), &file, misdeeds.next(), &told);
+                let _ = serve(client.unwrap(), &file, misdeeds.next(), &seen);
             }
         });
         Self { address, ranges, over }
@@ -60,7 +60,7 @@ impl Drop for FileServer {
     }
 }
 
-fn serve(mut to: TcpStream, file: &[u8], misdeed: Option<Misdeed>, told: &Mutex<Vec<String>>) -> std::io::Result<()> {
+fn serve(mut to: TcpStream, file: &[u8], misdeed: Option<Misdeed>, seen: &Mutex<Vec<String>>) -> std::io::Result<()> {
     to.set_read_timeout(Some(Duration::from_secs(10)))?;
     let mut lines = BufReader::new(to.try_clone()?).lines();
     let mut range = String::new();
@@ -70,7 +70,7 @@ fn serve(mut to: TcpStream, file: &[u8], misdeed: Option<Misdeed>, told: &Mutex<
             range = value.to_owned();
         }
     }
-    told.lock().unwrap().push(range.clone());
+    seen.lock().unwrap().push(range.clone());
     if let Some(Misdeed::Status(status)) = misdeed {
         return write!(to, "HTTP/1.1 {status} No\r\ncontent-length: 0\r\nconnection: close\r\n\r\n");
     }

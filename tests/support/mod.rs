@@ -4,6 +4,7 @@
 
 pub mod busy;
 pub mod counting;
+pub mod crates;
 pub mod fake_arms;
 pub mod fake_run;
 pub mod file_server;

@@ -1,4 +1,4 @@
-//! The real binary as a user runs it: in folders of its own, and always ended, whatever a test does.
+//! The real binary as a user runs it: in a home folder per test, and killed when the test ends.
 
 use std::io::Read;
 use std::os::unix::process::ExitStatusExt;
@@ -13,12 +13,12 @@ use dimos::rpc::place::RunFolder;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
-/// Nothing here takes longer; a test that waits this long has failed.
-pub const PATIENCE: Duration = Duration::from_secs(30);
+/// Nothing takes longer than this: a test that waits this long has failed.
+pub const TIMEOUT: Duration = Duration::from_secs(30);
 /// The last line of the banner: the run is up.
 pub const UP: &str = "Press Ctrl-C for a controlled stop.";
 
-/// A user's folders: sockets, logs, settings. Only what runs in them is seen.
+/// A user's folders: sockets, logs, settings. Runs of other users are not visible.
 pub struct Home(tempfile::TempDir);
 
 impl Home {
@@ -57,7 +57,7 @@ impl Home {
         Started::of(self.command(arguments).stdin(Stdio::null())).wait()
     }
 
-    /// Starts something that goes on, without waiting for anything.
+    /// Starts a verb without waiting for anything.
     pub fn start(&self, arguments: &str) -> Started {
         Started::of(self.command(arguments).stdin(Stdio::null()))
     }
@@ -70,7 +70,7 @@ impl Home {
         run
     }
 
-    /// Puts a file into the working folder.
+    /// Writes a file into the working folder.
     pub fn write(&self, name: &str, text: &str) {
         std::fs::write(self.path().join(name), text).unwrap();
     }
@@ -115,7 +115,7 @@ fn lock(text: &Text) -> MutexGuard<'_, String> {
     text.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A process of ours. It is killed when it is dropped.
+/// A process that is killed when it is dropped.
 pub struct Started {
     child: Option<Child>,
     out: Text,
@@ -124,7 +124,7 @@ pub struct Started {
 }
 
 impl Started {
-    /// Starts a command and collects what it says.
+    /// Starts a command and collects its output.
     pub fn of(command: &mut Command) -> Self {
         let mut started = Self::unheard(command.stdout(Stdio::piped()).stderr(Stdio::piped()));
         let child = started.child.as_mut().unwrap();
@@ -133,7 +133,7 @@ impl Started {
         started
     }
 
-    /// Starts a command whose output goes where it says.
+    /// Starts a command whose output goes where the command sends it.
     pub fn unheard(command: &mut Command) -> Self {
         Self { child: Some(command.spawn().unwrap()), out: Text::default(), err: Text::default(), readers: Vec::new() }
     }
@@ -154,19 +154,19 @@ impl Started {
         self.child.as_mut().unwrap().stdin.take().unwrap()
     }
 
-    /// Waits until a text stands on stderr or stdout.
+    /// Waits until stdout or stderr contains a text.
     #[track_caller]
     pub fn until(&self, text: &str) {
         let began = Instant::now();
         while !self.err().contains(text) && !self.out().contains(text) {
-            assert!(began.elapsed() < PATIENCE, "no {text:?} in\n{}{}", self.out(), self.err());
+            assert!(began.elapsed() < TIMEOUT, "no {text:?} in\n{}{}", self.out(), self.err());
             let ended = self.readers.iter().all(JoinHandle::is_finished);
             assert!(!ended || self.err().contains(text), "ended without {text:?}:\n{}{}", self.out(), self.err());
             std::thread::sleep(Duration::from_millis(2));
         }
     }
 
-    /// Whether it has ended, or at least will say no more.
+    /// Whether it has ended, or has closed its output.
     pub fn over(&self) -> bool {
         self.readers.iter().all(JoinHandle::is_finished)
     }
@@ -183,7 +183,7 @@ impl Started {
             if let Some(status) = child.try_wait().unwrap() {
                 break status;
             }
-            if began.elapsed() > PATIENCE {
+            if began.elapsed() > TIMEOUT {
                 let _ = (child.kill(), child.wait());
                 panic!("does not end\n{}{}", self.out(), self.err());
             }
@@ -227,7 +227,7 @@ pub struct Ended {
     pub signal: Option<i32>,
     pub out: String,
     pub err: String,
-    /// From the moment it was waited for.
+    /// Duration of the wait for its end.
     pub took: Duration,
 }
 
@@ -265,7 +265,7 @@ impl Ended {
 pub fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
     let began = Instant::now();
     while !holds() {
-        assert!(began.elapsed() < PATIENCE, "not within {PATIENCE:?}: {what}");
+        assert!(began.elapsed() < TIMEOUT, "not within {TIMEOUT:?}: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
 }

@@ -41,7 +41,7 @@ pub struct SimArm {
     pub mode_delay: u32,
     /// Whether its stop makes the place where it is its setpoint.
     pub stop_takes_hold: bool,
-    /// Joints stand still, whatever is commanded.
+    /// The joints do not move, whatever is commanded.
     pub blocked: bool,
     /// No new states come.
     pub silent: bool,
@@ -54,7 +54,7 @@ pub struct SimArm {
     pub link: Link,
     pub self_held: bool,
     pub mode: ControlMode,
-    /// What its joints are told [rad or rad/s]; `None`: never told anything.
+    /// Commanded positions or velocities [rad or rad/s]; `None`: never commanded.
     pub setpoint: Option<Vec<f64>>,
     pub state: ArmState,
     pub stops: u32,
@@ -117,7 +117,7 @@ impl SimArm {
         self.state
     }
 
-    /// Obeys a command for one period.
+    /// Executes a command for one period.
     fn obey(&mut self, command: &ArmCommand, dt: f64) {
         if command.stop_seq != self.last.stop_seq {
             self.stops += 1;
@@ -147,9 +147,9 @@ impl SimArm {
             }
         }
         for j in 0..self.dof {
-            let told = self.setpoint.as_ref().map(|s| s[j]);
+            let command = self.setpoint.as_ref().map(|s| s[j]);
             let share = if self.lag > 0.0 { 1.0 - (-dt / self.lag).exp() } else { 1.0 };
-            let next = match (self.mode, told) {
+            let next = match (self.mode, command) {
                 _ if self.blocked || !self.enabled => self.q[j],
                 (_, None) => self.q[j],
                 (ControlMode::Velocity, Some(v)) => {
@@ -171,7 +171,7 @@ pub struct Rig {
     pub now: Mono,
     pub ticks: u64,
     pub inbox: VecDeque<Envelope>,
-    /// Everything that was told, with the tick's number.
+    /// All events, with the number of their tick.
     pub events: Vec<(u64, Event)>,
     /// The commands of the last tick.
     pub commands: Vec<ArmCommand>,
@@ -255,7 +255,7 @@ impl Rig {
 
     /// With tasks of a table's types.
     pub fn with_types(table: &TaskTable, rate: f64, arms: Vec<ArmConfig>, tasks: Vec<TaskConfig>) -> Self {
-        let config = CoordinatorConfig { version: CONTROL_VERSION, rate, arms, tasks };
+        let config = CoordinatorConfig { version: CONFIG_VERSION, rate, arms, tasks };
         let wire = |a: &ArmConfig| Wire {
             mode: None,
             values: vec![0.0; a.dof],
@@ -352,7 +352,7 @@ impl Rig {
         self.tick_after(0);
     }
 
-    /// A tick after so many skipped periods.
+    /// Ticks after this number of skipped periods.
     pub fn tick_after(&mut self, skipped: u32) {
         let period = self.config.period();
         self.now = self.now.after(period * (skipped + 1));
@@ -364,7 +364,7 @@ impl Rig {
         }
     }
 
-    /// A tick that reads these states; no arm obeys its commands.
+    /// Ticks with these states; no arm executes the commands.
     pub fn tick_with(&mut self, states: &[ArmState], skipped: u32) {
         let late_ns = skipped as u64 * self.config.period().as_nanos() as u64;
         let time = TickTime {
@@ -396,7 +396,7 @@ impl Rig {
         self.run((seconds * self.config.rate).round() as u64);
     }
 
-    /// Runs until `done`, for so many seconds at most. Answers the time it took [s].
+    /// Runs until `done`, for at most this time [s]. Returns the time it took [s].
     pub fn run_until(&mut self, limit: f64, mut done: impl FnMut(&Self) -> bool) -> f64 {
         for k in 0..=(limit * self.config.rate) as u64 {
             if done(self) {
@@ -411,7 +411,7 @@ impl Rig {
         self.events.iter().filter(|(_, e)| wanted(e)).count()
     }
 
-    pub fn told(&self, event: Event) -> bool {
+    pub fn reported(&self, event: Event) -> bool {
         self.events.iter().any(|(_, e)| *e == event)
     }
 
@@ -481,8 +481,8 @@ impl Rig {
                     (false, false) => (values[j] - wire.values[j]) / dt,
                     (false, true) => {
                         let from_here = (values[j] - arm.state.position[j]).abs();
-                        let stands = wire.mode.is_none() && (values[j] - wire.values[j]).abs() < 1e-12;
-                        assert!(from_here <= 0.005 || stands, "{}", at("F12: first step"));
+                        let unchanged = wire.mode.is_none() && (values[j] - wire.values[j]).abs() < 1e-12;
+                        assert!(from_here <= 0.005 || unchanged, "{}", at("F12: first step"));
                         0.0
                     }
                 };

@@ -12,7 +12,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::pty::{OpenptFlags, grantpt, ioctl_tiocgptpeer, openpt, unlockpt};
 use rustix::termios::{LocalModes, Winsize, tcgetattr, tcsetwinsize};
 
-use super::program::{Home, PATIENCE, Started};
+use super::program::{Home, Started, TIMEOUT};
 
 /// A pseudo-terminal, and the screen that it would show.
 pub struct Terminal {
@@ -90,7 +90,7 @@ impl Terminal {
     pub fn until_with(&self, text: &str, mut meanwhile: impl FnMut()) {
         let began = std::time::Instant::now();
         while !self.text().contains(text) {
-            assert!(began.elapsed() < PATIENCE, "no {text:?} on the screen:\n{}", self.text());
+            assert!(began.elapsed() < TIMEOUT, "no {text:?} on the screen:\n{}", self.text());
             meanwhile();
             std::thread::sleep(std::time::Duration::from_millis(10));
         }

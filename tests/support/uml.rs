@@ -55,7 +55,7 @@ pub const VXCAN: &str = "
         ip link add can$i type vxcan peer name sim$i; ip link set can$i up; ip link set sim$i up
     done";
 
-/// Tells the executable that it runs in the guest.
+/// Set where the executable runs in the guest.
 const INSIDE: &str = "DIMOS_IN_GUEST";
 const TOOLS: [&str; 5] = ["linux.uml", "insmod", "ip", "tc", "cansend"];
 const FOLDERS: [&str; 6] = ["/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin"];
@@ -200,7 +200,7 @@ fn on_one_processor<T>(f: impl FnOnce() -> T) -> T {
 struct Kernel(Child);
 
 impl Kernel {
-    /// Waits a moment for it to halt by itself.
+    /// Waits up to 5 s until the kernel has halted.
     fn end(&mut self) {
         let deadline = Instant::now() + Duration::from_secs(5);
         while Instant::now() < deadline && self.0.try_wait().is_ok_and(|ended| ended.is_none()) {

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use dimos::arm::{ArmState, Link, Supervision, VelocitySource};
 use dimos::clock::{Mono, WallOffset};
-use dimos::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
+use dimos::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind, TrajectoryParams};
 use dimos::control::coordinator::{Coordinator, TickTime};
 use dimos::control::request::{Envelope, Motion, Request};
 use dimos::control::task_spec::TaskTable;
@@ -46,19 +46,19 @@ pub fn one_arm(dof: usize) -> CoordinatorConfig {
         priority: 10,
         auto_start: false,
     };
-    CoordinatorConfig { version: CONTROL_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
+    CoordinatorConfig { version: CONFIG_VERSION, rate: 100.0, arms: vec![arm], tasks: vec![task] }
 }
 
 /// A run on a clock that is set forward.
 pub struct VirtualRun {
     pub coordinator: Coordinator,
-    /// What the next tick reads. An arm that is enabled does what it is told, one period later.
+    /// States for the next tick. An enabled arm follows its commands one period later.
     pub states: Vec<ArmState>,
     /// What the tasks showed after the last tick.
     pub tasks: Vec<TaskView>,
     /// The next tick.
     pub tick: u64,
-    /// Samples that the recorder will be told to have been lost with the next tick.
+    /// Number of samples that the next tick reports as lost to the recorder.
     pub dropped: u32,
     config: CoordinatorConfig,
     names: Names,
@@ -94,7 +94,7 @@ impl VirtualRun {
             names: names.clone(),
             frame_id: "coordinator".into(),
             attachments: vec![attachment],
-            metadata: BTreeMap::new(),
+            metadata: BTreeMap::from([("config_version".to_owned(), config.version.to_string())]),
             wall: WallOffset::of(START.0, START.1),
             min_free: 0,
         };
@@ -128,8 +128,8 @@ impl VirtualRun {
 
     /// Asks something of the next tick.
     pub fn ask(&mut self, request: Request) {
-        let told = log_of(&request);
-        self.told(request, told);
+        let logged = log_of(&request);
+        self.send_logged(request, logged);
     }
 
     /// Asks for a trajectory.
@@ -138,14 +138,14 @@ impl VirtualRun {
         let index = |name| all.iter().position(|j| *j == name).unwrap() as u16;
         let joints = trajectory.joint_names.iter().map(index).collect();
         let motion = Motion { id: self.next_id, joints, spline: Spline::new(trajectory).unwrap() };
-        let told = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
-        self.told(Request::Execute { task, motion: Box::new(motion) }, told);
+        let logged = json!({"execute": {"task": task, "motion": motion.id, "trajectory": trajectory}});
+        self.send_logged(Request::Execute { task, motion: Box::new(motion) }, logged);
     }
 
-    fn told(&mut self, request: Request, told: serde_json::Value) {
+    fn send_logged(&mut self, request: Request, logged: serde_json::Value) {
         let (id, stamp) = (self.next_id, self.now);
         self.next_id += 1;
-        self.notes.send(Note::Request { id, stamp, json: told.to_string() }).unwrap();
+        self.notes.send(Note::Request { id, stamp, json: logged.to_string() }).unwrap();
         self.inbox.push_back(Envelope { id, request });
     }
 
@@ -154,7 +154,7 @@ impl VirtualRun {
         self.overrun(0);
     }
 
-    /// One tick, after so many that were skipped.
+    /// One tick, after this number of skipped ones.
     pub fn overrun(&mut self, skipped: u32) {
         self.now = self.now.after(PERIOD * skipped);
         let next = self.now.after(PERIOD);

@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
+use dimos::hardware::adapter::{AdapterResult, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use dimos::hardware::arms::mock;
-use dimos::hardware::fit::Fit;
+use dimos::hardware::check::Checked;
 use dimos::hardware::registry::{AdapterSpec, AddressForm};
-use dimos::hardware::spec::{AdapterResult, Gripper, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop};
 use dimos::joint::{ControlMode, JointLimits};
 use dimos::testing::MockAdapter;
 
@@ -33,7 +33,7 @@ pub const ROW: AdapterSpec = AdapterSpec {
     about: "an arm of a test",
     stale_after: Duration::from_secs(5),
     address: AddressForm { form: "TEXT", required: false, check: |address| Ok(address.to_owned()) },
-    fit: |config| Ok(Fit { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
+    check: |config| Ok(Checked { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
     ..mock::SPEC
 };
 

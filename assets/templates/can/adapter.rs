@@ -9,16 +9,16 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::kit::{fault, fill, finite};
-use dimos::hardware::registry::AdapterConfig;
-use dimos::hardware::spec::{
+use dimos::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use dimos::hardware::adapter_util::{fault, fill, finite};
+use dimos::hardware::registry::AdapterConfig;
 use dimos::hardware::transport::can::{self, CanAddress, CanEvent, CanFrame, CanPort};
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Control, FILTERS, Feedback, Identity, Mode, PAIRS, Status, WireJoints};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
 
 /// Longest wait for the arm's introduction, and for its first state: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1200);
@@ -59,7 +59,7 @@ struct State {
 impl AcmeAdapter {
     /// An adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        config.fit(fit)?;
+        config.check(check)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
             address: config.parse_address(CanAddress::parse)?,

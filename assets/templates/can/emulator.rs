@@ -7,17 +7,17 @@
 use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::adapter::AdapterResult;
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm};
 use dimos::hardware::sim::can_server::{CanController, CanServer, PLAYABLE};
-use dimos::hardware::spec::AdapterResult;
 use dimos::hardware::transport::can::CanFrame;
 use dimos::joint::ControlMode;
 
 use super::{DOF, NATIVE_RATE, Options, limits};
 
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
-pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
+pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Box<dyn Emulator>> {
     let options: Options = config.options()?;
     let arm = SimArm::new("acme", &limits(), &options.sim, PLAYABLE, MonotonicClock.now())?;
     let controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
@@ -41,7 +41,7 @@ impl HasArm for AcmeController {
 
 impl CanController for AcmeController {
     /// What the arm refuses it ignores, as arms on CAN do.
-    fn hear(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
+    fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
         self.arm.advance(now);
         let _refusal = match (frame.id, frame.bytes()) {
             (0x150, [1, on, ..]) => self.arm.enable(*on != 0),
@@ -142,7 +142,7 @@ mod tests {
         let mut controller = AcmeController { arm, speed: 100, targets: [0; DOF] };
         let mut answers = Vec::new();
         let mut hear = |frame: &CanFrame, after: u64| {
-            controller.hear(frame, now.after(Duration::from_millis(after)), &mut answers);
+            controller.on_frame(frame, now.after(Duration::from_millis(after)), &mut answers);
             (controller.arm.enabled(), controller.arm.mode(), controller.arm.moving(), controller.speed)
         };
         assert_eq!(hear(&frame(golden::ENABLE), 0), (true, ControlMode::Position, false, 100));

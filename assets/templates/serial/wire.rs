@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use dimos::hardware::registry::Place;
+use dimos::hardware::adapter::AdapterResult;
+use dimos::hardware::registry::EmulatorAddress;
 use dimos::hardware::sim::serial_server::SerialServer;
 use dimos::hardware::sim::stream::Controller;
-use dimos::hardware::spec::AdapterResult;
 use dimos::hardware::transport::serial::{SerialAddress, SerialLink};
 
 /// Rate of the line, where an address names none [bit/s].
@@ -34,6 +34,6 @@ pub fn connect(address: &Address) -> AdapterResult<Link> {
 }
 
 /// Puts an emulated controller on the wire: a pseudo-terminal.
-pub fn serve<C: Controller>(controller: C, place: &Place) -> AdapterResult<SerialServer<C>> {
+pub fn serve<C: Controller>(controller: C, place: &EmulatorAddress) -> AdapterResult<SerialServer<C>> {
     SerialServer::start("acme", controller, place)
 }

@@ -8,26 +8,26 @@
 use std::time::Duration;
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::kit::{fault, fill, finite};
-use dimos::hardware::registry::AdapterConfig;
-use dimos::hardware::spec::{
+use dimos::hardware::adapter::{
     AdapterError, AdapterResult, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
 };
+use dimos::hardware::adapter_util::{fault, fill, finite};
+use dimos::hardware::registry::AdapterConfig;
 use dimos::hardware::transport::device_time::DeviceTime;
-use dimos::hardware::transport::dialogue::{Dialogue, Patience};
+use dimos::hardware::transport::request_reply::{RequestReply, Retry};
 use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 use super::protocol::{self, Command, Hello, MAX_COMMAND, Mode, State, WireJoints};
 use super::wire::{self, Address, Link};
-use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
 
 /// The controller is asked who it is until it says so, as it may just be starting. With the connection: below 3 s.
-const HELLO: Patience = Patience { each: Duration::from_millis(250), times: 5 };
+const HELLO: Retry = Retry { each: Duration::from_millis(250), times: 5 };
 /// Longest wait for any other reply. YOUR ARM: several times what the controller needs.
-const REPLY: Patience = Patience::once(Duration::from_millis(100));
+const REPLY: Retry = Retry::once(Duration::from_millis(100));
 /// Longest wait for measurements, and for the reply to a setpoint. YOUR ARM: all tries together stay below `stale_after`,
 /// so that a single lost reply does not hold the arm.
-const CYCLE: Patience = Patience { each: Duration::from_millis(30), times: 3 };
+const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
 /// A reply answers further questions for one period of the controller.
 const STATE_AGE: Duration = Duration::from_micros((1e6 / NATIVE_RATE) as u64);
 
@@ -35,7 +35,7 @@ const STATE_AGE: Duration = Duration::from_micros((1e6 / NATIVE_RATE) as u64);
 pub struct AcmeAdapter {
     address: Address,
     /// The connection, and who is at its other end.
-    line: Dialogue<Link>,
+    line: RequestReply<Link>,
     hello: Option<Hello>,
     /// Number of the last command; its reply carries the same.
     number: u8,
@@ -48,11 +48,11 @@ pub struct AcmeAdapter {
 impl AcmeAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        config.fit(fit)?;
+        config.check(check)?;
         let _: Options = config.options()?; // YOUR ARM: keep those that the adapter needs
         Ok(Self {
             address: config.parse_address(wire::address)?,
-            line: Dialogue::default(),
+            line: RequestReply::default(),
             hello: None,
             number: 0,
             state: None,
@@ -65,14 +65,14 @@ impl AcmeAdapter {
     fn request<T>(
         &mut self,
         command: &Command,
-        patience: Patience,
+        timeout: Retry,
         decode: impl Fn(&[u8]) -> Option<T>,
     ) -> AdapterResult<T> {
         self.number = self.number.wrapping_add(1);
         let (number, (opcode, name)) = (self.number, command.sheet());
         let mut frame = [0; MAX_COMMAND];
         let frame = protocol::encode(command, number, &mut frame);
-        let reply = self.line.request(frame, patience, |bytes| {
+        let reply = self.line.request(frame, timeout, |bytes| {
             protocol::scan(bytes, opcode, number).map(|reply| match reply.status {
                 0 => Ok(decode(reply.data)),
                 status => Err(status),

@@ -5,10 +5,10 @@
 //! joints, motors, errors and faults, is in `SimArm`.
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::registry::{AdapterConfig, Emulator, Place};
+use dimos::hardware::adapter::AdapterResult;
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm};
 use dimos::hardware::sim::stream::Controller;
-use dimos::hardware::spec::AdapterResult;
 use dimos::hardware::transport::Scan;
 use dimos::joint::{ControlMode, Joints};
 
@@ -18,7 +18,7 @@ use super::{DOF, Options, limits, wire};
 const VELOCITY_TIMEOUT: f64 = 0.2;
 
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
-pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
+pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Box<dyn Emulator>> {
     let options: Options = config.options()?;
     let arm = SimArm::new("acme", &limits(), &options.sim, PLAYABLE, MonotonicClock.now())?;
     Ok(Box::new(wire::serve(AcmeController { arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT) }, place)?))

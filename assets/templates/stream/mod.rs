@@ -11,7 +11,7 @@ pub mod wire;
 
 use std::time::Duration;
 
-use dimos::hardware::fit::{Fit, Misfit};
+use dimos::hardware::check::{Checked, ConfigError};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use dimos::hardware::sim::arm::{PLAYABLE, SimOptions};
 use dimos::joint::{ControlMode, JointLimits};
@@ -49,17 +49,17 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: false,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
     emulate: Some(emulator::start),
 };
 
 /// Whether number of joints and options go together, and the joint limits that follow: `dimos check` asks this.
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("acme", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
     options.sim.check("acme", &limits, PLAYABLE)?;
-    Ok(Fit { limits }) // YOUR ARM: where an option changes the limits, like a model, this is the place
+    Ok(Checked { limits }) // YOUR ARM: where an option changes the limits, like a model, this is the place
 }
 
 /// The joint limits of the data sheet, in SI units.

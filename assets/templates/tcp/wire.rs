@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use dimos::hardware::registry::Place;
+use dimos::hardware::adapter::AdapterResult;
+use dimos::hardware::registry::EmulatorAddress;
 use dimos::hardware::sim::stream::Controller;
 use dimos::hardware::sim::tcp_server::TcpServer;
-use dimos::hardware::spec::AdapterResult;
 use dimos::hardware::transport::tcp::{Endpoint, TcpLink};
 
 /// The controller's TCP port, where an address names none.
@@ -34,6 +34,6 @@ pub fn connect(address: &Address) -> AdapterResult<Link> {
 }
 
 /// Puts an emulated controller on the wire.
-pub fn serve<C: Controller>(controller: C, place: &Place) -> AdapterResult<TcpServer<C>> {
+pub fn serve<C: Controller>(controller: C, place: &EmulatorAddress) -> AdapterResult<TcpServer<C>> {
     TcpServer::start("acme", controller, place.tcp(PORT)?)
 }

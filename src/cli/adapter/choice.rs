@@ -3,9 +3,9 @@
 use serde_json::{Map, Value};
 
 use super::super::exit::{Exit, Failure, Result};
-use crate::hardware::fit::Misfit;
+use crate::hardware::adapter::AdapterError;
+use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, Registry};
-use crate::hardware::spec::AdapterError;
 use crate::joint::MAX_DOF;
 
 /// Which arm, and how it is made.
@@ -51,13 +51,13 @@ impl Choice {
         let mut refusal = None;
         for dof in dofs.rev() {
             let config = self.with_dof(address, dof)?;
-            match (row.fit)(&config) {
+            match (row.check)(&config) {
                 Ok(_) => return Ok(config),
                 // With another number of joints it may be the model that was asked for.
-                Err(misfit) => refusal = refusal.or(Some(misfit)),
+                Err(error) => refusal = refusal.or(Some(error)),
             }
         }
-        let refusal = refusal.unwrap_or_else(|| Misfit::new("", format!("{} has no joints", row.name)));
+        let refusal = refusal.unwrap_or_else(|| ConfigError::new("", format!("{} has no joints", row.name)));
         Err(Failure { hint: refusal.hint, ..Failure::usage(refusal.what) })
     }
 

@@ -16,8 +16,8 @@ use super::super::output::{self, Table};
 use super::choice::{Choice, not_started};
 use crate::blueprint;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::{AdapterSpec, Emulator, Place, Registry};
-use crate::hardware::sim::diary::{self, Happening};
+use crate::hardware::registry::{AdapterSpec, Emulator, EmulatorAddress, Registry};
+use crate::hardware::sim::events::{self, SimEvent};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 
 /// How often the joints are shown.
@@ -60,7 +60,7 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
     let faults = args.fault.iter().map(|text| script(text)).collect::<Result<Vec<_>>>()?.concat();
     let place = args.place(&row)?;
-    diary::open();
+    events::open();
     let (emulator, dof) = start(args, &row, &place)?;
     for fault in &faults {
         emulator.inject(*fault).map_err(Failure::usage)?;
@@ -94,12 +94,12 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 
 /// Prints the events of the emulator since the last call: no thread that serves a client waits for a terminal.
 fn tell(bar: &ProgressBar, zero: Mono) {
-    while let Some((at, what)) = diary::take() {
+    while let Some((at, what)) = events::take() {
         let what = match what {
-            Happening::Came => "a client connected".to_owned(),
-            Happening::Gone => "the client is gone".to_owned(),
-            Happening::TurnedAway => "another client was rejected".to_owned(),
-            Happening::Struck(kind) => format!("the fault {} begins", kind.name()),
+            SimEvent::Connected => "a client connected".to_owned(),
+            SimEvent::Disconnected => "the client is gone".to_owned(),
+            SimEvent::Rejected => "another client was rejected".to_owned(),
+            SimEvent::Fault(kind) => format!("the fault {} begins", kind.name()),
         };
         bar.suspend(|| output::note(format_args!("{:8.3} s  {what}", at.seconds_since(zero))));
     }
@@ -108,7 +108,7 @@ fn tell(bar: &ProgressBar, zero: Mono) {
 /// The kinds of faults that this arm's emulator can play, each with what it means.
 fn list_faults(args: &Args, row: &AdapterSpec) -> Result {
     // At an address that disturbs no other program; for a bus, one with the faults that it can play on any.
-    let place = if row.transport == "can" { Place::Pty } else { Place::InProcess };
+    let place = if row.transport == "can" { EmulatorAddress::Pty } else { EmulatorAddress::InProcess };
     let (emulator, _) = start(args, row, &place)?;
     let mut table = Table::new(&["KIND", "WHAT GOES WRONG"]);
     for (kind, about) in FaultKind::all() {
@@ -123,22 +123,22 @@ fn list_faults(args: &Args, row: &AdapterSpec) -> Result {
 
 impl Args {
     /// Where the emulator listens; by default where a client of the arm looks for it.
-    fn place(&self, row: &AdapterSpec) -> Result<Place> {
+    fn place(&self, row: &AdapterSpec) -> Result<EmulatorAddress> {
         Ok(match (self.bind, &self.can, self.pty) {
-            (Some(address), ..) => Place::Bind(address),
-            (_, Some(interface), _) => Place::Can(interface.clone()),
-            (_, _, true) => Place::Pty,
+            (Some(address), ..) => EmulatorAddress::Bind(address),
+            (_, Some(interface), _) => EmulatorAddress::Can(interface.clone()),
+            (_, _, true) => EmulatorAddress::Pty,
             _ if row.transport == "can" => {
                 let failure = Failure::usage(format!("where is the CAN bus for {}?", row.name));
                 return Err(failure.hint("--can vcan0, an interface of this computer, or --pty for a serial adapter"));
             }
-            _ if row.transport == "serial" => Place::Pty,
-            _ => Place::Bind(IpAddr::from([127, 0, 0, 1])),
+            _ if row.transport == "serial" => EmulatorAddress::Pty,
+            _ => EmulatorAddress::Bind(IpAddr::from([127, 0, 0, 1])),
         })
     }
 }
 
-fn start(args: &Args, row: &AdapterSpec, place: &Place) -> Result<(Box<dyn Emulator>, usize)> {
+fn start(args: &Args, row: &AdapterSpec, place: &EmulatorAddress) -> Result<(Box<dyn Emulator>, usize)> {
     let Some(emulate) = row.emulate else {
         let failure = Failure::usage(format!("{} has no emulator", row.name));
         return Err(failure.hint(if row.address.required {

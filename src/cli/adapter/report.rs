@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::super::output::{self, Table, Tone, fixed, toned};
 use crate::hardware::conformance::figures::{Figures, Spread};
-use crate::hardware::conformance::gently::Motion;
+use crate::hardware::conformance::first_motion::Motion;
 use crate::hardware::conformance::lag::Lag;
 use crate::hardware::conformance::{Made, Needs, Outcome};
 use crate::joint::JointLimits;

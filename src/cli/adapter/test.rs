@@ -15,10 +15,10 @@ use super::super::follow::Signals;
 use super::super::output;
 use super::choice::{Choice, not_started};
 use super::report::{Arm, Limits, Report, Row};
+use crate::hardware::adapter::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
 use crate::hardware::conformance::lag::Lag;
-use crate::hardware::conformance::{Check, Made, Subject, checks, figures, gently, run_all};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry, SIM};
-use crate::hardware::spec::{AdapterError, ManipulatorAdapter, ManipulatorInfo};
+use crate::hardware::conformance::{Check, Made, Subject, checks, figures, first_motion, run_all};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry, SIM};
 use crate::joint::ControlMode;
 use crate::runtime::device_lock::{self, DeviceLock};
 
@@ -182,7 +182,7 @@ impl Args {
     fn emulate(&self, row: &AdapterSpec) -> Result<(Box<dyn Emulator>, AdapterConfig)> {
         let mut config = self.choice.config(row, SIM)?;
         let start = row.emulate.ok_or(AdapterError::Unsupported);
-        let emulator = start.and_then(|start| start(&config, &Place::InProcess)).map_err(not_started)?;
+        let emulator = start.and_then(|start| start(&config, &EmulatorAddress::InProcess)).map_err(not_started)?;
         config.address = emulator.address();
         Ok((emulator, config))
     }
@@ -219,7 +219,7 @@ impl Args {
         info: &ManipulatorInfo,
         bench: &Bench,
         signals: &Signals,
-    ) -> Result<(gently::Motion, Option<Lag>)> {
+    ) -> Result<(first_motion::Motion, Option<Lag>)> {
         if self.lag && !info.modes.contains(&ControlMode::ServoPosition) {
             let modes = info.modes.iter().map(|mode| mode.name()).collect::<Vec<_>>().join(", ");
             let what = format!("not moved: no lag to measure, {} has no servo_position mode", info.model);
@@ -234,8 +234,8 @@ impl Args {
                  back, first +, then −, at {:.0} % of its top speed, not collision-checked.\n\
                  Clear the space around it, keep out of it, and stay within reach of its E-stop button. Ctrl-C stops it.",
                 bench.address,
-                gently::REACH.to_degrees(),
-                100.0 * gently::SPEED,
+                first_motion::REACH.to_degrees(),
+                100.0 * first_motion::SPEED,
             ));
             confirm(signals)?;
         }
@@ -251,10 +251,10 @@ impl Args {
             },
         );
         let (motion, lag) = if self.lag {
-            let (motion, lag) = gently::measure_lag(adapter, bench.subject.row.lag, &interrupted, &mut tell);
+            let (motion, lag) = first_motion::measure_lag(adapter, bench.subject.row.lag, &interrupted, &mut tell);
             (motion, Some(lag))
         } else {
-            (gently::move_gently(adapter, &interrupted, &mut tell), None)
+            (first_motion::run_first_motion(adapter, &interrupted, &mut tell), None)
         };
         adapter.disconnect();
         Ok((motion, lag))
@@ -275,7 +275,7 @@ impl Args {
 /// Connects to an arm that is to be moved; fails if something prevents moving it from its position.
 fn connect_to_move(adapter: &mut dyn ManipulatorAdapter) -> Result<()> {
     adapter.connect().map_err(|e| Failure::of(Exit::Hardware, e))?;
-    let Err(why) = gently::refusal(adapter) else { return Ok(()) };
+    let Err(why) = first_motion::refusal(adapter) else { return Ok(()) };
     adapter.disconnect();
     Err(Failure::of(Exit::Failed, format!("not moved: {why}")))
 }

@@ -1,12 +1,12 @@
-//! What a check works with: a coordinator on a virtual clock, one arm that does what it is commanded, the task under
-//! test, and a stronger task on one of its joints.
+//! Test bench of the checks: a coordinator on a virtual clock, one ideal arm, the task under test, and a task of higher
+//! priority on one of its joints.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use crate::arm::{ArmState, Link, Supervision, VelocitySource};
 use crate::clock::Mono;
-use crate::control::config::{ArmConfig, CONTROL_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
+use crate::control::config::{ArmConfig, CONFIG_VERSION, CoordinatorConfig, TaskConfig, TaskKind};
 use crate::control::coordinator::{Coordinator, TickTime};
 use crate::control::request::{Envelope, Goal, Motion, Request};
 use crate::control::task::Task;
@@ -20,14 +20,14 @@ use crate::telemetry::{Event, Outcome, Phase, TaskState};
 use crate::trajectory::{JointTrajectory, Spline, TrajectoryPoint};
 
 const DOF: usize = 6;
-/// Where the arm begins, away from every singular pose of the built-in robot [rad].
+/// Initial positions, away from every singular pose of the built-in robot [rad].
 const HOME: [f64; DOF] = [0.2, -0.3, 0.9, 0.3, 0.8, 0.1];
 /// Tick rate [Hz].
 const RATE: f64 = 100.0;
-/// The task under test, and the stronger one.
+/// Indices of the task under test and of the one with higher priority.
 const TESTED: u16 = 0;
 const STRONGER: u16 = 1;
-/// The joint that the stronger task takes.
+/// Joint of the task with higher priority.
 pub const CONTESTED: u16 = 0;
 
 /// A coordinator, its arm and its clock.
@@ -106,7 +106,7 @@ impl Bench {
         self.coordinator.tasks().first().ok_or_else(|| "the coordinator lost the task".to_owned())
     }
 
-    /// Whether the task under test does something.
+    /// Returns whether the task under test is active.
     pub fn is_active(&self) -> bool {
         self.task().is_ok_and(Task::is_active)
     }
@@ -119,7 +119,7 @@ impl Bench {
         if self.phase == Phase::Ready { Ok(()) } else { Err(format!("the simulated arm is {:?}", self.phase)) }
     }
 
-    /// One tick, after this number of skipped periods.
+    /// Runs one tick, after this number of skipped periods.
     pub fn tick(&mut self, skipped: u32) {
         let period = Duration::from_secs_f64(1.0 / RATE);
         self.now = self.now.after(period * (skipped + 1));
@@ -150,7 +150,7 @@ impl Bench {
         (0..(seconds * RATE).round() as u64).for_each(|_| self.tick(0));
     }
 
-    /// Sends a request and returns what came of it in the next tick.
+    /// Sends a request and returns its outcome from the next tick.
     pub fn ask(&mut self, request: Request) -> Option<Outcome> {
         let id = self.send(request);
         self.tick(0);
@@ -216,7 +216,7 @@ impl Bench {
         })
     }
 
-    /// The same with numbers that are not finite; `None`: this kind cannot be sent with such.
+    /// Returns the same request with numbers that are not finite; `None`: not possible for this kind.
     pub fn not_finite(kind: TargetKind) -> Option<Request> {
         let (task, odd) = (TESTED, f64::NAN);
         Some(match kind {
@@ -248,7 +248,7 @@ impl Bench {
         Ok(Box::new(Motion { id: self.next_id, joints: (0..DOF as u16).collect(), spline }))
     }
 
-    /// Lets the stronger task take its joint for this time [s], and end.
+    /// Runs the task of higher priority for this time [s].
     pub fn interfere(&mut self, seconds: f64) {
         for _ in 0..(seconds * RATE).round() as u64 {
             let here = self.arm.position[usize::from(CONTESTED)];
@@ -262,24 +262,24 @@ impl Bench {
         self.ask(Request::Cancel { task: Some(STRONGER) });
     }
 
-    /// Where the joints are [rad].
+    /// Returns the positions of the joints [rad].
     pub fn positions(&self) -> [f64; DOF] {
         std::array::from_fn(|j| self.arm.position.get(j).copied().unwrap_or_default())
     }
 
-    /// How far the joint is that moved furthest from where the arm began [rad].
+    /// Returns the largest distance of a joint from its initial position [rad].
     pub fn moved(&self) -> f64 {
         self.positions().iter().zip(HOME).fold(0.0, |most, (q, home)| most.max((q - home).abs()))
     }
 
-    /// Whether the arm rests for this time [s], whatever the task does.
+    /// Returns whether the arm stays at rest for this time [s].
     pub fn rests(&mut self, seconds: f64) -> bool {
         let before = self.positions();
         self.run(seconds);
         self.positions() == before
     }
 
-    /// A refused command since the start, or another end that is the task's fault.
+    /// Returns a refused command, or another fault of the task, since the start.
     pub fn fault(&self) -> Option<String> {
         self.events.iter().find_map(|event| match event {
             Event::Task(TESTED, TaskState::Fault, reason) => Some(format!("its command was refused: {reason:?}")),
@@ -287,12 +287,12 @@ impl Bench {
         })
     }
 
-    /// Every command of every tick so far, bit by bit.
+    /// Returns the bits of all commands so far.
     pub fn trace(&self) -> &[u64] {
         &self.trace
     }
 
-    /// Allocations inside of ticks, where they are counted.
+    /// Returns the number of allocations inside ticks, if they are counted.
     pub fn allocated(&self) -> u64 {
         self.allocated
     }
@@ -325,7 +325,7 @@ fn config(spec: &TaskSpec, robot: &TaskKinematics) -> CoordinatorConfig {
     };
     let stronger = kind(stronger.name, (stronger.params.default)(), None);
     CoordinatorConfig {
-        version: CONTROL_VERSION,
+        version: CONFIG_VERSION,
         rate: RATE,
         arms: vec![arm],
         tasks: vec![

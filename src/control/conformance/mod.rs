@@ -15,14 +15,14 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use super::task_spec::TaskSpec;
 
-/// One thing that every task must do.
+/// A rule for every task.
 #[derive(Debug, Clone, Copy)]
 pub struct Check {
     /// Its name, as in `comes_to_rest_on_cancel`.
     pub name: &'static str,
-    /// What it asks for, in a sentence.
+    /// The rule, in a sentence.
     pub about: &'static str,
-    /// Says what is wrong.
+    /// Runs the check. The error describes the violation.
     pub run: fn(&mut Bench) -> Result<(), String>,
 }
 
@@ -32,7 +32,7 @@ impl Check {
     }
 }
 
-/// All checks, in the order in which they are best read.
+/// Returns all checks, in reading order.
 pub fn checks() -> impl Iterator<Item = &'static Check> {
     [row::CHECKS, motion::CHECKS, ends::CHECKS, tick::CHECKS].into_iter().flatten()
 }

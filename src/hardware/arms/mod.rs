@@ -1,4 +1,4 @@
-//! The arms in the box, one folder each. A new arm is one folder and one line here.
+//! The built-in arms, one folder each. A new arm is one folder and one line here.
 
 use crate::hardware::registry::{Absent, AdapterSpec};
 

@@ -1,24 +1,24 @@
-//! What a check works with: an adapter, the emulator it talks to, and the usual steps.
+//! The context of a check: an adapter, its emulator, and common steps.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
+use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::Fault;
-use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::joint::{ControlMode, JointLimits};
 
-/// Longest wait for something that must happen.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// When the first fault of an arm without an emulator strikes, and how much later each further one: time since the
-/// connection [s].
-const STRIKES_AT: f64 = 1.0;
+/// Maximum wait for an expected event.
+const WAIT_TIMEOUT: Duration = Duration::from_secs(10);
+/// Begin of the first fault of an arm without an emulator, and distance between further ones: time since the connection
+/// [s].
+const FAULT_AT: f64 = 1.0;
 
-/// Longest wait for room for a setpoint.
+/// Maximum wait for room for a setpoint.
 const ROOM: Duration = Duration::from_secs(1);
 
-/// Writes again while two setpoints are unacknowledged, as the device thread does.
+/// Retries a write while two setpoints are unacknowledged, as the device thread does.
 pub fn when_there_is_room(mut write: impl FnMut() -> AdapterResult<()>) -> AdapterResult<()> {
     let until = Instant::now() + ROOM;
     loop {
@@ -29,21 +29,21 @@ pub fn when_there_is_room(mut write: impl FnMut() -> AdapterResult<()>) -> Adapt
     }
 }
 
-/// What the checks are made on.
+/// The subject of the checks.
 #[derive(Debug, Clone)]
 pub struct Subject {
     /// The row of the arm.
     pub row: AdapterSpec,
-    /// What the adapter is made from. The address is only used with a real device.
+    /// Configuration of the adapter. The address is used only with a real device.
     pub config: AdapterConfig,
-    /// A real device stands at the address: nothing may be done to it that a check for emulators does.
+    /// Whether a real device is at the address. Checks for emulators are then skipped.
     pub real: bool,
-    /// Counts the calling thread's allocations so far, where the program has a counting allocator.
+    /// Returns the calling thread's allocations so far, if the program has a counting allocator.
     pub allocations: Option<fn() -> u64>,
 }
 
 impl Subject {
-    /// The emulator of a row, with as many joints as the row allows at most and default options.
+    /// Returns the emulator of a row, with the maximum number of joints and default options.
     pub fn emulated(row: &AdapterSpec) -> Self {
         let config = AdapterConfig {
             hardware_id: "conformance".into(),
@@ -55,33 +55,33 @@ impl Subject {
     }
 }
 
-/// An adapter that is not connected yet, and the other end of its wire.
+/// An adapter that is not connected yet, and its emulator.
 pub struct Context {
     /// The row under test.
     pub row: AdapterSpec,
-    /// What the adapter was made from.
+    /// Configuration of the adapter.
     pub config: AdapterConfig,
-    /// The other end of the wire; `None` where the adapter is its own plant, or the device is real.
+    /// The emulator; `None` if the adapter is its own plant, or the device is real.
     pub emulator: Option<Box<dyn Emulator>>,
     /// The adapter under test.
     pub adapter: Box<dyn ManipulatorAdapter>,
     /// Counts the thread's allocations so far.
     pub allocations: Option<fn() -> u64>,
-    /// A real device, with noise in what it measures.
+    /// Whether the device is real: its measurements have noise.
     pub real: bool,
     /// Why the check does not apply.
     pub(super) skipped: Option<String>,
-    /// What comes of the check, for people.
+    /// Finding of the check, for the report.
     pub(super) found: Option<String>,
     faults: VecDeque<Fault>,
 }
 
 impl Context {
-    /// A fresh adapter, and a fresh emulator where the device is not real.
+    /// Creates an adapter, and an emulator unless the device is real.
     pub(super) fn new(subject: &Subject) -> Result<Self, String> {
         let (row, mut config) = (subject.row, subject.config.clone());
         let emulator = match row.emulate.filter(|_| !subject.real) {
-            Some(start) => Some(start(&config, &Place::InProcess).map_err(|e| e.to_string())?),
+            Some(start) => Some(start(&config, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?),
             None => None,
         };
         if let Some(emulator) = &emulator {
@@ -93,35 +93,35 @@ impl Context {
         Ok(Self { row, config, emulator, adapter, allocations, real, skipped: None, found: None, faults })
     }
 
-    /// Ends a check that does not apply.
+    /// Marks the check as not applicable.
     pub fn skip(&mut self, why: &str) -> Result<(), String> {
         self.skipped = Some(why.to_owned());
         Ok(())
     }
 
-    /// Notes what was found, for the report.
+    /// Records a finding for the report.
     pub fn found(&mut self, what: impl Into<String>) -> Result<(), String> {
         self.found = Some(what.into());
         Ok(())
     }
 
-    /// How far a joint at rest may seem to move [rad]: nothing but rounding, or a real encoder's noise.
+    /// Returns how far a joint at rest may seem to move [rad]: rounding, or the noise of a real encoder.
     pub fn rest(&self) -> f64 {
         if self.real { 0.002 } else { 1e-6 }
     }
 
-    /// Prepares a fault; `false` when the arm's double cannot play it. Comes first in a check; faults strike in the
-    /// order in which they were prepared.
+    /// Prepares a fault; `false` if the emulator cannot play it. Must come first in a check. Faults begin in the order
+    /// in which they were prepared.
     pub fn prepare(&mut self, fault: Fault) -> bool {
         if self.real {
             return false;
         }
         self.faults.push_back(fault);
         if let Some(emulator) = &self.emulator {
-            // A fault in the far future only asks whether it is playable.
+            // A fault in the far future only tests whether it can be played.
             return emulator.inject(fault.at(1e6)).is_ok();
         }
-        let script = self.faults.iter().enumerate().map(|(i, fault)| fault.at(STRIKES_AT * (i + 1) as f64));
+        let script = self.faults.iter().enumerate().map(|(i, fault)| fault.at(FAULT_AT * (i + 1) as f64));
         let script = serde_json::to_value(script.collect::<Vec<_>>()).unwrap_or_default();
         let mut config = self.config.clone();
         match config.options.as_object_mut() {
@@ -134,8 +134,8 @@ impl Context {
         })
     }
 
-    /// Lets the next prepared fault happen, now or soon.
-    pub fn strike(&mut self) -> Result<(), String> {
+    /// Begins the next prepared fault, now or soon.
+    pub fn trigger_faults(&mut self) -> Result<(), String> {
         match (&self.emulator, self.faults.pop_front()) {
             (Some(emulator), Some(fault)) => emulator.inject(fault),
             _ => Ok(()),
@@ -154,9 +154,9 @@ impl Context {
         self.set_mode(mode).map_err(|e| format!("set_control_mode {}: {e}", mode.name()))
     }
 
-    /// Brings the arm into a mode. As to the device thread, `Rejected` means: not yet, ask again.
+    /// Sets the mode. Retries on `Rejected`, as the device thread does.
     pub fn set_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + WAIT_TIMEOUT;
         loop {
             let result = self.adapter.set_control_mode(mode);
             if !matches!(result, Err(AdapterError::Rejected(_))) || Instant::now() > end {
@@ -172,18 +172,18 @@ impl Context {
         self.until("the motors to come on", Self::enabled)
     }
 
-    /// The mode that the row names first.
+    /// Returns the first mode of the row.
     pub fn first_mode(&self) -> ControlMode {
         self.row.modes.first().copied().unwrap_or_default()
     }
 
-    /// Joint positions [rad], measured after this call.
+    /// Returns joint positions [rad] that were measured after this call.
     pub fn positions(&mut self) -> Result<Vec<f64>, String> {
         let reading = self.joints()?;
         Ok(reading.position.get(..self.config.dof).unwrap_or_default().to_vec())
     }
 
-    /// All of the joints, measured after this call.
+    /// Returns all joint values, measured after this call.
     pub fn joints(&mut self) -> Result<JointReading, String> {
         let asked = MonotonicClock.now();
         loop {
@@ -193,14 +193,14 @@ impl Context {
                 Some(stamp) if pushed && stamp < asked => {}
                 _ => return Ok(reading),
             }
-            if MonotonicClock.now().since(asked) > PATIENCE {
-                return Err(format!("read_joints: no newer state within {PATIENCE:?}"));
+            if MonotonicClock.now().since(asked) > WAIT_TIMEOUT {
+                return Err(format!("read_joints: no newer state within {WAIT_TIMEOUT:?}"));
             }
             std::thread::sleep(Duration::from_millis(1));
         }
     }
 
-    /// One call of `read_joints`, which may be late twice on a busy machine.
+    /// Calls `read_joints`; on a busy machine it may be late twice.
     fn read(&mut self) -> Result<JointReading, String> {
         let mut reading = JointReading::default();
         let mut result = self.adapter.read_joints(&mut reading);
@@ -213,24 +213,24 @@ impl Context {
         result.map(|()| reading).map_err(|e| format!("read_joints: {e}"))
     }
 
-    /// The joint limits.
+    /// Returns the joint limits.
     pub fn limits(&mut self) -> Result<JointLimits, String> {
         self.adapter.get_limits().map_err(|e| format!("get_limits: {e}"))
     }
 
-    /// Whether the motors are on, as the device says after this call.
+    /// Returns whether the motors are on, as the device reports after this call.
     pub fn enabled(&mut self) -> Result<bool, String> {
         self.joints()?;
         self.adapter.read_enabled().map_err(|e| format!("read_enabled: {e}"))
     }
 
-    /// The error code, as the device says after this call.
+    /// Returns the error, as the device reports it after this call.
     pub fn error(&mut self) -> Result<(i32, String), String> {
         self.joints()?;
         self.adapter.read_error().map_err(|e| format!("read_error: {e}"))
     }
 
-    /// The gripper's opening [m], as the device says after this call; `None` without gripper.
+    /// Returns the gripper's opening [m], as the device reports it after this call; `None` without a gripper.
     pub fn gripper(&mut self) -> Result<Option<f64>, String> {
         self.joints()?;
         let opening = self.adapter.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position());
@@ -244,8 +244,7 @@ impl Context {
         result.map_err(|e| format!("write_gripper_position: {e}"))
     }
 
-    /// Joint positions at nine tenths of the way from the lower to the upper limits [rad]: a long way from anywhere
-    /// that an arm stands at power-up.
+    /// Returns joint positions at nine tenths of the range between the limits [rad]: far from any pose at power-up.
     pub fn far(&mut self) -> Result<Vec<f64>, String> {
         let limits = self.limits()?;
         let range = limits.position_lower.iter().zip(&limits.position_upper);
@@ -271,8 +270,8 @@ impl Context {
         self.adapter.write_stop().map(drop).map_err(|e| format!("write_stop: {e}"))
     }
 
-    /// Joint positions a little off `from` [rad]: another amount for each joint, alternately up and down, inside
-    /// the limits.
+    /// Returns joint positions slightly off `from` [rad]: a different amount for each joint, alternately up and down,
+    /// inside the limits.
     pub fn nearby(&mut self, from: &[f64]) -> Result<Vec<f64>, String> {
         let limits = self.limits()?;
         let range = limits.position_lower.iter().zip(&limits.position_upper);
@@ -288,19 +287,19 @@ impl Context {
             .collect())
     }
 
-    /// Waits until `done` says so.
+    /// Waits until `done` returns true.
     pub fn until(&mut self, what: &str, mut done: impl FnMut(&mut Self) -> Result<bool, String>) -> Result<(), String> {
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + WAIT_TIMEOUT;
         while !done(self)? {
             if Instant::now() > end {
-                return Err(format!("{what}: not within {PATIENCE:?}"));
+                return Err(format!("{what}: not within {WAIT_TIMEOUT:?}"));
             }
             std::thread::sleep(Duration::from_millis(5));
         }
         Ok(())
     }
 
-    /// Waits until all joints stand still: positions that do not change for 50 ms.
+    /// Waits until all joints are at rest: positions that do not change for 50 ms.
     pub fn standstill(&mut self) -> Result<Vec<f64>, String> {
         let mut last = self.positions()?;
         self.until("standstill", |context| {
@@ -313,7 +312,7 @@ impl Context {
         Ok(last)
     }
 
-    /// Watches that no joint moves by more than `most` [rad] for a third of a second.
+    /// Checks for a third of a second that no joint moves by more than `most` [rad].
     pub fn stays(&mut self, from: &[f64], most: f64) -> Result<(), String> {
         for _ in 0..33 {
             std::thread::sleep(Duration::from_millis(10));
@@ -326,7 +325,7 @@ impl Context {
     }
 }
 
-/// The largest difference of two vectors.
+/// Returns the largest difference of two vectors.
 pub fn farthest(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }

@@ -3,24 +3,24 @@
 use super::Check;
 use super::Needs::{Motion, Nothing};
 use super::context::{Context, farthest, require};
-use super::pushed;
-use crate::hardware::spec::{AdapterError, JointReading};
+use super::streamed_state;
+use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::joint::ControlMode;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Nothing, "reads_agree", "read_joints says the same as the single reads", reads_agree),
+    Check::new(Nothing, "reads_agree", "read_joints agrees with the single reads", reads_agree),
     Check::new(Nothing, "positions_are_plausible", "positions are in rad, inside the limits", plausible),
-    Check::new(Nothing, "stamps_are_of_the_past", "stamps grow and are never of the future", stamps),
+    Check::new(Nothing, "stamps_are_of_the_past", "stamps increase and are never in the future", stamps),
     Check::new(Motion, "reads_do_not_allocate", "a cycle's reads and writes allocate nothing", no_allocation),
     Check::new(Motion, "modes_are_what_it_says", "its modes work, others are Unsupported", modes),
     Check::new(
         Motion,
         "optional_parts_never_fail",
-        "the parts that it has answer, velocities in no mode of it are Unsupported",
+        "its parts answer; velocities in no mode of it are Unsupported",
         optional_parts,
     ),
-    Check::new(Motion, "gripper_is_in_metres", "the gripper goes where it is sent", gripper),
+    Check::new(Motion, "gripper_is_in_metres", "the gripper moves to its target", gripper),
 ];
 
 fn reads_agree(context: &mut Context) -> Result<(), String> {
@@ -62,7 +62,7 @@ fn stamps(context: &mut Context) -> Result<(), String> {
     let mut last = Mono::ZERO;
     for _ in 0..20 {
         let reading = context.joints()?;
-        let Some(stamp) = reading.stamp else { return context.skip("it gives no time") };
+        let Some(stamp) = reading.stamp else { return context.skip("its states have no time stamp") };
         require(stamp >= last, || format!("{stamp:?} after {last:?}"))?;
         require(stamp <= MonotonicClock.now(), || format!("{stamp:?} is in the future"))?;
         last = stamp;
@@ -71,8 +71,8 @@ fn stamps(context: &mut Context) -> Result<(), String> {
     Ok(())
 }
 
-/// So many cycles with a new state and a command are looked at, out of so many at most: on a bus a state may come in
-/// several pieces.
+/// Cycles with a new state and a command that are checked, and maximum number of cycles to get them: on a CAN bus a
+/// state may arrive in several pieces.
 const GOOD_CYCLES: u32 = 40;
 const CYCLES: u32 = 600;
 
@@ -84,10 +84,10 @@ fn no_allocation(context: &mut Context) -> Result<(), String> {
     let mut reading = JointReading::default();
     let (mut good, mut last) = (0, None);
     for cycle in 0..CYCLES {
-        // What an arm sends by itself must come before a cycle has anything to take up.
+        // A streamed state must arrive before a cycle has anything to process.
         let pushed = context.adapter.state_fd().is_some();
         if pushed {
-            pushed::await_news(context)?;
+            streamed_state::await_news(context)?;
         }
         let before = allocations();
         let adapter = &mut context.adapter;
@@ -121,7 +121,7 @@ fn modes(context: &mut Context) -> Result<(), String> {
         if context.row.modes.contains(&mode) {
             require(result.is_ok(), || format!("{}: {result:?}", mode.name()))?;
             let now = context.adapter.get_control_mode();
-            require(now == mode, || format!("set to {}, says {}", mode.name(), now.name()))?;
+            require(now == mode, || format!("set to {}, reports {}", mode.name(), now.name()))?;
             context.stays(&start, 1e-3)?;
         } else {
             require(result == Err(AdapterError::Unsupported), || format!("{}: {result:?}", mode.name()))?;
@@ -142,7 +142,7 @@ fn optional_parts(context: &mut Context) -> Result<(), String> {
     }
     let pose = adapter.cartesian().map_or(Ok(None), |poses| poses.read_cartesian_position());
     if let Some(pose) = pose.map_err(|e| format!("read_cartesian_position: {e}"))? {
-        // 20 m away and 7 rad round: such an arm counts in millimetres or degrees.
+        // A pose at 20 m or 7 rad is in millimetres or degrees.
         require(pose.xyz.iter().all(|v| v.abs() < 20.0), || format!("{:?} is not in metres", pose.xyz))?;
         require(pose.rpy.iter().all(|v| v.abs() < 7.0), || format!("{:?} is not in rad", pose.rpy))?;
     }

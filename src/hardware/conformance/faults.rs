@@ -1,4 +1,4 @@
-//! When things go wrong.
+//! Faults: errors, E-stop, damaged packets.
 
 use super::Check;
 use super::Needs::Faults;
@@ -6,17 +6,17 @@ use std::time::Duration;
 
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading};
 
 /// The error code that is injected.
 const CODE: u16 = 2;
-/// For how long readings are watched after a damaged packet: many periods of any arm.
-const LONG_ENOUGH: Duration = Duration::from_millis(500);
+/// How long readings are checked after a damaged packet: many periods of any arm.
+const OBSERVATION_TIME: Duration = Duration::from_millis(500);
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Faults, "errors_have_code_and_text", "an error is told, refuses motion, is cleared", errors),
+    Check::new(Faults, "errors_have_code_and_text", "an error is reported, refuses motion, is cleared", errors),
     Check::new(Faults, "estop_needs_two_acts", "after an E-stop: clear, then enable", estop),
     Check::new(Faults, "noise_is_survived", "noise costs at most three readings", noise),
     Check::new(Faults, "damage_is_survived", "a damaged reply costs at most three readings", damage),
@@ -25,12 +25,12 @@ pub const CHECKS: &[Check] = &[
 
 fn errors(context: &mut Context) -> Result<(), String> {
     if !context.prepare(Fault::new(FaultKind::ErrorCode).code(CODE)) {
-        return context.skip("its double cannot be in error");
+        return context.skip("its emulator cannot be in error");
     }
     context.ready(context.first_mode())?;
     let healthy = context.error()?;
-    require(healthy == (0, String::new()), || format!("without error it says {healthy:?}"))?;
-    context.strike()?;
+    require(healthy == (0, String::new()), || format!("without an error it reports {healthy:?}"))?;
+    context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (code, text) = context.error()?;
     require(code == i32::from(CODE) && !text.is_empty(), || format!("error {code}, text {text:?}"))?;
@@ -45,18 +45,18 @@ fn errors(context: &mut Context) -> Result<(), String> {
 
 fn estop(context: &mut Context) -> Result<(), String> {
     if !context.prepare(Fault::new(FaultKind::Estop).lasting(0.3)) {
-        return context.skip("its double has no E-stop line");
+        return context.skip("its emulator has no E-stop line");
     }
     context.ready(context.first_mode())?;
     let mut start = context.positions()?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the E-stop", |context| Ok(context.error()?.0 != 0))?;
     require(context.adapter.write_enable(true).is_err(), || "enabling in E-stop is accepted".into())?;
     context.until("the release", |context| Ok(context.adapter.write_clear_errors().is_ok()))?;
     require(!context.enabled()?, || "clearing switched the motors on".into())?;
     context.activate()?;
     if !context.row.holds_when_disabled {
-        start = context.standstill()?; // it fell when the motors lost their power
+        start = context.standstill()?; // an arm without brakes has fallen
     }
     context.stays(&start, 0.005)
 }
@@ -75,27 +75,27 @@ fn truncation(context: &mut Context) -> Result<(), String> {
 
 fn survives(context: &mut Context, kind: FaultKind) -> Result<(), String> {
     if !context.prepare(Fault::new(kind)) {
-        return context.skip("its double has no such fault");
+        return context.skip("its emulator cannot play this fault");
     }
     context.connect()?;
     let start = context.positions()?;
     let struck = MonotonicClock.now();
-    context.strike()?;
-    // What is damaged may come with the next reading, or with one of those that the arm sends by itself.
+    context.trigger_faults()?;
+    // The damage may affect the next reading, or one of the streamed states.
     let mut failures = 0;
     let mut reading = JointReading::default();
-    while MonotonicClock.now().since(struck) < LONG_ENOUGH {
+    while MonotonicClock.now().since(struck) < OBSERVATION_TIME {
         match context.adapter.read_joints(&mut reading) {
             Ok(()) => {
                 let position = reading.position.get(..start.len()).unwrap_or_default();
                 let moved = farthest(position, &start);
-                require(moved < 1e-3, || format!("a damaged packet was believed: {moved} rad off"))?;
+                require(moved < 1e-3, || format!("a damaged packet was accepted: {moved} rad off"))?;
             }
             Err(_) => failures += 1,
         }
         require(failures <= 3, || "more than three readings failed".into())?;
         std::thread::sleep(Duration::from_millis(2));
     }
-    require(context.adapter.is_connected(), || "the connection was given up".into())?;
+    require(context.adapter.is_connected(), || "the connection was closed".into())?;
     context.stays(&start, 1e-3)
 }

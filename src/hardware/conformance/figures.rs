@@ -1,33 +1,33 @@
-//! How a device delivers its state, measured: how often, how evenly, how old, how long a reading takes.
+//! Measures how a device delivers its state: rate, jitter, age, duration of a reading.
 
 use std::time::Duration;
 
 use serde::Serialize;
 
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
+use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter};
 use crate::rt::histogram::Histogram;
 use crate::rt::host::sleep_until;
 use crate::rt::wake::Wake;
 
-/// What was measured.
+/// Measured figures.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Figures {
-    /// For how long [s].
+    /// Duration of the measurement [s].
     pub seconds: f64,
-    /// Whether the device sends by itself, or is asked.
+    /// Whether the device streams its state, or is polled.
     pub sends_by_itself: bool,
-    /// Whether its measurements have a time.
+    /// Whether its measurements have a time stamp.
     pub has_stamps: bool,
-    /// Readings made, and those of them that failed.
+    /// Readings.
     pub readings: u64,
     /// Readings that failed.
     pub failed: u64,
     /// New states per second [Hz].
     pub rate: f64,
-    /// From one new state to the next, by their stamps where there are such [ms].
+    /// Time between new states, by their stamps if there are any [ms].
     pub interval: Spread,
-    /// How long a reading takes [ms].
+    /// Duration of a reading [ms].
     pub reading: Spread,
     /// How old a state is when it has been read [ms]; `None` without stamps.
     pub age: Option<Spread>,
@@ -51,7 +51,7 @@ impl Spread {
     }
 }
 
-/// Reads a connected device's state for some time, at its own pace.
+/// Reads a connected device's state for some time, at its own rate.
 pub fn measure(adapter: &mut dyn ManipulatorAdapter, time: Duration) -> AdapterResult<Figures> {
     let (intervals, readings, ages) = (Histogram::default(), Histogram::default(), Histogram::default());
     let wake = Wake::new().map_err(|e| AdapterError::Io(e.to_string()))?;
@@ -66,7 +66,7 @@ pub fn measure(adapter: &mut dyn ManipulatorAdapter, time: Duration) -> AdapterR
         match adapter.state_fd() {
             Some(state) => {
                 sends_by_itself = true;
-                // As the device thread does, which also reads when a period has passed without news.
+                // As the device thread does, which also reads after a period without a new state.
                 wake.wait_or_readable(state, period);
             }
             None => {

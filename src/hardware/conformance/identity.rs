@@ -1,4 +1,4 @@
-//! What an adapter says of itself.
+//! Identity: table row, info, limits, address, options, number of joints.
 
 use super::Check;
 use super::Needs::Nothing;
@@ -41,9 +41,9 @@ fn describes_itself(context: &mut Context) -> Result<(), String> {
 fn limits_are_usable(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let dof = context.config.dof;
-    let fit =
-        (context.row.fit)(&context.config).map_err(|misfit| format!("its own configuration does not fit: {misfit}"))?;
-    for (source, limits) in [("fit", fit.limits), ("get_limits", context.limits()?)] {
+    let checked =
+        (context.row.check)(&context.config).map_err(|error| format!("its own configuration is refused: {error}"))?;
+    for (source, limits) in [("check", checked.limits), ("get_limits", context.limits()?)] {
         let required = [&limits.position_lower, &limits.position_upper, &limits.velocity_max];
         require(required.iter().all(|values| values.len() == dof), || format!("{source}: not {dof} values"))?;
         for optional in [&limits.acceleration_max, &limits.jerk_max] {
@@ -56,7 +56,7 @@ fn limits_are_usable(context: &mut Context) -> Result<(), String> {
         require(finite, || format!("{source}: a limit is not finite"))?;
         let ordered = limits.position_lower.iter().zip(&limits.position_upper).all(|(lower, upper)| lower < upper);
         require(ordered, || format!("{source}: a lower limit is not below its upper limit"))?;
-        // 100 rad or 100 rad/s is no arm: these are degrees.
+        // Limits of 100 rad or 100 rad/s are in degrees.
         let radians = limits.position_lower.iter().chain(&limits.position_upper).chain(&limits.velocity_max);
         require(radians.into_iter().all(|v| v.abs() < 100.0), || format!("{source}: these limits are not in rad"))?;
         require(limits.velocity_max.iter().all(|v| *v > 0.0), || format!("{source}: a velocity limit is not above 0"))?;
@@ -68,7 +68,7 @@ fn addresses_are_checked(context: &mut Context) -> Result<(), String> {
     let address = context.row.address;
     require(!address.form.is_empty(), || "the form of the address is not stated".into())?;
     if !address.required {
-        return context.skip("it needs no address");
+        return context.skip("this adapter needs no address");
     }
     require((address.check)("").is_err(), || "an empty address is accepted".into())?;
     let own = (address.check)(&context.config.address);
@@ -78,9 +78,9 @@ fn addresses_are_checked(context: &mut Context) -> Result<(), String> {
 fn options_are_strict(context: &mut Context) -> Result<(), String> {
     let options = serde_json::json!({ "no_such_option": 1 });
     let config = AdapterConfig { options, ..context.config.clone() };
-    let fit = (context.row.fit)(&config).map(drop).map_err(|misfit| misfit.to_string());
+    let checked = (context.row.check)(&config).map(drop).map_err(|error| error.to_string());
     let made = (context.row.create)(&config).map(drop).map_err(|error| error.to_string());
-    for (by, result) in [("fit", fit), ("create", made)] {
+    for (by, result) in [("check", checked), ("create", made)] {
         let error = result.err().ok_or_else(|| format!("{by} accepts an unknown option"))?;
         require(error.contains("no_such_option"), || format!("{by}: the error does not name the option: {error}"))?;
     }
@@ -91,7 +91,7 @@ fn dof_is_checked(context: &mut Context) -> Result<(), String> {
     let (fewest, most) = context.row.dof;
     for dof in [fewest.wrapping_sub(1), most + 1] {
         let config = AdapterConfig { dof, ..context.config.clone() };
-        require((context.row.fit)(&config).is_err(), || format!("fit accepts {dof} joints"))?;
+        require((context.row.check)(&config).is_err(), || format!("check accepts {dof} joints"))?;
         require((context.row.create)(&config).is_err(), || format!("create accepts {dof} joints"))?;
     }
     Ok(())

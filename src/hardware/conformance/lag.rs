@@ -6,82 +6,82 @@ use serde::Serialize;
 
 use crate::clock::Mono;
 
-/// Longest lag that is measured [s].
-const LONGEST: f64 = 0.5;
+/// Maximum lag that can be measured [s].
+const MAX_LAG: f64 = 0.5;
 /// Step of the search before its refinement [s].
 const COARSE: f64 = 0.005;
 /// Steps of the refinement: each leaves two thirds of the interval.
 const REFINEMENTS: u32 = 25;
-/// Fewest measurements, and smallest range of setpoints [rad], from which a lag is estimated.
-const ENOUGH: (usize, f64) = (50, 0.005);
-/// Part of the setpoints' variance that may remain when the measurements do not follow them exactly.
+/// Minimum number of measurements, and minimum range of setpoints [rad], for an estimate.
+const MIN_DATA: (usize, f64) = (50, 0.005);
+/// Maximum part of the setpoints' variance that may remain unexplained by the measurements.
 const UNEXPLAINED: f64 = 0.2;
-/// From one look at the arm to the next, this much is a gap in which this program did not run [s] …
-const GAP: f64 = 0.008;
+/// A time between two readings above this is a gap in which this program did not run [s] …
+const MIN_GAP: f64 = 0.008;
 /// … or this many times the median, for an arm whose states take long to read.
 const GAP_IN_MEDIANS: f64 = 3.0;
-/// Part of a wave's time that gaps may take where no wave is without gaps.
-const MOST_GAPS: f64 = 0.05;
+/// Maximum part of a wave's time in gaps, if every wave has gaps.
+const MAX_GAPS: f64 = 0.05;
 
 /// A value at a time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
-    /// When.
+    /// Time.
     pub at: Mono,
     /// Joint position [rad].
     pub value: f64,
 }
 
-/// An arm's lag, measured.
+/// Measured lag of an arm.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Lag {
-    /// The largest of all joints [s]: what the arm's `lag` must allow for.
+    /// Largest lag of all joints [s]: what the arm's `lag` must allow for.
     pub largest: Option<f64>,
-    /// The median of all joints [s].
+    /// Median of all joints [s].
     pub median: Option<f64>,
-    /// The adapter's row [s].
+    /// Lag that the adapter's row states [s].
     pub row: f64,
-    /// Each joint's [s]; `None` where it was not measured.
+    /// Lag of each joint [s]; `None` if not measured.
     pub joints: Vec<Option<f64>>,
 }
 
 impl Lag {
-    /// The lag of an arm with these joints, whose row states `row` [s].
+    /// Returns the lag of an arm with these joints, whose row states `row` [s].
     pub fn of(joints: Vec<Option<f64>>, row: f64) -> Self {
         let mut sorted: Vec<f64> = joints.iter().copied().flatten().collect();
         Self { median: median(&mut sorted), largest: sorted.last().copied(), row, joints }
     }
 
-    /// Whether every joint was measured.
+    /// Returns whether every joint was measured.
     pub fn complete(&self) -> bool {
         !self.joints.is_empty() && self.joints.iter().all(Option::is_some)
     }
 }
 
-/// Estimates by which delay, 0 to 0.5 s, the `measured` positions of a joint follow the `written` setpoints [s]: the
-/// one with the least squared difference. `None` when there is too little to compare, or they do not follow.
+/// Estimates the delay, 0 to 0.5 s, between the `written` setpoints and the `measured` positions of a joint [s]: the
+/// one with the least squared difference. `None` if there is too little data, or the positions do not follow.
 ///
-/// A setpoint holds until the next one, so a joint without lag moves in steps, and a real one moves smoothly through
-/// the middle of the steps. Both are the same on average, and the line through the middle of each hold is that average:
-/// it has no steps, between which the sum of squares would not change. A line through the setpoints at the times when
-/// they were written would be ahead of it by half a period, and the lag too long by that.
+/// A setpoint holds until the next one. A joint without lag moves in steps; a real one moves smoothly through the
+/// middle of the steps. Both are equal on average, and the line through the middle of each hold is that average. Unlike
+/// the steps, it gives a sum of squares without plateaus. A line through the setpoints at the times of their writes
+/// would be ahead by half a period, and the lag too long by as much.
 ///
-/// A constant difference (a joint sags under load) is not lag: it is left out. Motion to both sides tells them apart.
+/// A constant difference (droop under load) is not lag and is ignored. Motion in both directions separates the two.
 pub fn delay(written: &[Point], measured: &[Point]) -> Option<f64> {
     let origin = written.first()?.at;
     let seconds = |points: &[Point]| points.iter().map(|p| (p.at.seconds_since(origin), p.value)).collect::<Vec<_>>();
     let (line, measured) = (middles(&seconds(written)), seconds(measured));
     let values = || line.iter().map(|(_, value)| *value);
     let range = values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min);
-    if measured.len() < ENOUGH.0 || range.is_nan() || range < ENOUGH.1 {
+    if measured.len() < MIN_DATA.0 || range.is_nan() || range < MIN_DATA.1 {
         return None;
     }
     let cost = |delay: f64| variance(measured.iter().map(|(at, value)| value - on(&line, at - delay)));
-    let steps = (LONGEST / COARSE).round() as u32;
+    let steps = (MAX_LAG / COARSE).round() as u32;
     let coarse = (0..=steps).map(|step| (f64::from(step) * COARSE, cost(f64::from(step) * COARSE)));
     let (best, _) = coarse.min_by(|a, b| a.1.total_cmp(&b.1))?;
-    if best >= LONGEST - COARSE / 2.0 {
-        return None; // longer, perhaps
+    if best >= MAX_LAG - COARSE / 2.0 {
+        return None; // possibly longer
     }
     let (mut low, mut high) = ((best - COARSE).max(0.0), best + COARSE);
     for _ in 0..REFINEMENTS {
@@ -93,7 +93,7 @@ pub fn delay(written: &[Point], measured: &[Point]) -> Option<f64> {
     (cost(delay) <= UNEXPLAINED * moved).then_some(delay)
 }
 
-/// Each setpoint at the middle of the time for which it holds [s]. The last one holds for as long as the one before.
+/// Returns each setpoint at the middle of its hold [s]. The last one is assumed to hold as long as the one before.
 fn middles(written: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let ends = written.iter().skip(1).map(|(at, _)| *at);
     let mut half = 0.0;
@@ -106,7 +106,7 @@ fn middles(written: &[(f64, f64)]) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// The value at a time [s] of the line through some points.
+/// Returns the value at a time [s] of the line through some points.
 fn on(line: &[(f64, f64)], at: f64) -> f64 {
     let next = line.partition_point(|(time, _)| *time <= at);
     match (next.checked_sub(1).and_then(|last| line.get(last)), line.get(next)) {
@@ -122,7 +122,7 @@ fn variance(values: impl Iterator<Item = f64>) -> f64 {
     (squares - sum * sum / count) / count
 }
 
-/// The middle one, or the mean of the two in the middle. Sorts the values.
+/// Returns the median. Sorts the values.
 fn median(values: &mut [f64]) -> Option<f64> {
     values.sort_by(f64::total_cmp);
     let upper = *values.get(values.len() / 2)?;
@@ -130,14 +130,14 @@ fn median(values: &mut [f64]) -> Option<f64> {
     Some((lower + upper) / 2.0)
 }
 
-/// What was written to one joint and measured of it, in waves.
+/// Setpoints and measured positions of one joint, in waves.
 #[derive(Debug, Default)]
 pub struct Trace {
     written: Vec<Point>,
     measured: Vec<Point>,
-    /// When each look was, and how many were measured before it.
+    /// Time of each reading, and the number of measurements before it.
     looks: Vec<(Mono, usize)>,
-    /// The first look of each wave.
+    /// Index of the first reading of each wave.
     waves: Vec<usize>,
 }
 
@@ -147,12 +147,12 @@ impl Trace {
         self.waves.push(self.looks.len());
     }
 
-    /// Notes a setpoint that was written.
+    /// Records a setpoint.
     pub fn wrote(&mut self, at: Mono, value: f64) {
         self.written.push(Point { at, value });
     }
 
-    /// Notes a look at `now`, which found a position measured at `at`; not news if the last one was of the same time.
+    /// Records a reading at `now` of a position measured at `at`. A repeated measurement is ignored.
     pub fn saw(&mut self, now: Mono, at: Mono, value: f64) {
         self.looks.push((now, self.measured.len()));
         if self.measured.last().is_none_or(|last| last.at < at) {
@@ -160,8 +160,8 @@ impl Trace {
         }
     }
 
-    /// Estimates the lag [s] from the waves in which this program ran evenly. Where it never did, from those with the
-    /// shortest gaps; `None` when they are too long.
+    /// Estimates the lag [s] from the waves without gaps. If there are none, from those with the shortest gaps; `None`
+    /// if these are too long.
     pub fn lag(&self) -> Option<f64> {
         let ends = self.waves.iter().skip(1).copied().chain([self.looks.len()]);
         let waves: Vec<Range<usize>> = self.waves.iter().zip(ends).map(|(first, end)| *first..end).collect();
@@ -174,16 +174,16 @@ impl Trace {
             });
             measured.flatten().copied().collect::<Vec<_>>()
         };
-        delay(&self.written, &kept(0.0)).or_else(|| delay(&self.written, &kept(MOST_GAPS)))
+        delay(&self.written, &kept(0.0)).or_else(|| delay(&self.written, &kept(MAX_GAPS)))
     }
 
-    /// The part of a wave's time that gaps take; 1 for a wave without looks.
+    /// Returns the part of a wave's time in gaps; 1 for a wave without readings.
     fn gaps(&self, wave: Range<usize>) -> f64 {
         let looks = self.looks.get(wave).unwrap_or_default();
         let pairs = looks.iter().zip(looks.iter().skip(1));
         let intervals: Vec<f64> = pairs.map(|((from, _), (to, _))| to.seconds_since(*from)).collect();
         let Some(median) = median(&mut intervals.clone()) else { return 1.0 };
-        let gap = GAP.max(GAP_IN_MEDIANS * median);
+        let gap = MIN_GAP.max(GAP_IN_MEDIANS * median);
         intervals.iter().filter(|interval| **interval > gap).sum::<f64>() / intervals.iter().sum::<f64>()
     }
 }

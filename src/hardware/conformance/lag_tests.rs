@@ -16,12 +16,12 @@ fn wave(t: f64) -> f64 {
     reach * (part(t) - part(t - 1.0) - part(t - 2.0) + part(t - 3.0))
 }
 
-/// Setpoints each `period` [s].
+/// Setpoints with this `period` [s].
 fn written(period: f64) -> Vec<Point> {
     (0..(4.2 / period) as usize).map(|i| i as f64 * period).map(|t| Point { at: at(t), value: wave(t) }).collect()
 }
 
-/// Evenly spread numbers from −1 to 1.
+/// Evenly distributed numbers from −1 to 1.
 fn noise() -> impl FnMut() -> f64 {
     let mut state = 7_u64;
     move || {
@@ -35,7 +35,7 @@ fn holds(written: &[Point], t: f64) -> f64 {
     written[next.saturating_sub(1)].value
 }
 
-/// Positions each 2.7 ms, of a joint that repeats its setpoints after `lag` [s], off by a constant and noise [rad].
+/// Positions every 2.7 ms of a joint that repeats its setpoints after `lag` [s], with offset and noise [rad].
 fn repeated(written: &[Point], lag: f64, off: f64, noisy: f64) -> Vec<Point> {
     let mut noise = noise();
     let times = (0..1500).map(|i| 0.0027 * f64::from(i));
@@ -48,7 +48,7 @@ fn close(found: Option<f64>, lag: f64, within: f64) {
 }
 
 #[test]
-fn a_repeated_stream_is_found_at_any_period_of_set_points() {
+fn a_repeated_stream_is_found_at_any_period_of_setpoints() {
     for lag in [0.0, 0.003, 0.03, 0.037, 0.06, 0.15, 0.4] {
         for period in [0.002, 0.01, 0.02] {
             let written = written(period);
@@ -66,7 +66,7 @@ fn noise_and_sagging_do_not_look_like_lag() {
 }
 
 #[test]
-fn what_does_not_follow_has_no_lag() {
+fn a_joint_that_does_not_follow_has_no_lag() {
     let written = written(0.01);
     let still: Vec<_> = repeated(&written, 0.0, 0.0, 0.0).iter().map(|p| Point { value: 0.3, ..*p }).collect();
     assert_eq!(delay(&written, &still), None);
@@ -79,7 +79,7 @@ fn what_does_not_follow_has_no_lag() {
     assert_eq!(delay(&written[..1], &still), None);
 }
 
-/// The lag of an emulated joint whose setpoints come each `period` [s].
+/// Lag of an emulated joint whose setpoints have this `period` [s].
 fn emulated(lag: f64, period: f64) -> Option<f64> {
     let limits = JointLimits { acceleration_max: vec![10.0], ..JointLimits::uniform(1, 2.0, 3.0) };
     let mut plant = Plant::lagging(&limits, &[0.5], lag);
@@ -100,7 +100,7 @@ fn emulated(lag: f64, period: f64) -> Option<f64> {
 
 #[test]
 fn emulated_joints_have_the_lag_that_they_are_given() {
-    // A joint with less lag than half a period moves in steps, and its acceleration limit rounds them.
+    // A joint with less lag than half a period moves in steps, smoothed by its acceleration limit.
     for (lags, within) in [(vec![0.001, 0.005], 0.002), (vec![0.01, 0.02, 0.03, 0.037, 0.06, 0.15, 0.4], 0.001)] {
         for (lag, period) in lags.iter().flat_map(|lag| [(*lag, 0.005), (*lag, 0.01)]) {
             close(emulated(lag, period), lag, within);
@@ -108,8 +108,8 @@ fn emulated_joints_have_the_lag_that_they_are_given() {
     }
 }
 
-/// A trace of four waves with looks each 2.7 ms; the program does not run for 50 ms amid the waves `stalled`, and the
-/// setpoints of that time come 50 ms late.
+/// A trace of four waves with a reading every 2.7 ms. The program stalls for 50 ms in the waves `stalled`, and the
+/// setpoints of that time are 50 ms late.
 fn trace(lag: f64, stalled: &[usize]) -> Trace {
     let mut trace = Trace::default();
     let written = written(0.01);
@@ -141,7 +141,7 @@ fn a_state_that_is_read_twice_counts_once_and_slow_reads_are_no_gaps() {
     written.iter().for_each(|point| trace.wrote(point.at, point.value));
     trace.begin_wave();
     for (i, point) in repeated(&written, 0.06, 0.0, 0.0).iter().enumerate() {
-        // Looks each 10.8 ms, of which every second one finds nothing new.
+        // A reading every 10.8 ms; every second one finds no new state.
         if i % 4 == 0 {
             let measured = Point { at: at((i / 8) as f64 * 8.0 * 0.0027), value: 0.0 };
             let value = holds(&written, (measured.at.seconds_since(at(0.0)) - 0.06).max(0.0));

@@ -1,23 +1,23 @@
-//! Connecting, activating, leaving: nothing may move by it.
+//! Connecting, activating and disconnecting move nothing.
 
 use std::time::{Duration, Instant};
 
 use super::Check;
 use super::Needs::{Faults, Motion, Nothing};
 use super::context::{Context, farthest, require};
+use crate::hardware::adapter::{AdapterError, JointReading};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading};
 
-/// The longest that `connect` may take on an address that does not answer.
+/// Maximum duration of `connect` at an address that does not answer.
 const UNREACHABLE: Duration = Duration::from_secs(3);
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Nothing, "not_connected_is_said", "calls before connect answer NotConnected", not_connected_is_said),
+    Check::new(Nothing, "not_connected_is_said", "calls before connect return NotConnected", not_connected_is_said),
     Check::new(Nothing, "connecting_changes_nothing", "connect enables and moves nothing", connecting_changes_nothing),
     Check::new(Motion, "activation_holds", "activate enables and holds within 0.005 rad", activation_holds),
     Check::new(Motion, "leaving_moves_nothing", "deactivate and disconnect move nothing", leaving_moves_nothing),
-    Check::new(Nothing, "connects_twice", "connecting again, or after leaving, works", connects_twice),
+    Check::new(Nothing, "connects_twice", "connecting again, or after disconnecting, works", connects_twice),
     Check::new(Faults, "unreachable_is_clear", "an address without arm fails within 3 s", unreachable_is_clear),
     Check::new(Faults, "silence_is_clear", "an arm that accepts but is silent fails within 3 s", silence_is_clear),
     Check::new(Faults, "wrong_arm_is_refused", "another number of joints is refused", wrong_arm_is_refused),
@@ -50,7 +50,7 @@ fn connecting_changes_nothing(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     require(context.adapter.is_connected(), || "is_connected is false".into())?;
     let start = context.positions()?;
-    // A real arm is found as its last user left it; an emulator has just been switched on.
+    // A real arm is in the state in which its last user left it; an emulator has just been switched on.
     let before = context.real && context.enabled()?;
     if context.real {
         context.adapter.disconnect();
@@ -58,7 +58,7 @@ fn connecting_changes_nothing(context: &mut Context) -> Result<(), String> {
     }
     require(context.enabled()? == before, || "the motors are on".into())?;
     context.stays(&start, context.rest())?;
-    if before { context.found("the motors were on already, and stay so") } else { Ok(()) }
+    if before { context.found("the motors were on and stay on") } else { Ok(()) }
 }
 
 fn activation_holds(context: &mut Context) -> Result<(), String> {
@@ -97,7 +97,7 @@ fn connects_twice(context: &mut Context) -> Result<(), String> {
 
 fn unreachable_is_clear(context: &mut Context) -> Result<(), String> {
     if context.emulator.take().is_none() {
-        return context.skip("it is its own plant");
+        return context.skip("it has no address");
     }
     let start = Instant::now();
     fails_clearly(context, start)?;
@@ -108,9 +108,9 @@ fn unreachable_is_clear(context: &mut Context) -> Result<(), String> {
 
 fn silence_is_clear(context: &mut Context) -> Result<(), String> {
     if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::Silent).lasting(60.0)) {
-        return context.skip("its double cannot be silent");
+        return context.skip("its emulator cannot be silent");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     fails_clearly(context, Instant::now())
 }
 
@@ -125,9 +125,9 @@ fn fails_clearly(context: &mut Context, start: Instant) -> Result<(), String> {
 
 fn wrong_arm_is_refused(context: &mut Context) -> Result<(), String> {
     if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::WrongDof)) {
-        return context.skip("its double cannot be another arm");
+        return context.skip("its emulator cannot be another arm");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     let result = context.adapter.connect();
     let text = result.as_ref().err().map_or(String::new(), |e| e.to_string());
     let numbers = [context.config.dof, context.config.dof + 1].map(|n| n.to_string());
@@ -138,12 +138,12 @@ fn wrong_arm_is_refused(context: &mut Context) -> Result<(), String> {
 
 fn wrong_model_is_refused(context: &mut Context) -> Result<(), String> {
     if context.emulator.is_none() || !context.prepare(Fault::new(FaultKind::WrongModel)) {
-        return context.skip("its double cannot be another model");
+        return context.skip("its emulator cannot be another model");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     let result = context.adapter.connect();
     let text = result.as_ref().err().map_or(String::new(), |e| e.to_string());
     require(matches!(result, Err(AdapterError::Rejected(_))), || format!("connect answers {result:?}"))?;
-    require(text.contains("model"), || format!("the error does not speak of the model: {text}"))?;
+    require(text.contains("model"), || format!("the error does not name the model: {text}"))?;
     require(!context.adapter.is_connected(), || "is_connected is true".into())
 }

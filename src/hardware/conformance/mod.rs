@@ -1,21 +1,21 @@
-//! The conformance suite: what every adapter must do, checked against its emulator (or, where the adapter is its own
-//! plant, against itself). A new row of the table is tested without a further line of code.
+//! The conformance suite: what every adapter must do, checked against its emulator, or against the adapter alone if it
+//! is its own plant. New rows of the table are tested without further code.
 //!
-//! Each check is a function in one of the lists below and starts with an adapter of its own that is not connected.
+//! Each check is a function in one of the lists below and starts with a new adapter that is not connected.
 
 mod context;
-mod cuts;
 mod device;
+mod disconnects;
 mod faults;
 pub mod figures;
-pub mod gently;
+pub mod first_motion;
 mod identity;
 pub mod lag;
 mod lifecycle;
 mod motion;
-mod pushed;
 mod stale;
 mod stops;
+mod streamed_state;
 
 pub use context::{Context, Subject};
 
@@ -25,27 +25,27 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::hardware::registry::AdapterSpec;
 
-/// What a check does to the arm.
+/// Effect of a check on the arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Needs {
-    /// It connects and reads. Nothing is enabled and nothing moves: fit for any arm that is switched on.
+    /// Connects and reads. Nothing is enabled and nothing moves: safe for any arm.
     Nothing,
-    /// It enables the motors and may move the arm, faster than one would with somebody beside it: for emulators.
+    /// Enables the motors and may move the arm fast: for emulators only.
     Motion,
-    /// It cuts wires and lets faults happen: for emulators.
+    /// Cuts connections and plays faults: for emulators only.
     Faults,
 }
 
-/// One thing that every adapter must do.
+/// A requirement on every adapter.
 #[derive(Debug, Clone, Copy)]
 pub struct Check {
-    /// What it does to the arm.
+    /// Its effect on the arm.
     pub needs: Needs,
     /// Its name, as in `stop_ends_motion`.
     pub name: &'static str,
-    /// What it asks for, in a sentence.
+    /// The requirement in one sentence.
     pub about: &'static str,
-    /// Says what is wrong.
+    /// Runs the check; the error says what is wrong.
     pub run: fn(&mut Context) -> Result<(), String>,
 }
 
@@ -60,42 +60,42 @@ impl Check {
     }
 }
 
-/// What came out of a check.
+/// Result of a check.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
-    /// It does what it must.
+    /// The requirement is met.
     Passed,
-    /// The check does not apply, and why.
+    /// The check does not apply; why.
     Skipped(String),
     /// What is wrong.
     Failed(String),
 }
 
-/// All checks, in the order in which they are best read.
+/// Returns all checks, in reading order.
 pub fn checks() -> impl Iterator<Item = &'static Check> {
     [
         identity::CHECKS,
         lifecycle::CHECKS,
         device::CHECKS,
-        pushed::CHECKS,
+        streamed_state::CHECKS,
         motion::CHECKS,
         stops::CHECKS,
         faults::CHECKS,
         stale::CHECKS,
-        cuts::CHECKS,
+        disconnects::CHECKS,
     ]
     .into_iter()
     .flatten()
 }
 
-/// Runs one check on one row, against its emulator or its own plant. `allocations` counts the calling thread's
-/// allocations so far, where the program has a counting allocator. A panic in the adapter is a failure.
+/// Runs one check on one row, against its emulator or its own plant. `allocations` returns the calling thread's
+/// allocations so far, if the program has a counting allocator. A panic in the adapter is a failure.
 pub fn run(row: &AdapterSpec, check: &Check, allocations: Option<fn() -> u64>) -> Outcome {
     run_on(&Subject { allocations, ..Subject::emulated(row) }, check).0
 }
 
-/// Runs one check on any subject, with what it found worth telling. A check that may move a real device, or would do
-/// it harm, is skipped.
+/// Runs one check on any subject; also returns its finding for the report. On a real device, checks that move it or
+/// play faults are skipped.
 pub fn run_on(subject: &Subject, check: &Check) -> (Outcome, Option<String>) {
     if subject.real && check.needs != Needs::Nothing {
         return (Outcome::Skipped("for the emulator only".to_owned()), None);
@@ -118,14 +118,14 @@ pub fn run_on(subject: &Subject, check: &Check) -> (Outcome, Option<String>) {
     }
 }
 
-/// Checks of an emulated arm that run side by side: they mostly wait for motion.
-const SIDE_BY_SIDE: usize = 12;
+/// Maximum number of parallel checks of an emulated arm: they mostly wait for motion.
+const MAX_PARALLEL: usize = 12;
 
-/// A check that was made, what came out of it, and what it found worth telling.
+/// A check, its result, and its finding for the report.
 pub type Made = (&'static Check, Outcome, Option<String>);
 
-/// Runs those checks on a subject, until `interrupted` says so; `tell` hears of each as it is done, from any thread.
-/// The answer is in their order.
+/// Runs checks on a subject until `interrupted` returns true. `tell` is called after each check, from any thread.
+/// Results are in the order of the checks.
 pub fn run_all(
     subject: &Subject,
     checks: &[&'static Check],
@@ -134,8 +134,8 @@ pub fn run_all(
 ) -> Vec<Made> {
     let next = AtomicUsize::new(0);
     let made = Mutex::new(Vec::new());
-    // A real device has one wire, and is asked one thing at a time.
-    let workers = if subject.real { 1 } else { SIDE_BY_SIDE };
+    // A real device has one connection: one check at a time.
+    let workers = if subject.real { 1 } else { MAX_PARALLEL };
     std::thread::scope(|scope| {
         for _ in 0..workers {
             scope.spawn(|| {

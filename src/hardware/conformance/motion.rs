@@ -1,4 +1,4 @@
-//! Moving: units, signs, joint order, stopping, refusing.
+//! Motion: units, signs, order of joints, stopping, refusing.
 
 use std::time::{Duration, Instant};
 
@@ -9,10 +9,10 @@ use crate::joint::ControlMode;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Motion, "planned_moves_arrive", "each joint goes its own way, in rad", planned_moves_arrive),
+    Check::new(Motion, "planned_moves_arrive", "each joint moves to its target, in rad", planned_moves_arrive),
     Check::new(Motion, "set_points_are_followed", "streamed positions are followed", set_points_are_followed),
     Check::new(Motion, "velocities_are_kept", "rad/s written is rad/s moved and read", velocities_are_kept),
-    Check::new(Motion, "joints_are_the_arms_own", "values and order are those behind the wire", own_joints),
+    Check::new(Motion, "joints_are_the_arms_own", "values and order match the emulated joints", own_joints),
     Check::new(Motion, "disabled_arms_do_not_move", "commands without power are refused", disabled_arms),
     Check::new(Motion, "nonsense_is_refused", "NaN and wrong lengths are refused, nothing moves", nonsense),
 ];
@@ -47,14 +47,14 @@ fn set_points_are_followed(context: &mut Context) -> Result<(), String> {
     context.until("the last setpoint", |context| Ok(farthest(&context.positions()?, &target) < 1e-3))
 }
 
-/// An adapter that is wrong in the same way in both directions agrees with itself. The emulator knows better.
+/// An adapter with the same mistake in both directions agrees with itself. The emulator's true positions reveal it.
 fn own_joints(context: &mut Context) -> Result<(), String> {
     let truth = |context: &Context| {
         let all = context.emulator.as_ref()?.true_positions()?;
         Some(all.get(..context.config.dof).unwrap_or_default().to_vec())
     };
     if !context.row.modes.contains(&ControlMode::Position) || truth(context).is_none() {
-        return context.skip("its double does not tell where the arm is");
+        return context.skip("its emulator has no true positions");
     }
     context.ready(ControlMode::Position)?;
     let start = context.positions()?;
@@ -76,7 +76,7 @@ fn velocities_are_kept(context: &mut Context) -> Result<(), String> {
         return context.skip("it has no velocity mode");
     }
     context.ready(ControlMode::Velocity)?;
-    // A busy machine may tear a hole into the stream of commands; an adapter that is wrong is wrong every time.
+    // A busy machine may interrupt the stream of commands once; a wrong adapter fails every time.
     let mut result = stream_velocities(context);
     for _ in 0..2 {
         if result.is_err() {
@@ -93,7 +93,7 @@ fn stream_velocities(context: &mut Context) -> Result<(), String> {
     let away = context.nearby(&start)?;
     let wanted: Vec<f64> = start.iter().zip(&away).map(|(a, b)| SPEED.copysign(b - a)).collect();
     let mut measured = None;
-    // The speed between the two halves of the way: independent of how long the arm takes to get going.
+    // The speed between two positions on the way is independent of how long the arm takes to start.
     let mut half = None;
     let mut end = (start, Instant::now());
     for i in 0..40 {
@@ -108,7 +108,7 @@ fn stream_velocities(context: &mut Context) -> Result<(), String> {
         measured = reading.velocity;
     }
     context.adapter.write_stop().map_err(|e| format!("write_stop: {e}"))?;
-    let (from, then) = half.ok_or("the arm could not be watched")?;
+    let (from, then) = half.ok_or("the arm's motion could not be measured")?;
     let seconds = (end.1 - then).as_secs_f64();
     for (i, ((a, b), wanted)) in from.iter().zip(&end.0).zip(&wanted).enumerate() {
         let found = (b - a) / seconds;
@@ -127,7 +127,7 @@ fn disabled_arms(context: &mut Context) -> Result<(), String> {
     context.ready(mode)?;
     context.adapter.write_enable(false).map_err(|e| format!("write_enable: {e}"))?;
     context.until("the motors to go off", |context| Ok(!context.enabled()?))?;
-    let holds = context.row.holds_when_disabled; // one that falls does not stay anywhere
+    let holds = context.row.holds_when_disabled; // an arm without brakes falls
     let start = context.positions()?;
     let target = context.nearby(&start)?;
     let result = context.adapter.write_joint_positions(&target, 0.1);

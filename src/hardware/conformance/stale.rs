@@ -1,7 +1,7 @@
-//! Old news: an arm that falls silent, and one that repeats what it has said.
+//! Stale state: an arm that falls silent, and one that repeats a measurement.
 //!
-//! An adapter never passes off an old measurement as a new one. Where nothing new has come it answers with an error,
-//! or (a device that sends by itself) with the stamp of the old one, so that the age of the state is the truth.
+//! An adapter never reports an old measurement as new. Without a new one it returns an error or, for a device that
+//! streams its state, the stamp of the old one, so that the age of the state is correct.
 
 use std::time::Duration;
 
@@ -9,95 +9,94 @@ use super::Check;
 use super::Needs::Faults;
 use super::context::{Context, require};
 use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::adapter::JointReading;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::JointReading;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
-    Check::new(Faults, "silence_is_noticed", "of a silent arm no reading is new, and soon an error", silence),
+    Check::new(Faults, "silence_is_noticed", "readings of a silent arm are not new, and soon errors", silence),
     Check::new(Faults, "frozen_state_is_noticed", "a measurement that is repeated keeps its stamp", frozen),
 ];
 
-/// For how long an arm stays silent or frozen [s]: longer than any check lasts.
-const LONG: f64 = 60.0;
-/// What was on its way when the silence fell arrives within this time. Very generous: the emulator may have to wait
-/// for a processor.
-const LATE: Duration = Duration::from_secs(3);
-/// Without news for this long, none is on its way any more.
-const QUIET: Duration = Duration::from_millis(300);
-/// For how long old news are watched.
-const WATCH: Duration = Duration::from_secs(1);
-/// A single call never takes longer.
-const BOUND: Duration = Duration::from_secs(2);
-/// What counts as the same stamp: two clocks are compared [s].
-const SAME: f64 = 0.005;
+/// How long an arm stays silent or frozen [s]: longer than any check.
+const FAULT_TIME: f64 = 60.0;
+/// Delayed states arrive within this time. Generous, because the emulator may have to wait for a processor.
+const MAX_DELAY: Duration = Duration::from_secs(3);
+/// Without a new state for this long, none is delayed.
+const QUIET_TIME: Duration = Duration::from_millis(300);
+/// How long stale readings are checked.
+const OBSERVATION_TIME: Duration = Duration::from_secs(1);
+/// Maximum duration of a call.
+const CALL_TIMEOUT: Duration = Duration::from_secs(2);
+/// Tolerance for equal stamps: two clocks are compared [s].
+const STAMP_TOLERANCE: f64 = 0.005;
 
-/// One reading: its stamp (`Ok(None)`: it gives no time), or that there is none.
+/// Returns the stamp of one reading (`Ok(None)`: without a stamp), or its error.
 fn look(context: &mut Context) -> Result<Result<Option<Mono>, ()>, String> {
     let mut reading = JointReading::default();
     let began = MonotonicClock.now();
     let result = context.adapter.read_joints(&mut reading);
     let took = MonotonicClock.now().since(began);
-    require(took < BOUND, || format!("read_joints took {took:?}"))?;
+    require(took < CALL_TIMEOUT, || format!("read_joints took {took:?}"))?;
     std::thread::sleep(Duration::from_millis(5));
     Ok(result.map(|()| reading.stamp).map_err(drop))
 }
 
-/// Waits until what was under way has arrived: the stamp that stands, or `None` when readings fail.
+/// Waits until delayed states have arrived. Returns the final stamp, or `None` when readings fail.
 fn settle(context: &mut Context) -> Result<Option<Mono>, String> {
     let struck = MonotonicClock.now();
     let mut last = (Mono::ZERO, struck);
-    while MonotonicClock.now().since(struck) < LATE {
+    while MonotonicClock.now().since(struck) < MAX_DELAY {
         let now = MonotonicClock.now();
         match look(context)? {
             Err(()) => return Ok(None),
-            Ok(Some(stamp)) if stamp.seconds_since(last.0) > SAME => last = (stamp, now),
-            Ok(Some(stamp)) if now.since(last.1) > QUIET => return Ok(Some(stamp)),
+            Ok(Some(stamp)) if stamp.seconds_since(last.0) > STAMP_TOLERANCE => last = (stamp, now),
+            Ok(Some(stamp)) if now.since(last.1) > QUIET_TIME => return Ok(Some(stamp)),
             Ok(_) => {}
         }
     }
-    Err(format!("{} s after the last measurement its readings are still new", LATE.as_secs()))
+    Err(format!("{} s after the last measurement its readings are still new", MAX_DELAY.as_secs()))
 }
 
 fn silence(context: &mut Context) -> Result<(), String> {
-    if !context.prepare(Fault::new(FaultKind::Silent).lasting(LONG)) {
-        return context.skip("its double cannot be silent");
+    if !context.prepare(Fault::new(FaultKind::Silent).lasting(FAULT_TIME)) {
+        return context.skip("its emulator cannot be silent");
     }
     context.connect()?;
     context.positions()?;
-    context.strike()?;
+    context.trigger_faults()?;
     let old = settle(context)?;
     context.until("an error", |context| {
         let now = look(context)?;
-        let news = matches!((now, old), (Ok(Some(stamp)), Some(old)) if stamp.seconds_since(old) > SAME);
+        let news = matches!((now, old), (Ok(Some(stamp)), Some(old)) if stamp.seconds_since(old) > STAMP_TOLERANCE);
         require(!news, || "a reading of a silent arm claims to be new".into())?;
         Ok(now.is_err())
     })?;
-    let end = MonotonicClock.now().after(WATCH);
+    let end = MonotonicClock.now().after(OBSERVATION_TIME);
     while MonotonicClock.now() < end {
         let now = look(context)?;
-        require(now.is_err(), || "after the error, a silent arm is read again".into())?;
+        require(now.is_err(), || "after the error, reading a silent arm succeeds".into())?;
     }
     Ok(())
 }
 
 fn frozen(context: &mut Context) -> Result<(), String> {
-    if !context.prepare(Fault::new(FaultKind::Frozen).lasting(LONG)) {
-        return context.skip("its double cannot repeat itself");
+    if !context.prepare(Fault::new(FaultKind::Frozen).lasting(FAULT_TIME)) {
+        return context.skip("its emulator cannot freeze its state");
     }
     context.connect()?;
     if context.joints()?.stamp.is_none() {
-        return context.skip("it gives no time");
+        return context.skip("its states have no time stamp");
     }
-    context.strike()?;
+    context.trigger_faults()?;
     let Some(old) = settle(context)? else {
-        return Ok(()); // it is an error to this adapter, which is as good
+        return Ok(()); // this adapter returns an error instead
     };
-    let end = MonotonicClock.now().after(WATCH);
+    let end = MonotonicClock.now().after(OBSERVATION_TIME);
     while MonotonicClock.now() < end {
         if let Ok(Some(stamp)) = look(context)? {
             let younger = stamp.seconds_since(old);
-            require(younger < SAME, || format!("the same measurement is now {younger:.3} s younger"))?;
+            require(younger < STAMP_TOLERANCE, || format!("the same measurement is now {younger:.3} s younger"))?;
         }
     }
     Ok(())

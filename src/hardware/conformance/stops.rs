@@ -1,4 +1,4 @@
-//! Stopping: from every state that an arm can be in.
+//! Stops from every state of an arm.
 
 use std::time::Duration;
 
@@ -6,29 +6,34 @@ use super::Check;
 use super::Needs::{Faults, Motion};
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::device::gripper::GripperStop;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::AdapterError;
 use crate::joint::ControlMode;
 
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Motion, "stop_at_rest_is_harmless", "write_stop at rest changes nothing", stop_at_rest),
-    Check::new(Motion, "stop_ends_motion", "write_stop in a planned move brings standstill", stop_ends_motion),
+    Check::new(Motion, "stop_ends_motion", "write_stop ends a planned move", stop_ends_motion),
     Check::new(Motion, "stop_ends_streaming", "write_stop between setpoints holds the arm", stop_ends_streaming),
     Check::new(Motion, "stop_ends_velocity", "write_stop ends a velocity at once", stop_ends_velocity),
-    Check::new(Motion, "stop_is_no_fault", "after a stop, activate and a mode are enough to move", stop_is_no_fault),
+    Check::new(
+        Motion,
+        "stop_is_no_fault",
+        "after a stop, activate and set_control_mode allow motion",
+        stop_is_no_fault,
+    ),
     Check::new(Motion, "stop_holds_the_gripper", "after a stop a moving gripper can be held", stop_holds_gripper),
     Check::new(Faults, "stop_in_error_is_harmless", "write_stop in error clears nothing", stop_in_error),
 ];
 
-/// Speed of a planned move that is to be interrupted, as a fraction of the top speed.
+/// Speed of the planned move that is stopped, as a fraction of the top speed.
 const SLOW: f64 = 0.1;
-/// Speed of a stream that is to be interrupted [rad/s].
+/// Speed of the stream that is stopped [rad/s].
 const SPEED: f64 = 0.1;
-/// With less than this left of its way [m] a gripper may have arrived before a stop reaches it.
+/// Minimum remaining travel of the gripper for a stop to reach it in motion [m].
 const GRIPPER_ROOM: f64 = 0.02;
-/// How far an arm may still go that is stopped at `SPEED` [rad].
+/// Maximum travel after a stop at `SPEED` [rad].
 const COASTING: f64 = 0.008;
 
 fn stop_at_rest(context: &mut Context) -> Result<(), String> {
@@ -44,7 +49,7 @@ fn stop_at_rest(context: &mut Context) -> Result<(), String> {
     require(context.enabled()?, || "write_stop switched the motors off".into())
 }
 
-/// Sends the arm far away, and waits until it is on its way.
+/// Starts a long move, and waits until the arm is moving.
 fn set_off(context: &mut Context) -> Result<Vec<f64>, String> {
     let start = context.positions()?;
     let far = context.far()?;
@@ -61,7 +66,7 @@ fn stop_ends_motion(context: &mut Context) -> Result<(), String> {
     let far = set_off(context)?;
     context.stop()?;
     let stopped = context.standstill()?;
-    require(farthest(&stopped, &far) > 0.01, || "it went to its target all the same".into())?;
+    require(farthest(&stopped, &far) > 0.01, || "it moved to its target in spite of the stop".into())?;
     require(context.enabled()?, || "the motors are off".into())?;
     context.stays(&stopped, 1e-3)
 }
@@ -83,7 +88,7 @@ fn stop_ends_streaming(context: &mut Context) -> Result<(), String> {
     context.stop()?;
     let stopped = context.standstill()?;
     let off = farthest(&stopped, &point(1.0));
-    require(off < 0.02, || format!("it stands {off:.4} rad from where it was stopped"))?;
+    require(off < 0.02, || format!("it is {off:.4} rad from where it was stopped"))?;
     require(context.enabled()?, || "the motors are off".into())?;
     context.stays(&stopped, 1e-3)
 }
@@ -106,7 +111,7 @@ fn stop_ends_velocity(context: &mut Context) -> Result<(), String> {
     let here = context.positions()?;
     let stopped = context.standstill()?;
     let coasted = farthest(&stopped, &here);
-    require(coasted < COASTING, || format!("it went on for {coasted:.4} rad after the stop"))?;
+    require(coasted < COASTING, || format!("it moved {coasted:.4} rad after the stop"))?;
     require(context.enabled()?, || "the motors are off".into())?;
     context.stays(&stopped, 1e-3)
 }
@@ -130,25 +135,25 @@ fn stop_is_no_fault(context: &mut Context) -> Result<(), String> {
     context.until("arrival", |context| Ok(farthest(&context.positions()?, &start) < 1e-3))
 }
 
-/// What the device thread does after a stop, where the arm's own does not reach the gripper.
+/// Holds the gripper as the device thread does after a stop that does not affect it.
 fn stop_holds_gripper(context: &mut Context) -> Result<(), String> {
     context.ready(context.first_mode())?;
     if context.gripper()?.is_none() {
         return context.skip("it has no gripper");
     }
     let Some((closed, open)) = context.adapter.gripper().and_then(|gripper| gripper.get_gripper_range()) else {
-        return context.skip("nobody knows how far its gripper goes");
+        return context.skip("the range of its gripper is unknown");
     };
-    // A busy machine may look away until it has arrived: then it is sent back, and stopped again.
+    // On a busy machine the gripper may arrive before the stop: then the check is repeated in the other direction.
     for target in [open, closed, open, closed, open] {
         if let Some(stopped) = stop_gripper_on_its_way(context, target)? {
             return gripper_stays(context, stopped);
         }
     }
-    context.skip("its gripper is too fast to be stopped on its way")
+    context.skip("its gripper is too fast to be stopped in motion")
 }
 
-/// Sends the gripper somewhere and stops it. Where it came to rest; `None` when it was there already.
+/// Moves the gripper and stops it. Returns where it stopped; `None` if it had arrived.
 fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<f64>, String> {
     let left = |opening: Option<f64>| opening.map_or(0.0, |opening| (target - opening).abs());
     context.command_gripper(target)?;
@@ -174,22 +179,22 @@ fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<
         Ok(now.since(rest.1) > Duration::from_millis(400))
     })?;
     let went = left(rest.0);
-    require(went > 0.002, || format!("it went on to {target} m in spite of a stop"))?;
+    require(went > 0.002, || format!("it moved to {target} m in spite of a stop"))?;
     Ok(rest.0)
 }
 
 fn gripper_stays(context: &mut Context, stopped: f64) -> Result<(), String> {
     std::thread::sleep(Duration::from_millis(300));
     let now = context.gripper()?.unwrap_or(f64::NAN);
-    require((now - stopped).abs() < 0.001, || format!("it went on from {stopped:.4} to {now:.4} m"))
+    require((now - stopped).abs() < 0.001, || format!("it moved from {stopped:.4} to {now:.4} m"))
 }
 
 fn stop_in_error(context: &mut Context) -> Result<(), String> {
     if !context.prepare(Fault::new(FaultKind::ErrorCode)) {
-        return context.skip("its double cannot be in error");
+        return context.skip("its emulator cannot be in error");
     }
     context.ready(context.first_mode())?;
-    context.strike()?;
+    context.trigger_faults()?;
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (start, error) = (context.standstill()?, context.error()?);
     for _ in 0..3 {

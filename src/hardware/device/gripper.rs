@@ -1,17 +1,17 @@
-//! A stop is for the gripper too: what still moves after it is held where it is. A gripper that stands, on a workpiece
-//! say, is left as it is: a new target would loosen its grip.
+//! Holds a gripper that still moves after a stop of the arm. A gripper at rest, for example on a workpiece, gets no new
+//! target: that would loosen its grip.
 
 use std::time::Duration;
 
 use crate::clock::Mono;
 
-/// For how long after a stop the gripper is watched.
+/// How long the gripper is monitored after a stop.
 const WATCH: Duration = Duration::from_secs(2);
-/// A difference that is motion, and no noise or give [m].
+/// Smallest change of the opening that counts as motion rather than noise or compliance [m].
 const STEP: f64 = 0.000_25;
 
-/// Watches a gripper after a stop. Two steps the same way are motion: one may lie before the stop, where the opening
-/// is not read in every cycle.
+/// Monitors a gripper after a stop. Two steps in the same direction count as motion: a single one may lie before the
+/// stop, because the opening is not read in every cycle.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct GripperStop {
     until: Option<Mono>,
@@ -20,17 +20,17 @@ pub struct GripperStop {
 }
 
 impl GripperStop {
-    /// The arm was told to stop.
+    /// Starts monitoring, after a stop was sent.
     pub fn begin(&mut self, now: Mono) {
         *self = Self { until: Some(now.after(WATCH)), last: None, step: 0.0 };
     }
 
-    /// The gripper was sent somewhere after the stop, or everything is known.
+    /// Stops monitoring: the gripper was commanded after the stop, or is at rest.
     pub fn end(&mut self) {
         self.until = None;
     }
 
-    /// Takes an opening [m] that was read after the stop. Where the gripper is to be held, once it is seen moving.
+    /// Takes an opening [m] read after the stop. Returns where to hold the gripper, once it is seen moving.
     pub fn look(&mut self, opening: f64, now: Mono) -> Option<f64> {
         self.until = self.until.filter(|until| now < *until);
         self.until?;
@@ -62,22 +62,22 @@ mod tests {
     }
 
     #[test]
-    fn what_moves_is_held_where_it_is() {
+    fn a_moving_gripper_is_held_where_it_is() {
         assert_eq!(looks(&[0.05, 0.049, 0.048, 0.047]), Some(0.048));
-        // Slowly, between noise.
+        // Slow motion with noise.
         assert_eq!(looks(&[0.05, 0.0501, 0.0502, 0.0503, 0.0504, 0.0505, 0.0506, 0.0507]), Some(0.0506));
     }
 
     #[test]
-    fn what_stands_is_left_alone() {
+    fn a_gripper_at_rest_gets_no_target() {
         assert_eq!(looks(&[0.05, 0.0501, 0.0499, 0.0501, 0.05]), None, "noise");
-        assert_eq!(looks(&[0.05, 0.04, 0.04, 0.04]), None, "it had come to rest when the old opening was replaced");
+        assert_eq!(looks(&[0.05, 0.04, 0.04, 0.04]), None, "it was at rest before the first reading after the stop");
         assert_eq!(looks(&[0.05, 0.0497, 0.05, 0.0497]), None, "give");
         let mut stop = GripperStop::default();
         assert_eq!((stop.look(0.05, Mono(1)), stop.look(0.04, Mono(2)), stop.look(0.03, Mono(3))), (None, None, None));
         stop.begin(Mono(0));
         assert_eq!(stop.look(0.05, Mono(1)), None);
-        assert_eq!(stop.look(0.04, Mono(3_000_000_000)), None, "too late: somebody moves it by hand");
+        assert_eq!(stop.look(0.04, Mono(3_000_000_000)), None, "too late: this may be motion by hand");
         assert_eq!(stop.look(0.03, Mono(3_000_000_001)), None);
     }
 }

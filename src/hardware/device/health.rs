@@ -1,38 +1,38 @@
-//! What a device thread counts and remembers, for status and log. The tick never looks here.
+//! Counters and texts of a device thread, for status and log. The tick does not read them.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult, RobotState};
+use crate::hardware::adapter::{AdapterError, AdapterResult, RobotState};
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 
-/// Episodes that are remembered.
+/// Number of episodes kept.
 const EPISODES: usize = 16;
-/// Most lines about one stretch of trouble.
-const TOLD: usize = 8;
+/// Maximum log lines per episode.
+const MAX_LINES_PER_EPISODE: usize = 8;
 
-/// A stretch of trouble of one kind.
+/// A period of trouble of one kind.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// When it began.
     pub since: Mono,
-    /// When it ended; `None`: it lasts.
+    /// When it ended; `None` while it lasts.
     pub until: Option<Mono>,
-    /// How often it was seen.
+    /// How often the trouble occurred.
     pub count: u64,
-    /// What it is.
+    /// Text of the trouble.
     pub text: String,
 }
 
-/// Something worth a line in the log.
+/// A line for the log.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Note {
     /// Trouble began.
     Began(String),
-    /// It is over.
+    /// The trouble is over.
     Over(String),
 }
 
@@ -45,11 +45,11 @@ pub struct Health {
     pub read_errors: AtomicU64,
     /// Commands written.
     pub writes: AtomicU64,
-    /// Commands that were not written because they were too far from the last one written, or from the arm.
+    /// Commands not written because they were too far from the last one written, or from the arm.
     pub withheld: AtomicU64,
     /// Writes that failed.
     pub write_errors: AtomicU64,
-    /// Times the connection was made again.
+    /// Reconnects.
     pub reconnects: AtomicU64,
     /// `ArmCommand::stop_seq` of the last stop that the device confirmed.
     pub stop_confirmed: AtomicU32,
@@ -59,9 +59,9 @@ pub struct Health {
     interval_ns: AtomicU64,
     text: Mutex<Text>,
     codes: Mutex<Option<RobotState>>,
-    /// `ArmCommand::gripper_seq` of the last gripper order that was answered, and the answer.
+    /// `ArmCommand::gripper_seq` of the last gripper command that was answered, and the answer.
     gripper: Mutex<Option<(u32, AdapterResult<()>)>>,
-    /// Raised when an order that came with a command has its answer.
+    /// Raised when a stop or a gripper command is answered.
     listener: OnceLock<Wake>,
 }
 
@@ -69,12 +69,12 @@ pub struct Health {
 struct Text {
     error: String,
     episodes: VecDeque<Episode>,
-    /// What was told since all was well.
+    /// Log lines since the last time without trouble.
     told: Vec<String>,
 }
 
 impl Health {
-    /// How often states come [Hz].
+    /// Returns the rate of new states [Hz].
     pub fn rate(&self) -> f64 {
         match self.interval_ns.load(Ordering::Relaxed) {
             0 => 0.0,
@@ -82,7 +82,7 @@ impl Health {
         }
     }
 
-    /// A state came, so long after the one before [s].
+    /// Counts a state that arrived this long after the previous one [s].
     pub(super) fn state_came(&self, interval: f64) {
         self.reads.fetch_add(1, Ordering::Relaxed);
         if interval > 0.0 {
@@ -92,19 +92,19 @@ impl Health {
         }
     }
 
-    /// Raises `wake` whenever an order that came with a command (a stop, a gripper opening) has its answer.
+    /// Raises `wake` whenever a stop or a gripper command is answered.
     pub fn wake_on_answers(&self, wake: Wake) {
         let _ = self.listener.set(wake);
     }
 
-    /// What the arm answered to the gripper order with this `ArmCommand::gripper_seq`; `None`: nothing yet.
+    /// Returns the answer to the gripper command with this `ArmCommand::gripper_seq`; `None` while it is pending.
     pub fn gripper_answer(&self, order: u32) -> Option<AdapterResult<()>> {
         let last = lock(&self.gripper);
         match last.as_ref()? {
             (answered, result) if *answered == order => Some(result.clone()),
             // Sequence numbers wrap around: the nearer half of them is newer.
             (answered, _) if answered.wrapping_sub(order) < u32::MAX / 2 => {
-                Some(Err(AdapterError::Rejected("a newer gripper order replaced it".to_owned())))
+                Some(Err(AdapterError::Rejected("a newer gripper command replaced it".to_owned())))
             }
             _ => None,
         }
@@ -115,14 +115,14 @@ impl Health {
         self.answered();
     }
 
-    /// An order that came with a command has its answer.
+    /// A stop or a gripper command was answered.
     pub(super) fn answered(&self) {
         if let Some(listener) = self.listener.get() {
             listener.raise();
         }
     }
 
-    /// Text of the device's present error; empty when there is none.
+    /// Returns the text of the device's present error; empty if there is none.
     pub fn error_text(&self) -> String {
         lock(&self.text).error.clone()
     }
@@ -131,7 +131,7 @@ impl Health {
         lock(&self.text).error = text;
     }
 
-    /// The device's own state and mode codes; `None` before they were read, and where it has none.
+    /// Returns the device's own state and mode codes; `None` before they were read, and for a device without them.
     pub fn codes(&self) -> Option<RobotState> {
         *lock(&self.codes)
     }
@@ -140,19 +140,19 @@ impl Health {
         *lock(&self.codes) = Some(codes);
     }
 
-    /// Recent episodes, the newest last.
+    /// Returns recent episodes, the newest last.
     pub fn episodes(&self) -> Vec<Episode> {
         lock(&self.text).episodes.iter().cloned().collect()
     }
 
-    /// Trouble was seen. `true`: it is new, and worth a line. What comes again before all is well is not new, also
-    /// when other trouble came between: an arm that is gone fails at reads and writes in turn.
+    /// Counts trouble. Returns `true` if it deserves a log line. Trouble that repeats before the end of the episode
+    /// does not, even if other trouble came between: on a lost arm, reads and writes fail in turn.
     pub(super) fn trouble(&self, now: Mono, text: &str) -> bool {
         let mut all = lock(&self.text);
         let open = all.episodes.back_mut().filter(|e| e.until.is_none());
         if let Some(open) = open {
             open.count += 1;
-            if all.told.iter().any(|told| told == text) || all.told.len() == TOLD {
+            if all.told.iter().any(|told| told == text) || all.told.len() == MAX_LINES_PER_EPISODE {
                 return false;
             }
         }
@@ -167,7 +167,7 @@ impl Health {
         true
     }
 
-    /// All is well again. Answers what is over.
+    /// Ends the episode and returns its text.
     pub(super) fn over(&self, now: Mono) -> Option<String> {
         let mut all = lock(&self.text);
         let last = all.episodes.back_mut().filter(|e| e.until.is_none())?;
@@ -183,14 +183,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_gripper_order_has_its_own_answer() {
+    fn each_gripper_command_has_its_own_answer() {
         let (health, wake) = (Health::default(), Wake::new().unwrap());
         health.wake_on_answers(wake.clone());
         assert_eq!(health.gripper_answer(1), None);
         health.answer_gripper(1, Err(AdapterError::Unsupported));
         assert!(wake.wait(std::time::Duration::ZERO));
         assert_eq!(health.gripper_answer(1), Some(Err(AdapterError::Unsupported)));
-        assert_eq!(health.gripper_answer(2), None, "the answer to the order before says nothing about this one");
+        assert_eq!(health.gripper_answer(2), None, "the answer to the previous command does not count");
         health.answer_gripper(3, Ok(()));
         assert!(matches!(health.gripper_answer(2), Some(Err(AdapterError::Rejected(_)))), "it never reached the arm");
         health.answer_gripper(u32::MAX, Ok(()));
@@ -198,16 +198,16 @@ mod tests {
     }
 
     #[test]
-    fn trouble_is_told_once_until_it_is_over() {
+    fn trouble_is_logged_once_per_episode() {
         let health = Health::default();
         let told = |text: &str| health.trouble(Mono(1), text);
         assert!(told("no state") && told("no command"));
-        assert!((0..9).all(|_| !told("no state") && !told("no command")), "in turn is not new");
+        assert!((0..9).all(|_| !told("no state") && !told("no command")), "alternating trouble is not new");
         let counts: Vec<u64> = health.episodes().iter().map(|e| e.count).collect();
-        assert_eq!(counts, [2, 19], "the first, and the second that took its place");
+        assert_eq!(counts, [2, 19], "the first episode, and the second that replaced it");
         assert_eq!(health.over(Mono(2)).as_deref(), Some("no command"));
         assert_eq!(health.over(Mono(3)), None);
-        assert!(told("no state"), "the next time it is new");
-        assert_eq!((0..99).filter(|n| told(&format!("trouble {n}"))).count(), TOLD - 1);
+        assert!(told("no state"), "a new episode is logged");
+        assert_eq!((0..99).filter(|n| told(&format!("trouble {n}"))).count(), MAX_LINES_PER_EPISODE - 1);
     }
 }

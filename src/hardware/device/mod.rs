@@ -1,9 +1,10 @@
-//! One I/O thread per arm. It alone talks to the adapter, at the arm's own pace: a slow device hurts only itself.
+//! One I/O thread per arm. Only this thread talks to the adapter, at the arm's own rate: a slow device delays no other
+//! arm.
 //!
 //! ```text
 //! tick ──command slot──▶ ┌───────────────┐ ──▶ adapter ──▶ wire
 //!      ◀──state slot──── │ device/<arm>  │ ◀──
-//! rpc  ──orders─────────▶└───────────────┘   watches the tick's heartbeat; holds the arm by itself when it stops
+//! rpc  ──orders─────────▶└───────────────┘   monitors the tick's heartbeat; holds the arm without it
 //! ```
 
 pub mod gripper;
@@ -21,75 +22,74 @@ pub use health::{Episode, Health, Note};
 
 use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Clock;
-use crate::hardware::spec::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
+use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
 use crate::joint::JointLimits;
 use crate::rt::due::Due;
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
 
-/// Longest silence of the tick before the device thread holds the arm by itself, where the tick is fast.
+/// Heartbeat timeout of a fast tick: without a heartbeat for this long, the device thread holds the arm.
 const BEAT_TIMEOUT: Duration = Duration::from_millis(40);
-/// The longest time between two setpoints that counts as regular, however seldom the device reports.
-const LONGEST_WRITE_PERIOD: Duration = Duration::from_millis(20);
+/// Longest period of setpoints, even if the device reports less often.
+const MAX_WRITE_PERIOD: Duration = Duration::from_millis(20);
 
-/// What a device thread is made from.
+/// Configuration of a device thread.
 pub struct DeviceConfig {
-    /// The arm's name in the blueprint.
+    /// The arm's `hardware_id`.
     pub hardware_id: String,
-    /// Number of joints the blueprint names.
+    /// Number of joints in the blueprint.
     pub dof: usize,
     /// Period of the tick.
     pub tick_period: Duration,
-    /// How often the device can deliver its state [Hz].
+    /// Rate at which the device delivers its state [Hz].
     pub native_rate: f64,
-    /// Figures with which the arm's measurements and its motion are checked.
+    /// Limits for checking the arm's measurements and motion.
     pub supervision: Supervision,
     /// The tick's heartbeat.
     pub beat: Arc<Heartbeat>,
-    /// Time.
+    /// The clock.
     pub clock: Arc<dyn Clock>,
-    /// Hears of episodes, one note at their beginning and one at their end.
+    /// Receives a note at the beginning and at the end of each episode of trouble.
     pub notes: Box<dyn Fn(Note) + Send>,
 }
 
 impl DeviceConfig {
-    /// How often the device is read: with every tick, faster where the tick is slow, never faster than it delivers.
+    /// Returns the period of reads: that of the tick, at most 10 ms, and never shorter than the device's own.
     pub fn read_period(&self) -> Duration {
         let own = Duration::from_secs_f64(1.0 / self.native_rate.max(0.1));
         self.tick_period.min(Duration::from_millis(10)).max(own)
     }
 
-    /// The longer of the tick's period and the arm's own for setpoints.
-    /// `own`: what the adapter says of it.
+    /// Returns the period of setpoints: the longer of the tick's and the arm's own, `own` if the adapter states one.
     pub fn write_period(&self, own: Option<Duration>) -> Duration {
         let states = Duration::from_secs_f64(1.0 / self.native_rate.max(0.1));
-        self.tick_period.max(own.unwrap_or(states.min(LONGEST_WRITE_PERIOD)))
+        self.tick_period.max(own.unwrap_or(states.min(MAX_WRITE_PERIOD)))
     }
 
-    /// A state older than this is stale.
+    /// Returns the maximum age of a state.
     pub fn state_timeout(&self) -> Duration {
         self.supervision.stale_after.max(3 * self.read_period())
     }
 
-    /// Without the tick's heartbeat for this long, the device thread holds the arm by itself.
+    /// Returns the timeout of the tick's heartbeat, after which the device thread holds the arm.
     pub fn beat_timeout(&self) -> Duration {
         (3 * self.tick_period).max(BEAT_TIMEOUT)
     }
 }
 
-/// What a connected arm said of itself.
+/// What a connected arm reports about itself.
 #[derive(Debug, Clone)]
 pub struct Connected {
-    /// Who it is.
+    /// Identity.
     pub info: ManipulatorInfo,
-    /// Its joint limits.
+    /// Joint limits.
     pub limits: JointLimits,
-    /// How far its gripper closes and opens [m], where it has one and says so.
+    /// Opening of its gripper when closed and when open [m], if known.
     pub gripper_range: Option<(f64, f64)>,
-    /// Period of its states, as they are read.
+    /// Period of reads.
     pub read_period: Duration,
-    /// The longer of the tick's period and the arm's own for setpoints.
+    /// Period of setpoints: the longer of the tick's and the arm's own.
     pub write_period: Duration,
 }
 
@@ -102,7 +102,7 @@ enum Order {
     Finish { disable: bool, reply: SyncSender<AdapterResult<()>> },
 }
 
-/// A device thread's handle: orders go in, answers come out. All waiting is done by the caller.
+/// Handle of a device thread. Orders return an [`Answer`]; only the caller waits.
 pub struct Device {
     hardware_id: String,
     orders: std::sync::mpsc::Sender<Order>,
@@ -113,7 +113,7 @@ pub struct Device {
 }
 
 impl Device {
-    /// Starts the thread. It does nothing until it is told to connect.
+    /// Starts the thread. It does nothing until it is ordered to connect.
     pub fn spawn(
         config: DeviceConfig,
         adapter: Box<dyn ManipulatorAdapter>,
@@ -134,22 +134,22 @@ impl Device {
         Ok(Self { hardware_id, orders, wake, health, due, thread: Some(thread) })
     }
 
-    /// The arm's name in the blueprint.
+    /// Returns the arm's `hardware_id`.
     pub fn hardware_id(&self) -> &str {
         &self.hardware_id
     }
 
-    /// Wakes the thread when a command is in its slot.
+    /// Returns the event that wakes the thread for a new command.
     pub fn wake(&self) -> Wake {
         self.wake.clone()
     }
 
-    /// What the thread counts and remembers.
+    /// Returns the thread's counters and texts.
     pub fn health(&self) -> &Arc<Health> {
         &self.health
     }
 
-    /// Connects and asks the device what it is.
+    /// Connects and identifies the device.
     pub fn connect(&self) -> Answer<Connected> {
         self.order(Order::Connect)
     }
@@ -169,30 +169,30 @@ impl Device {
         self.order(Order::ClearErrors)
     }
 
-    /// Sets the limits that commands keep: the arm's own, narrowed by the blueprint.
+    /// Sets the limits of commands: the arm's own, narrowed by the blueprint.
     pub fn set_limits(&self, limits: JointLimits) -> Answer<()> {
         self.order(|reply| Order::SetLimits(limits, reply))
     }
 
-    /// When the thread means to be awake.
+    /// Returns the thread's wake deadline.
     pub fn due(&self) -> Arc<Due> {
         self.due.clone()
     }
 
-    /// Ends commanded motion, disables the motors if asked, disconnects, ends the thread.
+    /// Stops commanded motion, disables the motors if requested, disconnects, and ends the thread.
     pub fn finish(&self, disable: bool) -> Answer<()> {
         self.order(|reply| Order::Finish { disable, reply })
     }
 
     fn order<T>(&self, order: impl FnOnce(SyncSender<AdapterResult<T>>) -> Order) -> Answer<T> {
         let (reply, answer) = sync_channel(1);
-        // A thread that is gone drops the order, and the answer says so.
+        // If the thread has ended, the order is dropped and the answer reports it.
         let _ = self.orders.send(order(reply));
         self.wake.raise();
         Answer { answer }
     }
 
-    /// Waits for the thread's end; only after `finish` was answered.
+    /// Waits for the thread to end. Call only after `finish` was answered.
     pub fn join(mut self) {
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
@@ -200,13 +200,13 @@ impl Device {
     }
 }
 
-/// The answer to an order, when it comes.
+/// The answer to an order.
 pub struct Answer<T> {
     answer: Receiver<AdapterResult<T>>,
 }
 
 impl<T> Answer<T> {
-    /// Waits for it, so long at most.
+    /// Waits for the answer, at most `timeout`.
     pub fn wait(self, timeout: Duration) -> AdapterResult<T> {
         match self.answer.recv_timeout(timeout) {
             Ok(result) => result,

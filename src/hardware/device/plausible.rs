@@ -1,35 +1,34 @@
-//! Whether an arm's pose may be trusted enough to switch its motors on: stable for a while, confirmed by the device
-//! where it can, and not simply zero everywhere, which is what many controllers report before they have read their
-//! encoders.
+//! Decides whether joint positions are reliable enough to enable the motors: stable for a while, confirmed by the
+//! device if it can, and not all zero, which is what many controllers report before they have read their encoders.
 
 use std::time::Duration;
 
 use crate::arm::{ArmState, Supervision};
 use crate::clock::Mono;
-use crate::hardware::spec::JointReading;
+use crate::hardware::adapter::JointReading;
 
-/// How long a pose must have been stable.
+/// How long positions must have been stable.
 const STABLE_FOR: Duration = Duration::from_millis(100);
-/// Readings in a row that must agree.
+/// Consecutive readings that must agree.
 const READINGS: u32 = 3;
-/// Noise of a position [rad].
+/// Measurement noise [rad].
 const NOISE: f64 = 0.02;
-/// How much faster than its top speed a joint may seem.
+/// Tolerated apparent speed, as a factor of the top speed.
 const SPEED_MARGIN: f64 = 1.5;
 
-/// What speaks against a pose.
+/// Why positions are not plausible.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum Doubt {
-    /// Too few readings, or they jump.
+    /// Too few readings, or jumps between them.
     #[default]
     Unstable,
-    /// The device says that it has not measured yet.
+    /// The device reports that it has not measured yet.
     NotMeasured,
-    /// Every joint is at exactly zero, and the device has no sign to confirm that.
+    /// Every joint is at exactly zero, and the device cannot confirm that.
     Zero,
 }
 
-/// Watches the readings of an arm that is to be enabled.
+/// Monitors the readings of an arm that is to be enabled.
 #[derive(Debug, Default)]
 pub struct Plausible {
     since: Option<Mono>,
@@ -38,12 +37,12 @@ pub struct Plausible {
 }
 
 impl Plausible {
-    /// A reading failed, or the connection is new.
+    /// Starts over: a reading failed, or the connection is new.
     pub fn reset(&mut self) {
         *self = Self::default();
     }
 
-    /// Takes a new reading, after `before`. `speed` is the top speed of the fastest joint [rad/s].
+    /// Adds a reading that follows `before`. `speed` is the top speed of the fastest joint [rad/s].
     pub fn take(&mut self, reading: &JointReading, stamp: Mono, before: &ArmState, speed: f64, config: &Supervision) {
         let dof = before.dof;
         let zero = reading.position.iter().take(dof).all(|q| *q == 0.0);
@@ -62,12 +61,12 @@ impl Plausible {
         }
     }
 
-    /// Whether the pose has been stable for long enough at `stamp`.
+    /// Returns whether positions have been stable for long enough at `stamp`.
     pub fn stable(&self, stamp: Mono) -> bool {
         self.readings >= READINGS && self.since.is_some_and(|since| stamp.since(since) >= STABLE_FOR)
     }
 
-    /// Why an arm was not enabled, with what to do.
+    /// Returns why the arm was not enabled, with a hint.
     pub fn objection(&self, hardware_id: &str) -> String {
         match self.doubt {
             Doubt::Unstable => {
@@ -75,7 +74,7 @@ impl Plausible {
             }
             Doubt::NotMeasured => "the arm reports that its joint positions are not measured yet".to_owned(),
             Doubt::Zero => format!(
-                "every joint reads exactly 0: most controllers report that before they have measured\nhint: if the arm truly \
+                "every joint reads exactly 0, which most controllers report before they have measured\nhint: if the arm truly \
                  is at zero: --set hardware.{hardware_id}.accept_zero_pose=true"
             ),
         }
@@ -87,7 +86,7 @@ mod tests {
     use super::*;
     use crate::joint::joints_of;
 
-    /// Feeds readings 10 ms apart; how many it takes until the pose is stable.
+    /// Feeds readings 10 ms apart; returns how many it takes until positions are stable.
     fn readings_until_stable(of: impl Fn(u64) -> (f64, Option<bool>), config: &Supervision) -> Option<u64> {
         let (mut plausible, mut state) = (Plausible::default(), ArmState { dof: 2, ..ArmState::default() });
         (1..100).find(|&k| {

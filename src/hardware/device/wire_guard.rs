@@ -1,5 +1,5 @@
-//! The last look at a setpoint before it is written. The tick keeps the limits between its commands; this keeps them
-//! between what reaches the wire, where commands are skipped and time passes.
+//! The last check of a setpoint before it is written. The tick keeps the limits between its commands; this check keeps
+//! them between setpoints that reach the wire, even when commands are skipped.
 
 use std::time::Duration;
 
@@ -7,12 +7,12 @@ use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
-/// Periods that one step may cover.
+/// Number of periods that one step may cover.
 const PERIODS: u32 = 2;
-/// Rounding of computed setpoints, as a part of a step and beyond it [rad, rad/s].
+/// Tolerance for rounding, relative to a step and absolute [rad, rad/s].
 const ROUNDING: (f64, f64) = (1e-6, 1e-6);
 
-/// What was written last.
+/// The last setpoint written.
 #[derive(Debug, Clone, Copy)]
 struct Last {
     mode: ControlMode,
@@ -28,13 +28,14 @@ pub struct WireGuard {
     velocity: Joints,
     acceleration: Joints,
     dof: usize,
-    /// The longer of the tick's and the arm's period.
+    /// The longer of the tick's and the arm's own period.
     period: Duration,
     supervision: Supervision,
 }
 
 impl WireGuard {
-    /// For an arm of `dof` joints; `period` is the longer of the tick's and the arm's own for setpoints.
+    /// Creates the guard of an arm with `dof` joints; `period` is the longer of the tick's and the arm's own for
+    /// setpoints.
     pub fn new(dof: usize, period: Duration, supervision: Supervision) -> Self {
         Self {
             last: None,
@@ -46,30 +47,30 @@ impl WireGuard {
         }
     }
 
-    /// The longer of the tick's and the arm's own period for setpoints.
+    /// Sets the period: the longer of the tick's and the arm's own for setpoints.
     pub fn set_period(&mut self, period: Duration) {
         self.period = period;
     }
 
-    /// The limits that commands keep.
+    /// Sets the limits of commands.
     pub fn set_limits(&mut self, limits: &JointLimits) {
         let limits = limits.clone().with_defaults();
         self.velocity = crate::joint::joints_of(&limits.velocity_max);
         self.acceleration = crate::joint::joints_of(&limits.acceleration_max);
     }
 
-    /// Motors off, or another connection: what was written before counts no more.
+    /// Forgets the last setpoint: the motors are off, or the connection is new.
     pub fn forget(&mut self) {
         self.last = None;
     }
 
-    /// A setpoint was written, or may have been.
+    /// Records a setpoint that was written, or may have been.
     pub fn wrote(&mut self, command: &ArmCommand, mode: ControlMode) {
         self.last = Some(Last { mode, values: command.values, at: command.at, start_seq: command.start_seq });
     }
 
-    /// Whether a command may be written, with the arm measured at `state`, a reading of the age `age`, taken once in
-    /// `read_period`.
+    /// Returns whether a command may be written. `state` is the newest reading, `age` its age, `read_period` the period
+    /// of reads.
     pub fn admits(
         &self,
         command: &ArmCommand,
@@ -97,9 +98,9 @@ impl WireGuard {
         }
     }
 
-    /// Whether the first position is where the arm is, or where it was sent last and has been since.
+    /// Returns whether the first position is where the arm is, or where it was commanded last and still is.
     fn starts_at(&self, command: &ArmCommand, state: &ArmState) -> bool {
-        // A little more than the tick allows, which made it from an earlier reading.
+        // Slightly more than the tick allows, which used an earlier reading.
         let seed = self.supervision.seed_tolerance().max(2.0 * self.supervision.accuracy);
         let standing = self.last.filter(|last| last.mode.is_position());
         (0..self.dof).all(|j| {
@@ -146,17 +147,17 @@ mod tests {
         let admits = |g: &WireGuard, ms, q| g.admits(&command(ms, q, 1), servo, &state(9.0), Duration::ZERO, P);
         assert!(admits(&g, 110, 0.02) && !admits(&g, 110, 0.021));
         assert!(admits(&g, 120, 0.04) && !admits(&g, 120, 0.041));
-        assert!(admits(&g, 900, 0.04) && !admits(&g, 900, 0.041), "however long the gap");
+        assert!(admits(&g, 900, 0.04) && !admits(&g, 900, 0.041), "regardless of the length of the gap");
     }
 
     #[test]
-    fn the_first_set_point_is_where_the_arm_is_measured_now() {
+    fn the_first_setpoint_must_be_at_the_measured_position() {
         let (mut g, servo) = (guard(), ControlMode::ServoPosition);
         let admits = |g: &WireGuard, value, q, age| g.admits(&command(100, value, 2), servo, &state(q), age, P);
         assert!(admits(&g, 0.504, 0.5, P) && !admits(&g, 0.511, 0.5, P));
-        assert!(!admits(&g, 0.5, 0.5, 3 * P), "an old reading");
+        assert!(!admits(&g, 0.5, 0.5, 3 * P), "a stale reading");
         g.wrote(&command(90, 0.515, 1), servo);
-        assert!(admits(&g, 0.515, 0.5, P), "it stands there");
+        assert!(admits(&g, 0.515, 0.5, P), "the arm is there");
         g.forget();
         assert!(!admits(&g, 0.515, 0.5, P));
     }

@@ -1,24 +1,24 @@
-//! The arm behind an emulated controller, whatever its wire: joints with motors, one mode at a time, an error, an
-//! E-stop line, and a script of faults. Everything is in SI units, and time is passed in.
+//! Simulated arm behind an emulated controller, independent of the transport: joints with motors, one mode at a time,
+//! an error, an E-stop line, and a fault script. All values are in SI units, and time is passed in.
 
 use std::time::Duration;
 
 pub use super::delivery::Delivery;
 pub use super::options::{SimOptions, check_pose};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::faults::{FaultKind, FaultScript};
 use crate::hardware::sim::plant::{Drive, Plant};
-use crate::hardware::spec::AdapterResult;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
-/// Positions this close to a limit count as inside: numbers on the wire are rounded [rad].
+/// Positions this close to a limit count as inside: values on the wire are rounded [rad].
 const ROUNDING: f64 = 2e-5;
-/// Goals of a servo that come closer together than this in time and angle are a stream [s, rad].
+/// Consecutive goals of a servo closer than this in time and position are a stream [s, rad].
 const STREAM: (f64, f64) = (0.1, 0.1);
 /// Error code of the open E-stop line.
 pub const ESTOP: u16 = 1;
 
-/// The faults that a [`SimArm`] can play on a wire of bytes: those of the arm and those of [`SimArm::delivery`].
+/// The faults that a [`SimArm`] can play on a byte stream: those of the arm and those of [`SimArm::delivery`].
 pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
@@ -36,7 +36,7 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Blocked,
 ];
 
-/// Why the arm does not do what it is told.
+/// Why the arm refuses a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Refusal {
     /// The motors are off.
@@ -51,7 +51,7 @@ pub enum Refusal {
     InError,
 }
 
-/// What an arm measures: joint positions [rad], velocities [rad/s], torques [Nm].
+/// Measurements of an arm: joint positions [rad], velocities [rad/s], torques [Nm].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measured {
     /// Joint positions [rad].
@@ -62,24 +62,24 @@ pub struct Measured {
     pub efforts: Joints,
 }
 
-/// An emulated controller with an arm behind it: what its server needs to be the arm's emulator.
+/// An emulated controller with a simulated arm, as its server needs it.
 pub trait HasArm {
     /// The arm.
     fn arm(&mut self) -> &mut SimArm;
 
-    /// Brings everything up to `now`: the arm, and what else the controller has that moves.
+    /// Advances everything to `now`: the arm, and other moving parts of the controller.
     fn advance(&mut self, now: Mono) {
         self.arm().advance(now);
     }
 
-    /// Joint positions [rad] and velocities [rad/s] as they truly are at `now`.
+    /// Returns the true joint positions [rad] and velocities [rad/s] at `now`.
     fn joints_at(&mut self, now: Mono) -> (Joints, Joints) {
         self.advance(now);
         self.arm().joints()
     }
 }
 
-/// An arm that was just switched on: disabled, in position mode.
+/// A simulated arm. Initially disabled, in position mode.
 pub struct SimArm {
     name: &'static str,
     playable: &'static [FaultKind],
@@ -88,27 +88,27 @@ pub struct SimArm {
     /// How far outside its limits a target may be [rad].
     tolerance: f64,
     mode: ControlMode,
-    /// It has modes; an arm without takes any command at any time.
+    /// Whether the arm has modes. Without modes it takes any command at any time.
     has_modes: bool,
     error: u16,
     estop_open: bool,
-    /// When the E-stop line closes by itself.
+    /// When the E-stop line closes.
     estop_until: Option<Mono>,
-    /// In velocity mode the arm stops when no velocity arrives for this long.
+    /// In velocity mode the arm stops when no velocity arrives within this time.
     velocity_timeout: Option<Duration>,
     velocity_until: Option<Mono>,
-    /// The goal of a servo [rad], and when it came.
+    /// The goal of a servo [rad], and when it arrived.
     goal: Option<(Joints, Mono)>,
     script: FaultScript,
-    /// Time zero of the script.
+    /// Time zero of the fault script.
     first_client: Option<Mono>,
     powered_up: Mono,
     advanced_to: Mono,
 }
 
 impl SimArm {
-    /// An arm within `limits`. Refuses options that it cannot follow; `playable` are the faults that its controller can
-    /// play, `name` is the adapter's.
+    /// Creates an arm within `limits`. Returns an error for invalid options. `playable` are the faults that its
+    /// controller can play, `name` is the name of the adapter.
     pub fn new(
         name: &'static str,
         limits: &JointLimits,
@@ -117,7 +117,7 @@ impl SimArm {
         now: Mono,
     ) -> AdapterResult<Self> {
         options.check(name, limits, playable)?;
-        let options = options.clone().starting_at(&pose_of_no_symmetry(limits));
+        let options = options.clone().starting_at(&asymmetric_pose(limits));
         Ok(Self {
             name,
             playable,
@@ -139,45 +139,45 @@ impl SimArm {
         })
     }
 
-    /// The same arm with joints that move in another way.
+    /// Replaces the joints.
     pub fn with_plant(mut self, plant: Plant) -> Self {
         self.plant = plant;
         self
     }
 
-    /// The same arm, that in velocity mode stops when no velocity arrives within `timeout` [s].
+    /// Stops the arm in velocity mode when no velocity arrives within `timeout` [s].
     pub fn with_velocity_timeout(mut self, timeout: f64) -> Self {
         self.velocity_timeout = Some(Duration::from_secs_f64(timeout));
         self
     }
 
-    /// The same arm, that takes targets up to `tolerance` [rad] outside its limits. Joints never leave their limits.
+    /// Accepts targets up to `tolerance` [rad] outside the limits. Joints never leave their limits.
     pub fn with_tolerance(mut self, tolerance: f64) -> Self {
         self.tolerance = tolerance;
         self
     }
 
-    /// The same arm without modes: it takes targets, setpoints and velocities at any time, as servos do.
+    /// Removes the modes: the arm takes targets, setpoints and velocities at any time, as servos do.
     pub fn without_modes(mut self) -> Self {
         self.has_modes = false;
         self
     }
 
-    /// From now on joints whose motors are off fall at `speed` [rad/s], each to its place in `rest` [rad]; one without
-    /// stays where it is. Until then brakes, or somebody's hands, hold the arm.
+    /// Lets joints whose motors are off fall at `speed` [rad/s], each to its position in `rest` [rad]; a joint without
+    /// one stays where it is. Before this call, brakes or supports hold the arm.
     pub fn falls(&mut self, speed: f64, rest: &[Option<f64>]) {
         self.plant.falls(speed, rest);
     }
 
     // --- Time, power and clients ---
 
-    /// Brings the joints up to `now`, and lets the faults of the arm happen that are due. Comes before anything else.
+    /// Advances the joints to `now` and plays the arm's faults that are due. Call it before anything else.
     pub fn advance(&mut self, now: Mono) {
         self.integrate(now);
         self.apply_faults();
     }
 
-    /// Brings the joints up to `now`, without faults.
+    /// Advances the joints to `now`, without faults.
     pub fn integrate(&mut self, now: Mono) {
         if let Some(until) = self.velocity_until.filter(|until| *until < now) {
             self.pass(until);
@@ -197,18 +197,18 @@ impl SimArm {
         self.advanced_to = to.max(self.advanced_to);
     }
 
-    /// A client has connected: the first one is time zero of the script.
+    /// A client has connected. The first connection is time zero of the script.
     pub fn client_came(&mut self) {
         self.first_client.get_or_insert(self.advanced_to);
     }
 
-    /// The client is gone: the arm stops.
+    /// The client has disconnected: the arm stops.
     pub fn client_gone(&mut self, now: Mono) {
         self.advance(now);
         self.plant.stop();
     }
 
-    /// Opens the E-stop line: error, motors off.
+    /// Opens the E-stop line: sets the error and disables the motors.
     pub fn press_estop(&mut self) {
         self.estop_open = true;
         self.estop_until = None;
@@ -216,38 +216,38 @@ impl SimArm {
         self.plant.enable(false);
     }
 
-    /// Closes the E-stop line. Error and motors stay as they are.
+    /// Closes the E-stop line. Error and motors do not change.
     pub fn release_estop(&mut self) {
         self.estop_open = false;
         self.estop_until = None;
     }
 
-    /// Goes into error: stops.
+    /// Sets an error and stops the arm.
     pub fn fail(&mut self, code: u16) {
         self.error = code;
         self.plant.stop();
     }
 
-    /// Everything is as after power-up: motors off, in position mode, no error. The E-stop line stays as it is.
+    /// Resets the arm to its state at power-up: motors off, position mode, no error. The E-stop line does not change.
     pub fn restart(&mut self) {
         (self.mode, self.error, self.goal) = (ControlMode::Position, 0, None);
         self.powered_up = self.advanced_to;
         self.plant.enable(false);
     }
 
-    // --- What it reports ---
+    // --- State ---
 
-    /// Number of joints.
+    /// Returns the number of joints.
     pub fn dof(&self) -> usize {
         self.limits.position_lower.len()
     }
 
-    /// Number of joints that it claims to have: a fault makes it one more.
+    /// Returns the number of joints that the arm reports: one more during a fault.
     pub fn claimed_dof(&mut self) -> usize {
         self.dof() + usize::from(self.take_fault(FaultKind::WrongDof).is_some())
     }
 
-    /// What it measures; faults make it NaN or zero.
+    /// Returns the measurements; faults make them NaN or zero.
     pub fn measured(&mut self) -> Measured {
         let of = |value: f64| {
             let all = [value; MAX_DOF];
@@ -263,59 +263,59 @@ impl SimArm {
         }
     }
 
-    /// Joint positions [rad] and velocities [rad/s] as they truly are.
+    /// Returns the true joint positions [rad] and velocities [rad/s].
     pub fn joints(&self) -> (Joints, Joints) {
         (self.plant.positions(), self.plant.velocities())
     }
 
-    /// Joint torques [Nm] as they truly are.
+    /// Returns the true joint torques [Nm].
     pub fn efforts(&self) -> Joints {
         self.plant.efforts()
     }
 
-    /// Up to when it was brought.
+    /// Returns the time up to which the arm was advanced.
     pub fn now(&self) -> Mono {
         self.advanced_to
     }
 
-    /// Time since power-up.
+    /// Returns the time since power-up.
     pub fn uptime(&self) -> Duration {
         self.advanced_to.since(self.powered_up)
     }
 
-    /// Whether all motors are on.
+    /// Returns whether all motors are on.
     pub fn enabled(&self) -> bool {
         self.plant.enabled()
     }
 
-    /// Whether the motor of a joint (index from 0) is on.
+    /// Returns whether the motor of a joint (index from 0) is on.
     pub fn motor(&self, joint: usize) -> bool {
         self.plant.motor(joint)
     }
 
-    /// Whether a joint moves.
+    /// Returns whether any joint moves.
     pub fn moving(&self) -> bool {
         self.plant.moving()
     }
 
-    /// The error; 0 = none.
+    /// Returns the error code; 0 = none.
     pub fn error(&self) -> u16 {
         self.error
     }
 
-    /// Whether the E-stop line is open.
+    /// Returns whether the E-stop line is open.
     pub fn estop_open(&self) -> bool {
         self.estop_open
     }
 
-    /// The mode.
+    /// Returns the mode.
     pub fn mode(&self) -> ControlMode {
         self.mode
     }
 }
 
-/// A pose for power-up: no joint at zero or like another, so that nothing works by accident.
-fn pose_of_no_symmetry(limits: &JointLimits) -> Vec<f64> {
+/// Returns the default pose at power-up: no joint at zero or equal to another one, so that mistakes show.
+fn asymmetric_pose(limits: &JointLimits) -> Vec<f64> {
     let range = limits.position_lower.iter().zip(&limits.position_upper);
     let part = |i: usize| 0.5 + 0.02 * (i + 1) as f64 * if i.is_multiple_of(2) { 1.0 } else { -1.0 };
     range.enumerate().map(|(i, (lower, upper))| lower + (upper - lower) * part(i).clamp(0.1, 0.9)).collect()

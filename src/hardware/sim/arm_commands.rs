@@ -1,4 +1,4 @@
-//! What a [`SimArm`] is commanded, and what it refuses.
+//! Commands of a [`SimArm`], and when it refuses them.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use crate::hardware::sim::faults::FaultKind;
 use crate::joint::ControlMode;
 
 impl SimArm {
-    /// Changes the mode, at a standstill only.
+    /// Changes the mode; only while the arm is at rest.
     pub fn set_mode(&mut self, mode: ControlMode) -> Result<(), Refusal> {
         if mode == self.mode {
             return Ok(());
@@ -20,7 +20,7 @@ impl SimArm {
         Ok(())
     }
 
-    /// Switches all motors on, holding where the arm is, or off.
+    /// Switches all motors on, holding the current position, or off.
     pub fn enable(&mut self, on: bool) -> Result<(), Refusal> {
         if on && self.error != 0 {
             return Err(Refusal::InError);
@@ -29,8 +29,8 @@ impl SimArm {
         Ok(())
     }
 
-    /// Switches the motor of one joint (index from 0), also in error. A sagging arm sinks when the last of them comes
-    /// on.
+    /// Switches the motor of one joint (index from 0), also in error. With the fault `sag`, the arm sinks when its last
+    /// motor comes on.
     pub fn enable_joint(&mut self, joint: usize, on: bool) {
         let before = self.plant.enabled();
         self.plant.enable_joint(joint, on);
@@ -42,7 +42,7 @@ impl SimArm {
         }
     }
 
-    /// Clears the error; not while the E-stop line is open.
+    /// Clears the error; refused while the E-stop line is open.
     pub fn clear_error(&mut self) -> Result<(), Refusal> {
         if self.estop_open {
             return Err(Refusal::InError);
@@ -51,12 +51,12 @@ impl SimArm {
         Ok(())
     }
 
-    /// Decelerates to standstill; the motors stay on.
+    /// Decelerates to rest; the motors stay on.
     pub fn stop(&mut self) {
         self.plant.stop();
     }
 
-    /// Moves to `target` [rad] at a fraction of the top speed, in position mode.
+    /// Moves to `target` [rad] at a fraction of the top speed; requires position mode.
     pub fn move_to(&mut self, target: &[f64], speed: f64) -> Result<(), Refusal> {
         self.may_move(ControlMode::Position)?;
         self.within(target)?;
@@ -64,7 +64,7 @@ impl SimArm {
         Ok(())
     }
 
-    /// Follows a setpoint [rad], in servo mode.
+    /// Follows a setpoint [rad]; requires servo mode.
     pub fn servo(&mut self, target: &[f64]) -> Result<(), Refusal> {
         self.may_move(ControlMode::ServoPosition)?;
         self.within(target)?;
@@ -72,12 +72,12 @@ impl SimArm {
         Ok(())
     }
 
-    /// Keeps velocities [rad/s], in velocity mode, for as long as the arm keeps one by default.
+    /// Keeps velocities [rad/s] for the arm's default time; requires velocity mode.
     pub fn velocity(&mut self, velocities: &[f64]) -> Result<(), Refusal> {
         self.velocity_for(velocities, self.velocity_timeout)
     }
 
-    /// Keeps velocities [rad/s], in velocity mode, for this long; `None`: until it is told something else.
+    /// Keeps velocities [rad/s] for this time, or until the next command if `None`; requires velocity mode.
     pub fn velocity_for(&mut self, velocities: &[f64], duration: Option<Duration>) -> Result<(), Refusal> {
         self.may_move(ControlMode::Velocity)?;
         self.velocity_until = duration.map(|duration| self.advanced_to.after(duration));
@@ -85,9 +85,9 @@ impl SimArm {
         Ok(())
     }
 
-    /// Takes a goal [rad] as servos do, whose controllers know no modes: goals that come close together are a stream
-    /// and followed, others are moves at a fraction of the top speed. `direct`: every goal is followed. A goal that
-    /// comes while the motors are off is kept, for [`SimArm::resume_goal`].
+    /// Takes a goal [rad] as servos without modes do: goals in quick succession are followed as a stream, others are
+    /// moves at a fraction of the top speed. With `direct`, every goal is followed. A goal that arrives while the
+    /// motors are off is kept for [`SimArm::resume_goal`].
     pub fn take_goal(&mut self, goal: &[f64], speed: f64, direct: bool) {
         let mut joints = [0.0; crate::joint::MAX_DOF];
         joints.iter_mut().zip(goal).for_each(|(joint, value)| *joint = *value);
@@ -104,15 +104,15 @@ impl SimArm {
         }
     }
 
-    /// Goes to the goal that it was given last, at top speed, if it was given one since power-up: what careless servos
-    /// do when their motors come on.
+    /// Moves at top speed to the last goal since power-up, if there is one, as some servos do when their motors come
+    /// on.
     pub fn resume_goal(&mut self) {
         if let Some((goal, _)) = self.goal {
             self.plant.move_to(&goal, 1.0);
         }
     }
 
-    /// Refuses what moves anything while the motors are off or the arm is in error.
+    /// Refuses motion while the motors are off or the arm is in error.
     pub fn ready(&self) -> Result<(), Refusal> {
         match (self.error, self.plant.enabled()) {
             (0, true) => Ok(()),
@@ -121,7 +121,7 @@ impl SimArm {
         }
     }
 
-    /// The same, and what needs a mode that the arm is not in.
+    /// Refuses motion as [`SimArm::ready`] does, and commands of another mode.
     pub fn may_move(&self, mode: ControlMode) -> Result<(), Refusal> {
         self.ready()?;
         if !self.has_modes || self.mode == mode { Ok(()) } else { Err(Refusal::WrongMode) }

@@ -1,11 +1,11 @@
-//! What goes wrong with a [`SimArm`], and with its wire.
+//! Faults of a [`SimArm`] and of its wire.
 
 use super::{Delivery, SimArm};
 use crate::clock::Mono;
 use crate::hardware::sim::faults::{DEFAULT_STALL, Fault, FaultKind, check_kind};
 
 impl SimArm {
-    /// Lets the faults of the arm happen that are due at the time of the last [`SimArm::integrate`].
+    /// Plays the arm's faults that are due at the time of the last [`SimArm::integrate`].
     pub fn apply_faults(&mut self) {
         if let Some(fault) = self.take_fault(FaultKind::Estop) {
             self.press_estop();
@@ -18,7 +18,7 @@ impl SimArm {
         (0..self.dof()).for_each(|joint| self.plant.block(joint, blocked == Some(joint)));
     }
 
-    /// Lets a fault happen `fault.at` seconds from `now`; an error names the kinds that can be played.
+    /// Injects a fault that begins `fault.at` seconds after `now`; the error lists the kinds that can be played.
     pub fn inject(&mut self, fault: Fault, now: Mono) -> Result<(), String> {
         check_kind(&format!("the {} emulator", self.name), &fault, self.playable)?;
         let t = self.first_client.map_or(0.0, |first| now.seconds_since(first));
@@ -26,23 +26,23 @@ impl SimArm {
         Ok(())
     }
 
-    /// The fault of a kind that strikes now, if one does; counted as one strike.
+    /// Returns the fault of this kind that is due now, and counts it as played.
     pub fn take_fault(&mut self, kind: FaultKind) -> Option<Fault> {
         self.take_fault_if(kind, |_| true)
     }
 
-    /// The same, for a fault that `wanted` accepts; others stay.
+    /// As above, for a fault that `wanted` accepts; others remain.
     pub fn take_fault_if(&mut self, kind: FaultKind, wanted: impl Fn(&Fault) -> bool) -> Option<Fault> {
         let t = self.script_time();
         self.script.take_if(kind, t, wanted)
     }
 
-    /// Whether a fault of a kind with a duration is active now. No strike is counted.
+    /// Returns whether a fault of this kind with a duration is active now. Does not count it as played.
     pub fn fault_lasts(&self, kind: FaultKind) -> bool {
         self.script.lasts(kind, self.script_time())
     }
 
-    /// What the wire does to the answer or report that is due now.
+    /// Returns how the response or report that is due now is delivered.
     pub fn delivery(&mut self) -> Delivery {
         let t = self.script_time();
         let left = |fault: &Fault| fault.left(t);

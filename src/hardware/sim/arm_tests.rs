@@ -33,7 +33,7 @@ fn a_joint_without_its_motor_falls_while_the_others_hold() {
     let [first, second, third] = positions(&arm);
     assert!((second + 0.8).abs() < 1e-3 && (first, third) == (0.5, 1.0), "{:?}", positions(&arm));
     arm.advance(at(5.0));
-    assert_eq!(positions(&arm), [0.5, -1.0, 1.0], "it lies");
+    assert_eq!(positions(&arm), [0.5, -1.0, 1.0], "at its rest position");
     arm.enable(true).unwrap();
     arm.move_to(&[0.5, -0.9, 1.0], 1.0).unwrap();
     arm.advance(at(6.0));
@@ -53,34 +53,34 @@ fn switching_one_motor_off_in_motion_stops_the_others() {
 }
 
 #[test]
-fn a_servo_takes_goals_at_any_time_and_follows_those_that_stream() {
+fn a_servo_takes_goals_at_any_time_and_follows_a_stream() {
     let mut arm = arm().without_modes();
     arm.take_goal(&[0.9, -0.5, 1.0], 0.5, false);
     arm.advance(at(1.0));
-    assert_eq!(positions(&arm)[0], 0.5, "its motors are off");
+    assert_eq!(positions(&arm)[0], 0.5, "the motors are off");
     arm.enable(true).unwrap();
     arm.advance(at(2.0));
     assert_eq!(positions(&arm)[0], 0.5);
     arm.resume_goal();
     arm.advance(at(4.0));
-    assert_eq!(positions(&arm)[0], 0.9, "the goal that came before");
-    // A stream is followed at its own speed: the last goal is not approached at top speed.
+    assert_eq!(positions(&arm)[0], 0.9, "the goal from before");
+    // A stream is followed at its own speed; its last goal is not approached at top speed.
     for i in 1..=50 {
         arm.advance(at(4.0 + 0.01 * f64::from(i)));
         arm.take_goal(&[0.9 - 0.002 * f64::from(i), -0.5, 1.0], 1.0, false);
     }
     let speed = arm.joints().1[0];
     assert!((-0.35..-0.1).contains(&speed), "0.2 rad/s streamed, not the top speed of 1 rad/s: {speed}");
-    assert_eq!(arm.velocity(&[0.1, 0.0, 0.0]), Ok(()), "no mode forbids it");
+    assert_eq!(arm.velocity(&[0.1, 0.0, 0.0]), Ok(()), "there are no modes");
     assert_eq!(self::arm().velocity(&[0.1; 3]), Err(Refusal::Disabled));
 }
 
 #[test]
-fn joints_droop_below_their_targets_and_sink_when_they_are_sent_to_where_they_are() {
+fn joints_droop_and_sink_when_commanded_to_their_measured_positions() {
     let mut arm = arm_with(&SimOptions { droop: 0.01, ..SimOptions::default() });
     arm.enable(true).unwrap();
     arm.advance(at(1.0));
-    assert_eq!(positions(&arm)[0], 0.5, "a hold where it is");
+    assert_eq!(positions(&arm)[0], 0.5, "it holds");
     arm.move_to(&[0.8, -0.5, 1.0], 1.0).unwrap();
     arm.advance(at(3.0));
     assert_eq!(positions(&arm), [0.8 - 0.01, -0.5 - 0.01, 1.0 - 0.01]);
@@ -93,7 +93,7 @@ fn joints_droop_below_their_targets_and_sink_when_they_are_sent_to_where_they_ar
 }
 
 #[test]
-fn a_velocity_ends_exactly_when_its_time_is_over_however_late_one_looks() {
+fn a_velocity_ends_exactly_when_its_time_is_over() {
     let mut arms = [arm(), arm()];
     for arm in &mut arms {
         arm.set_mode(ControlMode::Velocity).unwrap();
@@ -107,7 +107,7 @@ fn a_velocity_ends_exactly_when_its_time_is_over_however_late_one_looks() {
 }
 
 #[test]
-fn an_estop_of_the_script_takes_the_power_and_closes_by_itself() {
+fn a_scripted_estop_disables_the_motors_and_closes_after_its_duration() {
     let mut arm = arm();
     arm.enable(true).unwrap();
     arm.client_came();
@@ -121,7 +121,7 @@ fn an_estop_of_the_script_takes_the_power_and_closes_by_itself() {
 }
 
 #[test]
-fn without_power_everything_starts_again() {
+fn a_loss_of_power_resets_the_arm() {
     let mut arm = arm();
     arm.client_came();
     arm.enable(true).unwrap();

@@ -1,5 +1,5 @@
-//! An emulated arm on a CAN bus: it takes commands, and sends its state in a rhythm of its own, whether anything
-//! listens or not.
+//! Server of an emulated arm on a CAN bus: receives commands, and sends the arm's state periodically, whether or not a
+//! program receives it.
 
 use std::io;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering::Relaxed};
@@ -8,24 +8,24 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use super::arm::{Delivery, HasArm};
-use super::can_seat::Seat;
-use super::diary::{self, Happening};
+use super::can_connection::CanConnection;
+use super::events::{self, SimEvent};
 use super::faults::{Fault, FaultKind};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::{Emulator, Place};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::registry::{Emulator, EmulatorAddress};
 use crate::hardware::transport::can::{CanAddress, CanEvent, CanFilter, CanFrame};
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 
-/// How long a fault that cuts the wire keeps it cut at least: longer than any adapter should believe in a silent arm.
-const CUT: Duration = Duration::from_millis(800);
-/// Missed periods that are made up for at most, after the computer has stalled.
-const MAKES_UP: u32 = 10;
+/// Minimum duration of a fault that cuts the wire: longer than any adapter tolerates silence.
+const MIN_CUT: Duration = Duration::from_millis(800);
+/// Maximum number of missed periods that are sent late after this computer has stalled.
+const MAX_LATE_PERIODS: u32 = 10;
 
-/// The faults that a `SimArm` can play on a bus whose frames hold integers: no byte is damaged there, nothing is NaN.
+/// The faults that a `SimArm` can play on a bus with integer values: no damaged bytes and no NaN.
 pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
@@ -41,31 +41,31 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Blocked,
 ];
 
-/// The arm's side of a bus.
+/// The arm's side of a CAN bus.
 pub trait CanController: Send + 'static {
-    /// Takes a frame. What the arm answers at once goes into `answers`.
-    fn hear(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>);
+    /// Processes a frame and puts immediate replies into `answers`.
+    fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>);
 
-    /// A period has passed: puts what the arm sends by itself into `frames`, and says how it is delivered.
+    /// Puts the periodic frames into `frames`, and returns how they are delivered.
     fn tick(&mut self, now: Mono, frames: &mut Vec<CanFrame>) -> Delivery;
 
-    /// The frames that the arm hears; all of them without filters.
+    /// Returns filters for the frames that the arm receives; empty for all frames.
     fn filters(&self) -> &'static [CanFilter] {
         &[]
     }
 
-    /// Frames that no client knows, for the fault `garbage`: identifiers and bytes.
+    /// Returns frames with unknown identifiers and random bytes, for the fault `garbage`.
     fn noise(&self) -> &'static [(u16, &'static [u8])] {
         &[(0x7FF, b"garbage")]
     }
 
-    /// The least time from a loss of power until the arm is heard again.
+    /// Returns the minimum time from a loss of power until the arm sends again.
     fn start_time(&self) -> Duration {
-        CUT
+        MIN_CUT
     }
 }
 
-/// An arm on a bus. It ends when it is dropped.
+/// A running emulator on a CAN bus. It ends when it is dropped.
 pub struct CanServer<C: CanController> {
     shared: Arc<Shared<C>>,
     address: CanAddress,
@@ -87,10 +87,10 @@ impl<C> Shared<C> {
 }
 
 impl<C: CanController> CanServer<C> {
-    /// An arm at `place` that sends every `period`. `name` is the arm's, for messages.
-    pub fn start(name: &str, controller: C, place: &Place, period: Duration) -> AdapterResult<Self> {
+    /// Starts the arm at `place`, sending every `period`. `name` is for messages.
+    pub fn start(name: &str, controller: C, place: &EmulatorAddress, period: Duration) -> AdapterResult<Self> {
         let failed = |e: io::Error| AdapterError::Io(format!("{name} emulator: {e}"));
-        let (seat, address) = Seat::take(name, place, controller.filters())?;
+        let (connection, address) = CanConnection::take(name, place, controller.filters())?;
         let shared = Arc::new(Shared {
             controller: Mutex::new(controller),
             closing: AtomicBool::new(false),
@@ -100,7 +100,7 @@ impl<C: CanController> CanServer<C> {
         });
         let mut arm = Arm {
             shared: shared.clone(),
-            seat,
+            connection,
             period,
             frames: Vec::with_capacity(64),
             stalled: Mono::ZERO,
@@ -113,23 +113,23 @@ impl<C: CanController> CanServer<C> {
         Ok(Self { shared, address, thread: Some(thread) })
     }
 
-    /// Where adapters find the bus.
+    /// Returns the address for adapters.
     pub fn address(&self) -> &CanAddress {
         &self.address
     }
 
-    /// Does something with the controller, now.
+    /// Calls `act` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         let mut controller = self.shared.controller();
         f(&mut controller, MonotonicClock.now())
     }
 
-    /// How many frames it has sent.
+    /// Returns how many frames the arm has sent.
     pub fn sent(&self) -> u64 {
         self.shared.sent.load(Relaxed)
     }
 
-    /// How many frames its bus did not take.
+    /// Returns how many frames the bus refused.
     pub fn not_taken(&self) -> u64 {
         self.shared.not_taken.load(Relaxed)
     }
@@ -159,19 +159,19 @@ impl<C: CanController> Drop for CanServer<C> {
     }
 }
 
-/// What the arm's thread works with.
+/// State of the arm's thread.
 struct Arm<C> {
     shared: Arc<Shared<C>>,
-    seat: Seat,
+    connection: CanConnection,
     period: Duration,
     frames: Vec<CanFrame>,
-    /// It does nothing until then; what arrives waits.
+    /// The arm is stalled until then; arriving frames wait.
     stalled: Mono,
-    /// It neither hears nor sends until then.
+    /// The arm neither receives nor sends until then.
     deaf: Mono,
-    /// In this period it sends nothing.
+    /// In this period the arm sends nothing.
     silent: bool,
-    /// A frame has come.
+    /// A frame has arrived.
     heard: bool,
 }
 
@@ -181,8 +181,8 @@ impl<C: CanController> Arm<C> {
         let mut next = MonotonicClock.now().after(self.period);
         while !self.shared.closing.load(Relaxed) {
             let now = MonotonicClock.now();
-            // An arm is not late because this computer is: what it would have sent meanwhile is sent now.
-            next = next.max(now.before(self.period * MAKES_UP));
+            // This computer was late, not the arm: the frames of the missed periods are sent now.
+            next = next.max(now.before(self.period * MAX_LATE_PERIODS));
             while next <= now {
                 self.tick(next);
                 next = next.after(self.period);
@@ -191,16 +191,16 @@ impl<C: CanController> Arm<C> {
                 self.listen(now);
             }
             let left = next.since(MonotonicClock.now());
-            match self.seat.fd().filter(|_| now >= self.stalled) {
+            match self.connection.fd().filter(|_| now >= self.stalled) {
                 Some(fd) => self.shared.wake.wait_or_readable(fd, left),
                 None => self.shared.wake.wait(left),
             };
         }
     }
 
-    /// Once per period: faults begin and end, and the state is sent.
+    /// Runs once per period: begins and ends faults, and sends the state.
     fn tick(&mut self, now: Mono) {
-        self.seat.mend(now);
+        self.connection.mend(now);
         if now < self.stalled || now < self.deaf {
             return;
         }
@@ -209,13 +209,13 @@ impl<C: CanController> Arm<C> {
         let mut controller = shared.controller();
         let delivery = controller.tick(now, &mut self.frames);
         self.silent = delivery == Delivery::Silent;
-        self.seat.refuse(delivery);
+        self.connection.refuse(delivery);
         match delivery {
             Delivery::Garbage => {
                 let noise = controller.noise().iter().map(|(id, bytes)| CanFrame::new(*id, bytes));
                 self.frames.splice(0..0, noise);
             }
-            // A bus knows no damaged frames: they are repeated. It knows short ones.
+            // CAN repeats damaged frames, so there are none; short frames exist.
             Delivery::Corrupt | Delivery::Truncated => {
                 let half =
                     |frame: &CanFrame| CanFrame::new(frame.id, frame.bytes().split_at(frame.bytes().len() / 2).0);
@@ -224,10 +224,10 @@ impl<C: CanController> Arm<C> {
             Delivery::Stall(time) => self.stalled = now.after(time),
             Delivery::PowerLoss(time) => {
                 self.deaf = now.after(time.max(controller.start_time()));
-                self.seat.lose_power(self.deaf);
+                self.connection.lose_power(self.deaf);
             }
             Delivery::Disconnect(time) => self.disconnect(now, time),
-            Delivery::BusOff => self.seat.bus_off(),
+            Delivery::BusOff => self.connection.bus_off(),
             _ => {}
         }
         drop(controller);
@@ -236,25 +236,25 @@ impl<C: CanController> Arm<C> {
         }
     }
 
-    /// The interface goes down; where it cannot, the arm neither hears nor sends.
+    /// Takes the interface down; if that is not possible, the arm neither receives nor sends.
     fn disconnect(&mut self, now: Mono, time: Duration) {
-        if !self.seat.go_down(now, time) {
-            self.deaf = now.after(time.max(CUT));
+        if !self.connection.go_down(now, time) {
+            self.deaf = now.after(time.max(MIN_CUT));
         }
     }
 
-    /// Does what has arrived.
+    /// Processes arrived frames.
     fn listen(&mut self, now: Mono) {
         self.frames.clear();
-        self.seat.open(now);
-        while let Some(event) = self.seat.receive(now) {
+        self.connection.open(now);
+        while let Some(event) = self.connection.receive(now) {
             if let CanEvent::Frame(frame) = event
                 && now >= self.deaf
             {
                 if !std::mem::replace(&mut self.heard, true) {
-                    diary::note(Happening::Came);
+                    events::note(SimEvent::Connected);
                 }
-                self.shared.controller().hear(&frame, now, &mut self.frames);
+                self.shared.controller().on_frame(&frame, now, &mut self.frames);
             }
         }
         self.send();
@@ -265,7 +265,7 @@ impl<C: CanController> Arm<C> {
         if self.silent {
             self.frames.clear();
         }
-        let sent = self.seat.send(&self.frames);
+        let sent = self.connection.send(&self.frames);
         self.shared.sent.fetch_add(sent as u64, Relaxed);
         self.shared.not_taken.fetch_add((self.frames.len() - sent) as u64, Relaxed);
         self.frames.clear();

@@ -1,31 +1,31 @@
-//! What becomes of an answer or report on its way: the faults of the wire.
+//! Delivery of responses and reports: faults of the wire.
 
 use std::time::Duration;
 
-/// How an answer or report is delivered.
+/// How a response or report is delivered.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Delivery {
-    /// It is sent.
+    /// Sent normally.
     Send,
-    /// It is sent this much later, and with it all that was requested later over the same connection.
+    /// Sent after this delay, together with later responses on the same connection.
     Late(Duration),
-    /// It is sent, and the connection ends.
+    /// Sent, then the connection is closed.
     HangUp,
-    /// It is sent this much later; no client is served until then.
+    /// Sent after this delay; no client is served meanwhile.
     Stall(Duration),
-    /// It is lost.
+    /// Lost.
     Silent,
-    /// The report before it is sent again; an answer is sent.
+    /// The previous report is sent again; a response is sent normally.
     Frozen,
-    /// Noise goes before it.
+    /// Sent after noise.
     Garbage,
-    /// One of its bytes is wrong.
+    /// Sent with one wrong byte.
     Corrupt,
-    /// Only its first half is sent.
+    /// Only the first half is sent.
     Truncated,
-    /// All connections end; a CAN interface in memory is down for this long.
+    /// All connections are closed; a CAN interface in memory is down for this time.
     Disconnect(Duration),
-    /// All connections end, and there is no power for this long.
+    /// All connections are closed, and there is no power for this time.
     PowerLoss(Duration),
     /// The computer's CAN controller leaves the bus.
     BusOff,
@@ -34,8 +34,8 @@ pub enum Delivery {
 }
 
 impl Delivery {
-    /// Does to an answer what a fault of the wire does to its bytes: `noise` goes before it, the byte at `spot` is
-    /// wrong, or its second half is missing.
+    /// Damages a response as this fault does: puts `noise` before it, changes the byte at `spot`, or drops its second
+    /// half.
     pub fn damage(self, answer: &mut Vec<u8>, noise: &[u8], spot: usize) {
         match self {
             Self::Garbage => drop(answer.splice(0..0, noise.iter().copied())),

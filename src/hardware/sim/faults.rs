@@ -6,10 +6,10 @@ use std::time::Duration;
 use schemars::{JsonSchema, SchemaGenerator};
 use serde::{Deserialize, Deserializer, Serialize};
 
-use super::diary::{self, Happening};
-use crate::hardware::fit::Misfit;
+use super::events::{self, SimEvent};
+use crate::hardware::check::ConfigError;
 
-/// What goes wrong. Not every simulated arm can play every kind; each names those it can.
+/// Kinds of faults. Each simulated arm can play some of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum FaultKind {
@@ -17,7 +17,7 @@ pub enum FaultKind {
     ReadError,
     /// Writes fail.
     WriteError,
-    /// The arm does not answer until `duration` is over (1 s when none is given), then answers as if nothing was.
+    /// The arm does not answer until `duration` is over (default 1 s), then continues normally.
     Stall,
     /// Requests are never answered.
     Silent,
@@ -25,9 +25,10 @@ pub enum FaultKind {
     Disconnect,
     /// The arm goes into error `code`: it stops and refuses motion until the error is cleared.
     ErrorCode,
-    /// The E-stop line opens: the arm stops and its motors lose power. It closes after `duration`; never without one.
+    /// The E-stop line opens: the arm stops and its motors lose power. It closes after `duration`; without a duration
+    /// it stays open.
     Estop,
-    /// The arm loses power: its connection breaks, its motors are off, it is unreachable for `duration`.
+    /// The arm loses power: the connection breaks, the motors are off, and the arm is unreachable for `duration`.
     PowerLoss,
     /// The adapter panics.
     Panic,
@@ -35,17 +36,17 @@ pub enum FaultKind {
     Nan,
     /// Joint positions and velocities are reported as zero.
     ZeroState,
-    /// Noise stands before an answer.
+    /// Noise precedes an answer.
     Garbage,
     /// One byte of an answer is wrong.
     Corrupt,
     /// Only the first half of an answer arrives.
     Truncated,
-    /// The arm says that it has one joint more than it has.
+    /// The arm reports one joint more than it has.
     WrongDof,
-    /// The arm says that it is another model.
+    /// The arm reports another model.
     WrongModel,
-    /// Measurements stand still for `duration`, time stamps and all, while the arm goes on.
+    /// Measurements are frozen for `duration`, time stamps included, while the arm continues to move.
     Frozen,
     /// The arm sinks by `amount` [rad] at its second joint when its motors are enabled.
     Sag,
@@ -53,14 +54,14 @@ pub enum FaultKind {
     Blocked,
     /// The computer's CAN controller leaves the bus after too many errors.
     BusOff,
-    /// The CAN interface has no room for what is sent.
+    /// The CAN interface has no room for frames to send.
     NoBuffers,
-    /// The arm leads others: it sends commands instead of its state.
+    /// The arm is a leader: it sends commands instead of its state.
     Leader,
 }
 
 impl FaultKind {
-    /// All kinds, each with what goes wrong, in the order of the reference.
+    /// Returns all kinds, each with its description, in the order of the reference.
     pub fn all() -> Vec<(Self, String)> {
         let schema = Self::json_schema(&mut SchemaGenerator::default());
         let kinds = schema.get("oneOf").and_then(|kinds| kinds.as_array());
@@ -71,7 +72,7 @@ impl FaultKind {
         kinds.map(|kinds| kinds.iter().filter_map(kind).collect()).unwrap_or_default()
     }
 
-    /// The name in a script.
+    /// Returns the name in a script.
     pub fn name(self) -> String {
         serde_json::to_value(self).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
     }
@@ -79,8 +80,8 @@ impl FaultKind {
 
 /// One fault of a script.
 ///
-/// It begins `at` seconds after the first connection. From then on it is active for `duration` seconds, and strikes
-/// at most `count` times. Without either it strikes once.
+/// It begins `at` seconds after the first connection, is active for `duration` seconds, and is played at most `count`
+/// times. Without either it is played once.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Fault {
@@ -90,11 +91,11 @@ pub struct Fault {
     pub at: f64,
     /// What goes wrong.
     pub kind: FaultKind,
-    /// How long it stays active [s]; 0 = until it has struck `count` times.
+    /// How long it stays active [s]; 0 = until it has been played `count` times.
     #[serde(default, deserialize_with = "seconds")]
     #[schemars(range(min = 0))]
     pub duration: f64,
-    /// How often it strikes; 0 = without limit during `duration`.
+    /// How often it is played; 0 = without limit during `duration`.
     #[serde(default)]
     pub count: u32,
     /// The arm's error code, for `error_code`.
@@ -104,7 +105,7 @@ pub struct Fault {
     /// How far the arm sinks, for `sag` [rad].
     #[serde(default = "default_amount", deserialize_with = "seconds")]
     pub amount: f64,
-    /// Which joint, counted from 1, for `blocked`.
+    /// Number of the joint, from 1, for `blocked`.
     #[serde(default = "default_joint")]
     #[schemars(range(min = 1))]
     pub joint: usize,
@@ -122,12 +123,12 @@ fn default_joint() -> usize {
     1
 }
 
-/// How long a stall lasts that states no duration.
+/// Duration of a stall that states none.
 pub const DEFAULT_STALL: Duration = Duration::from_secs(1);
-/// Longest time in a script [s]: eleven days.
+/// Latest time in a script [s]: eleven days.
 const LONGEST: f64 = 1e6;
 
-/// A number that is neither negative nor absurd.
+/// Reads a number that is neither negative nor too large.
 fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     let value = f64::deserialize(deserializer)?;
     if (0.0..=LONGEST).contains(&value) {
@@ -138,7 +139,7 @@ fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> 
 }
 
 impl Fault {
-    /// A fault that strikes once, at once.
+    /// Creates a fault that is played once, at once.
     pub fn new(kind: FaultKind) -> Self {
         Self {
             at: 0.0,
@@ -151,31 +152,31 @@ impl Fault {
         }
     }
 
-    /// The same, beginning `at` seconds after the first connection (injected: from now).
+    /// Sets its begin: `at` seconds after the first connection or, if injected, after the injection.
     pub fn at(mut self, at: f64) -> Self {
         self.at = at;
         self
     }
 
-    /// The same, active for `duration` seconds.
+    /// Sets its duration [s].
     pub fn lasting(mut self, duration: f64) -> Self {
         self.duration = duration;
         self
     }
 
-    /// The same, striking `count` times.
+    /// Sets how often it is played.
     pub fn times(mut self, count: u32) -> Self {
         self.count = count;
         self
     }
 
-    /// The same, with the arm's error code.
+    /// Sets the arm's error code.
     pub fn code(mut self, code: u16) -> Self {
         self.code = code;
         self
     }
 
-    /// How long from `now` [s since the first connection] the fault still lasts, where it has a duration.
+    /// Returns how long from `now` [s since the first connection] the fault still lasts, if it has a duration.
     pub fn left(&self, now: f64) -> Option<Duration> {
         let left = (self.at + self.duration - now).clamp(0.0, LONGEST);
         (self.duration > 0.0).then(|| Duration::from_secs_f64(left))
@@ -186,7 +187,7 @@ impl Fault {
     }
 }
 
-/// A script and how much of it has been played.
+/// A fault script, and how much of it has been played.
 #[derive(Debug, Clone, Default)]
 pub struct FaultScript {
     entries: Vec<Entry>,
@@ -195,20 +196,20 @@ pub struct FaultScript {
 #[derive(Debug, Clone)]
 struct Entry {
     fault: Fault,
-    struck: u32,
-    /// Whether the diary has it.
+    played: u32,
+    /// Whether its event was recorded.
     noted: Cell<bool>,
 }
 
 impl Entry {
     fn new(fault: Fault) -> Self {
-        Self { fault, struck: 0, noted: Cell::new(false) }
+        Self { fault, played: 0, noted: Cell::new(false) }
     }
 
     fn over(&self, now: f64) -> bool {
         let fault = &self.fault;
         let limit = if fault.count == 0 && fault.duration == 0.0 { 1 } else { fault.count };
-        (limit > 0 && self.struck >= limit) || fault.over(now)
+        (limit > 0 && self.played >= limit) || fault.over(now)
     }
 
     fn is(&self, kind: FaultKind, now: f64) -> bool {
@@ -217,13 +218,13 @@ impl Entry {
 
     fn note(&self) {
         if !self.noted.replace(true) {
-            diary::note(Happening::Struck(self.fault.kind));
+            events::note(SimEvent::Fault(self.fault.kind));
         }
     }
 }
 
 impl FaultScript {
-    /// A script that has not begun.
+    /// Creates a script.
     pub fn new(faults: &[Fault]) -> Self {
         Self { entries: faults.iter().copied().map(Entry::new).collect() }
     }
@@ -235,20 +236,20 @@ impl FaultScript {
         self.entries.push(Entry::new(fault));
     }
 
-    /// The fault of this kind that strikes at `now` [s since the first connection], counted as one strike.
+    /// Returns the fault of this kind that is due at `now` [s since the first connection], and counts it as played.
     pub fn take(&mut self, kind: FaultKind, now: f64) -> Option<Fault> {
         self.take_if(kind, now, |_| true)
     }
 
-    /// The same, for a fault that `wanted` accepts; others stay.
+    /// As above, for a fault that `wanted` accepts; others remain.
     pub fn take_if(&mut self, kind: FaultKind, now: f64, wanted: impl Fn(&Fault) -> bool) -> Option<Fault> {
         let entry = self.entries.iter_mut().find(|entry| entry.is(kind, now) && wanted(&entry.fault))?;
-        entry.struck += 1;
+        entry.played += 1;
         entry.note();
         Some(entry.fault)
     }
 
-    /// Whether a fault of this kind with a duration is active at `now`. No strike is counted.
+    /// Returns whether a fault of this kind with a duration is active at `now`. Does not count it as played.
     pub fn lasts(&self, kind: FaultKind, now: f64) -> bool {
         let active = self.entries.iter().find(|entry| entry.fault.duration > 0.0 && entry.is(kind, now));
         active.is_some_and(|entry| {
@@ -258,18 +259,18 @@ impl FaultScript {
     }
 }
 
-/// Refuses a script with kinds that the simulated arm `name` cannot play. The option is that of `faults`.
-pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), Misfit> {
+/// Refuses a script with kinds that the simulated arm `name` cannot play. The error names the entry of `faults`.
+pub fn check_script(name: &str, faults: &[Fault], playable: &[FaultKind]) -> Result<(), ConfigError> {
     let unknown = faults.iter().enumerate().find(|(_, fault)| !playable.contains(&fault.kind));
     let Some((index, fault)) = unknown else { return Ok(()) };
     let known: Vec<String> = playable.iter().map(|kind| format!("{:?}", kind.name())).collect();
     let what = format!("{name} cannot play the fault {:?}; it can play {}", fault.kind.name(), known.join(", "));
-    Err(Misfit::new(format!("faults.{index}.kind"), what))
+    Err(ConfigError::new(format!("faults.{index}.kind"), what))
 }
 
 /// Refuses a fault that the simulated arm `name` cannot play.
 pub fn check_kind(name: &str, fault: &Fault, playable: &[FaultKind]) -> Result<(), String> {
-    check_script(name, std::slice::from_ref(fault), playable).map_err(|misfit| misfit.what)
+    check_script(name, std::slice::from_ref(fault), playable).map_err(|error| error.what)
 }
 
 #[cfg(test)]
@@ -277,7 +278,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fault_without_count_or_duration_strikes_once() {
+    fn a_fault_without_count_or_duration_is_played_once() {
         let mut script = FaultScript::new(&[Fault::new(FaultKind::ReadError).at(1.0)]);
         assert_eq!(script.take(FaultKind::ReadError, 0.9), None);
         assert_eq!(script.take(FaultKind::WriteError, 1.0), None);
@@ -292,7 +293,7 @@ mod tests {
         assert!(script.take(FaultKind::Nan, 1.0).is_some());
         assert!(!script.lasts(FaultKind::Nan, 0.9) && script.lasts(FaultKind::Nan, 1.0));
         assert!(script.take(FaultKind::Nan, 2.0).is_some());
-        assert!(script.take(FaultKind::Nan, 2.5).is_none(), "struck twice already");
+        assert!(script.take(FaultKind::Nan, 2.5).is_none(), "played twice already");
         assert!((0..100).all(|_| script.take(FaultKind::Silent, 0.4).is_some()), "no count: any number of times");
         assert!(script.take(FaultKind::Silent, 0.5).is_none(), "its duration is over");
     }

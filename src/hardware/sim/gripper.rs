@@ -1,4 +1,4 @@
-//! The gripper of a simulated arm.
+//! Gripper of a simulated arm.
 
 /// A gripper with finite speed.
 #[derive(Debug, Clone, Copy)]
@@ -11,7 +11,7 @@ pub struct Gripper {
 }
 
 impl Gripper {
-    /// A gripper that opens to `max` [m] at `speed` [m/s]; half open.
+    /// Creates a gripper that opens to `max` [m] at `speed` [m/s]; initially half open.
     pub fn new(max: f64, speed: f64) -> Self {
         Self { position: max / 2.0, target: max / 2.0, max, speed }
     }
@@ -23,17 +23,17 @@ impl Gripper {
         }
     }
 
-    /// Stays where it is.
+    /// Stops where it is.
     pub fn stop(&mut self) {
         self.target = self.position;
     }
 
-    /// Whether it is on its way.
+    /// Returns whether it is moving.
     pub fn moving(&self) -> bool {
         self.position != self.target
     }
 
-    /// Lets `dt` [s] pass.
+    /// Advances by `dt` [s].
     pub fn advance(&mut self, dt: f64) {
         let reach = self.speed * dt.max(0.0);
         let error = self.target - self.position;

@@ -1,10 +1,10 @@
-//! What a blueprint may set of every emulated arm: the `sim` part of its options.
+//! Options of every emulated arm: the `sim` part of its options.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::faults::{Fault, FaultKind, check_script};
-use crate::hardware::fit::Misfit;
+use crate::hardware::check::ConfigError;
 use crate::joint::JointLimits;
 
 /// Default of [`SimOptions::lag`] [s].
@@ -14,19 +14,19 @@ const MAX_LAG: f64 = 0.5;
 /// Largest droop that an emulator can have [rad].
 const MAX_DROOP: f64 = 0.1;
 
-/// What an emulator does: the `sim` part of an arm's options. An arm with options of its own there has these too.
+/// Settings of an emulator: the `sim` part of an arm's options. Arms with more settings there have these too.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint; a pose of the arm's own when empty.
+    /// Joint positions at power-up [rad], one per joint; empty for the arm's default pose.
     pub initial_positions: Vec<f64>,
-    /// How far joints are behind their servo setpoints, 0 to 0.5 [s].
+    /// Lag of the joints behind their servo setpoints, 0 to 0.5 [s].
     #[schemars(range(min = 0, max = 0.5))]
     pub lag: f64,
-    /// How far below their targets joints rest under load, 0 to 0.1 [rad].
+    /// Droop of the joints below their targets at rest under load, 0 to 0.1 [rad].
     #[schemars(range(min = 0, max = 0.1))]
     pub droop: f64,
-    /// What goes wrong, and when (seconds after the first connection).
+    /// Faults, and when they begin (seconds after the first connection).
     pub faults: Vec<Fault>,
 }
 
@@ -37,7 +37,7 @@ impl Default for SimOptions {
 }
 
 impl SimOptions {
-    /// The same, with this pose [rad] at power-up where the options give none.
+    /// Uses this pose [rad] at power-up if the options give none.
     pub fn starting_at(mut self, pose: &[f64]) -> Self {
         if self.initial_positions.is_empty() {
             self.initial_positions = pose.to_vec();
@@ -45,38 +45,38 @@ impl SimOptions {
         self
     }
 
-    /// Refuses a pose outside `limits`, figures that no emulator has, and faults that are not among `playable`. `name`
-    /// is the arm's.
-    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), Misfit> {
+    /// Refuses a pose outside `limits`, values out of range, and faults that are not in `playable`. `name` is the name
+    /// of the adapter.
+    pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), ConfigError> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))
             .and_then(|()| within("lag", self.lag, MAX_LAG, "s"))
             .and_then(|()| within("droop", self.droop, MAX_DROOP, "rad"))
-            .map_err(|misfit| misfit.within("sim"))
+            .map_err(|error| error.within("sim"))
     }
 }
 
 /// Refuses `initial_positions` [rad] that are neither empty nor a pose within `limits`.
-pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), Misfit> {
+pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), ConfigError> {
     let (dof, given) = (limits.position_lower.len(), positions.len());
-    let needed = format!("initial_positions must be {dof} angles [rad] within the joint limits");
+    let needed = format!("initial_positions must be {dof} positions [rad] within the joint limits");
     if given != 0 && given != dof {
-        return Err(Misfit::new("initial_positions", format!("{needed}, not {given}")));
+        return Err(ConfigError::new("initial_positions", format!("{needed}, not {given}")));
     }
     let mut range = limits.position_lower.iter().zip(&limits.position_upper).zip(positions).enumerate();
     match range.find(|(_, ((lower, upper), value))| !(**lower..=**upper).contains(value)) {
         None => Ok(()),
         Some((joint, ((lower, upper), value))) => {
             let what = format!("{needed}: joint {} goes from {lower:.4} to {upper:.4}, not to {value}", joint + 1);
-            Err(Misfit::new(format!("initial_positions.{joint}"), what))
+            Err(ConfigError::new(format!("initial_positions.{joint}"), what))
         }
     }
 }
 
-fn within(name: &str, value: f64, most: f64, unit: &str) -> Result<(), Misfit> {
+fn within(name: &str, value: f64, most: f64, unit: &str) -> Result<(), ConfigError> {
     if (0.0..=most).contains(&value) {
         Ok(())
     } else {
-        Err(Misfit::new(name, format!("{name} must be 0 to {most} {unit}, not {value} {unit}")))
+        Err(ConfigError::new(name, format!("{name} must be 0 to {most} {unit}, not {value} {unit}")))
     }
 }

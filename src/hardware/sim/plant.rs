@@ -1,7 +1,7 @@
-//! The joints of a simulated arm: position, velocity, limits, and how they follow what they are told.
+//! The joints of a simulated arm: position, velocity, limits, and how they follow commands.
 //!
-//! Time is passed in ([`Plant::advance`]) and integrated in steps of one length, so the same inputs give the same
-//! motion however often somebody looks. Nothing here allocates after construction.
+//! Time is passed in ([`Plant::advance`]) and integrated in fixed steps, so the same inputs give the same motion
+//! regardless of how often the state is read. Nothing allocates after construction.
 
 use crate::hardware::sim::delay::DelayLine;
 use crate::hardware::sim::plant_joint::{CREDIT, Joint, braking_speed};
@@ -13,15 +13,15 @@ const STEP: f64 = 0.0005;
 const SAG_SPEED: f64 = 0.25;
 /// Viscous friction [Nm·s/rad].
 const FRICTION: f64 = 0.5;
-/// How much more than the acceleration limit the drives can do when they follow setpoints: one that could do no more
-/// than it is asked would never make up for starting late.
+/// Acceleration of the drives when they follow setpoints, as a factor of the acceleration limit: with exactly the limit
+/// they would never catch up after a late start.
 const HEADROOM: f64 = 2.0;
-/// The part of a lag that is first-order at most [s]; the rest is dead time.
+/// Largest first-order part of a lag [s]; the rest is dead time.
 const FIRST_ORDER: f64 = 0.02;
 /// How joints follow servo setpoints and velocities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Tracking {
-    /// At once, as far as the velocity limit allows.
+    /// Immediately, within the velocity limit.
     Ideal,
     /// First-order with this time constant [s]; setpoints within the acceleration limit, with some headroom.
     Lag(f64),
@@ -32,9 +32,9 @@ pub enum Tracking {
 pub enum Drive {
     /// Motors off: brakes hold, or the arm falls.
     Disabled,
-    /// Motors on: decelerates to standstill and holds.
+    /// Motors on: decelerates to rest and holds.
     Stop,
-    /// On its own trapezoid to the target.
+    /// On a trapezoid to the target.
     Position,
     /// Follows setpoints.
     Servo,
@@ -49,9 +49,9 @@ pub struct Plant {
     dof: usize,
     drive: Drive,
     tracking: Tracking,
-    /// Servo setpoints that have not taken effect.
+    /// Setpoints in dead time.
     delayed: DelayLine,
-    /// How far below its target a joint rests, under load [rad].
+    /// How far below its target a joint rests under load [rad].
     droop: f64,
     /// Fraction of the top speed in drive `Position` (0–1].
     speed: f64,
@@ -59,15 +59,15 @@ pub struct Plant {
     fall: f64,
     /// How far the second joint still has to sink [rad].
     sag: f64,
-    /// Time since the last servo setpoint, and between the two before [s].
+    /// Time since the last servo setpoint, and between the two before it [s].
     since_set_point: f64,
     interval: f64,
-    /// How far the joints have been integrated beyond the present [s]: less than a step.
+    /// How far the integration is ahead of the present [s]: less than a step.
     ahead: f64,
 }
 
 impl Plant {
-    /// Joints within `limits` (defaults where they state no acceleration), at rest at `initial` [rad], disabled.
+    /// Creates joints within `limits` (with defaults for missing accelerations), at rest at `initial` [rad], disabled.
     /// `fall` [rad/s] is the speed at which they sink when disabled, 0 for an arm with brakes.
     pub fn new(limits: &JointLimits, initial: &[f64], tracking: Tracking, fall: f64) -> Self {
         let limits = limits.clone().with_defaults();
@@ -98,25 +98,25 @@ impl Plant {
         }
     }
 
-    /// Joints as those of [`Plant::new`] with brakes, which move `lag` [s] after their servo setpoints: 20 ms of it
-    /// first-order, the rest dead time. First-order alone would be less than its time constant behind where the set
-    /// points accelerate, and would not reach the ends of short motions.
+    /// Creates joints with brakes that lag `lag` [s] behind their servo setpoints: 20 ms of it first-order, the rest
+    /// dead time. A first-order lag alone would be shorter than its time constant while setpoints accelerate, and would
+    /// not reach the ends of short motions.
     pub fn lagging(limits: &JointLimits, initial: &[f64], lag: f64) -> Self {
         let first_order = lag.min(FIRST_ORDER);
         let plant = Self::new(limits, initial, Tracking::Lag(first_order), 0.0);
-        // A setpoint is followed from the end of the present step on: half a step later, on average.
+        // A setpoint takes effect at the end of the present step: half a step later on average.
         Self { delayed: DelayLine::new(lag - first_order - 0.5 * STEP), ..plant }
     }
 
-    /// The same joints with position controllers that have no integral part: under load each rests `droop` [rad] below
-    /// its target. An arm that is commanded to where it is measured, again and again, sinks.
+    /// Gives the joints position controllers without an integral part: under load each rests `droop` [rad] below its
+    /// target. An arm that is repeatedly commanded to its measured position sinks.
     pub fn drooping(self, droop: f64) -> Self {
         Self { droop, ..self }
     }
 
     /// Joint positions [rad].
     pub fn positions(&self) -> Joints {
-        // Back from the end of the last step to the present; but an ideal servo is where it was sent.
+        // Interpolates back from the end of the last step to the present; an ideal servo is at its setpoint.
         let exact = self.drive == Drive::Servo && self.tracking == Tracking::Ideal;
         let back = if exact { 0.0 } else { self.ahead };
         self.joints.map(|joint| joint.position - joint.velocity * back)
@@ -132,22 +132,22 @@ impl Plant {
         self.joints.map(|joint| joint.velocity * FRICTION)
     }
 
-    /// What drives the joints now.
+    /// Returns what drives the joints.
     pub fn drive(&self) -> Drive {
         self.drive
     }
 
-    /// Whether all motors are on.
+    /// Returns whether all motors are on.
     pub fn enabled(&self) -> bool {
         self.active().iter().all(|joint| joint.on)
     }
 
-    /// Whether the motor of a joint (index from 0) is on.
+    /// Returns whether the motor of a joint (index from 0) is on.
     pub fn motor(&self, joint: usize) -> bool {
         self.active().get(joint).is_some_and(|joint| joint.on)
     }
 
-    /// Whether any joint is faster than 1 mrad/s, or has still to move to a target of its own.
+    /// Returns whether any joint is faster than 1 mrad/s, or has not reached its target.
     pub fn moving(&self) -> bool {
         self.active().iter().any(|joint| {
             joint.velocity.abs() > 1e-3
@@ -155,7 +155,7 @@ impl Plant {
         })
     }
 
-    /// Switches all motors on, holding where the arm is, or off.
+    /// Switches all motors on, holding the current position, or off.
     pub fn enable(&mut self, on: bool) {
         (0..self.dof).for_each(|joint| self.enable_joint(joint, on));
     }
@@ -170,7 +170,7 @@ impl Plant {
         self.drive = if self.active().iter().any(|joint| joint.on) { Drive::Stop } else { Drive::Disabled };
     }
 
-    /// Decelerates to standstill and holds. Nothing when disabled.
+    /// Decelerates to rest and holds; no effect while disabled.
     pub fn stop(&mut self) {
         self.delayed.clear();
         if self.drive != Drive::Disabled {
@@ -224,7 +224,7 @@ impl Plant {
         self.drive_to(Drive::Velocity, target);
     }
 
-    /// From now on the joints fall at `speed` [rad/s] when disabled, each to its place in `rest` [rad]; one without
+    /// Lets the joints fall at `speed` [rad/s] when disabled, each to its position in `rest` [rad]; a joint without one
     /// stays where it is.
     pub fn falls(&mut self, speed: f64, rest: &[Option<f64>]) {
         self.fall = speed;
@@ -238,14 +238,14 @@ impl Plant {
         self.sag = amount.max(0.0);
     }
 
-    /// Blocks a joint (index from 0) where it is, or frees it.
+    /// Blocks a joint (index from 0), or frees it.
     pub fn block(&mut self, joint: usize, blocked: bool) {
         if let Some(joint) = self.active_mut().get_mut(joint) {
             joint.blocked = blocked;
         }
     }
 
-    /// Lets `dt` [s] pass.
+    /// Advances by `dt` [s].
     pub fn advance(&mut self, dt: f64) {
         let mut left = if dt.is_finite() { dt.max(0.0) } else { 0.0 };
         while let Some((wait, target)) = self.delayed.pass(left) {
@@ -258,7 +258,7 @@ impl Plant {
 
     fn integrate(&mut self, dt: f64) {
         self.ahead -= dt;
-        // The margin keeps a sum of rounded times from being a step too many.
+        // The margin prevents a sum of rounded times from causing one step too many.
         while self.ahead < -1e-6 * STEP {
             if self.at_rest() {
                 let passed = -self.ahead;
@@ -280,7 +280,8 @@ impl Plant {
         self.joints.get_mut(..self.dof).unwrap_or_default()
     }
 
-    /// Takes over new targets; a joint whose value is missing or not finite stays where it is. `false` when disabled.
+    /// Sets new targets; a joint whose value is missing or not finite keeps its position. Returns `false` while
+    /// disabled.
     fn drive_to(&mut self, drive: Drive, target: &[f64]) -> bool {
         if self.drive == Drive::Disabled {
             return false;

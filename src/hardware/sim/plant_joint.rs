@@ -1,35 +1,35 @@
 //! One joint of a [`super::plant::Plant`].
 
-/// The most waiting time that an ideal joint may make up for in one jump [s].
+/// Maximum idle time that an ideal joint may make up for in one jump [s].
 pub(super) const CREDIT: f64 = 0.1;
-/// Part of its acceleration that a joint plans to brake with: the rest is for landing in a whole number of steps.
+/// Part of the acceleration that a joint plans to brake with; the rest is needed to stop after a whole number of steps.
 const BRAKING: f64 = 0.85;
-/// Below these a joint that follows a target has arrived [rad, rad/s].
+/// Thresholds below which a joint has reached its target [rad, rad/s].
 const ARRIVED: (f64, f64) = (1e-7, 1e-4);
 
-/// Its state and its limits.
+/// State and limits of a joint.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Joint {
     pub position: f64,
     pub velocity: f64,
-    /// Its motor is on.
+    /// Whether its motor is on.
     pub on: bool,
     /// Target position [rad] or velocity [rad/s].
     pub target: f64,
-    /// How fast the setpoints move, by the last two of them [rad/s].
+    /// Speed of the setpoints, from the last two [rad/s].
     pub pace: f64,
     pub lower: f64,
     pub upper: f64,
     pub velocity_max: f64,
     pub acceleration: f64,
-    /// Time in which an ideal joint has not moved although it might have [s].
+    /// Time in which an ideal joint has not moved although it could have [s].
     pub credit: f64,
     pub blocked: bool,
-    /// Where it comes to rest when it falls [rad]; `None`: friction holds it.
+    /// Where it stops when it falls [rad]; `None`: friction holds it.
     pub rest: Option<f64>,
 }
 
-/// The speed from which a joint can still stop within `distance` [rad], braking at `acceleration` [rad/s²] in
+/// Returns the speed from which a joint can still stop within `distance` [rad], braking at `acceleration` [rad/s²] in
 /// steps of `h` [s].
 pub(super) fn braking_speed(distance: f64, acceleration: f64, h: f64) -> f64 {
     let acceleration = acceleration * BRAKING;
@@ -53,8 +53,8 @@ impl Joint {
         self.travel(h);
     }
 
-    /// Towards the target, no faster than `top`, with first-order lag (0 = none), able to stop in time: not before a
-    /// target that moves on at `pace` [rad/s], only relative to it.
+    /// Moves towards the target, at most at speed `top`, with first-order lag (0 = none), able to stop in time. For a
+    /// target that moves at `pace` [rad/s], it stops relative to the target.
     pub fn approach(&mut self, top: f64, lag: f64, pace: f64, acceleration: f64, h: f64) {
         let error = self.target - self.position;
         let arrived = error.abs() < ARRIVED.0 && self.velocity.abs() < ARRIVED.1.max(acceleration * h);
@@ -67,7 +67,7 @@ impl Joint {
         self.accelerate(wanted.min(brake).min(top).copysign(error), acceleration, h);
     }
 
-    /// An ideal joint between setpoints: makes the rest of its way at top speed, then stands.
+    /// Moves an ideal joint between setpoints: at top speed to the setpoint, then at rest.
     pub fn follow(&mut self, pause: bool, h: f64) {
         let error = self.target - self.position;
         if error != 0.0 {

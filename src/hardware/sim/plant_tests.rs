@@ -50,8 +50,8 @@ fn a_lagging_servo_follows_a_ramp_one_time_constant_behind() {
 }
 
 #[test]
-fn a_lagging_servo_keeps_up_at_speed_and_stops_with_its_set_points() {
-    // 10 times the speed at which braking for each setpoint would still keep up.
+fn a_lagging_servo_keeps_up_at_speed_and_stops_with_its_setpoints() {
+    // 10 times the speed up to which braking for each setpoint would still keep up.
     let limits = JointLimits { acceleration_max: vec![10.0; 2], ..JointLimits::uniform(2, 9.0, 3.0) };
     let mut plant = Plant::new(&limits, &[0.0, 0.0], Tracking::Lag(0.02), 0.0);
     plant.enable(true);
@@ -80,9 +80,9 @@ fn an_ideal_servo_is_there_at_once_within_its_speed() {
     plant.servo(&[0.605, -0.5]);
     assert!((plant.positions()[0] - 0.515).abs() < 1e-9, "10 ms at 1 rad/s, not further");
     plant.advance(0.05);
-    assert!((plant.positions()[0] - 0.565).abs() < 1e-9, "goes on at top speed");
+    assert!((plant.positions()[0] - 0.565).abs() < 1e-9, "continues at top speed");
     plant.servo(&[0.605, -0.5]);
-    assert!((plant.positions()[0] - 0.565).abs() < 1e-9, "time on the way counts only once");
+    assert!((plant.positions()[0] - 0.565).abs() < 1e-9, "travel time counts only once");
     plant.advance(1.0);
     assert_eq!((plant.positions()[0], plant.velocities()[0]), (0.605, 0.0));
 }
@@ -167,7 +167,7 @@ fn a_planned_move_never_passes_its_target() {
 }
 
 #[test]
-fn a_dead_time_delays_set_points_and_a_stop_discards_those_on_their_way() {
+fn a_dead_time_delays_setpoints_and_a_stop_discards_them() {
     let limits = JointLimits { acceleration_max: vec![10.0; 2], ..JointLimits::uniform(2, 2.0, 1.0) };
     let mut plant = Plant::lagging(&limits, &[0.5, -0.5], 0.1);
     plant.servo(&[0.6, -0.5]);

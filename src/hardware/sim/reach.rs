@@ -1,40 +1,40 @@
-//! Poses of an emulated arm's end: x, y, z and roll, pitch, yaw, and the joint positions that bring it to one.
+//! Poses of an emulated arm's end effector (x, y, z, roll, pitch, yaw), and inverse kinematics.
 
 use nalgebra::{Isometry3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3, Vector6};
 
-/// Most steps of the inverse.
+/// Maximum number of iterations.
 const STEPS: usize = 200;
-/// Error at which it has arrived [m and rad].
+/// Error at which the goal is reached [m and rad].
 const TOLERANCE: f64 = 1e-6;
-/// Damping of the least squares.
+/// Damping of the least-squares step.
 const DAMPING: f64 = 1e-4;
-/// Longest step of a joint [rad].
-const LONGEST_STEP: f64 = 0.3;
+/// Maximum step of a joint [rad].
+const MAX_STEP: f64 = 0.3;
 
-/// A chain of turning joints, from the base to the end.
+/// A chain of revolute joints, from the base to the end effector.
 pub trait Chain {
-    /// The way from the frame before a joint (index from 0) to the one that it turns [m], at a position [rad]; `None`
-    /// behind the last joint.
+    /// Returns the transform from the frame before a joint (index from 0) to the joint's own frame [m], at a position
+    /// [rad]; `None` after the last joint.
     fn link(&self, joint: usize, position: f64) -> Option<Isometry3<f64>>;
 
-    /// The axis of a joint in the frame that it turns: z, unless the arm says otherwise.
+    /// Returns the axis of a joint in its own frame; by default z.
     fn axis(&self, _joint: usize) -> Vector3<f64> {
         Vector3::z()
     }
 
-    /// The end in the last joint's frame [m]: that frame, unless the arm says otherwise.
+    /// Returns the end effector in the last joint's frame [m]; by default that frame.
     fn end(&self) -> Isometry3<f64> {
         Isometry3::identity()
     }
 
-    /// The end's pose in the base frame [m] for joint positions [rad].
+    /// Returns the end-effector pose in the base frame [m] for joint positions [rad].
     fn forward(&self, joints: &[f64]) -> Isometry3<f64> {
         let links = joints.iter().enumerate().map_while(|(joint, position)| self.link(joint, *position));
         links.fold(Isometry3::identity(), |pose, link| pose * link) * self.end()
     }
 
-    /// Joint positions [rad] near `start` that bring the end to `goal`, by damped least squares; `None` when that does
-    /// not lead there. Knows no joint limits.
+    /// Returns joint positions [rad] near `start` that bring the end effector to `goal`, by damped least squares;
+    /// `None` if that does not converge. Ignores joint limits.
     fn inverse<const N: usize>(&self, goal: &Isometry3<f64>, start: &[f64; N]) -> Option<[f64; N]> {
         let mut joints = *start;
         for _ in 0..STEPS {
@@ -48,13 +48,13 @@ pub trait Chain {
             let jacobian = self.jacobian(&joints, &end.translation.vector);
             let square = jacobian * jacobian.transpose() + Matrix6::identity() * DAMPING;
             let step = jacobian.transpose() * square.cholesky()?.solve(&error);
-            let scale = (LONGEST_STEP / step.amax()).min(1.0);
+            let scale = (MAX_STEP / step.amax()).min(1.0);
             joints.iter_mut().zip(step.iter()).for_each(|(joint, d)| *joint += d * scale);
         }
         None
     }
 
-    /// How the end, which is at `end` [m], moves [m, rad] per joint [rad].
+    /// Returns the Jacobian of the end effector, which is at `end` [m]: m and rad per rad.
     fn jacobian<const N: usize>(&self, joints: &[f64; N], end: &Vector3<f64>) -> SMatrix<f64, 6, N> {
         let mut jacobian = SMatrix::<f64, 6, N>::zeros();
         let mut frame = Isometry3::identity();
@@ -69,13 +69,13 @@ pub trait Chain {
     }
 }
 
-/// x, y, z [m], roll, pitch, yaw [rad] (R = Rz·Ry·Rx) of a pose.
+/// Returns x, y, z [m], roll, pitch, yaw [rad] (R = Rz·Ry·Rx) of a pose.
 pub fn to_values(pose: &Isometry3<f64>) -> [f64; 6] {
     let (v, (roll, pitch, yaw)) = (pose.translation.vector, pose.rotation.euler_angles());
     [v.x, v.y, v.z, roll, pitch, yaw]
 }
 
-/// The pose of x, y, z [m], roll, pitch, yaw [rad].
+/// Returns the pose with x, y, z [m], roll, pitch, yaw [rad].
 pub fn from_values([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
 }

@@ -1,8 +1,8 @@
-//! Checks for the chains of the arms.
+//! Checks of the arms' kinematic chains.
 
 use super::*;
 
-/// The inverse from `start` leads back to the pose of `there`, and says so where a pose is out of reach.
+/// Checks that the inverse from `start` leads back to the pose of `there`, and fails for a pose out of reach.
 pub fn leads_back<const N: usize>(chain: &impl Chain, start: [f64; N], there: [f64; N]) {
     let goal = from_values(to_values(&chain.forward(&there)));
     let found = chain.inverse(&goal, &start).unwrap();

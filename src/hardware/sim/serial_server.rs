@@ -1,4 +1,4 @@
-//! An emulated controller on a serial line: a pseudo-terminal, which adapters open as they would open the hardware.
+//! An emulated controller on a pseudo-terminal, which adapters open like a serial port.
 
 use std::io::{Read, Write};
 use std::sync::Arc;
@@ -6,23 +6,23 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::arm::HasArm;
-use super::diary::{self, Happening};
+use super::events::{self, SimEvent};
 use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared};
 use crate::clock::Mono;
-use crate::hardware::registry::{Emulator, Place};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::registry::{Emulator, EmulatorAddress};
 use crate::hardware::transport::serial::Pty;
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::sync::lock;
 
-/// How long a fault that cuts the line keeps it cut: longer than any adapter should believe in a silent arm.
-const CUT: Duration = Duration::from_millis(800);
-/// How often the thread looks whether the emulator ends, while nothing arrives.
-const LOOK: Duration = Duration::from_millis(50);
+/// Minimum duration of a fault that cuts the line: longer than any adapter tolerates silence.
+const MIN_CUT: Duration = Duration::from_millis(800);
+/// How often the thread checks whether the emulator ends, while nothing arrives.
+const CHECK_PERIOD: Duration = Duration::from_millis(50);
 
-/// A controller at the end of a line. It ends when it is dropped, and the line with it.
+/// A running emulator on a serial line. It ends when it is dropped, and the line with it.
 pub struct SerialServer<C: Controller> {
     shared: Arc<Shared<C, ()>>,
     path: String,
@@ -30,9 +30,9 @@ pub struct SerialServer<C: Controller> {
 }
 
 impl<C: Controller> SerialServer<C> {
-    /// A controller at `place`. `name` is the arm's, for messages.
-    pub fn start(name: &str, controller: C, place: &Place) -> AdapterResult<Self> {
-        if !matches!(place, Place::InProcess | Place::Pty) {
+    /// Starts a controller at `place`. `name` is for messages.
+    pub fn start(name: &str, controller: C, place: &EmulatorAddress) -> AdapterResult<Self> {
+        if !matches!(place, EmulatorAddress::InProcess | EmulatorAddress::Pty) {
             let what = format!("{name} has a serial line: its emulator is on a pseudo-terminal (--pty)");
             return Err(AdapterError::Rejected(what));
         }
@@ -47,12 +47,12 @@ impl<C: Controller> SerialServer<C> {
         Ok(Self { shared, path, thread: Some(thread) })
     }
 
-    /// The line's other end: `/dev/pts/3`.
+    /// Returns the path for adapters: `/dev/pts/3`.
     pub fn path(&self) -> &str {
         &self.path
     }
 
-    /// Does something with the controller, now.
+    /// Calls `act` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         self.shared.with(f)
     }
@@ -88,34 +88,34 @@ fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
     let mut line = Line { pty, shared, heard: false };
     while !shared.closing() {
         let silence = match shared.serve(0, &mut line) {
-            Ending::Closed => LOOK,
-            // Starting takes its time, too.
-            Ending::Cut(time) => time.max(CUT),
+            Ending::Closed => CHECK_PERIOD,
+            // Starting takes time too.
+            Ending::Cut(time) => time.max(MIN_CUT),
         };
         shared.with(|controller, now| controller.client_gone(now));
         lock(&shared.line).dark_until = Instant::now() + silence;
         shared.wait(|line| line.dark_until);
-        // What came meanwhile was heard by nobody.
+        // Bytes that arrived while nothing was served are lost.
         while line.pty.read(&mut [0; 1024], Duration::ZERO).is_ok_and(|n| n > 0) {}
     }
 }
 
-/// The line as a stream that ends with the emulator.
+/// The line as a byte stream that ends with the emulator.
 struct Line<'a, C> {
     pty: Pty,
     shared: &'a Shared<C, ()>,
-    /// Somebody has written to it.
+    /// A client has written to it.
     heard: bool,
 }
 
 impl<C: Controller> Read for Line<'_, C> {
     fn read(&mut self, room: &mut [u8]) -> std::io::Result<usize> {
         while !self.shared.closing() && !room.is_empty() {
-            match self.pty.read(room, LOOK) {
+            match self.pty.read(room, CHECK_PERIOD) {
                 Ok(0) => {}
                 Ok(n) => {
                     if !std::mem::replace(&mut self.heard, true) {
-                        diary::note(Happening::Came);
+                        events::note(SimEvent::Connected);
                     }
                     return Ok(n);
                 }
@@ -127,7 +127,7 @@ impl<C: Controller> Read for Line<'_, C> {
 }
 
 impl<C> Write for Line<'_, C> {
-    /// What nobody takes is lost, as on a real line.
+    /// Bytes that no client reads are lost, as on a real line.
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         self.pty.write(bytes).map(|_| bytes.len()).map_err(|error| std::io::Error::other(error.to_string()))
     }

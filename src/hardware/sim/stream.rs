@@ -1,5 +1,5 @@
-//! Emulated controllers on streams of bytes: requests in, answers out, and what faults leave of them. The streams
-//! themselves are TCP connections ([`super::tcp_server`]) and serial lines ([`super::serial_server`]).
+//! Emulated controllers on byte streams: requests, responses, and faults of the wire. The streams are TCP connections
+//! ([`super::tcp_server`]) and serial lines ([`super::serial_server`]).
 
 use std::io::{Read, Write};
 use std::sync::{Condvar, Mutex, PoisonError};
@@ -10,64 +10,63 @@ use crate::hardware::sim::arm::Delivery;
 use crate::hardware::transport::tcp::Scan;
 use crate::sync::lock;
 
-/// Noise on a line: among it the beginning of a frame.
+/// Line noise, with the beginning of a frame in it.
 const NOISE: &[u8] = b"\x00\xffgarbage\x59";
-/// Most bytes that may wait for the rest of their request.
+/// Maximum number of bytes of an incomplete request.
 const MAX_PENDING: usize = 32_768;
 
-/// The controller's side of a stream of bytes.
+/// The controller's side of a byte stream.
 pub trait Controller: Send + 'static {
-    /// Looks at the front of what has arrived. Where a request stands there: does what it asks, puts the answer into
-    /// `answer` (which is empty), and says how many bytes the request took and how the answer is delivered.
+    /// Processes the request at the front of the received bytes, if it is complete. Puts the response into the empty
+    /// `answer`; returns the length of the request and how the response is delivered.
     fn serve(&mut self, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery>;
 
-    /// The client is gone.
+    /// The client has disconnected.
     fn client_gone(&mut self, now: Mono);
 
-    /// What a client hears that is one too many: puts an answer to its first request at the front of `bytes` into
-    /// `answer`. Without an answer the connection is only closed.
+    /// Puts a response to a rejected client's first request, which is at the front of `bytes`, into `answer`. Without a
+    /// response the connection is only closed.
     fn turn_away(&self, _bytes: &[u8], _answer: &mut Vec<u8>) {}
 
-    /// What the faults `garbage`, `corrupt` and `truncated` do to an answer or report.
+    /// Damages a response or report as the faults `garbage`, `corrupt` and `truncated` do.
     fn damage(&self, delivery: Delivery, answer: &mut Vec<u8>) {
-        // Behind the noise, the beginning of an answer that never goes on.
+        // After the noise, the beginning of a response that never continues.
         let noise = [NOISE, answer.get(..2).unwrap_or_default()].concat();
         delivery.damage(answer, &noise, answer.len().saturating_sub(1));
     }
 
-    /// [`Controller::serve`] for a controller with several ports, which count from 0.
+    /// As [`Controller::serve`], for a controller with several ports, counted from 0.
     fn serve_port(&mut self, _port: usize, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
         self.serve(bytes, now, answer)
     }
 
-    /// Puts what the controller sends by itself over a connection to `port` into `packet` (which is empty), once a
-    /// period; `None` ends the connection.
+    /// Puts the periodic report for clients of `port` into the empty `packet`; `None` closes the connection.
     fn report(&mut self, _port: usize, _now: Mono, _packet: &mut Vec<u8>) -> Option<Delivery> {
         None
     }
 }
 
-/// What the threads of a server share.
+/// State shared by the threads of a server.
 pub(super) struct Shared<C, Client> {
     pub controller: Mutex<C>,
     pub line: Mutex<Line<Client>>,
     pub changed: Condvar,
 }
 
-/// The state of the line.
+/// State of the line.
 pub(super) struct Line<Client> {
-    /// The emulator ends.
+    /// Whether the emulator ends.
     pub closing: bool,
-    /// The clients being served.
+    /// Clients being served.
     pub clients: Vec<Client>,
     /// No client is served until then.
     pub stalled_until: Instant,
-    /// The controller does not even listen until then.
+    /// The controller does not listen until then.
     pub dark_until: Instant,
 }
 
 impl<Client> Line<Client> {
-    /// Nothing is served: the emulator ends, or the controller has no power.
+    /// Returns whether nothing is served: the emulator ends, or the controller has no power.
     pub fn dead(&self) -> bool {
         self.closing || self.dark_until > Instant::now()
     }
@@ -84,13 +83,13 @@ impl<C: Controller, Client> Shared<C, Client> {
         lock(&self.line).closing
     }
 
-    /// Does something with the controller, now.
+    /// Calls `act` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         let mut controller = lock(&self.controller);
         f(&mut controller, MonotonicClock.now())
     }
 
-    /// Waits until `when` of the line has come, or the emulator ends.
+    /// Waits until the time that `when` returns, or until the emulator ends.
     pub fn wait(&self, when: impl Fn(&Line<Client>) -> Instant) {
         let mut line = lock(&self.line);
         while !line.closing {
@@ -102,7 +101,7 @@ impl<C: Controller, Client> Shared<C, Client> {
         }
     }
 
-    /// Answers what arrives on a stream to `port` until it ends.
+    /// Answers requests on a stream of `port` until it ends.
     pub fn serve(&self, port: usize, stream: &mut (impl Read + Write)) -> Ending {
         let (mut arrived, mut answer) = (Vec::with_capacity(4096), Vec::with_capacity(1024));
         let mut buffer = [0; 4096];
@@ -117,7 +116,7 @@ impl<C: Controller, Client> Shared<C, Client> {
                     Scan::Take(n, delivery) => {
                         used += n.max(1);
                         match self.play(delivery, &mut answer) {
-                            // A client that is gone gets no answer; what it had sent before still counts.
+                            // A client that is gone gets no response; its earlier requests still count.
                             Ok(true) => drop(stream.write_all(&answer)),
                             Ok(false) => {}
                             Err(ending) => return ending,
@@ -136,7 +135,7 @@ impl<C: Controller, Client> Shared<C, Client> {
         Ending::Closed
     }
 
-    /// Lets a fault strike at an answer or report: whether what is left of it is to be sent.
+    /// Applies faults to a response or report. Returns whether the rest of it is to be sent.
     pub fn play(&self, delivery: Delivery, answer: &mut Vec<u8>) -> Result<bool, Ending> {
         match delivery {
             Delivery::Silent => return Ok(false),
@@ -159,11 +158,11 @@ impl<C: Controller, Client> Shared<C, Client> {
     }
 }
 
-/// Why serving a client ended.
+/// Why a client is no longer served.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ending {
-    /// The client, or the controller, hung up.
+    /// The client or the controller closed the connection.
     Closed,
-    /// A fault ends all connections, and takes the power for this long.
+    /// A fault closes all connections, without power for this time.
     Cut(Duration),
 }

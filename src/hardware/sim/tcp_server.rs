@@ -1,12 +1,12 @@
-//! An emulated controller on TCP ports of this computer: ports for requests, which it answers, and ports where it sends
-//! reports by itself.
+//! An emulated controller on TCP ports of this computer: ports for requests, and ports on which it sends periodic
+//! reports.
 //!
 //! ```text
-//!  listening thread ── waits for clients, sends reports when they are due, listens again after a loss of power
-//!   └─▶ a thread per client of a port for requests: reads, asks the controller, answers
+//!  listening thread ── accepts clients, sends reports, listens again after a loss of power
+//!   └─▶ one thread per client of a request port: reads, calls the controller, responds
 //! ```
 //!
-//! All of them sleep in the kernel while nothing happens.
+//! All threads block in the kernel while nothing happens.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{IpAddr, Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -16,65 +16,65 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::arm::HasArm;
-use super::diary::{self, Happening};
+use super::events::{self, SimEvent};
 use super::faults::Fault;
 use super::stream::{Controller, Ending, Line, Shared};
-use super::tcp_listen::Floor;
+use super::tcp_listener::Floor;
 use crate::clock::Mono;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::Emulator;
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
 use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 
-/// How long a new client waits for the end of one that has just gone.
+/// How long a new client waits for the end of one that is disconnecting.
 const GRACE: Duration = Duration::from_millis(200);
 
-/// What a port is for.
+/// Purpose of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Port {
-    /// Clients send requests, and get an answer to each.
+    /// Clients send requests; each gets a response.
     Requests,
-    /// The controller sends a report once in this time to every client.
+    /// The controller sends a report to every client, with this period.
     Reports(Duration),
 }
 
-/// A listening controller. It ends when it is dropped.
+/// A running emulator on TCP. It ends when it is dropped.
 pub struct TcpServer<C: Controller> {
     inner: Arc<Inner<C>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// What the threads share.
+/// State shared by the threads.
 pub(super) struct Inner<C> {
-    /// The arm's, for the names of threads.
+    /// Name of the arm, for the names of threads.
     pub name: String,
     pub ports: Vec<(SocketAddr, Port)>,
-    /// Most clients that send requests.
+    /// Maximum number of clients that send requests.
     seats: usize,
     pub shared: Shared<C, Client>,
-    /// All connections have been ended: readers of reports, too.
+    /// All connections were closed, including those of report readers.
     pub ended: AtomicBool,
     pub wake: Wake,
     next_client: AtomicU64,
     refused: AtomicU64,
 }
 
-/// A client with requests: its number, and its connection.
+/// A client with requests: its number and its connection.
 type Client = (u64, TcpStream);
 
 impl<C: Controller> TcpServer<C> {
-    /// Listens at `address`, which should be a loopback address, and serves one client at a time. `name` is the arm's,
-    /// for messages.
+    /// Listens at `address`, which should be a loopback address, and serves one client at a time. `name` is for
+    /// messages.
     pub fn start(name: &str, controller: C, address: SocketAddr) -> AdapterResult<Self> {
         let failed = |e| cannot_listen(&format!("{name} emulator"), address, &e);
         let listener = TcpListener::bind(address).map_err(failed)?;
         Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1).map_err(failed)
     }
 
-    /// Serves several ports, and at most `seats` clients with requests at a time. A controller knows its ports by their
-    /// order here.
+    /// Serves several ports, and at most `seats` clients with requests at a time. Ports are numbered in their order
+    /// here.
     pub fn with_ports(name: &str, controller: C, ports: Vec<(TcpListener, Port)>, seats: usize) -> io::Result<Self> {
         let addresses = ports.iter().map(|(listener, port)| Ok((listener.local_addr()?, *port)));
         let inner = Arc::new(Inner {
@@ -96,17 +96,17 @@ impl<C: Controller> TcpServer<C> {
         Ok(Self { inner, thread: Some(thread) })
     }
 
-    /// Where it listens: its first port.
+    /// Returns the address of the first port.
     pub fn address(&self) -> SocketAddr {
         self.inner.ports.first().map_or(SocketAddr::from(([0; 4], 0)), |(address, _)| *address)
     }
 
-    /// Does something with the controller, now.
+    /// Calls `act` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         self.inner.shared.with(f)
     }
 
-    /// How many clients were turned away because others were connected.
+    /// Returns how many clients were rejected because others were connected.
     pub fn refused(&self) -> u64 {
         self.inner.refused.load(Ordering::Relaxed)
     }
@@ -137,7 +137,7 @@ impl<C: Controller> Drop for TcpServer<C> {
 }
 
 impl<C: Controller> Inner<C> {
-    /// Ends all connections, and for `dark` nothing listens.
+    /// Closes all connections, and stops listening for `dark`.
     pub fn cut(&self, dark: Duration) {
         let mut line = lock(&self.shared.line);
         self.ended.store(true, Ordering::Release);
@@ -148,18 +148,18 @@ impl<C: Controller> Inner<C> {
         self.wake.raise();
     }
 
-    /// Serves a client with requests until it is gone, unless there are too many.
+    /// Serves a client with requests until it disconnects, unless there are too many clients.
     pub fn attend(&self, mut stream: TcpStream, port: usize) {
         host::enter_realtime(host::EMULATOR_PRIORITY);
         self.shared.wait(|line| line.stalled_until);
         let Some(number) = self.take_seat(&stream) else {
             self.refused.fetch_add(1, Ordering::Relaxed);
-            diary::note(Happening::TurnedAway);
+            events::note(SimEvent::Rejected);
             return self.turn_away(stream);
         };
-        diary::note(Happening::Came);
+        events::note(SimEvent::Connected);
         let ending = self.shared.serve(port, &mut stream);
-        diary::note(Happening::Gone);
+        events::note(SimEvent::Disconnected);
         if let Ending::Cut(dark) = ending {
             self.cut(dark);
         }
@@ -169,7 +169,7 @@ impl<C: Controller> Inner<C> {
         self.shared.changed.notify_all();
     }
 
-    /// Waits a moment for a client to be gone, where there are enough; `None` when all stay.
+    /// Waits up to [`GRACE`] for another client to disconnect; `None` if none does.
     fn take_seat(&self, stream: &TcpStream) -> Option<u64> {
         let copy = stream.try_clone().ok()?;
         let line = lock(&self.shared.line);
@@ -184,7 +184,7 @@ impl<C: Controller> Inner<C> {
         Some(number)
     }
 
-    /// Answers the first request of a client that cannot be served, and hangs up.
+    /// Answers the first request of a rejected client, and closes the connection.
     fn turn_away(&self, mut stream: TcpStream) {
         let _ = stream.set_read_timeout(Some(GRACE));
         let mut buffer = [0; 512];
@@ -197,7 +197,7 @@ impl<C: Controller> Inner<C> {
     }
 }
 
-/// Listens at `count` ports in a row from `first` on; from any on where that is 0.
+/// Listens at `count` consecutive ports from `first`; from any free port if that is 0.
 pub fn ports_in_a_row(ip: IpAddr, first: u16, count: u16) -> io::Result<Vec<TcpListener>> {
     let listener = TcpListener::bind((ip, first))?;
     let first = listener.local_addr()?.port();
@@ -209,7 +209,7 @@ pub fn ports_in_a_row(ip: IpAddr, first: u16, count: u16) -> io::Result<Vec<TcpL
     Ok(all)
 }
 
-/// Why `who` cannot have a port of this computer, and what to do.
+/// Returns why `who` cannot listen at a port, with a hint.
 pub fn cannot_listen(who: &str, at: SocketAddr, error: &io::Error) -> AdapterError {
     let hint = match error.kind() {
         ErrorKind::PermissionDenied => format!(
@@ -217,7 +217,7 @@ pub fn cannot_listen(who: &str, at: SocketAddr, error: &io::Error) -> AdapterErr
              CAP_NET_BIND_SERVICE",
             at.port()
         ),
-        ErrorKind::AddrInUse => "\nhint: take another address of this computer, like 127.0.0.5".to_owned(),
+        ErrorKind::AddrInUse => "\nhint: use another loopback address, like 127.0.0.5".to_owned(),
         _ => String::new(),
     };
     AdapterError::Io(format!("{who}: cannot listen at {at}: {error}{hint}"))

@@ -1,9 +1,9 @@
-//! What came over an emulator's wire, for tests that judge a client by it.
+//! Received bytes of an emulator, for tests.
 
-/// Most entries that are kept; later ones are lost.
+/// Maximum number of entries; later ones are dropped.
 const CAPACITY: usize = 200_000;
 
-/// A record of what arrived, which is kept from [`Trace::start`] on.
+/// A record of what arrives after [`Trace::start`].
 #[derive(Debug, Clone)]
 pub struct Trace<T> {
     entries: Option<Vec<T>>,
@@ -16,19 +16,19 @@ impl<T> Default for Trace<T> {
 }
 
 impl<T: Clone> Trace<T> {
-    /// Starts to record, up to 200 000 entries; forgets what was recorded before.
+    /// Starts to record, up to 200 000 entries; discards earlier records.
     pub fn start(&mut self) {
         self.entries = Some(Vec::new());
     }
 
-    /// Records what arrived, where that was asked for.
+    /// Records what arrived, if recording was started.
     pub fn push(&mut self, entry: impl FnOnce() -> T) {
         if let Some(entries) = self.entries.as_mut().filter(|entries| entries.len() < CAPACITY) {
             entries.push(entry());
         }
     }
 
-    /// What was recorded since [`Trace::start`].
+    /// Returns the records since [`Trace::start`].
     pub fn entries(&self) -> Vec<T> {
         self.entries.clone().unwrap_or_default()
     }

@@ -2,14 +2,14 @@
 
 use crate::clock::Mono;
 
-/// How much faster than ours a device's clock may run, as a fraction: the estimate gives way this fast.
+/// Maximum drift of the device's clock against ours, as a fraction: the estimate relaxes at this rate.
 const DRIFT: f64 = 1e-4;
 
-/// The offset between a device's clock and ours, from the packets that travelled fastest.
+/// Offset between a device's clock and ours, from the fastest packets.
 ///
-/// A packet stamped `d` by the device that arrives at `m` was measured at `d + offset`, and every packet says
-/// `offset ≤ m − d`, with equality for one that took no time. So the smallest difference seen is the estimate. The
-/// stamps are late by the fastest packet's way (loopback: tens of µs), never early by more.
+/// A packet with the device's stamp `d` that arrives at `m` was measured at `d + offset`. Every packet shows that
+/// `offset ≤ m − d`, with equality for one without transit time, so the smallest difference is the estimate. Stamps are
+/// late by the fastest packet's transit time (loopback: tens of µs), and never early by more.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct DeviceTime {
     /// Offset [ns], device time [ns] and arrival of the last packet.
@@ -17,12 +17,12 @@ pub struct DeviceTime {
 }
 
 impl DeviceTime {
-    /// When the device measured what it stamped `device_ns` [ns on its own clock] and what arrived at `arrival`.
-    /// A device clock that goes back (a restart) begins anew.
+    /// Returns when the device measured what it stamped `device_ns` [ns on its own clock] and what arrived at
+    /// `arrival`. Starts over when the device's clock goes back (a restart).
     pub fn translate(&mut self, device_ns: u64, arrival: Mono) -> Mono {
         let difference = i128::from(arrival.0) - i128::from(device_ns);
         let offset = match self.last {
-            // The same measurement once more is no younger for having been sent again.
+            // A measurement that is sent again is not newer.
             Some((offset, before, _)) if device_ns == before => {
                 return Mono((i128::from(device_ns) + offset).clamp(0, i128::from(arrival.0)) as u64);
             }

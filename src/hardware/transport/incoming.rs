@@ -1,26 +1,26 @@
-//! Frames out of a stream of bytes, whatever the stream is.
+//! Frames from a byte stream.
 
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// Most bytes that may wait for the rest of their frame.
+/// Maximum size of an incomplete frame.
 pub(super) const BUFFER: usize = 4096;
 
-/// What stands at the front of the received bytes, as a protocol sees it.
+/// Result of scanning the front of the received bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scan<T> {
-    /// The beginning of a frame; more bytes are needed.
+    /// The beginning of a frame: more bytes are needed.
     More,
-    /// So many bytes (at least 1) are not the awaited frame.
+    /// This many bytes (at least 1) are not the expected frame.
     Skip(usize),
-    /// The awaited frame, and how many bytes it takes.
+    /// The expected frame, and its length.
     Take(usize, T),
 }
 
 impl<T> Scan<T> {
-    /// The same with what `f` makes of the frame.
+    /// Maps the frame.
     pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Scan<U> {
         match self {
             Self::More => Scan::More,
@@ -30,7 +30,7 @@ impl<T> Scan<T> {
     }
 }
 
-/// Bytes that have arrived and are not used up yet.
+/// Received bytes that are not processed yet.
 #[derive(Debug)]
 pub(super) struct Incoming {
     buffer: Vec<u8>,
@@ -42,7 +42,7 @@ impl Incoming {
         Self { buffer: vec![0; BUFFER], filled: 0..0 }
     }
 
-    /// The first frame that `scan` takes from what has arrived. What it skips is gone.
+    /// Returns the first frame that `scan` takes from the received bytes. Skipped bytes are dropped.
     pub(super) fn next<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> Option<T> {
         while !self.filled.is_empty() {
             match scan(self.buffer.get(self.filled.clone()).unwrap_or_default()) {
@@ -57,7 +57,7 @@ impl Incoming {
         None
     }
 
-    /// Lets `read` put more bytes behind those that wait; it answers how many. `Protocol` when there is no room left.
+    /// Lets `read` append bytes; it returns how many. `Protocol` if there is no room.
     pub(super) fn fill(
         &mut self,
         peer: &str,
@@ -74,8 +74,8 @@ impl Incoming {
         Ok(n)
     }
 
-    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the time it is given; 0 when
-    /// none have come.
+    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the given time and returns 0 if
+    /// none arrived.
     pub(super) fn receive<T>(
         &mut self,
         peer: &str,

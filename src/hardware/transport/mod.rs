@@ -1,10 +1,10 @@
-//! Ways to reach a device, shared by the arms.
+//! Transports to devices, shared by the arms.
 
 pub mod can;
 pub mod device_time;
-pub mod dialogue;
 mod incoming;
 pub mod pty;
+pub mod request_reply;
 pub mod serial;
 pub mod tcp;
 

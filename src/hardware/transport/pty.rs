@@ -11,27 +11,27 @@ use rustix::pty::{OpenptFlags, grantpt, ioctl_tiocgptpeer, openpt, ptsname, unlo
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
 use super::serial::{make_raw, wait};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::sync::lock;
 
-/// So many lines that are gone keep their numbers. The system would give them to the next lines, and a client that
-/// comes back for its own would find another's.
+/// Number of closed lines whose device numbers are kept. The system would reuse them for the next lines, and a client
+/// that reconnects would find another arm's.
 const KEEP: usize = 64;
-/// The far ends that keep them.
+/// The far ends that keep these numbers.
 static GONE: Mutex<VecDeque<OwnedFd>> = Mutex::new(VecDeque::new());
 
-/// A new serial line without hardware: clients open [`Pty::path`], the emulator has this end. Dropping it looks to
-/// them as if the device were unplugged.
+/// A serial line without hardware: clients open [`Pty::path`], the emulator has this end. Dropping it looks to them as
+/// if the device were unplugged.
 #[derive(Debug)]
 pub struct Pty {
     near: OwnedFd,
-    /// Held open so that a client that goes is no end of the line: the next may come.
+    /// Held open, so that the line survives a client that closes it.
     far: Option<OwnedFd>,
     path: String,
 }
 
 impl Pty {
-    /// Makes a new one.
+    /// Opens a new pseudo-terminal.
     pub fn open() -> AdapterResult<Self> {
         let make = || -> rustix::io::Result<Self> {
             let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
@@ -49,12 +49,12 @@ impl Pty {
         make().map_err(|e| AdapterError::Io(format!("cannot make a pseudo-terminal: {e}")))
     }
 
-    /// What clients open: `/dev/pts/3`.
+    /// Returns the path for clients: `/dev/pts/3`.
     pub fn path(&self) -> &str {
         &self.path
     }
 
-    /// Reads what clients have sent, waiting up to `timeout`; 0 when nothing has come.
+    /// Reads bytes from clients, waiting up to `timeout`; 0 if none arrived.
     pub fn read(&self, room: &mut [u8], timeout: Duration) -> AdapterResult<usize> {
         match wait(&self.near, PollFlags::IN, timeout).and_then(|_| rustix::io::read(&self.near, room)) {
             Ok(n) => Ok(n),
@@ -63,8 +63,8 @@ impl Pty {
         }
     }
 
-    /// Sends to the client; answers how many bytes there was room for: what nobody reads fills the line, and the rest
-    /// is up to the caller.
+    /// Sends to the client; returns how many bytes there was room for. Unread bytes fill the line; the caller handles
+    /// the rest.
     pub fn write(&self, bytes: &[u8]) -> AdapterResult<usize> {
         match rustix::io::write(&self.near, bytes) {
             Ok(n) => Ok(n),

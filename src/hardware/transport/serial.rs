@@ -1,8 +1,9 @@
-//! A serial line to a controller: 8 data bits, no parity, 1 stop bit, no flow control, any rate the hardware has.
+//! A serial line to a controller: 8 data bits, no parity, 1 stop bit, no flow control, any rate that the hardware
+//! supports.
 //!
 //! The line belongs to one program: a second one is refused. DTR and RTS go up when the line is opened, as the kernel
-//! always does, and stay up when it is closed: a board that restarts on a change of DTR does so on the first opening
-//! only, and not on each reconnect. Bytes from before are thrown away.
+//! always does, and stay up when it is closed: a board that restarts on a change of DTR restarts on the first opening
+//! only, and not on each reconnect. Older bytes are discarded.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
@@ -17,14 +18,14 @@ use rustix::termios::{
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
 pub use super::pty::Pty;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// How far the hardware may be off the wanted rate [%]; a character of 10 bits bears about twice that.
+/// Maximum error of the hardware's rate [%]; a character of 10 bits tolerates about twice that.
 const RATE_TOLERANCE: u32 = 2;
-/// How serial devices are named that an arm may be at.
+/// Names of serial devices that may be arms.
 const NAMES: [&str; 5] = ["ttyUSB", "ttyACM", "ttyAMA", "ttyTHS", "ttymxc"];
 
-/// Where a controller on a serial line is: `/dev/ttyUSB0`, `/dev/ttyUSB0@115200`.
+/// Address of a controller on a serial line: `/dev/ttyUSB0`, `/dev/ttyUSB0@115200`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SerialAddress {
     /// The device.
@@ -34,7 +35,7 @@ pub struct SerialAddress {
 }
 
 impl SerialAddress {
-    /// Reads `PATH[@BAUD]`; what is wrong with it, in a sentence without full stop. Opens nothing.
+    /// Parses `PATH[@BAUD]`; the error is a sentence without full stop. Opens nothing.
     pub fn parse(address: &str, default_baud: u32) -> Result<Self, String> {
         let (path, baud) = match address.rsplit_once('@') {
             None => (address, default_baud),
@@ -56,37 +57,37 @@ impl std::fmt::Display for SerialAddress {
     }
 }
 
-/// A serial line over which frames go both ways.
+/// A serial line with frames in both directions.
 #[derive(Debug)]
 pub struct SerialLink {
     line: OwnedFd,
     peer: String,
     incoming: Incoming,
-    /// How long a write may take.
+    /// Timeout of a write.
     timeout: Duration,
 }
 
 impl SerialLink {
-    /// Closes the line and discards what has not left this computer.
+    /// Closes the line and discards unsent bytes.
     pub fn abort(self) {
-        // A line that cannot be flushed is gone.
+        // A line that cannot be flushed is broken already.
         let _ = tcflush(&self.line, QueueSelector::OFlush);
     }
 
-    /// Opens the serial device at `path` with `baud` [bit/s]. `device` names the arm in messages, `timeout` bounds each
-    /// write. That anybody is at the other end shows only when they answer.
+    /// Opens the serial device at `path` with `baud` [bit/s]. `device` names the arm in messages, `timeout` limits each
+    /// write. Does not show whether a controller is connected.
     pub fn connect(device: &str, path: &str, baud: u32, timeout: Duration) -> AdapterResult<Self> {
         let line = open_line(device, path, baud)?;
         Ok(Self { line, peer: format!("{device} at {path}"), incoming: Incoming::new(), timeout })
     }
 
-    /// The device and its path, for messages.
+    /// Returns the device and its path, for messages.
     pub fn peer(&self) -> &str {
         &self.peer
     }
 
-    /// Sends all of `bytes`: hands them to the system, that is, which sends at the line's rate. `Timeout` when it takes
-    /// them too slowly; the line stays usable.
+    /// Passes all of `bytes` to the system, which sends them at the line's rate. `Timeout` if that is too slow; the
+    /// line stays usable.
     pub fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
         let deadline = Instant::now() + self.timeout;
         let mut rest = bytes;
@@ -107,8 +108,8 @@ impl SerialLink {
         Ok(())
     }
 
-    /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
-    /// a frame; it must skip what is not for it. `Timeout` leaves the line usable; `Io` does not.
+    /// Waits up to `timeout` for a frame. `scan` gets the received bytes from the first one on, until it takes a frame;
+    /// it must skip everything else. `Timeout` leaves the line usable; `Io` does not.
     pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
         let Self { line, peer, incoming, .. } = self;
         incoming.receive(peer, timeout, scan, |room, left| {
@@ -127,15 +128,15 @@ impl AsFd for SerialLink {
     }
 }
 
-/// Opens a serial device for this program alone, raw, with `baud` [bit/s]. Reads and writes do not wait.
+/// Opens a serial device for exclusive use, raw, with `baud` [bit/s]. Reads and writes do not block.
 pub(super) fn open_line(device: &str, path: &str, baud: u32) -> AdapterResult<OwnedFd> {
     let failed = |why: String| AdapterError::Io(format!("cannot open serial device {path} for {device}: {why}"));
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let line = open(path, flags, Mode::empty()).map_err(|e| failed(why_not(e)))?;
     if !isatty(&line) {
-        return Err(failed("it is no serial device".to_owned()));
+        return Err(failed("it is not a serial device".to_owned()));
     }
-    // The first keeps out programs that know nothing of locks, but not root's; the second, all that ask.
+    // The first lock excludes programs without locks, except those of root; the second excludes programs that check it.
     ioctl_tiocexcl(&line).map_err(|e| failed(e.to_string()))?;
     flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|e| failed(why_not(e)))?;
     let prepare = || -> rustix::io::Result<u32> {
@@ -153,7 +154,7 @@ pub(super) fn open_line(device: &str, path: &str, baud: u32) -> AdapterResult<Ow
     Ok(line)
 }
 
-/// 8N1, no flow control, no modem lines, bytes as they are; DTR stays up on closing.
+/// 8N1, no flow control, no modem lines, raw bytes; DTR stays up on closing.
 pub(super) fn make_raw(settings: &mut Termios) {
     use ControlModes as C;
     settings.make_raw();
@@ -161,10 +162,10 @@ pub(super) fn make_raw(settings: &mut Termios) {
     settings.control_modes |= C::CS8 | C::CREAD | C::CLOCAL;
 }
 
-/// Reads what has arrived on a line that is readable; 0 when it is not, after all.
+/// Reads what has arrived on a readable line; 0 if nothing has.
 pub(super) fn read_line(line: &OwnedFd, peer: &str, room: &mut [u8]) -> AdapterResult<usize> {
     match rustix::io::read(line, room) {
-        // A line that nobody hangs up has no end.
+        // End of file: the line was hung up.
         Ok(0) => Err(broken(peer, Errno::IO)),
         Ok(n) => Ok(n),
         Err(Errno::AGAIN | Errno::INTR) => Ok(0),
@@ -172,7 +173,7 @@ pub(super) fn read_line(line: &OwnedFd, peer: &str, room: &mut [u8]) -> AdapterR
     }
 }
 
-/// Waits up to `timeout` until `fd` can be read from or written to, or is broken, which the next call tells.
+/// Waits up to `timeout` until `fd` is readable or writable, or broken, which the next call reports.
 pub(super) fn wait(fd: impl AsFd, flags: PollFlags, timeout: Duration) -> rustix::io::Result<bool> {
     let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos() as i64 };
     match poll(&mut [PollFd::new(&fd, flags)], Some(&timeout)) {
@@ -182,7 +183,7 @@ pub(super) fn wait(fd: impl AsFd, flags: PollFlags, timeout: Duration) -> rustix
     }
 }
 
-/// What is told of a line that works no more.
+/// Returns the error of a broken line.
 pub(super) fn broken(peer: &str, error: Errno) -> AdapterError {
     let why = match error {
         Errno::IO | Errno::NODEV | Errno::NXIO => "the serial device is gone (unplugged?)".to_owned(),
@@ -191,7 +192,7 @@ pub(super) fn broken(peer: &str, error: Errno) -> AdapterError {
     AdapterError::Io(format!("the connection to {peer} broke: {why}"))
 }
 
-/// Why a serial device cannot be opened, with the remedy.
+/// Returns why a serial device cannot be opened, with a hint.
 fn why_not(error: Errno) -> String {
     match error {
         Errno::NOENT | Errno::NODEV | Errno::NXIO => format!("there is no such device\nhint: {}", others()),
@@ -203,7 +204,7 @@ fn why_not(error: Errno) -> String {
     }
 }
 
-/// Names the serial devices that there are.
+/// Lists the serial devices of this computer.
 fn others() -> String {
     let entries = std::fs::read_dir("/dev").into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
@@ -354,7 +355,7 @@ mod tests {
         assert!(
             missing.starts_with("cannot open serial device /dev/ttyUSB77 for test: there is no such device\nhint: ")
         );
-        assert_eq!(error("/dev/null"), "cannot open serial device /dev/null for test: it is no serial device");
+        assert_eq!(error("/dev/null"), "cannot open serial device /dev/null for test: it is not a serial device");
         assert!(why_not(Errno::ACCESS).contains("\nhint: ") && why_not(Errno::ACCESS).contains("dialout"));
     }
 }

@@ -1,4 +1,4 @@
-//! A TCP connection to a controller: bounded connecting, bounded waiting, frames out of a byte stream.
+//! A TCP connection to a controller: connect and wait with timeouts, frames from a byte stream.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv6Addr, SocketAddr, TcpStream, ToSocketAddrs};
@@ -8,12 +8,12 @@ use std::time::{Duration, Instant};
 
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// A peer that acknowledges nothing for this long is gone [ms].
+/// A peer that acknowledges nothing for this time is lost [ms].
 const USER_TIMEOUT_MS: u32 = 1000;
 
-/// Where a controller listens.
+/// Address of a controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
     /// IPv4 or IPv6 address, or a name.
@@ -23,7 +23,7 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
-    /// Reads `HOST[:PORT]`; an IPv6 address with a port stands in brackets. Asks nobody.
+    /// Parses `HOST[:PORT]`; an IPv6 address with a port is in brackets. Does not use the network.
     pub fn parse(address: &str, default_port: u16) -> Result<Self, String> {
         let (host, port) = if let Some(rest) = address.strip_prefix('[') {
             let (host, port) = rest.split_once(']').ok_or_else(|| format!("{address:?} lacks the closing bracket"))?;
@@ -58,12 +58,12 @@ impl Endpoint {
         Ok(Self { host: host.to_owned(), port })
     }
 
-    /// Looks the name up, within `timeout`.
+    /// Resolves the name within `timeout`.
     fn resolve(&self, timeout: Duration) -> Result<SocketAddr, String> {
         if let Ok(ip) = self.host.parse::<IpAddr>() {
             return Ok(SocketAddr::new(ip, self.port));
         }
-        // The system's resolver knows no deadline, so it gets a thread of its own, left behind when it is late.
+        // The system's resolver has no timeout, so it runs in a separate thread, abandoned when it is late.
         let (sender, receiver) = mpsc::channel();
         let target = (self.host.clone(), self.port);
         std::thread::Builder::new()
@@ -85,18 +85,18 @@ impl std::fmt::Display for Endpoint {
     }
 }
 
-/// A connection over which frames go both ways.
+/// A connection with frames in both directions.
 #[derive(Debug)]
 pub struct TcpLink {
     stream: TcpStream,
     peer: String,
     incoming: Incoming,
-    /// How long a read waits.
+    /// Timeout of reads.
     timeout: Duration,
 }
 
 impl TcpLink {
-    /// Connects within `timeout`, the look-up of a name included. `device` names the arm in messages.
+    /// Connects within `timeout`, including name resolution. `device` names the arm in messages.
     pub fn connect(device: &str, endpoint: &Endpoint, timeout: Duration) -> AdapterResult<Self> {
         let failed = |why: String| AdapterError::Io(format!("cannot connect to {device} at {endpoint}: {why}"));
         let deadline = Instant::now() + timeout;
@@ -123,7 +123,7 @@ impl TcpLink {
         Ok(Self { stream, peer, incoming: Incoming::new(), timeout })
     }
 
-    /// The device and its address, for messages.
+    /// Returns the device and its address, for messages.
     pub fn peer(&self) -> &str {
         &self.peer
     }
@@ -133,21 +133,21 @@ impl TcpLink {
         self.stream.write_all(bytes).map_err(|e| broken(&self.peer, &e))
     }
 
-    /// Sends `bytes` as far as there is room for them, without waiting. For a last word before [`TcpLink::abort`].
+    /// Sends as much of `bytes` as possible without blocking. For a last message before [`TcpLink::abort`].
     pub fn send_now(&mut self, bytes: &[u8]) {
         let flags = rustix::net::SendFlags::DONTWAIT | rustix::net::SendFlags::NOSIGNAL;
         let _ = rustix::net::send(&self.stream, bytes, flags);
     }
 
-    /// Closes the connection and discards what has not left this computer yet (linger 0: the peer sees a reset). A
-    /// plain drop would let the kernel go on sending it for as long as the peer takes it. Never blocks.
+    /// Closes the connection and discards unsent bytes (linger 0: the peer sees a reset). After a plain drop the kernel
+    /// would continue to send them. Never blocks.
     pub fn abort(self) {
-        // Where the option is refused the connection is broken already, and nothing more is sent either.
+        // If the option is refused, the connection is broken already and sends nothing more.
         let _ = rustix::net::sockopt::set_socket_linger(&self.stream, Some(Duration::ZERO));
     }
 
-    /// Waits up to `timeout` for a frame. `scan` is shown what has arrived, from its first byte on, until it takes
-    /// a frame; it must skip what is not for it. `Timeout` leaves the connection usable; `Io` does not.
+    /// Waits up to `timeout` for a frame. `scan` gets the received bytes from the first one on, until it takes a frame;
+    /// it must skip everything else. `Timeout` leaves the connection usable; `Io` does not.
     pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
         let Self { stream, peer, incoming, timeout: set } = self;
         incoming.receive(peer, timeout, scan, |room, left| {
@@ -166,7 +166,7 @@ impl TcpLink {
         })
     }
 
-    /// The next frame among what has arrived already, without waiting; `None` when there is none. `scan` as above.
+    /// Returns the next frame among the received bytes, without waiting; `None` if there is none. `scan` as above.
     pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
         let Self { stream, peer, incoming, .. } = self;
         loop {
@@ -188,7 +188,7 @@ impl TcpLink {
     }
 }
 
-/// Becomes readable when something has arrived.
+/// Becomes readable when bytes have arrived.
 impl AsFd for TcpLink {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.stream.as_fd()
@@ -199,7 +199,7 @@ fn broken(peer: &str, error: &std::io::Error) -> AdapterError {
     AdapterError::Io(format!("the connection to {peer} broke: {}", reason(error)))
 }
 
-/// An I/O error in plain words, without the system's number.
+/// Describes an I/O error without the system's number.
 fn reason(error: &std::io::Error) -> String {
     match error.kind() {
         ErrorKind::ConnectionRefused => "connection refused".into(),
@@ -273,7 +273,7 @@ mod tests {
         assert!(matches!(result, Err(AdapterError::Protocol(_))), "{result:?}");
     }
 
-    /// What a peer that does not read at first gets in the end: how many bytes, and how the connection ended.
+    /// What a slow peer finally receives: the number of bytes sent and received, and how the connection ended.
     fn received_after(close: impl FnOnce(TcpLink)) -> (usize, usize, std::io::Result<usize>) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let endpoint = Endpoint { host: "127.0.0.1".into(), port: listener.local_addr().unwrap().port() };

@@ -105,6 +105,7 @@ fn start(path: &Path, notices: &Notices) -> (Recorder, rtrb::Producer<Sample>, N
         let text = match notice {
             Notice::Event { tick, described, .. } => format!("{tick}: {}", described.text),
             Notice::Lost(samples) => format!("lost {samples}"),
+            Notice::Unsynced(after) => format!("not synced after {after:?}"),
             Notice::Stopped(e) => e.to_string(),
         };
         notices.lock().unwrap().push(text);

@@ -91,7 +91,7 @@ pub fn traits(folder: &Path) -> Vec<(String, Vec<String>)> {
             let mut lines = vec![format!("trait {}", head.trim())];
             // A method begins at the trait's own indent, so nothing inside a default body does.
             for method in format!("\n{body}\n").split("\n    fn ").skip(1) {
-                // `;` also stands in the type of an array.
+                // `;` also occurs in the type of an array.
                 let end = [" {", ";\n"].iter().filter_map(|end| method.find(end)).min();
                 let signature = &method[..end.unwrap_or(method.len())];
                 lines.push(format!("  fn {}", signature.split_whitespace().collect::<Vec<_>>().join(" ")));

@@ -4,7 +4,7 @@ use std::any::Any;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place, Registry};
+use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry};
 use dimos::hardware::sim::faults::Fault;
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Record, Run};
@@ -16,7 +16,7 @@ use super::stream::Proxy;
 use super::{Gate, decode, lock};
 
 /// Nothing here takes longer.
-pub const PATIENCE: Duration = Duration::from_secs(20);
+pub const TIMEOUT: Duration = Duration::from_secs(20);
 /// Period of the tick of all these runs [s].
 pub const PERIOD: f64 = 0.01;
 
@@ -24,13 +24,13 @@ pub const PERIOD: f64 = 0.01;
 #[derive(Clone, Copy)]
 pub struct Arm {
     pub name: &'static str,
-    /// Its row, where it is not in the box.
+    /// Its row, unless it is built-in.
     pub row: Option<&'static AdapterSpec>,
     /// Two poses far apart: from one to the other some joint reaches its top speed [rad].
     pub ends: [[f64; 6]; 2],
     /// What a setpoint is rounded to on the wire [rad].
     pub rounding: f64,
-    /// In velocity mode it stops by itself after this time without a setpoint [s]; `None`: it has no such mode.
+    /// Its controller ends a velocity after this time without a setpoint [s]; `None`: no velocity mode.
     pub time_limit: Option<f64>,
 }
 
@@ -103,7 +103,7 @@ impl Arm {
 /// How an arm of a test differs from one that is well.
 #[derive(Debug, Clone, Default)]
 pub struct Setup {
-    /// Where it stands at the start [rad]; one of its ends when empty.
+    /// Initial positions [rad]; empty: one end of its range.
     pub start: Vec<f64>,
     pub faults: Vec<Fault>,
 }
@@ -133,7 +133,7 @@ impl World {
         let start = if setup.start.is_empty() { arm.ends[0].to_vec() } else { setup.start.clone() };
         let options = json!({ "sim": { "initial_positions": start, "faults": setup.faults } });
         let config = AdapterConfig { hardware_id: "arm".into(), address: "sim".into(), dof: 6, options };
-        let emulator = arm.spec().emulate.unwrap()(&config, &Place::InProcess).unwrap();
+        let emulator = arm.spec().emulate.unwrap()(&config, &EmulatorAddress::InProcess).unwrap();
         let address = emulator.address();
         let emulator = Arc::new(Mutex::new(emulator));
         let watched = emulator.clone();
@@ -223,8 +223,8 @@ impl Bed {
         let began = Instant::now();
         while !holds(self) {
             assert!(
-                began.elapsed() < PATIENCE,
-                "{}: not within {PATIENCE:?}: {what}: {:?}, {:?}",
+                began.elapsed() < TIMEOUT,
+                "{}: not within {TIMEOUT:?}: {what}: {:?}, {:?}",
                 self.arm.name,
                 self.phase(),
                 self.run.status().tasks
@@ -237,7 +237,7 @@ impl Bed {
     #[track_caller]
     pub fn rest(&self) {
         let (mut last, mut since) = (self.place(), Instant::now());
-        self.until("it stands", |bed| {
+        self.until("it is at rest", |bed| {
             let here = bed.place();
             if here.iter().zip(&last).any(|(a, b)| (a - b).abs() > 1e-4) {
                 (last, since) = (here, Instant::now());
@@ -294,7 +294,7 @@ impl Bed {
                 if report.done {
                     break report;
                 }
-                if began.elapsed() > PATIENCE {
+                if began.elapsed() > TIMEOUT {
                     let last = self.gate.sent().last().map(|t| (super::now().since(t.at), t.what.clone()));
                     panic!(
                         "{}: it does not arrive: {report:?}, {last:?}, {:?}",

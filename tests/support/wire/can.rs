@@ -14,7 +14,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use super::decode::piper;
 use super::{Gate, Passage, Stall, TRICKLE, Way};
 
-/// How often the thread looks at the gate, so that a stall ends in time.
+/// How often the thread checks the gate, so that a stall ends in time.
 const LOOK: Duration = Duration::from_millis(1);
 
 /// A bus in front of an emulator's. Ends when it is dropped.
@@ -27,7 +27,7 @@ pub struct CanProxy {
 impl CanProxy {
     /// In front of the arm on the bus at `upstream`.
     ///
-    /// In a stall on the way to the arm nobody acknowledges what the run sends, as where the arm's plug is out: it
+    /// In a stall towards the arm no node acknowledges what the run sends, as where the arm's plug is out: it
     /// waits in the queue of the computer's own controller, and nothing comes back. In the other stalls frames wait
     /// behind the bus, as in a gateway.
     pub fn start(upstream: &str, gate: &Gate) -> Self {

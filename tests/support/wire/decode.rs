@@ -8,17 +8,17 @@ use serde_json::Value;
 
 use super::{Decoder, NewDecoder, What};
 
-/// What stands at the front of the bytes that have arrived.
+/// What the received bytes begin with.
 enum Front {
     /// Not all of it is there yet.
     More,
-    /// So many bytes are no frame.
+    /// This number of bytes is no frame.
     Skip(usize),
-    /// A frame of so many bytes, and what it commands if anything.
+    /// A frame of this length, and its command, if any.
     Frame(usize, Option<What>),
 }
 
-/// A decoder from a function that looks at the front.
+/// A decoder from a function that examines the front.
 fn by(look: impl Fn(&[u8]) -> Front + Send + Sync + Clone + 'static) -> NewDecoder {
     Arc::new(move || -> Decoder {
         let (look, mut bytes) = (look.clone(), VecDeque::new());
@@ -165,7 +165,7 @@ pub fn template() -> NewDecoder {
     })
 }
 
-/// A Piper's CAN frames, put together to setpoints: 0x155 to 0x157 carry two joints each, big-endian in 0.001°.
+/// A Piper's CAN frames, assembled to setpoints: 0x155 to 0x157 carry two joints each, big-endian in 0.001°.
 pub fn piper() -> impl FnMut(&CanFrame) -> Option<What> + Send {
     let mut joints = [None; 6];
     move |frame| {

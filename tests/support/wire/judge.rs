@@ -2,7 +2,7 @@
 
 use dimos::clock::Mono;
 
-use super::{Told, What};
+use super::{What, WireCommand};
 
 /// Limits of an arm, and how its setpoints come.
 #[derive(Debug, Clone)]
@@ -17,9 +17,9 @@ pub struct Bounds {
     pub rounding: f64,
     /// Age limit of a state [s].
     pub stale_after: f64,
-    /// It is stopped by a setpoint this close to where it is [rad], whatever it was told before.
+    /// It is stopped by a setpoint this close to where it is [rad], whatever was commanded before.
     pub stopped_within: Option<f64>,
-    /// In velocity mode the arm stands after this time without a setpoint [s].
+    /// In velocity mode the arm stops after this time without a setpoint [s].
     pub time_limit: Option<f64>,
 }
 
@@ -28,10 +28,10 @@ pub const WINDOW: f64 = 0.05;
 /// What is noted of times is this uncertain [s].
 const CLOCK: f64 = 1e-3;
 
-/// Setpoints of one kind that follow one another: neither a change of mode nor new torque stands between them.
-fn chains(told: &[Told], values: fn(&What) -> Option<&Vec<f64>>) -> Vec<Vec<(Mono, &Vec<f64>)>> {
+/// Setpoints of one kind that follow one another: without a change of mode or new torque between them.
+fn chains(commands: &[WireCommand], values: fn(&What) -> Option<&Vec<f64>>) -> Vec<Vec<(Mono, &Vec<f64>)>> {
     let (mut chains, mut mode) = (vec![Vec::new()], None);
-    for one in told {
+    for one in commands {
         let breaks = match &one.what {
             What::Enable(_) | What::Planned(_) => true,
             What::Mode(new) => mode.replace(new.clone()).is_some_and(|old| old != *new),
@@ -93,37 +93,38 @@ impl Worst {
 }
 
 impl Bounds {
-    /// The position setpoints that follow one another. One that stops the arm where it is begins anew.
-    fn positions<'a>(&self, told: &'a [Told]) -> Vec<Vec<(Mono, &'a Vec<f64>)>> {
-        let stops = |one: &Told| match (position(&one.what), &one.truth, self.stopped_within) {
-            (Some(told), Some(truth), Some(most)) => told.iter().zip(truth).all(|(a, b)| (a - b).abs() <= most),
+    /// The position setpoints that follow one another. One that stops the arm where it is begins a new sequence.
+    fn positions<'a>(&self, commands: &'a [WireCommand]) -> Vec<Vec<(Mono, &'a Vec<f64>)>> {
+        let stops = |one: &WireCommand| match (position(&one.what), &one.truth, self.stopped_within) {
+            (Some(commands), Some(truth), Some(most)) => commands.iter().zip(truth).all(|(a, b)| (a - b).abs() <= most),
             _ => false,
         };
         // Its stop at full speed may be measured by frames that waited in the stall: then the last setpoint of all goes
         // back towards the arm, and stays.
-        let last = told.iter().rev().find_map(|one| position(&one.what));
-        let stays = |one: &Told| {
-            let after = told.iter().filter(|later| later.at >= one.at).filter_map(|later| position(&later.what));
+        let last = commands.iter().rev().find_map(|one| position(&one.what));
+        let stays = |one: &WireCommand| {
+            let after = commands.iter().filter(|later| later.at >= one.at).filter_map(|later| position(&later.what));
             position(&one.what).is_some() && after.into_iter().all(|values| Some(values) == last)
         };
-        let nearer = |before: &Told, one: &Told| match (position(&before.what), position(&one.what), &one.truth) {
-            (Some(from), Some(to), Some(truth)) if self.stopped_within.is_some() => {
-                let mut joints = from.iter().zip(to).zip(truth);
-                joints.all(|((from, to), truth)| (to - truth).abs() <= (from - truth).abs() + self.rounding)
-            }
-            _ => false,
-        };
+        let nearer =
+            |before: &WireCommand, one: &WireCommand| match (position(&before.what), position(&one.what), &one.truth) {
+                (Some(from), Some(to), Some(truth)) if self.stopped_within.is_some() => {
+                    let mut joints = from.iter().zip(to).zip(truth);
+                    joints.all(|((from, to), truth)| (to - truth).abs() <= (from - truth).abs() + self.rounding)
+                }
+                _ => false,
+            };
         let mut all = Vec::new();
-        for part in told.chunk_by(|one, next| !(stops(next) || (nearer(one, next) && stays(next)))) {
+        for part in commands.chunk_by(|one, next| !(stops(next) || (nearer(one, next) && stays(next)))) {
             all.extend(chains(part, position));
         }
         all
     }
 
     /// Neighbouring setpoints: at most two periods at top speed apart; in velocity mode, at most acceleration.
-    pub fn neighbours(&self, told: &[Told], since: Mono) -> Result<(), String> {
+    pub fn neighbours(&self, commands: &[WireCommand], since: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
-        for chain in self.positions(told) {
+        for chain in self.positions(commands) {
             for pair in chain.windows(2) {
                 for (j, (a, b)) in pair[0].1.iter().zip(pair[1].1).enumerate() {
                     let most = self.velocity[j] * self.period * 2.0 + self.rounding;
@@ -133,14 +134,14 @@ impl Bounds {
         }
         worst.verdict("neighbouring setpoints", "rad", since)?;
         let mut worst = Worst::default();
-        for chain in chains(told, velocity) {
+        for chain in chains(commands, velocity) {
             for pair in chain.windows(2) {
-                // An arm that has stopped by itself meanwhile may begin at rest.
+                // An arm that its controller has stopped meanwhile may begin at rest.
                 let silence = pair[1].0.seconds_since(pair[0].0);
-                let stands = self.time_limit.is_some_and(|limit| silence > limit);
+                let stopped = self.time_limit.is_some_and(|limit| silence > limit);
                 for (j, (a, b)) in pair[0].1.iter().zip(pair[1].1).enumerate() {
                     let most = self.acceleration[j] * self.period * 2.0 + self.rounding;
-                    worst.look(j, pair[1].0, if stands { b.abs().min((b - a).abs()) } else { (b - a).abs() }, most);
+                    worst.look(j, pair[1].0, if stopped { b.abs().min((b - a).abs()) } else { (b - a).abs() }, most);
                 }
             }
         }
@@ -148,7 +149,7 @@ impl Bounds {
     }
 
     /// The way within any 50 ms: at top speed, and two periods.
-    pub fn windows(&self, delivered: &[Told], since: Mono) -> Result<(), String> {
+    pub fn windows(&self, delivered: &[WireCommand], since: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
         for chain in self.positions(delivered) {
             let steps: Vec<(Mono, Vec<f64>)> = chain
@@ -175,7 +176,7 @@ impl Bounds {
     }
 
     /// Where setpoints go after a stall that the arm is held for.
-    pub fn travel(&self, delivered: &[Told], began: Mono) -> Result<(), String> {
+    pub fn travel(&self, delivered: &[WireCommand], began: Mono) -> Result<(), String> {
         let mut worst = Worst::default();
         let last = delivered.iter().rev().filter(|t| t.at < began).find_map(|t| Some((t.at, position(&t.what)?)));
         let Some((at, last)) = last else { return Ok(()) };
@@ -190,7 +191,7 @@ impl Bounds {
     }
 
     /// How long after a moment setpoints still moved [s].
-    pub fn moved_for(&self, sent: &[Told], began: Mono) -> f64 {
+    pub fn moved_for(&self, sent: &[WireCommand], began: Mono) -> f64 {
         let points: Vec<(Mono, &Vec<f64>)> = sent.iter().filter_map(|t| Some((t.at, position(&t.what)?))).collect();
         let moves = |pair: &[(Mono, &Vec<f64>)]| pair[0].1.iter().zip(pair[1].1).any(|(a, b)| (a - b).abs() > 1e-4);
         let last = points.windows(2).rev().find(|pair| moves(pair));
@@ -207,11 +208,15 @@ impl Bounds {
     }
 
     /// Setpoints beside the pose at which the arm truly was when they reached it.
-    pub fn beside_the_truth(&self, delivered: &[Told], most: f64) -> Result<(), String> {
+    pub fn beside_the_truth(&self, delivered: &[WireCommand], most: f64) -> Result<(), String> {
         let (mut worst, first) = (Worst::default(), delivered.first().map_or(Mono::ZERO, |t| t.at));
         for one in delivered {
-            if let (Some(told), Some(truth)) = (position(&one.what), &one.truth) {
-                told.iter().zip(truth).enumerate().for_each(|(j, (a, b))| worst.look(j, one.at, (a - b).abs(), most));
+            if let (Some(commands), Some(truth)) = (position(&one.what), &one.truth) {
+                commands
+                    .iter()
+                    .zip(truth)
+                    .enumerate()
+                    .for_each(|(j, (a, b))| worst.look(j, one.at, (a - b).abs(), most));
             }
         }
         worst.verdict("a setpoint beside the true pose", "rad", first)

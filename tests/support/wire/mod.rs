@@ -59,7 +59,7 @@ pub enum What {
     Position(Vec<f64>),
     /// Velocities [rad/s].
     Velocity(Vec<f64>),
-    /// A target that the arm's controller goes to by itself [rad].
+    /// A target that the arm's controller plans its motion to [rad].
     Planned(Vec<f64>),
     Enable(bool),
     /// The arm's own number or name of the mode.
@@ -69,7 +69,7 @@ pub enum What {
 
 /// A command and when it went by.
 #[derive(Debug, Clone)]
-pub struct Told {
+pub struct WireCommand {
     pub at: Mono,
     /// Counts the connections of the run to the arm.
     pub connection: usize,
@@ -96,8 +96,8 @@ pub type Truth = Arc<dyn Fn() -> Vec<f64> + Send + Sync>;
 
 #[derive(Default)]
 struct Log {
-    sent: Vec<Told>,
-    delivered: Vec<Told>,
+    sent: Vec<WireCommand>,
+    delivered: Vec<WireCommand>,
     bytes: Vec<Passed>,
     connections: usize,
 }
@@ -162,14 +162,14 @@ impl Gate {
     fn note_sent(&self, connection: usize, what: impl Iterator<Item = What>) {
         for what in what {
             let truth = Some((self.truth)());
-            lock(&self.log).sent.push(Told { at: now(), connection, what, truth });
+            lock(&self.log).sent.push(WireCommand { at: now(), connection, what, truth });
         }
     }
 
     fn note_delivered(&self, connection: usize, what: impl Iterator<Item = What>) {
         for what in what {
             let truth = Some((self.truth)());
-            lock(&self.log).delivered.push(Told { at: now(), connection, what, truth });
+            lock(&self.log).delivered.push(WireCommand { at: now(), connection, what, truth });
         }
     }
 
@@ -185,12 +185,12 @@ impl Gate {
     }
 
     /// What the run sent, in order.
-    pub fn sent(&self) -> Vec<Told> {
+    pub fn sent(&self) -> Vec<WireCommand> {
         lock(&self.log).sent.clone()
     }
 
     /// What reached the arm, in order.
-    pub fn delivered(&self) -> Vec<Told> {
+    pub fn delivered(&self) -> Vec<WireCommand> {
         lock(&self.log).delivered.clone()
     }
 
@@ -203,7 +203,7 @@ impl Gate {
     /// mode the last velocities.
     pub fn speed(&self, period: f64) -> Vec<f64> {
         let log = lock(&self.log);
-        let points = |t: &Told| matches!(t.what, What::Position(_) | What::Velocity(_)).then(|| t.what.clone());
+        let points = |t: &WireCommand| matches!(t.what, What::Position(_) | What::Velocity(_)).then(|| t.what.clone());
         let mut last = log.delivered.iter().rev().filter_map(points);
         match (last.next(), last.next()) {
             (Some(What::Position(b)), Some(What::Position(a))) => {

@@ -26,7 +26,7 @@ pub struct Proxy {
     threads: Vec<JoinHandle<()>>,
 }
 
-/// An address of this computer that no other test has: connections from elsewhere are told apart by it.
+/// A loopback address that no other test uses: it distinguishes connections.
 pub fn own_address() -> Ipv4Addr {
     static NEXT: AtomicU32 = AtomicU32::new(0);
     let n = std::process::id().wrapping_mul(61).wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed));

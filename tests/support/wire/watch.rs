@@ -1,49 +1,97 @@
-//! Whether this computer stood still while something was measured.
+//! Whether this computer was stalled during a measurement.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use dimos::rt::host;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 
-/// A thread that notices when it gets no processor.
+/// Above every thread of a run.
+const ABOVE_ALL: i32 = 95;
+/// Shorter delays are not recorded.
+const SHORTEST: Duration = Duration::from_millis(2);
+
+/// A time in which a thread should have run and did not.
+#[derive(Clone, Copy, Debug)]
+pub struct Delay {
+    pub began: Instant,
+    /// By the wall clock, as logs have it.
+    pub ended: SystemTime,
+    pub length: Duration,
+}
+
+/// Threads that sleep for 1 ms in a loop, and record how late they wake.
 pub struct Watch {
-    longest: Arc<AtomicU64>,
+    delays: Arc<Mutex<Vec<Delay>>>,
     closing: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 impl Watch {
-    /// At the priority of emulators, or of any program.
-    pub fn start(realtime: bool) -> Self {
-        let (longest, closing) = (Arc::new(AtomicU64::new(0)), Arc::new(AtomicBool::new(false)));
-        let (max, end) = (longest.clone(), closing.clone());
-        let thread = std::thread::spawn(move || {
-            if realtime {
-                host::enter_realtime(host::EMULATOR_PRIORITY);
-            }
-            while !end.load(Ordering::Relaxed) {
-                let began = Instant::now();
-                std::thread::sleep(Duration::from_millis(1));
-                max.fetch_max(
-                    began.elapsed().saturating_sub(Duration::from_millis(1)).as_micros() as u64,
-                    Ordering::Relaxed,
-                );
-            }
-        });
-        Self { longest, closing, thread: Some(thread) }
+    /// A thread at the priority of emulators.
+    pub fn of_emulators() -> Self {
+        Self::start(vec![Box::new(|| {
+            host::enter_realtime(host::EMULATOR_PRIORITY);
+        })])
     }
 
-    /// The longest time without a processor since this was last asked.
-    pub fn stood_still(&self) -> Duration {
-        Duration::from_micros(self.longest.swap(0, Ordering::Relaxed))
+    /// An ordinary thread.
+    pub fn of_programs() -> Self {
+        Self::start(vec![Box::new(|| ())])
+    }
+
+    /// A thread on each processor, above all others: only the kernel, or the host of a virtual machine, delays it.
+    pub fn of_processors() -> Self {
+        let allowed = sched_getaffinity(None).unwrap();
+        let bound = |cpu: usize| -> Box<dyn Fn() + Send> {
+            Box::new(move || {
+                let mut only = CpuSet::new();
+                only.set(cpu);
+                sched_setaffinity(None, &only).unwrap();
+                host::enter_realtime(ABOVE_ALL);
+            })
+        };
+        Self::start((0..CpuSet::MAX_CPU).filter(|cpu| allowed.is_set(*cpu)).map(bound).collect())
+    }
+
+    fn start(preparations: Vec<Box<dyn Fn() + Send>>) -> Self {
+        let (delays, closing) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
+        let one = |prepare: Box<dyn Fn() + Send>| {
+            let (delays, closing) = (delays.clone(), closing.clone());
+            std::thread::spawn(move || {
+                prepare();
+                while !closing.load(Ordering::Relaxed) {
+                    let began = Instant::now();
+                    std::thread::sleep(Duration::from_millis(1));
+                    let length = began.elapsed();
+                    if length >= SHORTEST {
+                        delays.lock().unwrap().push(Delay { began, ended: SystemTime::now(), length });
+                    }
+                }
+            })
+        };
+        let threads = preparations.into_iter().map(one).collect();
+        Self { delays, closing, threads }
+    }
+
+    /// All delays of at least `length`.
+    pub fn delays(&self, length: Duration) -> Vec<Delay> {
+        self.delays.lock().unwrap().iter().filter(|delay| delay.length >= length).copied().collect()
+    }
+
+    /// The longest delay that ended after `from`.
+    pub fn longest_since(&self, from: Instant) -> Duration {
+        let delays = self.delays.lock().unwrap();
+        let since = delays.iter().rev().take_while(|delay| delay.began + delay.length >= from);
+        since.map(|delay| delay.length).max().unwrap_or_default()
     }
 }
 
 impl Drop for Watch {
     fn drop(&mut self) {
         self.closing.store(true, Ordering::Relaxed);
-        drop(self.thread.take().map(JoinHandle::join));
+        self.threads.drain(..).for_each(|thread| drop(thread.join()));
     }
 }

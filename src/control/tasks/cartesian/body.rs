@@ -1,5 +1,5 @@
-//! Takes an end effector to poses, or moves it with given velocities: a stream of either. When the stream stops, the
-//! end effector decelerates to rest and the joints are released.
+//! Follows a stream of poses or twists of an end effector. When the stream stops, the end effector decelerates to rest
+//! and the joints are released.
 
 use glamx::{DAffine3, DMat3, DQuat, DVec3};
 
@@ -13,11 +13,11 @@ use crate::joint::braking_speed;
 use crate::robot::kinematics::step::rotation_between;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 
-/// Part of the acceleration that a goal is approached with; the rest is for what a joint needs besides.
+/// Fraction of the acceleration limit for approaching a goal; the remainder is for the joints' own limits.
 const APPROACH: f64 = 0.8;
-/// How far the length of a quaternion may be from 1.
+/// Maximum deviation of a quaternion's length from 1.
 const QUATERNION_SLACK: f64 = 0.01;
-/// Nearer than this is there [m, rad].
+/// Tolerance of the goal [m, rad].
 const THERE: f64 = 1e-9;
 
 /// A goal in the frame of the model's root.
@@ -38,7 +38,7 @@ pub struct CartesianTask {
 }
 
 impl CartesianTask {
-    /// A task without a target, for the end effector of a robot.
+    /// Creates a task without a target, for the end effector of a robot.
     pub fn new(params: CartesianParams, robot: TaskKinematics) -> Self {
         Self { effector: EndEffector::new(params, robot), target: None, slowing: false, timed_out: false }
     }
@@ -50,7 +50,7 @@ impl TaskBody for CartesianTask {
         if let Some((joint, error)) = self.effector.strayed(cx).filter(|_| !cx.active) {
             return Err(Outcome::StartStateMismatch(joint, error.abs()));
         }
-        // A goal that cannot be followed ends the one before it.
+        // A goal that cannot be followed also ends the previous one.
         let tracked = tracked(&self.effector, goal);
         self.target = tracked.map(|target| (target, cx.now));
         if tracked.is_none() {
@@ -71,7 +71,7 @@ impl TaskBody for CartesianTask {
         };
         let ending = self.slowing || self.timed_out;
         if !cx.granted {
-            // Nothing of it goes out: there is nothing to slow down.
+            // Nothing was commanded: there is nothing to decelerate.
             if ending {
                 return ended();
             }
@@ -117,10 +117,10 @@ impl TaskBody for CartesianTask {
     }
 }
 
-/// The velocity with which to go the rest of a way, so that both its parts end together and at rest.
+/// Returns the twist for the remaining way, so that translation and rotation end together and at rest.
 fn towards(p: &CartesianParams, way: &Velocity, dt: f64) -> Velocity {
     let (far, turned) = (way.linear.length(), way.angular.length());
-    // How much of the way per second.
+    // Fraction of the way per second.
     let rate = |length: f64, fastest: f64, acceleration: f64| match length > THERE {
         true => braking_speed(length, APPROACH * acceleration, dt).min(fastest) / length,
         false => f64::INFINITY,
@@ -136,7 +136,7 @@ fn towards(p: &CartesianParams, way: &Velocity, dt: f64) -> Velocity {
     Velocity { linear: way.linear * rate, angular: way.angular * rate }
 }
 
-/// A goal in the frame of the model's root; `None` where it is not finite, or no orientation.
+/// Converts a goal to the frame of the model's root; `None` if it is not finite or has no valid orientation.
 fn tracked(effector: &EndEffector, goal: &Goal) -> Option<Tracked> {
     let (p, robot) = (effector.params(), effector.robot());
     match *goal {
@@ -155,7 +155,7 @@ fn tracked(effector: &EndEffector, goal: &Goal) -> Option<Tracked> {
             if !(linear.is_finite() && angular.is_finite()) {
                 return None;
             }
-            // What is too fast is slowed down as a whole: it keeps its direction.
+            // A twist that is too fast is scaled as a whole, to keep its direction.
             let asked = Velocity { linear, angular };
             let over = seconds(&asked, p.max_linear_velocity, p.max_angular_velocity).max(1.0);
             let base = if tool { DMat3::IDENTITY } else { DMat3::from_quat(DQuat::from_array(robot.base).normalize()) };

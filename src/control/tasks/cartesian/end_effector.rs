@@ -1,5 +1,5 @@
-//! Moves an end effector by moving joints: what the Cartesian tasks have in common. Integrates joint positions from the
-//! last *commanded* ones, so that an arm that sags below its commands does not creep.
+//! Moves an end effector: the common part of the Cartesian tasks. Integrates joint positions from the last *commanded*
+//! ones, so that an arm that sags below its commands does not creep.
 
 use glamx::{DAffine3, DVec3};
 
@@ -10,21 +10,21 @@ use crate::joint::MAX_DOF;
 use crate::robot::kinematics::step::{Bound as Bounded, JointBounds, JointMotion, StepSettings, Stepper, TargetTwist};
 use crate::telemetry::Bound;
 
-/// A velocity of the end effector, in the frame of the model's root.
+/// Twist of the end effector, in the frame of the model's root.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Velocity {
-    /// Of its origin [m/s].
+    /// Velocity of its origin [m/s].
     pub linear: DVec3,
-    /// Angular [rad/s].
+    /// Angular velocity [rad/s].
     pub angular: DVec3,
 }
 
-/// How long a change takes at least [s], where both its parts keep to their rates.
+/// Returns the minimum duration of a change [s] within the limits of both parts.
 pub fn seconds(change: &Velocity, linear: f64, angular: f64) -> f64 {
     (change.linear.length() / linear).max(change.angular.length() / angular)
 }
 
-/// An end effector that is moved.
+/// An end effector in motion.
 #[derive(Debug)]
 pub struct EndEffector {
     params: CartesianParams,
@@ -32,13 +32,13 @@ pub struct EndEffector {
     stepper: Stepper,
     joints: JointMotion,
     bounds: [JointBounds; MAX_DOF],
-    /// Its velocity as far as its own acceleration limits let it change.
+    /// Its twist, limited by its own accelerations.
     velocity: Velocity,
     bound: Bound,
 }
 
 impl EndEffector {
-    /// An end effector that was not moved yet.
+    /// Creates an end effector at rest.
     pub fn new(params: CartesianParams, robot: TaskKinematics) -> Self {
         Self {
             stepper: Stepper::new(robot.kinematics.clone(), robot.link, StepSettings::default()),
@@ -51,22 +51,22 @@ impl EndEffector {
         }
     }
 
-    /// Its parameters.
+    /// Returns its parameters.
     pub fn params(&self) -> &CartesianParams {
         &self.params
     }
 
-    /// Its robot.
+    /// Returns its robot.
     pub fn robot(&self) -> &TaskKinematics {
         &self.robot
     }
 
-    /// What holds it back just now.
+    /// Returns the limit that slows it at present.
     pub fn bound(&self) -> Bound {
         self.bound
     }
 
-    /// Begins where the joints are commanded to be, as fast as they are commanded to move.
+    /// Starts from the last commanded positions and velocities of the joints.
     pub fn rebase(&mut self, cx: &Context<'_>) {
         self.velocity = Velocity::default();
         let motion = self.joints.position.iter_mut().zip(&mut self.joints.velocity);
@@ -76,7 +76,7 @@ impl EndEffector {
         }
     }
 
-    /// The first joint that is measured too far from where it is commanded to be, and how far [rad].
+    /// Returns the first joint whose measured position is too far from its command, and the error [rad].
     pub fn strayed(&self, cx: &Context<'_>) -> Option<(u16, f64)> {
         cx.joints.iter().find_map(|&joint| {
             let view = cx.joint(joint);
@@ -85,17 +85,17 @@ impl EndEffector {
         })
     }
 
-    /// Where it is commanded to be, in the frame of the model's root.
+    /// Returns its commanded pose, in the frame of the model's root.
     pub fn pose(&mut self) -> DAffine3 {
         self.stepper.pose(&self.joints.position)
     }
 
-    /// Whether neither it nor a joint of it is to move.
+    /// Returns whether it and all its joints are commanded to rest.
     pub fn at_rest(&self) -> bool {
         self.velocity == Velocity::default() && self.joints.velocity.iter().all(|v| *v == 0.0)
     }
 
-    /// Moves on by one tick towards a velocity and claims the joints. `way`: what is left to a goal, where it must
+    /// Advances by one tick towards a twist and claims the joints. `way`: remaining way to a goal, at which it must
     /// stop.
     pub fn advance(&mut self, cx: &Context<'_>, wanted: &Velocity, way: Option<&Velocity>, claims: &mut Vec<Claim>) {
         let before = self.velocity;
@@ -118,7 +118,7 @@ impl EndEffector {
             };
         }
         let step = self.stepper.step(&mut self.joints, &TargetTwist { linear, angular, horizon }, &self.bounds, cx.dt);
-        // It changes its velocity no faster than the joints can follow, so that it keeps its direction.
+        // Its twist changes no faster than the joints can follow, so that it keeps its direction.
         if step.share < 1.0 {
             self.velocity.linear = before.linear + (linear - before.linear) * step.share;
             self.velocity.angular = before.angular + (angular - before.angular) * step.share;
@@ -134,7 +134,7 @@ impl EndEffector {
         claims.extend(joints.iter().zip(&self.joints.position).map(|(&joint, &value)| Claim { joint, value }));
     }
 
-    /// Changes the velocity towards the wanted one, both its parts by the same share, as fast as they may change.
+    /// Changes the twist towards the requested one, both parts by the same fraction, as fast as their limits allow.
     fn approach(&mut self, wanted: &Velocity, dt: f64) {
         if !(wanted.linear.is_finite() && wanted.angular.is_finite()) {
             return self.approach(&Velocity::default(), dt);

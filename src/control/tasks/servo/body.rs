@@ -1,6 +1,6 @@
-//! Follows a stream of joint positions. Targets that come less often than the tick are joined by straight lines
-//! over the stream's own period, so that a slow stream makes a smooth motion. When the stream stops, so do the
-//! joints.
+//! Follows a stream of joint positions. If targets arrive less often than the tick, commands are interpolated linearly
+//! over the period of the stream, so that a slow stream gives a smooth motion. When the stream stops, the joints
+//! decelerate to rest.
 
 use super::params::ServoParams;
 use crate::clock::Mono;
@@ -9,7 +9,7 @@ use crate::control::task_body::{Claim, Context, OnLoss, Step, Target, TaskBody};
 use crate::joint::{Joints, MAX_DOF, joints_of};
 use crate::telemetry::{Outcome, Reason, TaskState};
 
-/// A pause longer than this is no stream's period [s].
+/// Maximum period of a stream; a longer pause starts a new one [s].
 const LONGEST_PERIOD: f64 = 0.1;
 
 /// State of a servo task.
@@ -17,7 +17,7 @@ const LONGEST_PERIOD: f64 = 0.1;
 pub struct ServoTask {
     params: ServoParams,
     target: Option<Setpoint>,
-    /// Joints lost to a stronger task, until the next target.
+    /// Joints lost to a task of higher priority, until the next target.
     muted: [bool; MAX_DOF],
 }
 
@@ -32,8 +32,8 @@ struct Setpoint {
 
 impl Setpoint {
     fn reached(&self, cx: &Context<'_>) -> Joints {
-        // A target counts from its tick on, so the first step is made at once. The line is a tick longer than the
-        // stream's period: the next target may come so much later without a halt in between.
+        // The first step is made in the tick of the target. The interpolation takes a tick longer than the period of
+        // the stream, so that a target which is a tick late causes no halt.
         let done = if self.period > 1.5 * cx.dt {
             ((cx.now.seconds_since(self.at) + cx.dt) / (self.period + cx.dt)).clamp(0.0, 1.0)
         } else {
@@ -50,12 +50,12 @@ impl Setpoint {
 }
 
 impl ServoTask {
-    /// A task without a target.
+    /// Creates a task without a target.
     pub fn new(params: ServoParams) -> Self {
         Self { params, target: None, muted: [false; MAX_DOF] }
     }
 
-    /// A new target [rad], in the order of the task's joints.
+    /// Sets a new target [rad], in the order of the task's joints.
     fn set_target(&mut self, cx: &Context<'_>, to: &Joints) {
         self.muted = [false; MAX_DOF];
         let (from, period) = match &self.target {
@@ -69,7 +69,7 @@ impl ServoTask {
                 };
                 let before = Context { now: cx.now.before(std::time::Duration::from_secs_f64(cx.dt)), ..*cx };
                 let from = last.reached(&before);
-                // What no joint could do in that time is a jump: passed on whole, so that it is refused.
+                // A step that no joint can make in that time is a jump: not interpolated, so that it is refused.
                 let reachable = |(k, joint): (usize, &u16)| {
                     let step = to.get(k).zip(last.to.get(k)).map_or(0.0, |(to, last)| (to - last).abs());
                     step <= JUMP.max(cx.joint(*joint).velocity_limit * pause * 1.5)
@@ -86,7 +86,7 @@ impl TaskBody for ServoTask {
     fn accept(&mut self, cx: &Context<'_>, target: &Target<'_>) -> Result<(), Outcome> {
         let Target::Positions(positions) = target else { return Err(Outcome::WrongTask(cx.task)) };
         if !cx.active {
-            // A stream begins where the arm is; once it runs, a jump in it is a fault.
+            // A stream begins at the arm's position; later a jump is a fault.
             for (&joint, value) in cx.joints.iter().zip(positions) {
                 let step = value - cx.joint(joint).commanded;
                 if step.abs() > JUMP {

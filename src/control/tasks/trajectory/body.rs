@@ -1,4 +1,4 @@
-//! Executes a trajectory: positions along its curve, from where the arm is, until the arm has arrived.
+//! Executes a trajectory: commands positions along it, from the arm's position until the arm has arrived.
 
 use super::params::TrajectoryParams;
 use crate::clock::Mono;
@@ -9,7 +9,7 @@ use crate::joint::TICK_STANDSTILL;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
 use crate::trajectory::{Cursor, Sample};
 
-/// The shortest time over which the difference between the first point and the last command is faded out [s].
+/// Minimum time for fading out the offset between the last command and the first point [s].
 const SHORTEST_FADE: f64 = 0.2;
 
 /// State of a trajectory task.
@@ -20,13 +20,13 @@ pub struct TrajectoryTask {
     /// Time along the trajectory.
     clock: PathClock,
     slowing: bool,
-    /// The arm has taken it up.
+    /// Whether the arm has begun to follow it.
     begun: bool,
-    /// Its last point was commanded.
+    /// Whether its last point was commanded.
     at_end: bool,
-    /// Time since then [s].
+    /// Time since the last point [s].
     settling: f64,
-    /// What the last commands were ahead of the first point, joint by joint [rad].
+    /// Offset of the last command from the first point, per joint [rad].
     offsets: Vec<f64>,
     fade: f64,
     samples: Vec<Sample>,
@@ -34,7 +34,7 @@ pub struct TrajectoryTask {
 }
 
 impl TrajectoryTask {
-    /// A task for up to `width` joints.
+    /// Creates a task for up to `width` joints.
     pub fn new(params: TrajectoryParams, width: usize) -> Self {
         Self {
             params,
@@ -51,7 +51,7 @@ impl TrajectoryTask {
         }
     }
 
-    /// The first joint that is too far from the start, and how far it is ahead of it [rad].
+    /// Returns the first joint that is too far from the start, and its offset [rad].
     fn away_from_start(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
         motion.joints.iter().enumerate().find_map(|(k, &joint)| {
             let error = cx.joint(joint).position - motion.spline.start(k);
@@ -60,7 +60,7 @@ impl TrajectoryTask {
         })
     }
 
-    /// Begins a motion.
+    /// Starts a motion.
     fn start(&mut self, cx: &Context<'_>, motion: &Motion) {
         self.cursor = Cursor::default();
         self.clock.start();
@@ -71,7 +71,7 @@ impl TrajectoryTask {
         self.set_out(cx, motion);
     }
 
-    /// Notes what the last commands are ahead of the first point, and over which time that is faded out.
+    /// Sets the offsets of the last commands from the first point, and the time for fading them out.
     fn set_out(&mut self, cx: &Context<'_>, motion: &Motion) {
         self.fade = SHORTEST_FADE;
         self.offsets.clear();
@@ -79,7 +79,7 @@ impl TrajectoryTask {
             let view = cx.joint(joint);
             let offset = view.commanded - motion.spline.start(k);
             self.offsets.push(offset);
-            // The fade may use a quarter of the joint's speed and acceleration: peaks of a quintic step are
+            // Fading may use a quarter of the joint's velocity and acceleration limits: the peaks of a quintic step are
             // 1.875 offset / T and 5.774 offset / T².
             let by_speed = 1.875 * offset.abs() / (0.25 * view.velocity_limit);
             let by_acceleration = (5.774 * offset.abs() / (0.25 * view.acceleration)).sqrt();
@@ -96,7 +96,7 @@ impl TrajectoryTask {
         errors.find(|(_, e)| e.abs() > tolerance).map(|(j, e)| Reason::PathTolerance(j, e))
     }
 
-    /// The first joint that has not arrived, and its error [rad].
+    /// Returns the first joint that has not arrived, and its error [rad].
     fn away_from_goal(&self, cx: &Context<'_>, motion: &Motion) -> Option<(u16, f64)> {
         motion.joints.iter().zip(&self.samples).find_map(|(&joint, sample)| {
             let view = cx.joint(joint);
@@ -125,7 +125,7 @@ impl TaskBody for TrajectoryTask {
                 return Step::End(TaskState::Aborted, Reason::Cancelled);
             }
             if !self.begun {
-                // While the arm slows down and changes its mode for it, the way to the start changes.
+                // The offsets change while the arm decelerates and changes its mode for the motion.
                 self.set_out(cx, motion);
                 if let Some((joint, error)) = self.away_from_start(cx, motion) {
                     return Step::End(TaskState::Aborted, Reason::PathTolerance(joint, error));
@@ -170,7 +170,7 @@ impl TaskBody for TrajectoryTask {
         Step::Continue
     }
 
-    /// The motion is the coordinator's; the figures of the last one stay.
+    /// The coordinator owns the motion; the progress of the last one stays for the status.
     fn end(&mut self) {}
 
     fn cancel(&mut self) -> OnCancel {
@@ -197,8 +197,8 @@ fn note_progress(view: &mut TaskView, elapsed: f64, duration: f64) {
     view.progress = (elapsed / duration).min(1.0);
 }
 
-/// How fast the speed along the path may fall [1/s] so that no joint exceeds its acceleration: along a path q(s)
-/// with s' = r, q'' = q_ss r² + q_s r'. At least a tenth of the acceleration is used where the path itself needs all.
+/// Returns how fast the rate may fall [1/s] so that no joint exceeds its acceleration limit: along a path q(s)
+/// with s' = r, q'' = q_ss r² + q_s r'. Uses at least a tenth of the limit where the path itself needs all of it.
 fn steepest_slowdown(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate: f64) -> f64 {
     let mut steepest = f64::MAX;
     for (&joint, s) in motion.joints.iter().zip(samples) {
@@ -209,7 +209,7 @@ fn steepest_slowdown(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate
     steepest
 }
 
-/// How fast the speed along the path may rise: see [`steepest_slowdown`], and q''' = … + q_s r'' for the jerk.
+/// Returns how fast the rate may rise: see [`steepest_slowdown`], and q''' = … + q_s r'' for the jerk.
 fn rate_limits(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate: f64) -> RateLimits {
     let mut second = f64::MAX;
     for (&joint, s) in motion.joints.iter().zip(samples) {
@@ -218,7 +218,7 @@ fn rate_limits(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate: f64)
     RateLimits { first: steepest_slowdown(cx, motion, samples, rate), second }
 }
 
-/// 0 → 1 with zero velocity and acceleration at both ends.
+/// Quintic step from 0 to 1 with zero velocity and acceleration at both ends.
 fn smooth_step(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * x * (10.0 + x * (6.0 * x - 15.0))

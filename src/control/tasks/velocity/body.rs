@@ -1,4 +1,4 @@
-//! Follows a stream of joint velocities. When the stream stops, the joints slow down to zero.
+//! Follows a stream of joint velocities. When the stream stops, the joints decelerate to rest.
 
 use super::params::VelocityParams;
 use crate::clock::Mono;
@@ -11,14 +11,14 @@ use crate::telemetry::{Outcome, Reason, TaskState};
 pub struct VelocityTask {
     params: VelocityParams,
     target: Option<(Joints, Mono)>,
-    /// The stream has stopped and the joints are kept at zero.
+    /// Whether the stream has stopped and zero velocity is commanded.
     timed_out: bool,
-    /// Joints lost to a stronger task, until the next target.
+    /// Joints lost to a task of higher priority, until the next target.
     muted: [bool; MAX_DOF],
 }
 
 impl VelocityTask {
-    /// A task without a target.
+    /// Creates a task without a target.
     pub fn new(params: VelocityParams) -> Self {
         Self { params, target: None, timed_out: false, muted: [false; MAX_DOF] }
     }

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use super::device::{Device, GRIPPER_MAX};
 use super::options::Options;
-use super::{MODES, NATIVE_RATE, fit, limits};
+use super::{MODES, NATIVE_RATE, check, limits};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
     Stop,
 };
+use crate::hardware::registry::AdapterConfig;
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
 /// An ideal arm in memory.
@@ -31,7 +31,7 @@ impl MockArm {
 
     /// A mock arm on another clock, for tests. Latency and stalls block in real time all the same.
     pub fn with_clock(config: &AdapterConfig, clock: Arc<dyn Clock>) -> AdapterResult<Self> {
-        config.fit(fit)?;
+        config.check(check)?;
         let (options, dof) = (config.options::<Options>()?, config.dof);
         Ok(Self { device: Device::new(dof, &options, clock)?, options, dof, measured: None })
     }
@@ -45,7 +45,7 @@ impl MockArm {
         if values.len() == self.dof && values.iter().all(|value| value.is_finite()) {
             Ok(())
         } else {
-            Err(AdapterError::Rejected(format!("{} finite values are needed, one per joint", self.dof)))
+            Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)))
         }
     }
 }
@@ -220,7 +220,7 @@ impl Gripper for MockArm {
         Ok(Some(self.device.gripper.position))
     }
 
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
         Some((0.0, GRIPPER_MAX))
     }
 

@@ -6,11 +6,11 @@ use std::time::Duration;
 use super::limits;
 use super::options::{Options, PLAYABLE};
 use crate::clock::{Clock, Mono};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::sim::arm::{Delivery, ESTOP, Refusal, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Plant, Tracking};
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::Joints;
 
 /// Widest opening of the gripper [m].

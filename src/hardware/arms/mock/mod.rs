@@ -11,7 +11,7 @@ pub use options::Options;
 
 use std::time::Duration;
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 use std::f64::consts::PI;
@@ -39,15 +39,15 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: true,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(MockArm::new(config)?)),
     emulate: None,
 };
 
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("a mock arm", SPEC.dof)?;
     config.options::<Options>()?.check(config.dof)?;
-    Ok(Fit { limits: limits(config.dof) })
+    Ok(Checked { limits: limits(config.dof) })
 }
 
 /// ±2π rad, π rad/s, 10 rad/s², 100 rad/s³ for every joint.

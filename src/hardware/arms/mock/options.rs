@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::limits;
-use crate::hardware::fit::Misfit;
+use crate::hardware::check::ConfigError;
 use crate::hardware::sim::arm::{SimOptions, check_pose};
 use crate::hardware::sim::faults::{Fault, FaultKind, check_script};
 
@@ -70,16 +70,16 @@ impl Default for Options {
 
 impl Options {
     /// Says what is wrong with the values for an arm of `dof` joints.
-    pub(super) fn check(&self, dof: usize) -> Result<(), Misfit> {
+    pub(super) fn check(&self, dof: usize) -> Result<(), ConfigError> {
         let given = self.initial_positions.len();
         if given != 0 && given != dof {
             let what = format!("initial_positions has {given} values for {dof} joints");
-            return Err(Misfit::new("initial_positions", what));
+            return Err(ConfigError::new("initial_positions", what));
         }
         check_pose(&self.initial_positions, &limits(dof))?;
         for (name, value, max) in [("latency_ms", self.latency_ms, 10_000.0), ("lag", self.lag, 10.0)] {
             if !(0.0..=max).contains(&value) {
-                return Err(Misfit::new(name, format!("{name}: {value} is not between 0 and {max}")));
+                return Err(ConfigError::new(name, format!("{name}: {value} is not between 0 and {max}")));
             }
         }
         check_script("mock", &self.faults, PLAYABLE)

@@ -3,8 +3,8 @@ use std::time::Duration;
 
 use super::MockArm;
 use crate::clock::{Mono, VirtualClock};
+use crate::hardware::adapter::{AdapterError, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{AdapterError, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
 fn arm(options: serde_json::Value) -> (MockArm, VirtualClock) {

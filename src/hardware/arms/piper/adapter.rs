@@ -1,40 +1,40 @@
-//! The Piper adapter: the adapter protocol on one side, the arm's CAN frames on the other.
+//! The Piper adapter: the adapter trait on one side, the arm's CAN frames on the other.
 //!
 //! Wire: 0.001°, 0.001 mm, 0.001 rad/s, mA. Here: rad, m, rad/s, Nm. The conversions are in this file, those of angles
 //! in `protocol.rs`.
 //!
-//! The arm sends its state by itself, 200 times a second; nothing is asked for after `connect`. It takes joint targets
-//! without a word: what it does shows in its feedback, and so enabling, clearing and stopping are confirmed by that.
+//! The arm streams its state, 200 times per second; after `connect` nothing is polled. It does not acknowledge joint
+//! targets, so enabling, clearing and stopping are confirmed by its feedback.
 //!
-//! Nothing here takes the power from the motors but `write_enable(false)`: the arm has no brakes. So a stop is a hold
-//! where the arm is; the arm's own E-stop command can only be left by a reset that lets it fall, and is never sent.
+//! Only `write_enable(false)` disables the motors: the arm has no brakes. A stop is a hold at the current position. The
+//! arm's own E-stop command is never sent: it can only be left by a reset that lets the arm fall.
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
+use super::feedback::{Counts, Feedback, STANDSTILL};
 use super::hold;
-use super::picture::{Counts, Picture, STANDSTILL};
 use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
-use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit};
+use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
     Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::can::CanAddress;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
-/// How long clearing may take; drivers report every 25 ms.
+/// Timeout of clearing errors; drivers report every 25 ms.
 const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
-/// How long a stop waits for the joints to get slower, and what counts as slower [0.001 rad/s].
+/// How long a stop waits for the joints to decelerate, and the change of speed that shows it [0.001 rad/s].
 const STOP_TIMEOUT: Duration = Duration::from_millis(20);
-const SLOWER: i32 = 20;
-/// So far outside its limits a joint may be sent [rad]: the coordinator keeps to the limits, and an arm that lies
-/// beyond one must find back.
+const DECELERATION: i32 = 20;
+/// How far outside its limits a target may be [rad]: the coordinator keeps the limits, but an arm outside must be able
+/// to return.
 const MARGIN: f64 = 0.1;
 /// Motor torque per current [Nm/A]: joints 1 to 3, and 4 to 6.
 const TORQUE: [f64; DOF] = [1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844];
@@ -52,22 +52,22 @@ pub struct PiperAdapter {
 }
 
 impl PiperAdapter {
-    /// An adapter for the arm on the bus at `config.address`. Does not connect.
+    /// Creates an adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let options: Options = config.options()?;
         let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
         Ok(Self { arm, options, mode: ControlMode::Position })
     }
 
-    /// What was counted since the connection was made: frames of the arm, and of the bus.
+    /// Returns the counts since the connection was made: frames of the arm, and of the bus.
     pub fn counts(&self) -> (Counts, WireCounts) {
-        (self.arm.picture.counts, self.arm.wire.as_ref().map(|wire| wire.counts).unwrap_or_default())
+        (self.arm.feedback.counts, self.arm.wire.as_ref().map(|wire| wire.counts).unwrap_or_default())
     }
 
-    /// Speed of a planned move [%] from a fraction of the top speed.
+    /// Returns the speed of a planned move [%] from a fraction of the top speed.
     fn percent(&self, velocity: f64) -> u8 {
         (velocity * self.options.speed_scale * 100.0).round().clamp(1.0, 100.0) as u8
     }
@@ -79,26 +79,26 @@ impl PiperAdapter {
         }
     }
 
-    /// With how much torque the gripper closes at most [mNm].
+    /// Returns the maximum closing torque of the gripper [mNm].
     fn gripper_torque(&self) -> u16 {
         (self.options.gripper_torque / MILLI).round() as u16
     }
 
-    /// Velocities [rad/s]; `None` when a motor has not told its own lately.
+    /// Velocities [rad/s]; `None` if a motor has not reported its own recently.
     fn velocities(&self) -> Option<Joints> {
         let known = self.arm.measures();
-        known.then(|| joints_of(&self.arm.picture.motors.map(|motor| f64::from(motor.speed) * MILLI)))
+        known.then(|| joints_of(&self.arm.feedback.motors.map(|motor| f64::from(motor.speed) * MILLI)))
     }
 
-    /// Torques [Nm]; `None` when a motor has not told its current lately, and when the firmware is not known, which
-    /// says how to read the currents.
+    /// Torques [Nm]; `None` if a motor has not reported its current recently, or if the firmware, which determines the
+    /// unit of the currents, is unknown.
     fn efforts(&self) -> Option<Joints> {
         if !self.arm.measures() {
             return None;
         }
-        let quarter = self.arm.picture.firmware()? <= QUARTER_CURRENT;
+        let quarter = self.arm.feedback.firmware()? <= QUARTER_CURRENT;
         let mut efforts = [0.0; DOF];
-        let motors = self.arm.picture.motors.iter().zip(TORQUE).enumerate();
+        let motors = self.arm.feedback.motors.iter().zip(TORQUE).enumerate();
         for (effort, (joint, (motor, torque))) in efforts.iter_mut().zip(motors) {
             let scale = if quarter && joint < 3 { 4.0 } else { 1.0 };
             *effort = f64::from(motor.current) * MILLI * torque * scale;
@@ -112,7 +112,7 @@ fn fill(out: &mut [f64], values: &[f64]) {
     out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
 }
 
-/// How long a stop waits for positions that are measured now.
+/// How long a stop waits for current positions.
 const LIVE_TIMEOUT: Duration = Duration::from_millis(60);
 
 impl ManipulatorAdapter for PiperAdapter {
@@ -131,14 +131,14 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.wire.is_some()
     }
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         ManipulatorInfo {
             vendor: "AgileX".into(),
             model: "Piper".into(),
             dof: DOF,
-            firmware_version: self.arm.picture.firmware().map(|(a, b, c)| format!("S-V{a}.{b}-{c}")),
+            firmware_version: self.arm.feedback.firmware().map(|(a, b, c)| format!("S-V{a}.{b}-{c}")),
             serial_number: None,
             native_rate: NATIVE_RATE,
             modes: MODES,
@@ -151,7 +151,7 @@ impl ManipulatorAdapter for PiperAdapter {
         DOF
     }
 
-    /// The data sheet's limits, narrowed by those that the controller has been given.
+    /// Returns the limits of the data sheet, narrowed by those of the controller.
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
         let (limits, odd) = self.arm.limits();
         odd.iter().for_each(|what| tracing::warn!("{}", self.arm.about(what)));
@@ -160,7 +160,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     // --- Mode ---
 
-    /// Both modes are MOVE J and differ in what stands before each target, so that nothing is sent here.
+    /// Both modes are MOVE J and differ only in the frame before each target, so nothing is sent here.
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
         if !MODES.contains(&mode) {
             return Err(AdapterError::Unsupported);
@@ -171,9 +171,9 @@ impl ManipulatorAdapter for PiperAdapter {
         Ok(())
     }
 
-    /// The ordered mode, or another one when somebody else has changed it.
+    /// Returns the ordered mode, or another one if another client has changed it.
     fn get_control_mode(&self) -> ControlMode {
-        self.arm.picture.guard.change.map_or(self.mode, |change| change.mode(self.mode))
+        self.arm.feedback.guard.change.map_or(self.mode, |change| change.mode(self.mode))
     }
 
     // --- State ---
@@ -184,7 +184,7 @@ impl ManipulatorAdapter for PiperAdapter {
 
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
         self.arm.whole()?;
-        fill(positions, &self.arm.picture.joints.map(radians));
+        fill(positions, &self.arm.feedback.joints.map(radians));
         Ok(())
     }
 
@@ -205,8 +205,8 @@ impl ManipulatorAdapter for PiperAdapter {
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         self.arm.whole()?;
         *reading = JointReading {
-            stamp: Some(self.arm.picture.joints_at),
-            position: joints_of(&self.arm.picture.joints.map(radians)),
+            stamp: Some(self.arm.feedback.joints_at),
+            position: joints_of(&self.arm.feedback.joints.map(radians)),
             velocity: self.velocities(),
             effort: self.efforts(),
             valid: self.arm.valid(),
@@ -214,20 +214,20 @@ impl ManipulatorAdapter for PiperAdapter {
         Ok(())
     }
 
-    /// State: the arm's own (0 = in order, 1 = E-stop …); mode: who controls it (0 nobody, 1 CAN, 2 teaching …).
+    /// State: the arm's own (0 = normal, 1 = E-stop …); mode: who controls it (0 = none, 1 = CAN, 2 = teaching …).
     fn read_state(&mut self) -> AdapterResult<RobotState> {
         let status = self.arm.known()?.status;
         Ok(RobotState { state: status.arm.into(), mode: status.control.into() })
     }
 
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
-        let picture = self.arm.known()?;
-        Ok((picture.error_code(), picture.error_text())) // an empty text allocates nothing
+        let feedback = self.arm.known()?;
+        Ok((feedback.error_code(), feedback.error_text())) // an empty text allocates nothing
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
-        let picture = self.arm.known()?;
-        Ok(picture.enabled() && !picture.guard.just_off(MonotonicClock.now()))
+        let feedback = self.arm.known()?;
+        Ok(feedback.enabled() && !feedback.guard.just_off(MonotonicClock.now()))
     }
 
     // --- Motion ---
@@ -237,7 +237,7 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(self.arm.refuse(format!("{DOF} values are needed, one per joint")));
         };
         for (i, (value, (lower, upper))) in positions.iter().zip(super::RANGES).enumerate() {
-            // Not finite is not inside either.
+            // NaN is not inside either.
             if !(lower - MARGIN..=upper + MARGIN).contains(value) {
                 let joint = i + 1;
                 return Err(self.arm.refuse(format!("joint {joint}: {value} rad is not within {lower} to {upper}")));
@@ -248,7 +248,7 @@ impl ManipulatorAdapter for PiperAdapter {
             return Err(AdapterError::Busy);
         }
         let mut joints: WireJoints = positions.map(millidegrees);
-        let here = self.arm.picture.joints.iter().zip(&self.arm.ranges);
+        let here = self.arm.feedback.joints.iter().zip(&self.arm.ranges);
         for (target, (here, range)) in joints.iter_mut().zip(here) {
             *target = hold::within(*target, *here, *range, self.arm.strict);
         }
@@ -258,30 +258,30 @@ impl ManipulatorAdapter for PiperAdapter {
         }
     }
 
-    /// Holds the arm: at what was last written, 0.02 rad from where it is at most. Confirmed when its feedback shows
-    /// that every joint gets slower or stands.
+    /// Holds the arm at the last written target, at most 0.02 rad from its position. Confirmed when the feedback shows
+    /// that every joint decelerates or is at rest.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
-        self.arm.refresh()?; // an arm that was somewhere else before it fell silent is not sent back there
-        if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
-            // Where the arm is now: not where it was before a pause of its feedback. One that stays silent is held
-            // there.
-            self.arm.watch(LIVE_TIMEOUT, Picture::is_live)?;
+        self.arm.refresh()?; // a hold needs a current position
+        if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
+            // Use current positions, not those from before a gap in the feedback. An arm that stays silent is held at
+            // the old ones.
+            self.arm.watch(LIVE_TIMEOUT, Feedback::is_live)?;
             self.arm.settle()?;
         }
-        let before = self.arm.picture.motors.map(|motor| i32::from(motor.speed).abs());
-        if self.arm.picture.enabled() && self.arm.picture.status.arm != ESTOP {
+        let before = self.arm.feedback.motors.map(|motor| i32::from(motor.speed).abs());
+        if self.arm.feedback.enabled() && self.arm.feedback.status.arm != ESTOP {
             self.arm.hold(self.follow())?;
         }
         let sent = MonotonicClock.now();
-        let slower = |picture: &Picture| {
-            let speeds = picture.motors.iter().map(|motor| i32::from(motor.speed).abs());
-            picture.motors_heard(sent)
-                && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + SLOWER <= then)
+        let slower = |feedback: &Feedback| {
+            let speeds = feedback.motors.iter().map(|motor| i32::from(motor.speed).abs());
+            feedback.motors_heard(sent)
+                && speeds.zip(before).all(|(now, then)| now <= STANDSTILL || now + DECELERATION <= then)
         };
         Ok(if self.arm.watch(STOP_TIMEOUT, slower)? { Stop::Confirmed } else { Stop::Sent })
     }
 
-    /// Enabling holds the arm where it is: the target is set before the motors come on, and again when they are on.
+    /// Enabling holds the arm at its position: the target is set before the motors come on, and again when they are on.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         if !enable {
             self.arm.drain()?;
@@ -291,7 +291,7 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.refresh()?;
         self.arm.in_order()?;
         self.arm.plausible()?;
-        let were_on = self.arm.picture.enabled();
+        let were_on = self.arm.feedback.enabled();
         self.arm.release();
         self.arm.written = self.arm.written.filter(|_| were_on);
         self.arm.take_up_hold(self.follow())?;
@@ -304,29 +304,30 @@ impl ManipulatorAdapter for PiperAdapter {
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.arm.refresh()?;
-        if self.arm.picture.status.arm == ESTOP {
+        if self.arm.feedback.status.arm == ESTOP {
             return self.arm.in_order();
         }
         self.arm.learn();
         self.arm.send(&[protocol::clear_errors()])?;
-        if let Some(gripper) = self.arm.picture.gripper.filter(|_| self.arm.picture.gripper_errors().next().is_some()) {
+        if let Some(gripper) = self.arm.feedback.gripper.filter(|_| self.arm.feedback.gripper_errors().next().is_some())
+        {
             let frame = protocol::clear_gripper(gripper.stroke, self.gripper_torque(), gripper.enabled());
             self.arm.send(&[frame])?;
         }
         let asked = MonotonicClock.now();
-        let cleared = |p: &Picture| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
+        let cleared = |p: &Feedback| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
         if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
-            if matches!(self.arm.picture.status.control, 0 | 1) {
+            if matches!(self.arm.feedback.status.control, 0 | 1) {
                 self.arm.release();
             }
             return Ok(());
         }
-        let (code, text) = (self.arm.picture.error_code(), self.arm.picture.error_text());
+        let (code, text) = (self.arm.feedback.error_code(), self.arm.feedback.error_text());
         Err(AdapterError::Fault { code, text })
     }
 
-    /// Set points that wait for the bus are taken back, where the bus lets them be; otherwise nothing new is sent
-    /// before they are out.
+    /// Takes back setpoints that wait for the bus, if the bus allows it; otherwise nothing new is sent until they are
+    /// out.
     fn discard_pending(&mut self) {
         self.arm.discard();
     }
@@ -347,7 +348,7 @@ impl Gripper for PiperAdapter {
         Ok(self.arm.known()?.gripper.map(|gripper| f64::from(gripper.stroke) * MICRO))
     }
 
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
         self.options.gripper.stroke().map(|stroke| (0.0, stroke))
     }
 
@@ -370,7 +371,7 @@ impl Cartesian for PiperAdapter {
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
-        // Ten metres and ten turns are far beyond the arm, and far inside the wire's numbers.
+        // Ten metres and ten turns are far beyond the arm's reach, and fit the wire's numbers.
         let sensible = pose.xyz.iter().all(|v| v.abs() < 10.0) && pose.rpy.iter().all(|v| v.abs() < 62.0);
         if !sensible {
             return Err(self.arm.refuse("the pose is not finite, or absurd".into()));
@@ -379,7 +380,7 @@ impl Cartesian for PiperAdapter {
         let ([x, y, z], [roll, pitch, yaw]) =
             (pose.xyz.map(|v| (v / MICRO).round() as i32), pose.rpy.map(millidegrees));
         (self.arm.written, self.arm.control) = (None, None);
-        self.arm.picture.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
+        self.arm.feedback.guard.order(protocol::MoveMode::Pose as u8, MonotonicClock.now());
         self.arm.send(&protocol::pose_target(self.percent(velocity), [x, y, z, roll, pitch, yaw]))
     }
 }

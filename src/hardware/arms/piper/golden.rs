@@ -1,5 +1,4 @@
-//! Frames as they stand on the bus, put together by hand from the sheet: `id#data`. The adapter's and the emulator's
-//! code are both held against them.
+//! Frames written by hand from the data sheet: `id#data`. The code of both adapter and emulator is compared with them.
 
 use crate::hardware::transport::can::CanFrame;
 

@@ -1,7 +1,8 @@
-//! Changes of the arm's mode and power that this run did not order: by its button, hand guiding, or another program.
+//! Detects changes of the arm's mode and power that this run did not order: by its button, hand guiding, or another
+//! program.
 //!
-//! They are remembered until this run takes control again: a change that is undone a moment later, or comes between two
-//! readings, is seen all the same. Nothing here undoes one.
+//! They are latched until this run takes control again, so a change between two readings is seen too. Nothing here
+//! undoes one.
 
 use std::time::Duration;
 
@@ -9,26 +10,26 @@ use super::protocol::{Status, control_text, mode_text};
 use crate::clock::Mono;
 use crate::joint::ControlMode;
 
-/// How long the arm gets to report a mode that was ordered.
+/// How long the arm may take to report an ordered mode.
 const SETTLING: Duration = Duration::from_millis(100);
-/// For how long motors that went off are reported as off at least, so that no reader misses it.
-const NOTICEABLE: Duration = Duration::from_millis(100);
+/// Minimum time for which motors that went off are reported as off, so that every reader sees it.
+const MIN_OFF_TIME: Duration = Duration::from_millis(100);
 
-/// A change that was not ordered.
+/// A change that this run did not order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Change {
     /// Who controls the arm (0x2A1, byte 0).
     Control(u8),
     /// Its move mode (0x2A1, byte 2).
     MoveMode(u8),
-    /// It is being taught (0x2A1, byte 3).
+    /// It is in teaching (0x2A1, byte 3).
     Teaching,
     /// Another program commands it in the same mode.
     Commands,
 }
 
 impl Change {
-    /// What happened, in words.
+    /// Returns the change as text.
     pub fn text(self) -> String {
         match self {
             Self::Control(control) => format!("control went to {}", control_text(control)),
@@ -38,7 +39,7 @@ impl Change {
         }
     }
 
-    /// The mode that the arm is in now, for readers that compare it with `ordered`.
+    /// Returns the mode that the arm is in now, different from `ordered`.
     pub fn mode(self, ordered: ControlMode) -> ControlMode {
         match self {
             Self::MoveMode(4) | Self::Teaching | Self::Control(2 | 6) => ControlMode::Impedance,
@@ -50,25 +51,25 @@ impl Change {
     }
 }
 
-/// Compares what the arm reports with what this run has ordered.
+/// Compares the arm's reports with the orders of this run.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Guard {
-    /// Control, move mode and teaching as ordered, and from when on reports count; `None`: not under this run's
+    /// Control, move mode and teaching as ordered, and the time from which reports count; `None` while this run has no
     /// control.
     ordered: Option<((u8, u8, u8), Mono)>,
-    /// The first change that was not ordered.
+    /// The first change that this run did not order.
     pub change: Option<Change>,
-    /// A motor went off that this run had switched on; when one was last seen off.
+    /// Whether a motor went off that this run had enabled, and when one was last seen off.
     off_at: Option<Mono>,
 }
 
 impl Guard {
-    /// This run has enabled the arm, which reports `status` since.
+    /// This run has enabled the arm, which now reports `status`.
     pub fn begin(&mut self, status: &Status, now: Mono) {
         *self = Self { ordered: Some((key(status), now)), ..Self::default() };
     }
 
-    /// The arm is not under this run's control any more, or is to be taken under it again.
+    /// This run loses or takes control of the arm.
     pub fn release(&mut self) {
         *self = Self::default();
     }
@@ -97,32 +98,32 @@ impl Guard {
         }
     }
 
-    /// A motor reports that it is off.
+    /// A motor is reported off.
     pub fn motor_off(&mut self, now: Mono) {
         if self.ordered.take().is_some() || self.off_at.is_some() {
             self.off_at = Some(now);
         }
     }
 
-    /// Another program's command was heard.
+    /// A command of another program was received.
     pub fn commanded(&mut self) {
         if self.ordered.is_some() {
             self.change.get_or_insert(Change::Commands);
         }
     }
 
-    /// Whether motors that this run had switched on went off since.
+    /// Returns whether motors went off that this run had enabled.
     pub fn lost_power(&self) -> bool {
         self.off_at.is_some()
     }
 
-    /// Whether they did so just now.
+    /// Returns whether they went off just now.
     pub fn just_off(&self, now: Mono) -> bool {
-        self.off_at.is_some_and(|at| now.since(at) < NOTICEABLE)
+        self.off_at.is_some_and(|at| now.since(at) < MIN_OFF_TIME)
     }
 }
 
-/// What is compared.
+/// The compared part of a status.
 fn key(status: &Status) -> (u8, u8, u8) {
     (status.control, status.mode, status.teaching)
 }
@@ -138,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_ordered_is_remembered() {
+    fn changes_that_were_not_ordered_are_latched() {
         for (status, change) in [
             (Status { control: 2, ..OURS }, Change::Control(2)),
             (Status { mode: 0, ..OURS }, Change::MoveMode(0)),

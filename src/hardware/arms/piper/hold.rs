@@ -1,30 +1,30 @@
-//! Where the arm is told to stay.
+//! Computes and sends the pose at which the arm holds.
 
 use std::time::Duration;
 
 use super::protocol::{self, DOF, Follow, MoveMode, Status, WireJoints, millidegrees};
 use super::session::Session;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 
-/// Farthest that a hold may be from the measured position [rad].
+/// Maximum distance of a hold from the measured position [rad].
 const WINDOW: f64 = 0.02;
-/// How long positions that contradict each other get to agree: some 10 sets do where every fifth is wrong.
+/// How long contradicting positions may take to agree: about 10 sets if every fifth is wrong.
 const SETTLE_TIMEOUT: Duration = Duration::from_millis(300);
-/// How long the controller gets to refuse a target outside the limits, and to clear that error.
+/// How long the controller may take to refuse a target outside the limits, and to clear that error.
 const REFUSAL_TIMEOUT: Duration = Duration::from_millis(100);
 const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
-/// How long the arm gets to report the mode that was ordered.
+/// How long the arm may take to report the ordered mode.
 const CONTROL_TIMEOUT: Duration = Duration::from_millis(300);
-/// A target beyond the limits, among the arm's states.
+/// State of the arm: target beyond the limits.
 pub const BEYOND: u8 = 4;
 
-/// Lowest and highest target of each joint [0.001°].
+/// Minimum and maximum target of each joint [0.001°].
 pub type WireRanges = [(i32, i32); DOF];
 
-/// The pose to hold [0.001°]: the targets that were last written, since another one would move an arm that stands; but
-/// no farther from the measured positions than 0.02 rad. It is inside the limits, or where the arm lies outside, no
-/// farther outside than it lies. `strict`: the controller refuses targets outside.
+/// Returns the pose to hold [0.001°]: the last written targets, since others would move an arm at rest, but at most
+/// 0.02 rad from the measured positions. It is inside the limits; for a joint outside, at most as far outside as
+/// measured. `strict`: the controller refuses targets outside.
 pub fn target(measured: &WireJoints, written: Option<&WireJoints>, ranges: &WireRanges, strict: bool) -> WireJoints {
     let window = (WINDOW.to_degrees() * 1000.0) as i32;
     let mut target = *measured;
@@ -33,7 +33,7 @@ pub fn target(measured: &WireJoints, written: Option<&WireJoints>, ranges: &Wire
         let wanted = written.and_then(|written| written.get(i)).copied().unwrap_or(here);
         let near = wanted.clamp(here.saturating_sub(window), here.saturating_add(window));
         let inside = within(near, here, *range, strict);
-        // A joint that lies farther outside stays where it is, also where the controller will refuse that.
+        // A joint farther outside stays where it is, even if the controller refuses that.
         if inside.saturating_sub(here).saturating_abs() <= window {
             *target = inside;
         }
@@ -41,7 +41,7 @@ pub fn target(measured: &WireJoints, written: Option<&WireJoints>, ranges: &Wire
     target
 }
 
-/// A target [0.001°] inside the limits, or no farther outside than the measured position; with `strict` inside them.
+/// Limits a target [0.001°] to the range, or for a joint outside to its measured position; with `strict` to the range.
 pub fn within(target: i32, measured: i32, (lower, upper): (i32, i32), strict: bool) -> i32 {
     match strict {
         true => target.clamp(lower, upper.max(lower)),
@@ -49,22 +49,22 @@ pub fn within(target: i32, measured: i32, (lower, upper): (i32, i32), strict: bo
     }
 }
 
-/// The ranges [0.001°] of limits [rad].
+/// Converts limits [rad] to ranges [0.001°].
 pub fn ranges(lower: &[f64], upper: &[f64]) -> WireRanges {
     let mut ranges = [(0, 0); DOF];
     for (range, (lower, upper)) in ranges.iter_mut().zip(lower.iter().zip(upper)) {
-        // Inwards: a rounded limit is none.
+        // Rounded inwards, to stay inside the limits.
         *range = ((lower.to_degrees() * 1000.0).ceil() as i32, (upper.to_degrees() * 1000.0).floor() as i32);
     }
     ranges
 }
 
-/// Whether a measured position is outside its range by more than the wire's resolution.
+/// Returns whether a position is outside its range by more than the wire's resolution.
 pub fn outside(measured: &WireJoints, ranges: &WireRanges) -> bool {
     measured.iter().zip(ranges).any(|(here, (lower, upper))| !(lower - 1..=upper + 1).contains(here))
 }
 
-/// The joint, counted from 1, that lies so far outside its range that no hold brings it back, and by how much [rad].
+/// Returns the joint, from 1, that is too far outside its range for any hold, and by how much [rad].
 pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(usize, f64)> {
     let by = |(here, (lower, upper)): (&i32, &(i32, i32))| (lower - here).max(here - upper);
     let far = measured.iter().zip(ranges).map(by).enumerate().find(|(_, by)| *by > millidegrees(WINDOW));
@@ -72,67 +72,67 @@ pub fn too_far_outside(measured: &WireJoints, ranges: &WireRanges) -> Option<(us
 }
 
 impl Session {
-    /// Commands the arm to stay where it is. When its feedback pauses during a stream, the target is the last setpoint:
-    /// positions measured before the pause would pull the arm back.
+    /// Holds the arm at its position. If the feedback has a gap during a stream, the target is the last setpoint: older
+    /// positions would pull the arm back.
     pub fn hold(&mut self, follow: Follow) -> AdapterResult<()> {
         let target = match self.written() {
-            Some(written) if self.streamed && !self.picture.is_live() => written,
-            written => target(&self.picture.joints, written.as_ref(), &self.ranges, self.strict),
+            Some(written) if self.streamed && !self.feedback.is_live() => written,
+            written => target(&self.feedback.joints, written.as_ref(), &self.ranges, self.strict),
         };
         self.write(100, follow, target)
     }
 
-    /// Waits until no measured positions contradict the believed ones, where that decides what is held: not where the
-    /// arm is close to what was written. `false`: they do not agree.
+    /// Waits until measured positions agree with the accepted ones, unless the arm is close to the last target. Returns
+    /// `false` if they do not agree.
     pub fn settle(&mut self) -> AdapterResult<bool> {
-        let (believed, written) = (&self.picture.joints, self.written());
+        let (believed, written) = (&self.feedback.joints, self.written());
         let near = |(here, written): (&i32, &i32)| (written - here).abs() <= millidegrees(WINDOW);
         if written.is_some_and(|written| believed.iter().zip(&written).all(near)) {
             return Ok(true);
         }
-        self.watch(SETTLE_TIMEOUT, |picture| !picture.disputed(MonotonicClock.now()))
+        self.watch(SETTLE_TIMEOUT, |feedback| !feedback.disputed(MonotonicClock.now()))
     }
 
-    /// The hold before the motors come on. Where the arm lies a little outside its limits, that is the target, if the
-    /// controller takes it; otherwise the limit is.
+    /// Holds before the motors come on. For an arm slightly outside its limits, the target is its position if the
+    /// controller accepts that; otherwise the limit.
     pub fn take_up_hold(&mut self, follow: Follow) -> AdapterResult<()> {
         loop {
-            if let (true, Some((joint, by))) = (self.strict, too_far_outside(&self.picture.joints, &self.ranges)) {
+            if let (true, Some((joint, by))) = (self.strict, too_far_outside(&self.feedback.joints, &self.ranges)) {
                 return Err(self.refuse(format!(
                     "joint {joint} lies {by:.3} rad outside its limits, and the controller takes no target there: not \
                      enabled\nhint: move it back by hand"
                 )));
             }
             self.hold(follow)?;
-            if self.strict || !outside(&self.picture.joints, &self.ranges) {
+            if self.strict || !outside(&self.feedback.joints, &self.ranges) {
                 return Ok(());
             }
             let sent = MonotonicClock.now();
-            if !self.watch(REFUSAL_TIMEOUT, |picture| picture.status_at > sent && picture.status.arm == BEYOND)? {
+            if !self.watch(REFUSAL_TIMEOUT, |feedback| feedback.status_at > sent && feedback.status.arm == BEYOND)? {
                 return Ok(());
             }
             self.strict = true;
             let asked = MonotonicClock.now();
             self.send(&[protocol::clear_errors()])?;
-            self.watch(CLEAR_TIMEOUT, |picture| picture.status_at > asked && picture.status.arm == 0)?;
+            self.watch(CLEAR_TIMEOUT, |feedback| feedback.status_at > asked && feedback.status.arm == 0)?;
             self.in_order()?;
         }
     }
 
-    /// Waits until the arm reports the mode that the hold has ordered: changes after that are not this run's.
+    /// Waits until the arm reports the ordered mode: later changes are not by this run.
     pub fn take_control(&mut self) -> AdapterResult<()> {
         let sent = MonotonicClock.now();
         let ours = |status: &Status| (status.control, status.mode, status.teaching) == (1, MoveMode::Joint as u8, 0);
-        self.watch(CONTROL_TIMEOUT, |picture| picture.status_at > sent && ours(&picture.status))?;
+        self.watch(CONTROL_TIMEOUT, |feedback| feedback.status_at > sent && ours(&feedback.status))?;
         self.in_order()?;
-        let status = self.picture.status;
-        self.picture.guard.begin(&status, MonotonicClock.now());
+        let status = self.feedback.status;
+        self.feedback.guard.begin(&status, MonotonicClock.now());
         Ok(())
     }
 
-    /// Remembers what an error before its clearing says of the controller.
+    /// Records what an error reveals about the controller, before it is cleared.
     pub fn learn(&mut self) {
-        let beyond = self.picture.status.arm == BEYOND;
+        let beyond = self.feedback.status.arm == BEYOND;
         self.strict |= beyond && self.written.is_some_and(|written| outside(&written, &self.ranges));
     }
 }

@@ -1,24 +1,26 @@
 //! AgileX Piper: 6 joints and a gripper on a CAN bus. `docs/arms/piper.md` is for those who run one.
 
 pub mod adapter;
-mod belief;
+mod controller_limits;
 pub mod emulator;
+pub mod feedback;
 #[cfg(test)]
 mod golden;
 mod guard;
 mod hold;
-mod own_limits;
-pub mod picture;
+mod jump_filter;
 pub mod protocol;
 mod session;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
+mod tests_bus;
+#[cfg(test)]
 mod tests_faults;
 #[cfg(test)]
 mod tests_holds;
 #[cfg(test)]
-mod tests_others;
+mod tests_other_clients;
 mod wire;
 
 use std::time::Duration;
@@ -26,7 +28,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::hardware::transport::can::{self, address::FORMS};
 use crate::joint::{ControlMode, JointLimits};
@@ -57,7 +59,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(adapter::PiperAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::PiperEmulator::start(config, place)?))),
 };
@@ -71,10 +73,10 @@ const SPEED: f64 = 3.0;
 const ACCELERATION: f64 = 5.0;
 
 /// All arms have the same limits; a connected one may have been given narrower ones.
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("piper", SPEC.dof)?;
     config.options::<Options>()?.sim.check(emulator::PLAYABLE)?;
-    Ok(Fit { limits: limits() })
+    Ok(Checked { limits: limits() })
 }
 
 /// The joint limits of the data sheet.

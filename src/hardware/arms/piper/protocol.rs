@@ -1,8 +1,8 @@
-//! The wire format of the Piper: pure encoding and decoding, no I/O, no units but the wire's own (0.001°, 0.001 mm,
-//! 0.001 rad/s, mA, mNm). All numbers are big-endian.
+//! Wire format of the Piper: encoding and decoding in wire units (0.001°, 0.001 mm, 0.001 rad/s, mA, mNm), without I/O.
+//! All numbers are big-endian.
 //!
-//! There is no encoder for 0x150 (stop and reset) on purpose: its stop can only be left by its reset, and its reset
-//! takes the power from the motors, so that the arm falls.
+//! There is intentionally no encoder for 0x150 (stop and reset): its stop can only be left by its reset, which disables
+//! the motors, so that the arm falls.
 
 use crate::hardware::transport::can::CanFrame;
 
@@ -50,26 +50,25 @@ fn motion_control(mode: MoveMode, speed: u8, follow: Follow) -> CanFrame {
     frame(0x151, [1, mode as u8, speed.min(100), follow as u8, 0, 0, 0, 0])
 }
 
-/// Joint targets [0.001°] at a speed [%]: 0x151 stands before every burst, so that a lost frame costs one burst only.
+/// Joint targets [0.001°] at a speed [%]. 0x151 precedes every burst, so that a lost frame affects one burst only.
 pub fn joint_targets(speed: u8, follow: Follow, [j1, j2, j3, j4, j5, j6]: WireJoints) -> [CanFrame; 4] {
     let mode = motion_control(MoveMode::Joint, speed, follow);
     [mode, pair(0x155, j1, j2), pair(0x156, j3, j4), pair(0x157, j5, j6)]
 }
 
-/// A target of the end: x, y, z [0.001 mm], roll, pitch, yaw [0.001°], at a speed [%].
+/// End-effector target: x, y, z [0.001 mm], roll, pitch, yaw [0.001°], at a speed [%].
 pub fn pose_target(speed: u8, [x, y, z, roll, pitch, yaw]: [i32; 6]) -> [CanFrame; 4] {
     let mode = motion_control(MoveMode::Pose, speed, Follow::Smooth);
     [mode, pair(0x152, x, y), pair(0x153, z, roll), pair(0x154, pitch, yaw)]
 }
 
-/// Opens the gripper to a stroke [0.001 mm] with a torque of at most so much [mNm], and enables it.
+/// Opens the gripper to a stroke [0.001 mm] with a maximum torque [mNm], and enables it.
 pub fn gripper_target(stroke: i32, torque: u16) -> CanFrame {
     let ([a, b, c, d], [e, f]) = (stroke.to_be_bytes(), torque.min(5000).to_be_bytes());
     frame(0x159, [a, b, c, d, e, f, 1, 0])
 }
 
-/// Clears the gripper's errors and leaves it on or off, as it was; its target is this stroke [0.001 mm], with a torque
-/// of at most so much [mNm].
+/// Clears the gripper's errors and leaves it on or off, with a target stroke [0.001 mm] and a maximum torque [mNm].
 pub fn clear_gripper(stroke: i32, torque: u16, on: bool) -> CanFrame {
     let [a, b, c, d, e, f, ..] = gripper_target(stroke, torque).data;
     frame(0x159, [a, b, c, d, e, f, if on { 3 } else { 2 }, 0])
@@ -80,33 +79,33 @@ pub fn enable(on: bool) -> CanFrame {
     frame(0x471, [7, if on { 2 } else { 1 }, 0, 0, 0, 0, 0, 0])
 }
 
-/// Clears the errors of all joints and leaves everything else as it is: no zero point set, accelerations kept.
+/// Clears the errors of all joints and changes nothing else: no zero point is set, accelerations are kept.
 pub fn clear_errors() -> CanFrame {
     frame(0x475, [7, 0, 0, 0x7F, 0xFF, 0xAE, 0, 0])
 }
 
-/// Asks for the position and speed limits of a joint, counted from 1.
+/// Requests the position and speed limits of a joint, from 1.
 pub fn ask_limits(joint: u8) -> CanFrame {
     frame(0x472, [joint, 1, 0, 0, 0, 0, 0, 0])
 }
 
-/// Asks for the firmware's name.
+/// Requests the firmware's name.
 pub fn ask_firmware() -> CanFrame {
     frame(0x4AF, [1, 0, 0, 0, 0, 0, 0, 0])
 }
 
 // --- Feedback ---
 
-/// What the controller says of itself (0x2A1).
+/// Status of the controller (0x2A1).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Status {
-    /// Who controls the arm: 0 nobody, 1 CAN, 2 teaching …
+    /// Who controls the arm: 0 none, 1 CAN, 2 teaching …
     pub control: u8,
-    /// The arm's state; 0 = in order.
+    /// State of the arm; 0 = normal.
     pub arm: u8,
-    /// Its move mode: 0 MOVE P, 1 MOVE J …
+    /// Move mode: 0 MOVE P, 1 MOVE J …
     pub mode: u8,
-    /// What it does of teaching by hand; 0 = nothing.
+    /// State of teaching; 0 = off.
     pub teaching: u8,
     /// Joints beyond their limits: bit 0 = joint 1.
     pub limits: u8,
@@ -170,9 +169,9 @@ pub struct MotorLimits {
     pub speed: u16,
 }
 
-/// What a frame says. Indices of joints and parts count from 0.
+/// A decoded frame. Indices of joints and parts count from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Feedback {
+pub enum FeedbackFrame {
     /// 0x2A1
     Status(Status),
     /// 0x2A2–4, a third of the pose: x y, z roll, pitch yaw [0.001 mm, 0.001°].
@@ -189,41 +188,46 @@ pub enum Feedback {
     Limits(usize, MotorLimits),
     /// 0x4AF: a piece of text and its length.
     Firmware([u8; 8], usize),
-    /// What an arm sends that leads others: its own joints as commands, or feedback under shifted identifiers.
+    /// A frame of a leader arm: its own joints as commands, or feedback with shifted identifiers.
     Leader,
     /// Another command to the arm: a stop, a mode, a pose, its motors, its errors.
     Command,
-    /// A frame of the arm with too few bytes, or a number that no frame has.
+    /// A frame with too few bytes, or with impossible values.
     Damaged,
-    /// Of no interest here.
+    /// Not used.
     Other,
 }
 
-/// What a frame means. Never fails: see [`Feedback::Damaged`] and [`Feedback::Other`].
-pub fn decode(frame: &CanFrame) -> Feedback {
+/// Decodes a frame. Never fails: see [`FeedbackFrame::Damaged`] and [`FeedbackFrame::Other`].
+pub fn decode(frame: &CanFrame) -> FeedbackFrame {
     let id = frame.id;
     if let 0x151 | 0x155..=0x157 | 0x159 | 0x3A0..=0x3AF = id {
-        return Feedback::Leader;
+        return FeedbackFrame::Leader;
     }
     if let 0x150 | 0x152..=0x154 | 0x158 | 0x15A..=0x15F | 0x470 | 0x471 | 0x474 | 0x475 = id {
-        return Feedback::Command;
+        return FeedbackFrame::Command;
     }
     if id == 0x4AF {
-        return Feedback::Firmware(frame.data, usize::from(frame.len.min(8)));
+        return FeedbackFrame::Firmware(frame.data, usize::from(frame.len.min(8)));
     }
     let [a, b, c, d, e, f, g, h] = frame.data;
     let two = [i32::from_be_bytes([a, b, c, d]), i32::from_be_bytes([e, f, g, h])];
     let from = |first: u16| usize::from(id.wrapping_sub(first));
     let feedback = match id {
-        0x2A1 => {
-            Feedback::Status(Status { control: a, arm: b, mode: c, teaching: d, limits: g & 0x3F, silent: h & 0x3F })
-        }
-        0x2A2..=0x2A4 => Feedback::Pose(from(0x2A2), two),
-        0x2A5..=0x2A7 => Feedback::Joints(from(0x2A5), two),
-        0x2A8 => Feedback::Gripper(Gripper { stroke: two[0], status: g }),
+        0x2A1 => FeedbackFrame::Status(Status {
+            control: a,
+            arm: b,
+            mode: c,
+            teaching: d,
+            limits: g & 0x3F,
+            silent: h & 0x3F,
+        }),
+        0x2A2..=0x2A4 => FeedbackFrame::Pose(from(0x2A2), two),
+        0x2A5..=0x2A7 => FeedbackFrame::Joints(from(0x2A5), two),
+        0x2A8 => FeedbackFrame::Gripper(Gripper { stroke: two[0], status: g }),
         0x251..=0x256 => {
             let motor = Motor { speed: i16::from_be_bytes([a, b]), current: i16::from_be_bytes([c, d]) };
-            Feedback::Motor(from(0x251), motor)
+            FeedbackFrame::Motor(from(0x251), motor)
         }
         0x261..=0x266 => {
             let driver = Driver {
@@ -232,7 +236,7 @@ pub fn decode(frame: &CanFrame) -> Feedback {
                 motor_temperature: i8::from_be_bytes([e]),
                 status: f,
             };
-            Feedback::Driver(from(0x261), driver)
+            FeedbackFrame::Driver(from(0x261), driver)
         }
         0x473 if (1..=6).contains(&a) => {
             let limits = MotorLimits {
@@ -240,12 +244,12 @@ pub fn decode(frame: &CanFrame) -> Feedback {
                 lower: i16::from_be_bytes([d, e]),
                 speed: u16::from_be_bytes([f, g]),
             };
-            Feedback::Limits(usize::from(a) - 1, limits)
+            FeedbackFrame::Limits(usize::from(a) - 1, limits)
         }
-        0x473 => Feedback::Damaged,
-        _ => return Feedback::Other,
+        0x473 => FeedbackFrame::Damaged,
+        _ => return FeedbackFrame::Other,
     };
-    if frame.len == 8 { feedback } else { Feedback::Damaged }
+    if frame.len == 8 { feedback } else { FeedbackFrame::Damaged }
 }
 
 // --- Angles ---
@@ -260,9 +264,9 @@ pub fn millidegrees(value: f64) -> i32 {
     (value.to_degrees() * 1000.0).round() as i32
 }
 
-// --- Words ---
+// --- Texts ---
 
-/// What a state of the arm means (0x2A1, byte 1).
+/// Returns the text of a state of the arm (0x2A1, byte 1).
 pub fn arm_text(code: u8) -> &'static str {
     match code {
         0 => "in order",
@@ -285,10 +289,10 @@ pub fn arm_text(code: u8) -> &'static str {
     }
 }
 
-/// Who controls the arm (0x2A1, byte 0).
+/// Returns who controls the arm (0x2A1, byte 0).
 pub fn control_text(control: u8) -> &'static str {
     match control {
-        0 => "nobody",
+        0 => "no client",
         1 => "CAN",
         2 => "its teach button",
         3 => "Ethernet",
@@ -300,7 +304,7 @@ pub fn control_text(control: u8) -> &'static str {
     }
 }
 
-/// The name of a move mode (0x2A1, byte 2).
+/// Returns the name of a move mode (0x2A1, byte 2).
 pub fn mode_text(mode: u8) -> &'static str {
     match mode {
         0 => "MOVE P",
@@ -313,7 +317,7 @@ pub fn mode_text(mode: u8) -> &'static str {
     }
 }
 
-/// What an error bit of a driver means (0x261–6, byte 5); `None` for bits that are no error.
+/// Returns the text of a driver's error bit (0x261–6, byte 5); `None` for bits that are not errors.
 pub fn driver_text(bit: u8) -> Option<&'static str> {
     match bit {
         0 => Some("low voltage"),
@@ -327,7 +331,7 @@ pub fn driver_text(bit: u8) -> Option<&'static str> {
     }
 }
 
-/// What an error bit of the gripper means (0x2A8, byte 6); `None` for bits that are no error.
+/// Returns the text of a gripper's error bit (0x2A8, byte 6); `None` for bits that are not errors.
 pub fn gripper_text(bit: u8) -> Option<&'static str> {
     match bit {
         4 => Some("sensor error"),

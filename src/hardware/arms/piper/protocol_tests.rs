@@ -21,31 +21,31 @@ fn commands_are_the_golden_bytes() {
 fn feedback_is_read_from_the_golden_bytes() {
     let read = |text| decode(&frame(text));
     let status = Status { control: 1, arm: 4, mode: 1, teaching: 0, limits: 0b10, silent: 0b100000 };
-    assert_eq!(read(golden::STATUS), Feedback::Status(status));
+    assert_eq!(read(golden::STATUS), FeedbackFrame::Status(status));
     for part in 0..3 {
         let two = |all: [i32; 6]| [all[2 * part], all[2 * part + 1]];
-        assert_eq!(read(golden::POSE_FEEDBACK[part]), Feedback::Pose(part, two(POSE)));
-        assert_eq!(read(golden::JOINT_FEEDBACK[part]), Feedback::Joints(part, two(JOINTS)));
+        assert_eq!(read(golden::POSE_FEEDBACK[part]), FeedbackFrame::Pose(part, two(POSE)));
+        assert_eq!(read(golden::JOINT_FEEDBACK[part]), FeedbackFrame::Joints(part, two(JOINTS)));
     }
     let gripper = Gripper { stroke: 42_500, status: 0xC0 };
-    assert_eq!(read(golden::GRIPPER_FEEDBACK), Feedback::Gripper(gripper));
-    assert_eq!(read(golden::MOTOR_1), Feedback::Motor(0, Motor { speed: -1500, current: 2000 }));
-    assert_eq!(read(golden::MOTOR_6), Feedback::Motor(5, Motor { speed: 1, current: -1 }));
+    assert_eq!(read(golden::GRIPPER_FEEDBACK), FeedbackFrame::Gripper(gripper));
+    assert_eq!(read(golden::MOTOR_1), FeedbackFrame::Motor(0, Motor { speed: -1500, current: 2000 }));
+    assert_eq!(read(golden::MOTOR_6), FeedbackFrame::Motor(5, Motor { speed: 1, current: -1 }));
     let driver = Driver { voltage: 240, driver_temperature: 45, motor_temperature: -5, status: 0xC0 };
-    assert_eq!(read(golden::DRIVER_3), Feedback::Driver(2, driver));
+    assert_eq!(read(golden::DRIVER_3), FeedbackFrame::Driver(2, driver));
     assert!(driver.enabled());
-    assert_eq!(read(golden::LIMITS_3), Feedback::Limits(2, MotorLimits { upper: 0, lower: -1700, speed: 3000 }));
-    assert_eq!(read(golden::FIRMWARE), Feedback::Firmware(*b"S-V1.6-3", 8));
+    assert_eq!(read(golden::LIMITS_3), FeedbackFrame::Limits(2, MotorLimits { upper: 0, lower: -1700, speed: 3000 }));
+    assert_eq!(read(golden::FIRMWARE), FeedbackFrame::Firmware(*b"S-V1.6-3", 8));
     for leader in ["151#01", "155#", "157#0000000000000000", "159#00", "3A5#0000000000000000"] {
-        assert_eq!(read(leader), Feedback::Leader);
+        assert_eq!(read(leader), FeedbackFrame::Leader);
     }
     for command in ["150#02", golden::MOVE_POSE[1], golden::ENABLE, golden::CLEAR, "15A#00", "470#FC", "474#01"] {
-        assert_eq!(read(command), Feedback::Command);
+        assert_eq!(read(command), FeedbackFrame::Command);
     }
     for other in
         [golden::ACK_ENABLE, golden::ACCELERATION_3, golden::ASK_LIMITS, "000#", "2A0#00", "2A9#00", "7FF#FFFF"]
     {
-        assert_eq!(read(other), Feedback::Other);
+        assert_eq!(read(other), FeedbackFrame::Other);
     }
 }
 
@@ -55,7 +55,7 @@ fn short_frames_and_every_identifier_are_survived() {
         for len in [0, 1, 7, 8, 255] {
             let feedback = decode(&CanFrame { id, len, data: [0xFF; 8] });
             let whole = matches!(id, 0x2A1..=0x2A8 | 0x251..=0x256 | 0x261..=0x266 | 0x473);
-            assert_eq!(feedback == Feedback::Damaged, whole && len != 8 || id == 0x473, "{id:X} {len}");
+            assert_eq!(feedback == FeedbackFrame::Damaged, whole && len != 8 || id == 0x473, "{id:X} {len}");
         }
     }
 }
@@ -72,7 +72,7 @@ fn every_error_has_words() {
 /// Prints how fast frames are read; the figure of a debug build is a lower bound.
 #[test]
 fn reading_a_second_of_frames_takes_far_less_than_a_second() {
-    use super::super::picture::Picture;
+    use super::super::feedback::Feedback;
     use crate::clock::Mono;
     let burst: Vec<CanFrame> =
         [golden::STATUS, golden::GRIPPER_FEEDBACK, golden::MOTOR_1, golden::MOTOR_6, golden::DRIVER_3]
@@ -81,14 +81,14 @@ fn reading_a_second_of_frames_takes_far_less_than_a_second() {
             .chain(golden::JOINT_FEEDBACK)
             .map(frame)
             .collect();
-    let mut picture = Picture::default();
+    let mut feedback = Feedback::default();
     let began = std::time::Instant::now();
     let rounds = 20_000;
     for round in 0..rounds {
-        burst.iter().for_each(|frame| picture.take(decode(frame), Mono(5_000_000 * (round + 1))));
+        burst.iter().for_each(|frame| feedback.take(decode(frame), Mono(5_000_000 * (round + 1))));
     }
     let seconds = began.elapsed().as_secs_f64();
-    assert_eq!(picture.counts.sets, rounds);
-    println!("{:.1} million frames/s", picture.counts.decoded as f64 / seconds / 1e6);
-    assert!(picture.counts.decoded as f64 / seconds > 30_400.0, "ten times what an arm sends");
+    assert_eq!(feedback.counts.sets, rounds);
+    println!("{:.1} million frames/s", feedback.counts.decoded as f64 / seconds / 1e6);
+    assert!(feedback.counts.decoded as f64 / seconds > 30_400.0, "ten times what an arm sends");
 }

@@ -1,71 +1,71 @@
-//! The adapter's dealings with the arm, apart from units: what arrives is taken up, silence is noticed, and what may be
-//! sent is decided by what the arm says of itself.
+//! A session with the arm, in wire units: processes received frames, detects silence, and decides from the arm's
+//! feedback what may be sent.
 
 use std::time::Duration;
 
+use super::controller_limits;
+use super::feedback::Feedback;
 use super::hold::{self, WireRanges};
 use super::limits;
-use super::own_limits;
-use super::picture::Picture;
 use super::protocol::{self, DOF, Driver, Follow, MoveMode, Status, WireJoints, radians};
 use super::wire::Wire;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::{CanAddress, CanFrame};
 use crate::joint::JointLimits;
 
-/// Longest waits for the first whole state, and then for what was asked.
+/// Timeouts of the first complete state, and of responses.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1000);
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(300);
-/// What has arrived within this time need not be looked for again: the arm's period.
+/// Received frames are not processed again within this time: the arm's period.
 const RECENT: Duration = Duration::from_millis(5);
-/// A state older than this is no state: a living arm sends one every 5 ms; the rest is for a busy host.
-const SILENCE: Duration = Duration::from_millis(150);
-/// The same of what the drivers say, which comes every 25 ms.
-const DRIVERS_SILENCE: Duration = Duration::from_millis(300);
-/// After this long without a state the connection is given up: the arm has lost its power.
-const LOST: Duration = Duration::from_millis(400);
-/// Enabling and disabling are asked for again and again, as the vendor does, and for so long.
+/// Maximum age of the state: a live arm sends one every 5 ms; the rest is for a busy host.
+const STALE_AFTER: Duration = Duration::from_millis(150);
+/// Maximum age of the drivers' reports, which arrive every 25 ms.
+const DRIVERS_STALE_AFTER: Duration = Duration::from_millis(300);
+/// Without a state for this long the connection is closed: the arm has lost power.
+const LOST_AFTER: Duration = Duration::from_millis(400);
+/// Period of the repeated commands for enabling and disabling, as in the vendor's SDK.
 const REPEAT: Duration = Duration::from_millis(10);
 const ENABLE_TIMEOUT: Duration = Duration::from_millis(1000);
-/// The E-stop among the arm's states.
+/// State of the arm: E-stop.
 pub const ESTOP: u8 = 1;
-/// So far outside its limits a joint may lie and still be enabled [rad].
-const PLAUSIBLE: f64 = 0.2;
+/// How far outside its limits a joint may be when it is enabled [rad].
+const MAX_OUTSIDE: f64 = 0.2;
 
 /// An arm on its bus, connected or not.
 pub struct Session {
-    /// The arm's name in the blueprint, for messages.
+    /// The arm's `hardware_id`, for messages.
     hardware_id: String,
     address: CanAddress,
     /// The open port, while connected.
     pub wire: Option<Wire>,
-    /// What is known of the arm.
-    pub picture: Picture,
-    /// The joint targets that the arm was last sent [0.001°]; `None` where it does not follow them.
+    /// The arm's feedback.
+    pub feedback: Feedback,
+    /// The last joint targets [0.001°]; `None` if the arm does not follow them.
     pub written: Option<WireJoints>,
-    /// It is a setpoint of a stream: the arm is at most its lag behind it.
+    /// Whether they are a setpoint of a stream: the arm is at most its lag behind it.
     pub streamed: bool,
-    /// Speed [%] and way of following of the last control frame for joint targets, where no other one came after it.
+    /// Speed [%] and mode of following in the last control frame for joint targets, unless another one followed it.
     pub control: Option<(u8, Follow)>,
-    /// Its joint limits [0.001°].
+    /// Joint limits [0.001°].
     pub ranges: WireRanges,
-    /// The controller refuses targets outside its limits.
+    /// Whether the controller refuses targets outside its limits.
     pub strict: bool,
-    /// When what had arrived was last taken up.
+    /// When received frames were last processed.
     drained_at: Mono,
 }
 
 impl Session {
-    /// A session with the arm on the bus at `address`. Does not connect.
+    /// Creates a session with the arm on the bus at `address`. Does not connect.
     pub fn new(hardware_id: String, address: CanAddress, gripper_used: bool) -> Self {
-        let picture = Picture::of_arm(gripper_used);
+        let feedback = Feedback::of_arm(gripper_used);
         let ranges = [(0, 0); DOF];
         Self {
             hardware_id,
             address,
             wire: None,
-            picture,
+            feedback,
             written: None,
             streamed: false,
             control: None,
@@ -75,9 +75,9 @@ impl Session {
         }
     }
 
-    /// Opens the port and waits for a whole state. Only asks.
+    /// Opens the port and waits for a complete state. Sends only requests.
     pub fn connect(&mut self) -> AdapterResult<()> {
-        self.picture = Picture::of_arm(self.picture.gripper_used);
+        self.feedback = Feedback::of_arm(self.feedback.gripper_used);
         (self.written, self.control, self.strict) = (None, None, false);
         self.wire = Some(Wire::open(&self.address)?);
         let introduced = self.introduce();
@@ -89,36 +89,36 @@ impl Session {
 
     // --- The wire ---
 
-    /// Takes up what has arrived. A broken wire ends the session.
+    /// Processes received frames. A broken connection ends the session.
     pub fn drain(&mut self) -> AdapterResult<()> {
         let wire = self.wire.as_mut().ok_or(AdapterError::NotConnected)?;
         self.drained_at = MonotonicClock.now();
-        let result = wire.drain(&mut self.picture);
+        let result = wire.drain(&mut self.feedback);
         if result.is_err() {
             self.wire = None;
         }
         result
     }
 
-    /// Sends a command: an error unless the bus has taken all of it.
+    /// Sends a command; an error unless the bus has taken all of it.
     pub fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<()> {
         self.wire.as_mut().ok_or(AdapterError::NotConnected)?.send(frames)
     }
 
-    /// Sends a joint target, with its control frame, and remembers it.
+    /// Sends a joint target with its control frame, and records it.
     pub fn write(&mut self, speed: u8, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         let frames = protocol::joint_targets(speed, follow, target);
-        self.picture.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
+        self.feedback.guard.order(MoveMode::Joint as u8, MonotonicClock.now());
         self.send(&frames)?;
         (self.written, self.control, self.streamed) = (Some(target), Some((speed, follow)), false);
         Ok(())
     }
 
-    /// Sends a setpoint. The control frame is left out where the arm reports that it is in the mode: another program
-    /// that has just changed it would have that undone before it shows.
+    /// Sends a setpoint. The control frame is omitted while the arm reports the mode: it would undo a change by another
+    /// program before that shows.
     pub fn stream(&mut self, follow: Follow, target: WireJoints) -> AdapterResult<()> {
         const SPEED: u8 = 100;
-        let Status { control, mode, .. } = self.picture.status;
+        let Status { control, mode, .. } = self.feedback.status;
         if self.control != Some((SPEED, follow)) || (control, mode) != (1, MoveMode::Joint as u8) {
             self.write(SPEED, follow, target)?;
             self.streamed = true;
@@ -130,12 +130,12 @@ impl Session {
         Ok(())
     }
 
-    /// Whether another setpoint may wait for the bus.
+    /// Returns whether another setpoint may wait for the bus.
     pub fn has_room(&self) -> bool {
         self.wire.as_ref().is_some_and(Wire::has_room)
     }
 
-    /// Takes back what has not left this computer; see [`Wire::discard`]. Where that fails, the connection ends.
+    /// Discards unsent frames; see [`Wire::discard`]. If that fails, closes the connection.
     pub fn discard(&mut self) {
         let discarded = self.wire.as_mut().map(Wire::discard);
         if let Some(Err(_)) = discarded {
@@ -143,14 +143,14 @@ impl Session {
         }
     }
 
-    /// Takes up feedback until `done` says so; `false` when the time is over.
-    pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Picture) -> bool) -> AdapterResult<bool> {
+    /// Processes feedback until `done` returns true; `false` after the timeout.
+    pub fn watch(&mut self, timeout: Duration, mut done: impl FnMut(&Feedback) -> bool) -> AdapterResult<bool> {
         let end = MonotonicClock.now().after(timeout);
         loop {
             self.drain()?;
             let left = end.since(MonotonicClock.now());
-            if done(&self.picture) || left.is_zero() {
-                return Ok(done(&self.picture));
+            if done(&self.feedback) || left.is_zero() {
+                return Ok(done(&self.feedback));
             }
             if let Some(wire) = &self.wire {
                 wire.wait(left);
@@ -158,52 +158,55 @@ impl Session {
         }
     }
 
-    /// Takes up what has arrived; an error when the newest positions are too old to act on.
+    /// Processes received frames; an error if the newest positions are stale.
     pub fn refresh(&mut self) -> AdapterResult<()> {
         self.drain()?;
-        let age = MonotonicClock.now().since(self.picture.joints_at);
-        if age <= SILENCE {
+        let age = MonotonicClock.now().since(self.feedback.joints_at);
+        if age <= STALE_AFTER {
             return Ok(());
         }
-        // The same words each time, so that they are told once.
-        if age > LOST {
+        // The same text each time, so that it is logged once.
+        if age > LOST_AFTER {
             self.wire = None;
-            let text =
-                format!("the connection to piper at {} broke: no state for {} ms", self.address, LOST.as_millis());
+            let text = format!(
+                "the connection to piper at {} broke: no state for {} ms",
+                self.address,
+                LOST_AFTER.as_millis()
+            );
             return Err(AdapterError::Io(text));
         }
-        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, SILENCE.as_millis())))
+        Err(AdapterError::Timeout(format!("piper at {}: no state for {} ms", self.address, STALE_AFTER.as_millis())))
     }
 
-    /// Takes up what has arrived; an error when the state is too old to be told, or the drivers do not say any more
-    /// whether the motors are on.
+    /// Processes what has arrived; an error if the state is stale, or if the drivers no longer report whether the
+    /// motors are on.
     pub fn whole(&mut self) -> AdapterResult<()> {
         self.refresh()?;
-        let earliest = MonotonicClock.now().before(DRIVERS_SILENCE);
-        if self.picture.drivers_heard(earliest) {
+        let earliest = MonotonicClock.now().before(DRIVERS_STALE_AFTER);
+        if self.feedback.drivers_heard(earliest) {
             return Ok(());
         }
-        let (address, silent) = (&self.address, self.picture.silent_drivers(earliest));
+        let (address, silent) = (&self.address, self.feedback.silent_drivers(earliest));
         Err(AdapterError::Timeout(format!(
             "piper at {address}: the drivers of joints {silent} have said nothing for {} ms",
-            DRIVERS_SILENCE.as_millis()
+            DRIVERS_STALE_AFTER.as_millis()
         )))
     }
 
-    /// Whether what is known of the motors' speeds and currents is new enough to be told.
+    /// Returns whether the motors' speeds and currents are recent.
     pub fn measures(&self) -> bool {
-        self.picture.motors_heard(MonotonicClock.now().before(SILENCE))
+        self.feedback.motors_heard(MonotonicClock.now().before(STALE_AFTER))
     }
 
-    /// The picture, for reads that mostly follow one of the joints and then answer from memory.
-    pub fn known(&mut self) -> AdapterResult<&Picture> {
+    /// The feedback, for reads that mostly follow one of the joints and then answer from memory.
+    pub fn known(&mut self) -> AdapterResult<&Feedback> {
         if self.wire.is_none() {
             return Err(AdapterError::NotConnected);
         }
         if MonotonicClock.now().since(self.drained_at) > RECENT {
             self.drain()?;
         }
-        Ok(&self.picture)
+        Ok(&self.feedback)
     }
 
     /// Waits for a whole state, then for what was asked.
@@ -211,10 +214,10 @@ impl Session {
         let mut questions = [protocol::ask_firmware(); DOF + 1];
         questions.iter_mut().zip(1..).take(DOF).for_each(|(frame, joint)| *frame = protocol::ask_limits(joint));
         self.send(&questions)?;
-        if !self.watch(CONNECT_TIMEOUT, Picture::complete)? {
+        if !self.watch(CONNECT_TIMEOUT, Feedback::complete)? {
             return Err(self.why_not());
         }
-        let answered = |p: &Picture| p.firmware().is_some() && p.limits.iter().all(Option::is_some);
+        let answered = |p: &Feedback| p.firmware().is_some() && p.limits.iter().all(Option::is_some);
         if !self.watch(ANSWER_TIMEOUT / 2, answered)? {
             self.send(&questions)?;
             self.watch(ANSWER_TIMEOUT / 2, answered)?; // what stays unanswered is known from the data sheet
@@ -226,13 +229,13 @@ impl Session {
 
     /// The data sheet's limits, narrowed by those that the controller has been given; and what of these is odd.
     pub fn limits(&self) -> (JointLimits, Vec<String>) {
-        own_limits::narrowed(&self.picture.limits)
+        controller_limits::narrowed(&self.feedback.limits)
     }
 
     /// Why there is no whole state.
     fn why_not(&self) -> AdapterError {
-        let (address, counts) = (&self.address, self.picture.counts);
-        if self.picture.joints_at != Mono::ZERO {
+        let (address, counts) = (&self.address, self.feedback.counts);
+        if self.feedback.joints_at != Mono::ZERO {
             return AdapterError::Timeout(format!("piper at {address}: some of its motors send no state"));
         }
         if counts.leader > 0 {
@@ -259,10 +262,10 @@ impl Session {
     pub fn valid(&self) -> Option<bool> {
         let silent =
             |driver: &Driver| (driver.voltage, driver.driver_temperature, driver.motor_temperature) == (0, 0, 0);
-        if self.picture.status.silent != 0 || self.picture.drivers.iter().all(silent) {
+        if self.feedback.status.silent != 0 || self.feedback.drivers.iter().all(silent) {
             return Some(false);
         }
-        (self.picture.joints != [0; DOF]).then_some(true)
+        (self.feedback.joints != [0; DOF]).then_some(true)
     }
 
     // --- What may be done ---
@@ -277,12 +280,12 @@ impl Session {
         AdapterError::Rejected(format!("{}: {why}", self.hardware_id))
     }
 
-    /// An error unless the arm is in order and listens to nobody but us.
+    /// Checks that the arm has no error and that only this run controls it.
     pub fn in_order(&self) -> AdapterResult<()> {
-        let code = self.picture.error_code();
+        let code = self.feedback.error_code();
         if code != 0 {
-            let mut text = self.picture.error_text();
-            if self.picture.status.arm == ESTOP {
+            let mut text = self.feedback.error_text();
+            if self.feedback.status.arm == ESTOP {
                 text.push_str(
                     "\nhint: the arm leaves its E-stop only by a reset that takes the power from its motors: hold it, \
                      then switch it off and on",
@@ -290,13 +293,13 @@ impl Session {
             }
             return Err(AdapterError::Fault { code, text });
         }
-        if MonotonicClock.now().since(self.picture.commanded_at) < SILENCE {
+        if MonotonicClock.now().since(self.feedback.commanded_at) < STALE_AFTER {
             return Err(self.refuse(
                 "somebody else commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
                     .into(),
             ));
         }
-        match self.picture.status.control {
+        match self.feedback.status.control {
             0 | 1 => Ok(()),
             other => Err(self.refuse(format!(
                 "the arm is controlled by {}\nhint: end that at the arm; where it does not let go, hold it and switch \
@@ -308,13 +311,13 @@ impl Session {
 
     /// An error when somebody else has changed the arm's mode or power, which is left as it is.
     pub fn ours(&self) -> AdapterResult<()> {
-        let what = match (self.picture.guard.change, self.picture.guard.lost_power()) {
+        let what = match (self.feedback.guard.change, self.feedback.guard.lost_power()) {
             (Some(change), _) => change.text(),
             (None, true) => "its motors were switched off".to_owned(),
             (None, false) => return Ok(()),
         };
         Err(self.refuse(format!(
-            "{what}, which this run did not order: the arm is left alone\nhint: end that, then enable the arm again"
+            "{what}, which this run did not order: the arm is not commanded\nhint: end that, then enable the arm again"
         )))
     }
 
@@ -322,7 +325,7 @@ impl Session {
     pub fn release(&mut self) {
         self.written = self.written();
         self.control = None;
-        self.picture.guard.release();
+        self.feedback.guard.release();
     }
 
     /// What was written, if the arm has followed it since.
@@ -330,12 +333,12 @@ impl Session {
         self.written.filter(|_| self.ours().is_ok())
     }
 
-    /// An error unless the arm may be told to move.
+    /// Checks that the arm may be moved.
     pub fn may_move(&mut self) -> AdapterResult<()> {
         self.whole()?;
         self.in_order()?;
         self.ours()?;
-        if self.picture.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
+        if self.feedback.enabled() { Ok(()) } else { Err(self.refuse("the motors are disabled".into())) }
     }
 
     /// An error when the measured pose cannot be true: holding there would be a jump.
@@ -347,7 +350,7 @@ impl Session {
                     .into(),
             ));
         }
-        if self.picture.only_zeros(MonotonicClock.now()) {
+        if self.feedback.only_zeros(MonotonicClock.now()) {
             return Err(self.refuse(
                 "every joint reads exactly 0, as from a controller that has not measured yet: not enabled\nhint: if \
                  the arm truly lies there, move a joint a little by hand"
@@ -356,13 +359,13 @@ impl Session {
         }
         let limits = limits();
         let range = limits.position_lower.iter().zip(&limits.position_upper);
-        for (i, (wire, (lower, upper))) in self.picture.joints.iter().zip(range).enumerate() {
+        for (i, (wire, (lower, upper))) in self.feedback.joints.iter().zip(range).enumerate() {
             let value = radians(*wire);
-            if !(lower - PLAUSIBLE..=upper + PLAUSIBLE).contains(&value) {
+            if !(lower - MAX_OUTSIDE..=upper + MAX_OUTSIDE).contains(&value) {
                 let joint = i + 1;
                 return Err(self.refuse(format!(
                     "joint {joint} reads {value:.3} rad, outside its range of {lower} to {upper}: not enabled\nhint: \
-                     move it back by hand, or set its zero point anew with the vendor's tool"
+                     move it back by hand, or set its zero point again with the vendor's tool"
                 )));
             }
         }
@@ -373,7 +376,7 @@ impl Session {
     pub fn switch_motors(&mut self, on: bool) -> AdapterResult<()> {
         let began = MonotonicClock.now();
         let end = began.after(ENABLE_TIMEOUT);
-        let switched = |p: &Picture| p.drivers_heard(began) && if on { p.enabled() } else { p.disabled() };
+        let switched = |p: &Feedback| p.drivers_heard(began) && if on { p.enabled() } else { p.disabled() };
         let mut sent = Ok(());
         while MonotonicClock.now() < end {
             sent = self.send(&[protocol::enable(on)]);
@@ -383,14 +386,14 @@ impl Session {
         }
         sent?;
         let (name, within) = (&self.hardware_id, ENABLE_TIMEOUT.as_millis());
-        let silent = self.picture.silent_drivers(began);
+        let silent = self.feedback.silent_drivers(began);
         if !silent.is_empty() {
             let what = format!("{name}: the drivers of joints {silent} have said nothing for {within} ms");
             return Err(AdapterError::Timeout(what));
         }
         let wrong = |(_, driver): &(usize, &protocol::Driver)| driver.enabled() != on;
         let joints: Vec<String> =
-            (1..).zip(&self.picture.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
+            (1..).zip(&self.feedback.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
         let (joints, word) = (joints.join(", "), if on { "on" } else { "off" });
         Err(AdapterError::Timeout(format!("{name}: the motors of joints {joints} do not go {word} within {within} ms")))
     }

@@ -8,9 +8,9 @@ use super::protocol::DOF;
 use super::{GripperKind, SPEC, golden};
 use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, Cartesian, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::ControlMode;
 
@@ -21,7 +21,7 @@ pub fn config(address: &str, options: serde_json::Value) -> AdapterConfig {
 }
 
 pub fn pair(options: serde_json::Value) -> (PiperEmulator, PiperAdapter) {
-    let emulator = PiperEmulator::start(&config("sim", options.clone()), &Place::InProcess).unwrap();
+    let emulator = PiperEmulator::start(&config("sim", options.clone()), &EmulatorAddress::InProcess).unwrap();
     let adapter = PiperAdapter::new(&config(&emulator.address(), options)).unwrap();
     (emulator, adapter)
 }
@@ -236,7 +236,7 @@ fn disabling_is_verified_and_the_arm_falls() {
     assert_eq!(refused, AdapterError::Rejected("arm: the motors are disabled".into()));
     until("the fall", || emulator.joints().0[1] < 0.5);
     assert!(!SPEC.holds_when_disabled && !arm.get_info().holds_when_disabled);
-    // Where it has fallen to is where it holds: not where it was told to be before.
+    // It holds where it has fallen to, not at its earlier target.
     until("the end of the fall", || emulator.joints().1.iter().all(|v| *v == 0.0));
     let (lies, _) = emulator.joints();
     until("the last of it", || farthest(&read(&mut arm).unwrap().position, &lies) < 1e-4);
@@ -262,7 +262,7 @@ fn stamps_are_of_the_arrival_and_the_same_when_nothing_came() {
 #[test]
 fn limits_are_the_narrower_of_sheet_and_arm() {
     let (emulator, mut arm) = connected();
-    let sheet = (SPEC.fit)(&config("can0", serde_json::json!({}))).unwrap().limits;
+    let sheet = (SPEC.check)(&config("can0", serde_json::json!({}))).unwrap().limits;
     let own = arm.get_limits().unwrap();
     assert!(farthest(&own.position_lower, &sheet.position_lower) < 1e-3);
     assert!(farthest(&own.position_upper, &sheet.position_upper) < 1e-3);
@@ -300,16 +300,19 @@ fn wrong_configurations_are_refused() {
         let error = (SPEC.create)(&config).err().unwrap().to_string();
         assert!(error.contains(part), "{error}");
     }
-    let emulate = |sim: serde_json::Value, place: &Place| {
+    let emulate = |sim: serde_json::Value, place: &EmulatorAddress| {
         PiperEmulator::start(&config("sim", serde_json::json!({ "sim": sim })), place).err().unwrap().to_string()
     };
     assert!(
-        emulate(serde_json::json!({ "initial_positions": [0, 0, 1, 0, 0, 0] }), &Place::InProcess).contains("limits")
+        emulate(serde_json::json!({ "initial_positions": [0, 0, 1, 0, 0, 0] }), &EmulatorAddress::InProcess)
+            .contains("limits")
     );
-    assert!(emulate(serde_json::json!({ "feedback_hz": 500 }), &Place::InProcess).contains("between 20 and 200"));
-    assert!(emulate(serde_json::json!({ "firmware": "1.6" }), &Place::InProcess).contains("8 characters"));
-    let bind = Place::Bind([127, 0, 0, 5].into());
+    assert!(
+        emulate(serde_json::json!({ "feedback_hz": 500 }), &EmulatorAddress::InProcess).contains("between 20 and 200")
+    );
+    assert!(emulate(serde_json::json!({ "firmware": "1.6" }), &EmulatorAddress::InProcess).contains("8 characters"));
+    let bind = EmulatorAddress::Bind([127, 0, 0, 5].into());
     assert!(emulate(serde_json::json!({}), &bind).contains("no IP address"));
     let script = SimOptions { faults: vec![Fault::new(FaultKind::Nan)], ..SimOptions::default() };
-    assert!(PiperEmulator::with(&script, GripperKind::Small, &Place::InProcess).is_err());
+    assert!(PiperEmulator::with(&script, GripperKind::Small, &EmulatorAddress::InProcess).is_err());
 }

@@ -1,4 +1,4 @@
-//! Where the arm is told to stay: by a stop, and when its motors come on. Judged by what the emulator received.
+//! Where the arm holds after a stop and when its motors come on, judged by what the emulator received.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
@@ -8,8 +8,8 @@ use super::adapter::PiperAdapter;
 use super::emulator::PiperEmulator;
 use super::protocol::DOF;
 use super::tests::{START, activate, connected, farthest, pair, two, until};
+use crate::hardware::adapter::ManipulatorAdapter;
 use crate::hardware::registry::Emulator;
-use crate::hardware::spec::ManipulatorAdapter;
 use crate::hardware::transport::can::{self, CanAddress, CanFrame};
 
 /// Farthest that a hold may be from where the arm is [rad].
@@ -103,7 +103,7 @@ fn a_stop_never_moves_a_standing_arm_when_some_frames_are_random() {
 fn a_stop_keeps_what_was_written_where_the_arm_sags() {
     let (emulator, mut arm) = connected();
     activate(&emulator, &mut arm);
-    // The arm is told to be 0.01 rad higher than it gets: its second joint is blocked.
+    // The target is 0.01 rad above the position that the arm reaches: its second joint is blocked.
     let fault = crate::hardware::sim::faults::Fault {
         joint: 2,
         ..crate::hardware::sim::faults::Fault::new(crate::hardware::sim::faults::FaultKind::Blocked).lasting(60.0)

@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use super::picture::Picture;
+use super::feedback::Feedback;
 use super::protocol::decode;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::can::{self, CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
 
 /// What the arm sends, and what it would send if it led other arms (0x15x, 0x3Ax).
@@ -86,32 +86,32 @@ impl Wire {
 
     fn no_room(&self) -> AdapterError {
         AdapterError::Io(format!(
-            "{}: its bus takes no frames: the queue is full\nhint: nobody acknowledges: is the arm powered, plugged \
+            "{}: its bus takes no frames: the queue is full\nhint: no node acknowledges: is the arm powered, plugged \
              in, and the bus at 1 Mbit/s?",
             self.peer
         ))
     }
 
-    /// Adds all that has arrived to the picture, without waiting.
-    pub fn drain(&mut self, picture: &mut Picture) -> AdapterResult<()> {
+    /// Adds all that has arrived to the feedback, without waiting.
+    pub fn drain(&mut self, feedback: &mut Feedback) -> AdapterResult<()> {
         for _ in 0..BATCH {
             match self.port.receive()? {
                 None => break,
-                Some(CanEvent::Frame(frame)) => picture.take(decode(&frame), MonotonicClock.now()),
-                Some(CanEvent::Trouble(trouble)) => self.suffer(trouble)?,
+                Some(CanEvent::Frame(frame)) => feedback.take(decode(&frame), MonotonicClock.now()),
+                Some(CanEvent::Trouble(trouble)) => self.apply_trouble(trouble)?,
             }
         }
         Ok(())
     }
 
-    fn suffer(&mut self, trouble: CanTrouble) -> AdapterResult<()> {
+    fn apply_trouble(&mut self, trouble: CanTrouble) -> AdapterResult<()> {
         let (what, hint) = match trouble {
             CanTrouble::BusOff => (
                 "the CAN controller has left the bus after too many errors",
                 "check cable, termination and bit rate (1 Mbit/s); then set the interface down and up",
             ),
             CanTrouble::NoAcknowledge => {
-                ("nobody acknowledges on its bus", "is the arm powered, plugged in, and the bus at 1 Mbit/s?")
+                ("no node acknowledges on its bus", "is the arm powered, plugged in, and the bus at 1 Mbit/s?")
             }
             CanTrouble::Overflow => {
                 self.counts.overflows += 1;
@@ -125,7 +125,7 @@ impl Wire {
         Err(AdapterError::Io(format!("the connection to {} broke: {what}\nhint: {hint}", self.peer)))
     }
 
-    /// Waits until something has arrived, so long at most.
+    /// Waits until something has arrived, at most `timeout`.
     pub fn wait(&self, timeout: Duration) {
         let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
         let _ = poll(&mut [PollFd::from_borrowed_fd(self.port.fd(), PollFlags::IN)], Some(&timeout));

@@ -9,13 +9,13 @@ use std::time::Duration;
 use super::address::Address;
 use super::protocol::{Act, Command, Description, Measured, WirePose};
 use super::session::Session;
-use super::{MODES, NATIVE_RATE, fit, limits, same_modes};
+use super::{MODES, NATIVE_RATE, check, limits, same_modes};
 use crate::arm::Pose;
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
 /// Longest wait for the motors: a vendor's SDK may take its time.
@@ -38,7 +38,7 @@ impl RemoteAdapter {
     /// An adapter for the peer at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         let (mode, assumed_enabled) = (ControlMode::Position, false);
         Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })
@@ -54,11 +54,11 @@ impl RemoteAdapter {
     }
 
     /// Asks for an act and waits for its answer.
-    fn act(&mut self, act: &Act, patience: Duration) -> AdapterResult<()> {
-        let answer = self.with(|session| session.act(act, patience))?;
+    fn act(&mut self, act: &Act, timeout: Duration) -> AdapterResult<()> {
+        let answer = self.with(|session| session.act(act, timeout))?;
         answer.unwrap_or_else(|| {
             let peer = self.session.as_ref().map(Session::peer).unwrap_or_default();
-            let text = format!("{peer} has not answered {} within {patience:?}", act.method());
+            let text = format!("{peer} has not answered {} within {timeout:?}", act.method());
             Err(AdapterError::Timeout(text))
         })
     }
@@ -72,15 +72,15 @@ impl RemoteAdapter {
         self.with(|session| session.recent().map(|state| state.map(of)))?
     }
 
-    /// Whether the peer of this or of the last connection said that its arm has a part.
+    /// Whether the peer of this connection, or of the previous one, has the part.
     fn has_part(&self, name: &str) -> bool {
-        self.last.as_ref().is_some_and(|said| said.parts.iter().any(|part| part == name))
+        self.last.as_ref().is_some_and(|description| description.parts.iter().any(|part| part == name))
     }
 
     /// Refuses what the arm would refuse, and sends the rest.
     fn command(&mut self, mode: ControlMode, values: &[f64], velocity: f64) -> AdapterResult<()> {
         if values.len() != self.dof || !values.iter().all(|value| value.is_finite()) {
-            return Err(AdapterError::Rejected(format!("{} finite values are needed, one per joint", self.dof)));
+            return Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)));
         }
         self.with(Session::take_up)?;
         let (enabled, held, error) = self.recent(|state| (state.enabled, state.held, state.error))?;
@@ -88,9 +88,7 @@ impl RemoteAdapter {
             return Err(AdapterError::Fault { code, text: text.to_string() });
         }
         if held {
-            return Err(AdapterError::Rejected(
-                "the process that serves the arm has stopped it: enable it anew".into(),
-            ));
+            return Err(AdapterError::Rejected("the arm's server process stopped the arm; enable it again".into()));
         }
         if enabled == Some(false) {
             return Err(AdapterError::Rejected("the motors are disabled".into()));
@@ -172,9 +170,9 @@ impl ManipulatorAdapter for RemoteAdapter {
         if !self.get_info().modes.contains(&mode) {
             return Err(AdapterError::Unsupported);
         }
-        let patience = self.late()?;
-        match self.act(&Act::Mode(mode), patience) {
-            // It is asked for again with the next command, and goes on then.
+        let timeout = self.late()?;
+        match self.act(&Act::Mode(mode), timeout) {
+            // The next command retries it; the server has continued meanwhile.
             Err(AdapterError::Timeout(text)) => Err(AdapterError::Rejected(text)),
             result => result.map(|()| self.mode = mode),
         }
@@ -266,8 +264,8 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
-        let patience = self.late()?;
-        self.act(&Act::Stop, patience).map(|()| Stop::Confirmed)
+        let timeout = self.late()?;
+        self.act(&Act::Stop, timeout).map(|()| Stop::Confirmed)
     }
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
@@ -310,16 +308,16 @@ impl Gripper for RemoteAdapter {
         self.recent(|state| state.gripper)
     }
 
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
         self.last.as_ref()?.gripper_range
     }
 
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
-        let patience = self.late()?;
+        let timeout = self.late()?;
         if !position.is_finite() {
             return Err(AdapterError::Rejected(format!("a gripper opening of {position} m")));
         }
-        self.act(&Act::Gripper(position), patience)
+        self.act(&Act::Gripper(position), timeout)
     }
 }
 
@@ -335,10 +333,10 @@ impl Cartesian for RemoteAdapter {
     }
 
     fn write_cartesian_position(&mut self, pose: &Pose, velocity: f64) -> AdapterResult<()> {
-        let patience = self.late()?;
+        let timeout = self.late()?;
         if !pose.xyz.iter().chain(&pose.rpy).all(|value| value.is_finite()) {
             return Err(AdapterError::Rejected("the pose is not finite".into()));
         }
-        self.act(&Act::Cartesian(WirePose::of(pose), velocity), patience)
+        self.act(&Act::Cartesian(WirePose::of(pose), velocity), timeout)
     }
 }

@@ -20,7 +20,7 @@ pub enum Address {
 }
 
 impl Address {
-    /// Reads `unix:/PATH`, `tcp:HOST:PORT` or `HOST:PORT`. Asks nobody.
+    /// Parses `unix:/PATH`, `tcp:HOST:PORT` or `HOST:PORT`, without using the network.
     pub fn parse(text: &str) -> Result<Self, String> {
         if let Some(path) = text.strip_prefix("unix:") {
             return match path.len() {

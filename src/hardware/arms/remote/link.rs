@@ -14,7 +14,7 @@ use rustix::net::{
 
 use super::address::Address;
 use super::protocol::MAX_LINE;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// Room for a line and the beginning of the next.
 const BUFFER: usize = 2 * MAX_LINE;
@@ -45,7 +45,7 @@ impl Link {
         let socket = socket.map_err(|error| {
             let why = match error.kind() {
                 ErrorKind::NotFound => "there is no such socket".to_owned(),
-                ErrorKind::ConnectionRefused => "nobody listens there".to_owned(),
+                ErrorKind::ConnectionRefused => "connection refused: nothing is listening at this address".to_owned(),
                 ErrorKind::PermissionDenied => "it belongs to another user".to_owned(),
                 ErrorKind::WouldBlock | ErrorKind::TimedOut => "it takes no more connections".to_owned(),
                 _ => error.to_string(),
@@ -83,7 +83,7 @@ impl Link {
         let _ = rustix::net::sockopt::set_socket_linger(&self.socket, Some(Duration::ZERO));
     }
 
-    /// Waits until something arrives, so long at most.
+    /// Waits until something arrives, at most `timeout`.
     pub fn wait(&self, timeout: Duration) {
         let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos() as i64 };
         let _ = poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timeout));
@@ -139,7 +139,7 @@ impl Link {
     fn broken(&self, error: Errno) -> AdapterError {
         let why = match error {
             Errno::PIPE | Errno::CONNRESET => "closed the connection".to_owned(),
-            _ => format!("cannot be reached any more: {error}"),
+            _ => format!("is no longer reachable: {error}"),
         };
         AdapterError::Io(format!("{} {why}", self.peer))
     }

@@ -18,7 +18,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::hardware::sim::arm::SimOptions;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
@@ -48,20 +48,20 @@ pub const SPEC: AdapterSpec = AdapterSpec {
         required: true,
         check: |address| Address::parse(address).map(|address| address.to_string()),
     },
-    // Nobody knows before the peer is asked, and then a blueprint's default must be the careful one.
+    // Unknown before the connection; the default must be the safe one.
     holds_when_disabled: false,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(adapter::RemoteAdapter::new(config)?)),
     emulate: Some(emulator::start),
 };
 
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("a remote arm", SPEC.dof)?;
     let (sim, limits) = (config.options::<Options>()?.sim, limits(config.dof));
     sim.check("remote", &limits, emulator::PLAYABLE)?;
-    Ok(Fit { limits })
+    Ok(Checked { limits })
 }
 
 /// Nominal limits: ±2π rad, π rad/s. The peer states the real ones.

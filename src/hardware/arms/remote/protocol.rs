@@ -9,7 +9,7 @@ use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::arm::Pose;
-use crate::hardware::spec::AdapterError;
+use crate::hardware::adapter::AdapterError;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
 /// The version of the protocol.
@@ -150,7 +150,7 @@ impl Reply {
         })
     }
 
-    /// Whether the peer says that it has lost its arm, so that the connection must be made anew.
+    /// Returns whether the peer has lost its arm, so that a new connection is needed.
     pub fn lost(&self) -> bool {
         self.error.is_some_and(|error| error.as_str() == "not_connected")
     }
@@ -178,7 +178,7 @@ pub struct Measured {
     /// Whether the motors are on.
     #[serde(default, rename = "read_enabled")]
     pub enabled: Option<bool>,
-    /// Whether the peer takes no command before the arm is enabled anew.
+    /// Whether the peer takes no command before the arm is enabled again.
     #[serde(default)]
     pub held: bool,
     /// The device's error and what it means.

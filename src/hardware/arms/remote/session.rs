@@ -11,16 +11,16 @@ use super::link::Link;
 
 use super::protocol::{self, Act, Command, Description, Measured, Reply};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
 
 /// Longest waits for the connection and for the description: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(500);
 const HELLO_TIMEOUT: Duration = Duration::from_millis(1500);
-/// A reply is late after so many of the device's periods, and not before so long; then reads fail.
-const LATE: (u32, Duration) = (3, Duration::from_millis(100));
-/// A peer that owes a reply for so many periods, and not less than so long, has stopped answering.
-const GONE: (u32, Duration) = (10, Duration::from_secs(1));
+/// Reply timeout: this many device periods, but at least this long. Reads fail after it.
+const REPLY_TIMEOUT: (u32, Duration) = (3, Duration::from_millis(100));
+/// The peer is lost when a reply is missing for this many device periods, but at least this long.
+const LOST_AFTER: (u32, Duration) = (10, Duration::from_secs(1));
 /// Longer than any cycle request [bytes].
 const LINE: usize = 1024;
 /// An act that is asked for again within this time is the same one, still to be answered.
@@ -46,7 +46,7 @@ pub struct Session {
     asked: Mono,
     /// The number of the last cycle: a peer gets one at a time.
     cycling: u32,
-    /// The act that was asked last, until its answer is handed over, and when it was last waited for.
+    /// The last requested act, until its answer is returned, and when a caller last waited for it.
     act: Option<(Act, Mono)>,
     /// Number of the last act: a state that is older is of the time before it.
     last_act: u32,
@@ -78,7 +78,7 @@ fn after(a: u32, b: u32) -> bool {
 }
 
 impl Heard {
-    /// Takes a reply. An error says that the peer is not one to go on talking to.
+    /// Takes a reply. An error ends the session.
     fn take(&mut self, reply: &Reply) -> AdapterResult<()> {
         let trouble = reply.trouble(&self.peer);
         if reply.lost() {
@@ -105,7 +105,7 @@ impl Heard {
     fn take_measured(&mut self, measured: Measured, of: u32) {
         self.at = MonotonicClock.now();
         let stamp = match &self.measured {
-            // Read again before the device measured anew: the same state, and as old as it is.
+            // Read again before the device measured: the same state, with the same stamp.
             Some((before, _, stamp)) if before.time == measured.time => *stamp,
             _ => self.device_time.translate(measured.time, self.at),
         };
@@ -120,7 +120,7 @@ impl Session {
         let mut link = Link::connect(address, CONNECT_TIMEOUT)?;
         let mut line = Vec::with_capacity(LINE);
         protocol::hello(1, dof, &mut line);
-        // Who is turned away may find the connection closed already; the reason can be read all the same.
+        // A rejected client may find the connection closed already; the reason can still be read.
         let _ = link.send(&line);
         let description = introduction(&mut link)?;
         let (peer, found) = (link.peer().to_owned(), description.dof);
@@ -167,7 +167,7 @@ impl Session {
 
     /// How long a reply may take without being late.
     pub fn late(&self) -> Duration {
-        self.periods(LATE)
+        self.periods(REPLY_TIMEOUT)
     }
 
     fn periods(&self, (count, least): (u32, Duration)) -> Duration {
@@ -237,7 +237,7 @@ impl Session {
         self.take_up()?;
         let now = MonotonicClock.now();
         match self.owed_since {
-            Some(since) if now.since(since) > self.periods(GONE) => {
+            Some(since) if now.since(since) > self.periods(LOST_AFTER) => {
                 return Err(AdapterError::Timeout(format!("{} has stopped answering", self.heard.peer)));
             }
             Some(since) if now.since(since) > self.late() => {
@@ -313,9 +313,9 @@ impl Session {
         }
     }
 
-    /// Asks for an act and waits for its answer, so long at most: `None` when it has not come. A stop and a change of
-    /// mode that are asked for again soon go on waiting for it. The outer error ends the session.
-    pub fn act(&mut self, act: &Act, patience: Duration) -> AdapterResult<Option<AdapterResult<()>>> {
+    /// Requests an act and waits for its answer: `None` after `timeout`. A retry of a stop or a change of mode
+    /// continues to wait for the same answer. The outer error ends the session.
+    pub fn act(&mut self, act: &Act, timeout: Duration) -> AdapterResult<Option<AdapterResult<()>>> {
         let now = MonotonicClock.now();
         let same = |(asked, waited): &(Act, Mono)| asked == act && now.since(*waited) < AGAIN;
         if !(matches!(act, Act::Stop | Act::Mode(_)) && self.act.as_ref().is_some_and(same)) {
@@ -324,8 +324,8 @@ impl Session {
             protocol::act(number, act, &mut self.line);
             self.link.send(&self.line)?;
         }
-        self.act = Some((act.clone(), now.after(patience)));
-        let end = Instant::now() + patience;
+        self.act = Some((act.clone(), now.after(timeout)));
+        let end = Instant::now() + timeout;
         loop {
             self.take_up()?;
             if let Some(answer) = self.heard.acted.take() {

@@ -5,9 +5,9 @@ use std::time::{Duration, Instant};
 use super::SPEC;
 use super::emulator::wire;
 use super::protocol::{self, Act, Command, Description, Reply, WirePose};
+use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{self, AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::transport::Scan;
 use crate::joint::ControlMode;
 
@@ -132,7 +132,7 @@ fn a_client_that_falls_silent_loses_the_arm() {
     arm.read_joint_positions(&mut position).unwrap();
     assert!(position[0] > 0.01 && position[0] < 1.0, "it was on its way and was stopped: {position:?}");
     let refused = arm.write_joint_positions(&[2.0], 0.1).unwrap_err().to_string();
-    assert!(refused.contains("enable it anew"), "{refused}");
+    assert!(refused.contains("enable it again"), "{refused}");
     assert_eq!(arm.read_enabled(), Ok(false));
     arm.activate().unwrap();
     arm.write_joint_positions(&[2.0], 0.1).unwrap();
@@ -149,7 +149,7 @@ fn refusals_come_with_the_next_command_and_stale_states_are_said() {
     let mut reading = JointReading::default();
     until("a late reply", || matches!(arm.read_joints(&mut reading), Err(AdapterError::Timeout(_))));
     assert!(arm.is_connected(), "late is not gone");
-    assert!(matches!(arm.write_stop(), Err(AdapterError::Timeout(_))), "nobody has confirmed");
+    assert!(matches!(arm.write_stop(), Err(AdapterError::Timeout(_))), "no confirmation");
     until("the end", || arm.read_joints(&mut reading).is_err() && !arm.is_connected());
 }
 

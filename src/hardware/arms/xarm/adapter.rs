@@ -1,4 +1,4 @@
-//! The xArm adapter: the adapter protocol on one side, a [`Session`] with the controller on the other.
+//! The xArm adapter: the adapter trait on one side, a [`Session`] with the controller on the other.
 //!
 //! Wire: rad, rad/s, Nm, but millimetres. Here: SI units. The conversions between the two are in this file, those of
 //! the gripper's pulses in `protocol/gripper.rs`.
@@ -9,18 +9,18 @@ use std::time::Duration;
 use super::address::Address;
 use super::connect::{connect, ends_velocities};
 pub use super::control::Counts;
-use super::measured::measured;
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, WireJoints};
 use super::protocol::gripper::GripperKind;
+use super::report_validity::measured;
 use super::session::Session;
-use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, fit, model_of};
+use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
 use crate::arm::Pose;
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
 };
+use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, joints_of};
 
 /// The controller's modes that the adapter uses.
@@ -28,17 +28,17 @@ const PLANNED: u8 = 0;
 const SERVO: u8 = 1;
 const JOINT_VELOCITY: u8 = 4;
 
-/// What is known answers further questions for so long.
+/// Maximum age of the state that answers further reads of a cycle.
 const RECENT: Duration = Duration::from_millis(2);
 /// Accelerations of planned moves: the vendor's own defaults [rad/s², mm/s²].
 const JOINT_ACCELERATION: f64 = 8.726_646;
 const LINE_ACCELERATION: f64 = 2000.0;
-/// Slowest planned moves that the controller takes [rad/s, mm/s].
+/// Slowest planned moves that the controller accepts [rad/s, mm/s].
 const SLOWEST: (f64, f64) = (1e-4, 0.1);
-/// The arm stops by itself when no velocity follows for so long [s].
+/// The arm stops when no velocity follows within this time [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
-/// Targets of planned moves closer than this are the same [rad].
-const SAME: f64 = 1e-6;
+/// Planned moves to targets closer than this are the same move [rad].
+const SAME_TARGET: f64 = 1e-6;
 
 const MM_PER_M: f64 = 1000.0;
 
@@ -53,22 +53,22 @@ pub struct XArmAdapter {
 }
 
 impl XArmAdapter {
-    /// An adapter for the controller at `config.address`. Does not connect.
+    /// Creates an adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
         let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
-        config.fit(fit)?;
+        config.check(check)?;
         let options: Options = config.options()?;
         let model = model_of(&options, config.dof)?;
         let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
         Ok(Self { address, model, options, session: None, target: None })
     }
 
-    /// What became of the requests on the present connection.
+    /// Returns the counts of requests on the present connection.
     pub fn counts(&self) -> Option<Counts> {
         self.session.as_ref().map(Session::counts)
     }
 
-    /// Does something with the connection. One that broke is given up.
+    /// Calls `act` with the connection; drops a broken one.
     fn with<T>(&mut self, act: impl FnOnce(&mut Session) -> AdapterResult<T>) -> AdapterResult<T> {
         let result = act(self.session.as_mut().ok_or(AdapterError::NotConnected)?);
         if matches!(result, Err(AdapterError::Io(_))) {
@@ -77,41 +77,41 @@ impl XArmAdapter {
         result
     }
 
-    /// The connection, with what has arrived lately.
+    /// Returns the connection, with its state updated recently.
     fn recent(&mut self) -> AdapterResult<&mut Session> {
         self.with(|session| session.update(RECENT))?;
         self.session.as_mut().ok_or(AdapterError::NotConnected)
     }
 
-    /// The modes of this very arm.
+    /// Returns the modes of this arm, given its firmware.
     fn modes(&self) -> &'static [ControlMode] {
         let old = self.session.as_ref().is_some_and(|session| !ends_velocities(session.device.firmware));
         if old { MODES_WITHOUT_VELOCITY } else { MODES }
     }
 
-    /// Our joint values as those of the wire.
+    /// Converts joint values to those of the wire.
     fn joints(&self, values: &[f64]) -> AdapterResult<WireJoints> {
         let dof = self.model.axes();
         if values.len() != dof || !values.iter().all(|value| value.is_finite()) {
-            return Err(AdapterError::Rejected(format!("{dof} finite values are needed, one per joint")));
+            return Err(AdapterError::Rejected(format!("expected {dof} finite values, one per joint")));
         }
         let mut joints = [0.0; 7];
         joints.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
         Ok(joints)
     }
 
-    /// Fills in values of the wire.
+    /// Copies values of the wire.
     fn fill(&self, out: &mut [f64], values: &[f64; 7]) {
         out.iter_mut().zip(values).take(self.model.axes()).for_each(|(to, value)| *to = *value);
     }
 
-    /// Speed of a planned move, from a fraction of the top speed.
+    /// Returns the speed of a planned move from a fraction of the top speed.
     fn speed(&self, fraction: f64, top: f64, slowest: f64) -> f64 {
         let fraction = if fraction.is_finite() { fraction.clamp(0.0, 1.0) } else { 0.0 };
         (fraction * self.options.speed_scale * top).max(slowest)
     }
 
-    /// The joints of an arm with fewer than seven.
+    /// Returns the values of the arm's joints; it may have fewer than seven.
     fn only<const N: usize>(&self, values: &[f64; N]) -> crate::joint::Joints {
         joints_of(values.get(..self.model.axes()).unwrap_or_default())
     }
@@ -135,7 +135,7 @@ impl ManipulatorAdapter for XArmAdapter {
         self.session.take().into_iter().for_each(Session::abort);
     }
 
-    /// Stops nothing where another client has taken the arm over: it is not this run's motion.
+    /// Does not stop an arm that another client has taken over.
     fn deactivate(&mut self) -> AdapterResult<()> {
         match self.session.as_ref().and_then(Session::foreign_change) {
             Some(_) => Ok(()),
@@ -147,14 +147,14 @@ impl ManipulatorAdapter for XArmAdapter {
         self.session.is_some()
     }
 
-    /// Servo mode, because that is what the coordinator uses first: the way there leads through a stop.
+    /// Activates in servo mode, which the coordinator uses first: a later change of mode would go through a stop.
     fn activate(&mut self) -> AdapterResult<()> {
         let force_torque = self.options.force_torque;
         self.target = None;
         self.with(|session| session.activate(SERVO, force_torque))
     }
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         let device = self.session.as_ref().map(|session| &session.device);
@@ -200,8 +200,8 @@ impl ManipulatorAdapter for XArmAdapter {
     }
 
     fn get_control_mode(&self) -> ControlMode {
-        // A mode that the adapter does not use has the nearest name that `set_control_mode` does not know, so that
-        // nobody takes it for one that does.
+        // A mode that the adapter does not use is reported as the most similar one that `set_control_mode` refuses, so
+        // that it never counts as a used one.
         match self.session.as_ref().map_or(PLANNED, |session| session.motion().0.mode) {
             PLANNED => ControlMode::Position,
             SERVO => ControlMode::ServoPosition,
@@ -280,7 +280,7 @@ impl ManipulatorAdapter for XArmAdapter {
         if mode != PLANNED {
             return self.with(|session| session.stream(SERVO, &Command::Servo(joints)));
         }
-        let same = |target: WireJoints| target.iter().zip(&joints).all(|(a, b)| (a - b).abs() < SAME);
+        let same = |target: WireJoints| target.iter().zip(&joints).all(|(a, b)| (a - b).abs() < SAME_TARGET);
         let speed = self.speed(velocity, VELOCITY, SLOWEST.0);
         let known = self.target.is_some_and(same);
         let command = Command::MoveJoints { joints, speed, acceleration: JOINT_ACCELERATION };
@@ -303,7 +303,7 @@ impl ManipulatorAdapter for XArmAdapter {
         self.with(Session::stop)
     }
 
-    /// Switched on, the arm is ready in the mode it is in, or in servo mode.
+    /// After enabling, the arm is ready in its present mode, or in servo mode.
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         self.target = None;
         let modes = self.modes();
@@ -346,7 +346,7 @@ impl Gripper for XArmAdapter {
         Ok(self.recent()?.gripper().opening())
     }
 
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
         self.options.gripper.widest().map(|widest| (0.0, widest))
     }
 

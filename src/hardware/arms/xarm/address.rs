@@ -1,23 +1,23 @@
-//! Where a controller is: `HOST[:CONTROL_PORT[:REPORT_PORT]]`.
+//! Address of a controller: `HOST[:CONTROL_PORT[:REPORT_PORT]]`.
 
 use crate::hardware::transport::tcp::Endpoint;
 
-/// Where the controller takes commands.
+/// Port for commands.
 pub const CONTROL_PORT: u16 = 502;
-/// The first of the four ports at which the controller reports its state.
+/// The first of the four report ports.
 pub const REPORT_PORT: u16 = 30000;
 
-/// A controller's ports. The four report ports follow one another, as they do on every controller.
+/// A controller's ports. The four report ports are consecutive, as on every controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Address {
-    /// Where it takes commands.
+    /// Port for commands.
     pub control: Endpoint,
-    /// The first of its report ports.
+    /// The first report port.
     pub reports: u16,
 }
 
 impl Address {
-    /// Reads an address; what is wrong with it is said in a sentence without full stop.
+    /// Parses an address; the error is a sentence without full stop.
     pub fn parse(text: &str) -> Result<Self, String> {
         let (control, reports) = match without_reports(text) {
             Some((control, reports)) => match reports.parse() {
@@ -29,18 +29,18 @@ impl Address {
         Ok(Self { control: Endpoint::parse(control, CONTROL_PORT)?, reports })
     }
 
-    /// The second control port, one above the first: newer boxes have it for the devices behind them.
+    /// Returns the second control port, one above the first. Newer boxes have it, for the tool's bus.
     pub fn second(&self) -> Endpoint {
         Endpoint { host: self.control.host.clone(), port: self.control.port.saturating_add(1) }
     }
 
-    /// The report port so many after the first.
+    /// Returns the report port at this offset from the first.
     pub fn report(&self, offset: u16) -> Endpoint {
         Endpoint { host: self.control.host.clone(), port: self.reports.saturating_add(offset) }
     }
 }
 
-/// Splits the third part off, where there is one.
+/// Splits off the third part, if there is one.
 fn without_reports(text: &str) -> Option<(&str, &str)> {
     let ports = if text.starts_with('[') { text.find(']')? } else { 0 };
     let one_more = text.get(ports..)?.matches(':').count() == 2;

@@ -1,5 +1,5 @@
-//! How the controller is: error, warning, motors. Register 15 alone says what the error is; everything else that hints
-//! at a change (the state byte of any response, a report, a stop that nobody asked for) only makes us ask it.
+//! Condition of the controller: error, warning, motors. Only register 15 says what the error is. Anything that hints at
+//! a change (the state byte of a response, a report, a stop that this run did not order) triggers a request for it.
 
 use std::time::Duration;
 
@@ -9,16 +9,16 @@ use super::protocol::frame::{Response, Status};
 use super::protocol::report::Health;
 use crate::clock::Mono;
 
-/// The controller hears from us at least this often, which also shows that it still answers.
+/// Maximum time between two requests, which also shows that the controller still answers.
 const HEARTBEAT: Duration = Duration::from_millis(250);
-/// A question that is not answered within this time is asked again.
-const ASK_AGAIN: Duration = Duration::from_millis(200);
-/// Errors of the joints' servos: more about them is in another register.
+/// Unanswered requests are retried after this time.
+const RETRY_AFTER: Duration = Duration::from_millis(200);
+/// Errors of the joints' servos, with details in another register.
 const SERVO_ERRORS: std::ops::RangeInclusive<u8> = 10..=17;
 /// Errors that mean an open E-stop line: the motors have no power.
 const POWER_CUT: std::ops::RangeInclusive<u8> = 1..=3;
 
-/// What is known of the controller's condition.
+/// Condition of the controller.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Condition {
     /// The error; 0 = none.
@@ -27,48 +27,48 @@ pub struct Condition {
     pub warning: u8,
     /// Motors that are on, one bit per joint.
     pub enabled: u8,
-    /// Where the tool is from the flange: x, y, z [mm].
+    /// Position of the tool relative to the flange: x, y, z [mm].
     pub tool: [f64; 3],
     /// Error codes of the joints' servos.
     servos: [u8; 7],
-    /// Something has changed; register 15 must say what.
+    /// Whether something has changed, so that register 15 must be read.
     pub changed: bool,
-    /// When something was seen that only an answer to a later question explains.
+    /// When a change was seen that only a later request explains.
     doubted: Mono,
     servos_changed: bool,
-    /// When it was asked, while the answer is outstanding.
+    /// Time of the outstanding request.
     asked: Option<Mono>,
 }
 
 impl Condition {
-    /// Whether the motors of the first `axes` joints are on.
+    /// Returns whether the motors of the first `axes` joints are on.
     pub fn all_enabled(&self, axes: usize) -> bool {
         let all = ((1_u16 << axes) - 1) as u8;
         self.enabled & all == all
     }
 
-    /// Whether the motors of the first `axes` joints are off.
+    /// Returns whether the motors of the first `axes` joints are off.
     pub fn none_enabled(&self, axes: usize) -> bool {
         u16::from(self.enabled) & ((1 << axes) - 1) == 0
     }
 
-    /// Looks at the state byte of a response.
+    /// Checks the state byte of a response.
     pub fn hint(&mut self, status: Status) {
         self.changed |= status.error() != (self.error != 0);
     }
 
-    /// Looks at a report.
+    /// Checks a report.
     pub fn report(&mut self, health: Health) {
         (self.enabled, self.tool) = (health.enabled, health.tool);
         self.changed |= health.error != self.error || health.warning != self.warning;
     }
 
-    /// Something happened just now: what was asked before does not explain it.
+    /// Records a change at `now`, which earlier requests do not explain.
     pub fn doubt(&mut self, now: Mono) {
         (self.changed, self.doubted) = (true, now);
     }
 
-    /// Takes the answer to a question of [`Condition::due`].
+    /// Takes the response to a request of [`Condition::due`].
     pub fn take(&mut self, response: &Response) {
         match (response.register, response.data()) {
             (15, [error, warning, ..]) => {
@@ -89,9 +89,9 @@ impl Condition {
         }
     }
 
-    /// The next question, if one is due. `last_sent`: when the controller last heard from us.
+    /// Returns the next request, if one is due. `last_sent`: time of the last request.
     pub fn due(&mut self, now: Mono, last_sent: Mono) -> Option<Command> {
-        if self.asked.is_some_and(|asked| now.since(asked) < ASK_AGAIN) {
+        if self.asked.is_some_and(|asked| now.since(asked) < RETRY_AFTER) {
             return None;
         }
         let command = if self.changed || now.since(last_sent) > HEARTBEAT {
@@ -105,7 +105,7 @@ impl Condition {
         Some(command)
     }
 
-    /// What the error means; empty (and without allocation) when there is none.
+    /// Returns the text of the error; empty (without allocation) if there is none.
     pub fn text(&self) -> String {
         let mut text = error_text(self.error).to_owned();
         if SERVO_ERRORS.contains(&self.error) {

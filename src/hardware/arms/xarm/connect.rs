@@ -1,5 +1,5 @@
-//! Connecting: who is there, which reports it has, and whether what the blueprint says is true. Nothing is switched on
-//! and nothing moves.
+//! Connecting: identifies the arm, finds its report ports, and compares it with the blueprint. Enables and moves
+//! nothing.
 
 use std::time::Duration;
 
@@ -17,28 +17,28 @@ use super::protocol::report::{Health, Kind, Motion};
 use super::session::{Device, Session};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
-/// Longest time for all of it.
-const ALL: Duration = Duration::from_millis(3000);
-/// Longest wait for the connection, for the introduction, and for the first report of a kind.
+/// Timeout of the whole connection.
+const TOTAL_TIMEOUT: Duration = Duration::from_millis(3000);
+/// Timeouts of the TCP connection, of the version, and of the first report of each kind.
 const CONNECT: Duration = Duration::from_millis(1200);
 const VERSION: Duration = Duration::from_millis(1000);
 const FIRST_REPORT: Duration = Duration::from_millis(1000);
-/// Longest wait for the second control port, which older boxes refuse.
+/// Timeout of the second control port, which older boxes refuse.
 const SECOND: Duration = Duration::from_millis(300);
-/// Longest wait for the gripper's first answer over it.
+/// Timeout of the gripper's first response over it.
 const FIRST_TELEGRAM: Duration = Duration::from_millis(1200);
 
-/// What is left of a time limit, at most `most`.
+/// Returns the rest of a timeout, at most `most`.
 fn left(until: Mono, most: Duration) -> Duration {
     until.since(MonotonicClock.now()).min(most)
 }
 
 /// Connects to the arm at `address`, which must be a `model`.
 pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterResult<Session> {
-    let until = MonotonicClock.now().after(ALL);
+    let until = MonotonicClock.now().after(TOTAL_TIMEOUT);
     let named = |error| name(error, address);
     let link = TcpLink::connect("xarm", &address.control, left(until, CONNECT)).map_err(named)?;
     let mut control = Control::new(link);
@@ -69,8 +69,8 @@ pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterRes
     Ok(Session::new(device, (control, bus), motion, first, normal, condition, gripper))
 }
 
-/// Connects to the joints' reports: those of port 30000 where there are any, else those of port 30003, which every
-/// firmware has.
+/// Connects to the reports with joint positions: those of port 30000 if available, otherwise those of port 30003, which
+/// every firmware has.
 fn reports(address: &Address, firmware: Firmware, until: Mono) -> AdapterResult<(Stream<Motion>, Motion)> {
     let begin = |kind, decode: fn(&[u8]) -> _| -> AdapterResult<_> {
         let mut stream = Stream::connect(address, kind, decode, left(until, FIRST_REPORT))?;
@@ -87,7 +87,7 @@ fn ask(control: &mut Control, command: &Command, timeout: Duration) -> AdapterRe
     control.ask(command, timeout, |_: Purpose, _| ())
 }
 
-/// Puts the address as the blueprint has it into a message about its control port.
+/// Adds the blueprint's address to an error about the control port.
 fn name(error: AdapterError, address: &Address) -> AdapterError {
     let in_full = |text: String| match address.reports == super::address::REPORT_PORT {
         true => text,
@@ -107,7 +107,7 @@ fn no_report(error: AdapterError) -> AdapterError {
     }
 }
 
-/// Says whether the other end is the arm that this adapter is for.
+/// Checks that the arm is the expected one.
 fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()> {
     let is = Model::of(found);
     if is == Some(model) {
@@ -134,8 +134,8 @@ fn verify(address: &Address, model: Model, found: &Identity) -> AdapterResult<()
     )))
 }
 
-/// Looks whether the gripper of the blueprint answers: over which connection, where `control` is not to be used, and
-/// where it is [pulses].
+/// Checks that the blueprint's gripper answers. Returns its connection, if it is not `control`, and its position
+/// [pulses].
 fn find_gripper(
     control: &mut Control,
     kind: GripperKind,
@@ -158,7 +158,7 @@ fn find_gripper(
         }
     }
     let telegram = Rtu::read_position();
-    // What listens there may be something else altogether.
+    // Another kind of server may be listening there.
     let second = || {
         let mut bus = Control::new(TcpLink::connect("xarm", &address.second(), left(until, SECOND))?);
         let answer = ask(&mut bus, &Command::Tool(telegram), left(until, FIRST_TELEGRAM))?;
@@ -177,13 +177,13 @@ fn find_gripper(
     }
 }
 
-/// What the firmware can do that an older one cannot.
+/// Returns whether this firmware has the parameter for collision detection.
 pub fn takes_detection(firmware: Firmware) -> bool {
     firmware.at_least(1, 10, 0)
 }
 
-/// Whether joint velocities have a time after which the controller ends them. Without it a velocity lasts until the
-/// next command, also when no command can come any more: such an arm has no velocity mode here.
+/// Returns whether the controller ends joint velocities after a time. Without this, a velocity lasts until the next
+/// command, even after a loss of the connection; such an arm has no velocity mode here.
 pub fn ends_velocities(firmware: Firmware) -> bool {
     firmware.at_least(1, 8, 0)
 }

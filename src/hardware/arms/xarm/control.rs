@@ -1,5 +1,5 @@
-//! The control connection. Requests go out without waiting for the responses to earlier ones: a setpoint must not
-//! wait for the answer to the setpoint before. Each response is matched to its request by number, whenever it comes.
+//! The control connection. Requests are sent without waiting for earlier responses, so that a setpoint never waits for
+//! the previous one. Each response is matched to its request by number.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
@@ -7,39 +7,39 @@ use std::time::Duration;
 use super::protocol::commands::{Command, QUICK, STOP};
 use super::protocol::frame::{self, Arrived, MAX_REQUEST, PRIVATE, Response, Status};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::tcp::TcpLink;
 
-/// Most requests without response.
+/// Maximum number of requests without a response.
 const WINDOW: usize = 64;
-/// Most setpoints without response: what a stalled connection still delivers when it is back.
+/// Maximum number of setpoints without a response: a stalled connection still delivers them later.
 const IN_FLIGHT: usize = 2;
-/// A controller that answers nothing for so long, while it is asked what it answers quickly, is gone.
-const GONE: Duration = Duration::from_millis(1000);
+/// Without a response to a quick request for this time the controller is lost.
+const LOST_AFTER: Duration = Duration::from_millis(1000);
 
-/// Who wants the response.
+/// Purpose of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// A caller waits for it.
     Answer,
-    /// A command that moves the arm: only a refusal is of interest.
+    /// A motion command: only a refusal matters.
     Motion,
-    /// It tells how the controller is.
+    /// Requests the controller's condition.
     Health,
-    /// It is for the gripper.
+    /// A telegram of the gripper.
     Gripper,
 }
 
-/// What became of requests.
+/// Counts of requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
     /// Requests sent.
     pub sent: u64,
-    /// Responses that came, but late.
+    /// Late responses.
     pub late: u64,
-    /// Requests whose response did not come in time.
+    /// Requests without a response in time.
     pub overdue: u64,
-    /// Whole frames that answered nothing.
+    /// Complete frames that match no request.
     pub stray: u64,
 }
 
@@ -54,13 +54,13 @@ struct Pending {
 }
 
 impl Pending {
-    /// Whether the controller may take its time over it. It answers in order: what was asked later waits as well.
+    /// Whether the controller may be slow to answer. It answers in order, so later requests wait too.
     fn is_slow(&self) -> bool {
         self.timeout > QUICK && !self.overdue
     }
 }
 
-/// The connection to the control port.
+/// Connection to the control port.
 pub struct Control {
     link: TcpLink,
     protocol: u16,
@@ -68,19 +68,19 @@ pub struct Control {
     pending: [Option<Pending>; WINDOW],
     last_sent: Mono,
     last_response: Mono,
-    /// When the newest of the requests that were answered was sent.
+    /// When the newest answered request was sent.
     answered_up_to: Mono,
-    /// When the last slow request was settled.
+    /// When the last slow request was answered or timed out.
     unblocked: Mono,
     /// When the newest request was sent whose response says that the arm is not ready.
     not_ready: Option<Mono>,
-    /// A motion command that was refused, and when it was sent, until the session takes it.
+    /// A refused motion command, and when it was sent, until the session takes it.
     refusal: Option<(Status, Mono)>,
     counts: Counts,
 }
 
 impl Control {
-    /// Talks over this connection, in the plain private protocol.
+    /// Uses this connection with the plain private protocol.
     pub fn new(link: TcpLink) -> Self {
         let now = MonotonicClock.now();
         Self {
@@ -98,33 +98,33 @@ impl Control {
         }
     }
 
-    /// Speaks another protocol from now on.
+    /// Switches to another protocol.
     pub fn speak(&mut self, protocol: u16) {
         self.protocol = protocol;
     }
 
-    /// When the last request went out.
+    /// Returns when the last request was sent.
     pub fn last_sent(&self) -> Mono {
         self.last_sent
     }
 
-    /// What became of requests so far.
+    /// Returns the counts of requests.
     pub fn counts(&self) -> Counts {
         self.counts
     }
 
-    /// Becomes readable when a response has come.
+    /// Returns the descriptor that becomes readable when a response has arrived.
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.link.as_fd()
     }
 
-    /// The device and its address, for messages.
+    /// Returns the device and its address, for messages.
     pub fn peer(&self) -> &str {
         self.link.peer()
     }
 
-    /// Closes the connection and discards what has not left this computer. Setpoints that have left it may still
-    /// arrive, and velocities would drive the arm on once more: a stop goes right behind them.
+    /// Closes the connection and discards unsent bytes. Setpoints that have left this computer may still arrive, and
+    /// velocities would move the arm again, so a stop is sent after them.
     pub fn abort(mut self) {
         if self.in_flight() > 0 {
             let mut frame = [0; MAX_REQUEST];
@@ -134,30 +134,30 @@ impl Control {
         self.link.abort();
     }
 
-    /// The refusal of an earlier motion command, and when that was sent; once.
+    /// Returns the refusal of an earlier motion command, and when that was sent; once.
     pub fn take_refusal(&mut self) -> Option<(Status, Mono)> {
         self.refusal.take()
     }
 
-    /// Whether the response to a request that was sent after `since` says that the arm is not ready.
+    /// Returns whether the response to a request sent after `since` says that the arm is not ready.
     pub fn not_ready_after(&self, since: Mono) -> bool {
         self.not_ready.is_some_and(|sent| sent > since)
     }
 
-    /// Whether a request is under way over which the controller may take its time.
+    /// Returns whether a slow request is outstanding.
     pub fn waits(&self) -> bool {
         self.pending.iter().flatten().any(Pending::is_slow)
     }
 
-    /// Setpoints on their way: without response, and nothing that was sent later has one. A connection that stands
-    /// still keeps this count, however long it does.
+    /// Returns the number of setpoints in flight: without a response, and nothing sent later has one. While the
+    /// connection stalls, the number does not change.
     fn in_flight(&self) -> usize {
         let on_their_way = |p: &&Pending| p.purpose == Purpose::Motion && p.sent > self.answered_up_to;
         self.pending.iter().flatten().filter(on_their_way).count()
     }
 
-    /// Sends a request and returns its number at once. The response shows up in [`Control::next`]. `Busy` for a set
-    /// point while two are on their way.
+    /// Sends a request and returns its number at once. [`Control::next`] returns the response. `Busy` for a setpoint
+    /// while two are in flight.
     pub fn post(&mut self, command: &Command, purpose: Purpose) -> AdapterResult<u16> {
         let now = MonotonicClock.now();
         if purpose == Purpose::Motion && self.in_flight() >= IN_FLIGHT {
@@ -183,8 +183,8 @@ impl Control {
         Ok(transaction)
     }
 
-    /// What somebody waits for goes out, however far behind the controller is: it may be a stop. The response to the
-    /// oldest request is then nobody's.
+    /// Makes room for a request that a caller waits for, even if the controller is far behind: it may be a stop. The
+    /// response to the oldest request is then ignored.
     fn make_room(&mut self) {
         if self.pending.iter().all(Option::is_some)
             && let Some(oldest) = self.pending.iter_mut().min_by_key(|slot| slot.map(|pending| pending.sent))
@@ -193,7 +193,7 @@ impl Control {
         }
     }
 
-    /// Takes the next response that has arrived, without waiting, with who wanted it.
+    /// Returns the next response that has arrived, and its purpose, without waiting.
     pub fn next(&mut self) -> AdapterResult<Option<(Purpose, Response)>> {
         loop {
             let (protocol, pending) = (self.protocol, &self.pending);
@@ -213,7 +213,7 @@ impl Control {
         }
     }
 
-    /// Sends a request and waits for its response. What else arrives meanwhile is given to `other`.
+    /// Sends a request and waits for its response. Passes other responses to `other`.
     pub fn ask(
         &mut self,
         command: &Command,
@@ -246,7 +246,7 @@ impl Control {
         }
     }
 
-    /// Forgets the request of a response; answers who wants it, unless it is too late for that.
+    /// Removes the request of a response; returns its purpose unless the response is too late.
     fn settle(&mut self, response: &Response) -> Option<Purpose> {
         let at = find(&self.pending, response.transaction, response.register)?;
         let pending = self.pending.get_mut(at)?.take()?;
@@ -269,8 +269,8 @@ impl Control {
         Some(pending.purpose)
     }
 
-    /// Gives up waiting for what is overdue; an error when the controller has answered nothing for too long. Time in
-    /// which it was busy with something slow does not count for what was asked later.
+    /// Drops overdue requests; an error if the controller has not answered for too long. Time spent on a slow request
+    /// does not count for later ones.
     fn expire(&mut self) -> AdapterResult<()> {
         let (now, last_response) = (MonotonicClock.now(), self.last_response);
         let slow = self.pending.iter().flatten().filter(|p| p.is_slow()).map(|p| p.sent).min();
@@ -283,9 +283,9 @@ impl Control {
                 pending.overdue = true;
                 self.counts.overdue += 1;
             }
-            let gone = age > GONE.max(pending.timeout);
+            let gone = age > LOST_AFTER.max(pending.timeout);
             if gone && last_response < pending.sent {
-                return Err(AdapterError::Io(format!("{} answers nothing any more", self.link.peer())));
+                return Err(AdapterError::Io(format!("{} does not answer", self.link.peer())));
             }
             if gone {
                 *slot = None; // lost, while others were answered
@@ -343,7 +343,7 @@ mod tests {
             panic!("no response")
         };
         go.send(()).unwrap();
-        assert_eq!(next(&mut control).data(), [13], "the third came first, after one to nobody");
+        assert_eq!(next(&mut control).data(), [13], "the third came first, after one without a request");
         go.send(()).unwrap();
         assert_eq!(next(&mut control).data(), [11]);
         let second = |control: &Control| control.pending.iter().flatten().map(|p| p.transaction).collect::<Vec<_>>();
@@ -353,7 +353,7 @@ mod tests {
         assert_eq!(control.counts(), Counts { sent: 3, late: 0, overdue: 1, stray: 1 });
         go.send(()).unwrap();
         while control.counts().late == 0 {
-            assert_eq!(control.next().unwrap().map(|_| ()), None, "nobody wants it any more");
+            assert_eq!(control.next().unwrap().map(|_| ()), None, "its request was dropped");
         }
         assert_eq!(control.counts(), Counts { sent: 3, late: 1, overdue: 1, stray: 2 });
     }
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn set_points_that_may_arrive_late_are_followed_by_a_stop() {
+    fn setpoints_that_may_arrive_late_are_followed_by_a_stop() {
         let orders = |set_points: usize| {
             let listener = TcpListener::bind("127.0.0.1:0").unwrap();
             let port = listener.local_addr().unwrap().port();

@@ -1,7 +1,7 @@
-//! What the codes of the controller, the joints and the gripper mean, and what to do. Numbers as in the vendor's
-//! manual; the words are ours.
+//! Texts of the error codes of the controller, the joints and the gripper, with what to do. Numbers as in the vendor's
+//! manual; the wording is ours.
 
-/// The text of a controller error, as register 15 gives it; empty for 0.
+/// Returns the text of a controller error of register 15; empty for 0.
 pub fn error_text(code: u8) -> &'static str {
     match code {
         0 => "",
@@ -51,7 +51,7 @@ pub fn error_text(code: u8) -> &'static str {
     }
 }
 
-/// The text of a controller warning, as register 15 gives it; empty for 0.
+/// Returns the text of a controller warning of register 15; empty for 0.
 pub fn warning_text(code: u8) -> &'static str {
     match code {
         0 => "",
@@ -64,7 +64,7 @@ pub fn warning_text(code: u8) -> &'static str {
     }
 }
 
-/// The text of a joint servo's error; empty for 0.
+/// Returns the text of a joint servo's error; empty for 0.
 pub fn servo_text(code: u8) -> &'static str {
     match code {
         0 => "",
@@ -97,7 +97,7 @@ pub fn servo_text(code: u8) -> &'static str {
     }
 }
 
-/// The text of a gripper's error; empty for 0.
+/// Returns the text of a gripper's error; empty for 0.
 pub fn gripper_text(code: u16) -> &'static str {
     match code {
         0 => "",

@@ -1,13 +1,13 @@
-//! Frames and parts of reports computed from the vendor's pages with tools that are not ours (Python's `struct`); the
-//! setpoint is the one that the vendor's own client sends. Adapter and emulator are both tested against them, so that
-//! a mistake which both sides share still shows.
+//! Frames and parts of reports computed from the vendor's documents with independent tools (Python's `struct`); the
+//! setpoint is the one that the vendor's client sends. Adapter and emulator are both tested against them, so that a
+//! mistake in both shows.
 
-/// Bytes written as hexadecimal digits.
+/// Parses hexadecimal digits.
 pub fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len()).step_by(2).map(|i| u8::from_str_radix(&hex[i..i + 2], 16).unwrap()).collect()
 }
 
-/// A packet of zeros with these parts: place and digits.
+/// Returns a packet of zeros with these parts: offset and digits.
 pub fn packet(length: usize, parts: &[(usize, &str)]) -> Vec<u8> {
     let mut packet = vec![0; length];
     for (at, hex) in parts {

@@ -1,8 +1,8 @@
-//! The gripper, one telegram at a time: each costs 10 to 100 ms on the tool's bus, so no caller waits for one.
-//! Commands are kept until their turn; the position is read now and then and answered from memory.
+//! The gripper, one telegram at a time: each takes 10 to 100 ms on the tool's bus, so no caller waits for one. Commands
+//! wait for their turn; the position is polled and answered from memory.
 //!
-//! Telegrams go over the second control port. A box without one has them on the same connection as the setpoints, which
-//! would wait behind each telegram: there a gripper at rest is not asked while setpoints are streamed.
+//! Telegrams use the second control port. In a box without one they share the connection with the setpoints, which
+//! would wait behind each telegram: there a gripper at rest is not polled while setpoints are streamed.
 
 use std::time::Duration;
 
@@ -10,24 +10,24 @@ use super::errors::gripper_text;
 use super::protocol::frame::Response;
 use super::protocol::gripper::{GripperKind, Rtu, decode_error, decode_position};
 use crate::clock::Mono;
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// How often the position is asked for, and how often when the gripper does not answer.
+/// Period of polling, and while the gripper does not answer.
 const POLL: Duration = Duration::from_millis(100);
 const POLL_SILENT: Duration = Duration::from_millis(1000);
-/// For how long it is asked again and again after a stop, to see whether it still moves.
+/// How long the gripper is polled after a stop, to see whether it still moves.
 const WATCH: Duration = Duration::from_millis(500);
-/// A telegram whose answer takes longer is lost.
+/// Timeout of a telegram.
 const TIMEOUT: Duration = Duration::from_secs(2);
-/// After so many equal positions, a few pulses apart at most, a gripper is at rest.
+/// Number of equal positions, within a few pulses, after which a gripper is at rest.
 const RESTS_AFTER: u32 = 10;
 const SAME_PULSES: u32 = 2;
-/// So many lost telegrams in a row mean that there is no gripper.
+/// Consecutive lost telegrams after which there is no gripper.
 const SILENT_AFTER: u32 = 3;
-/// After so many positions the error is asked for.
+/// Number of positions between two requests for the error.
 const ERROR_EVERY: u32 = 10;
 
-/// What a telegram was for.
+/// Purpose of a telegram.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Step {
     Clear,
@@ -39,11 +39,11 @@ enum Step {
     Position,
 }
 
-/// What is known of the gripper and what it is to do.
+/// State of the gripper, and its pending commands.
 #[derive(Debug, Clone, Copy)]
 pub struct Gripper {
     kind: GripperKind,
-    /// What it must still be told before it takes targets; `None`: nothing.
+    /// The next step before it takes targets; `None` when it is ready.
     wake: Option<Step>,
     wanted: Option<i32>,
     clear: bool,
@@ -51,7 +51,7 @@ pub struct Gripper {
     pulses: Option<i32>,
     error: u16,
     failures: u32,
-    /// Equal positions in a row.
+    /// Consecutive equal positions.
     same: u32,
     next_poll: Mono,
     watched_until: Mono,
@@ -59,7 +59,7 @@ pub struct Gripper {
 }
 
 impl Gripper {
-    /// A gripper that was found at `pulses`.
+    /// Creates the state of a gripper found at `pulses`.
     pub fn new(kind: GripperKind, pulses: Option<i32>) -> Self {
         Self {
             kind,
@@ -77,12 +77,12 @@ impl Gripper {
         }
     }
 
-    /// Its opening [m], as far as it is known.
+    /// Returns its opening [m], if known.
     pub fn opening(&self) -> Option<f64> {
         self.pulses.map(|pulses| self.kind.opening(pulses))
     }
 
-    /// Lets it go to an opening [m], when its turn comes.
+    /// Queues a move to an opening [m].
     pub fn go_to(&mut self, opening: f64) -> AdapterResult<()> {
         let widest = self.kind.widest().ok_or(AdapterError::Unsupported)?;
         if !(0.0..=widest).contains(&opening) {
@@ -99,31 +99,32 @@ impl Gripper {
         Ok(())
     }
 
-    /// The arm was told to stop. A target that is not sent yet is dropped; whether it still goes to one shows soon.
+    /// The arm was stopped. An unsent target is dropped; the next positions show whether the gripper still moves.
     pub fn stopped(&mut self, now: Mono) {
         self.wanted = None;
         self.watched_until = now.after(WATCH);
     }
 
-    /// Clears its error, when its turn comes.
+    /// Queues the clearing of its error.
     pub fn clear_error(&mut self) {
         self.clear |= self.error != 0;
     }
 
-    /// The connection over which it was asked is gone.
+    /// Its connection was closed.
     pub fn unplugged(&mut self) {
         if self.under_way.is_some() {
             self.failed();
         }
     }
 
-    /// Whether there is nothing to send it and nothing to expect of it.
+    /// Returns whether there is nothing to send and nothing to wait for.
     fn rests(&self, now: Mono) -> bool {
         let asked = self.clear || self.wanted.is_some() || now < self.watched_until;
         !asked && self.pulses.is_some() && self.same >= RESTS_AFTER
     }
 
-    /// The next telegram, if one is due. `quiet`: a telegram would delay setpoints, so one that can wait does.
+    /// Returns the next telegram, if one is due. `quiet`: telegrams would delay setpoints, so only urgent ones are
+    /// sent.
     pub fn due(&mut self, now: Mono, quiet: bool) -> Option<Rtu> {
         if self.kind == GripperKind::None || (quiet && (self.rests(now) || self.failures >= SILENT_AFTER)) {
             return None;
@@ -164,7 +165,7 @@ impl Gripper {
         Some(if self.polls.is_multiple_of(ERROR_EVERY) { Step::Error } else { Step::Position })
     }
 
-    /// Takes the answer to the telegram under way.
+    /// Takes the response to the outstanding telegram.
     pub fn take(&mut self, response: &Response) {
         let Some((step, telegram, _)) = self.under_way.take() else { return };
         let Some(data) = telegram.answered(response.data()) else { return self.failed() };
@@ -177,7 +178,7 @@ impl Gripper {
             Step::Go(pulses) => {
                 self.same = 0;
                 self.wanted = self.wanted.filter(|wanted| *wanted != pulses);
-                self.polls = ERROR_EVERY - 1; // whether it took it shows in its error
+                self.polls = ERROR_EVERY - 1; // its error shows whether it accepted the target
                 self.next_poll = Mono::ZERO;
             }
             Step::Error => {
@@ -199,7 +200,7 @@ impl Gripper {
         self.under_way = None;
         self.failures += 1;
         if self.failures >= SILENT_AFTER {
-            // Where it is, and what it was told, is not known any more.
+            // Its position and target are unknown now.
             (self.pulses, self.wanted, self.wake, self.clear) = (None, None, Some(Step::Enable), false);
         }
     }

@@ -1,10 +1,10 @@
 //! UFACTORY's arms behind a control box on TCP: xArm 5, 6 and 7, Lite 6, 850. `docs/arms/xarm.md` is for users.
 //!
 //! ```text
-//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched whenever they come; port 503: the gripper
+//!  adapter ──▶ session ──▶ control   port 502: requests, responses matched by number; port 503: the gripper
 //!   (SI)       (state)  ◀── stream    ports 30000 or 30003: joints; 30001: motors, error
-//!                 ├── orders: motors, mode, stop; foreign: what other clients change
-//!                 └── mode, condition, gripper: small machines that never wait
+//!                 ├── motion_commands, state_commands (motors, mode, stop), other_clients
+//!                 └── mode, condition, gripper: state machines that never wait
 //! ```
 
 pub mod adapter;
@@ -14,21 +14,24 @@ mod connect;
 mod control;
 pub mod emulator;
 pub mod errors;
-mod foreign;
 #[cfg(test)]
 mod golden;
 mod gripper;
-mod measured;
 mod mode;
 pub mod model;
-mod orders;
+mod motion_commands;
+mod other_clients;
 pub mod protocol;
+mod report_validity;
 mod session;
+mod state_commands;
 mod stream;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
-mod tests_foreign;
+mod tests_models;
+#[cfg(test)]
+mod tests_other_clients;
 #[cfg(test)]
 mod tests_slow;
 
@@ -37,7 +40,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::joint::ControlMode;
 use address::Address;
@@ -47,10 +50,10 @@ use protocol::gripper::GripperKind;
 /// The modes of the arm.
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 
-/// Those of firmware before 1.8.0, which does not end a velocity by itself.
+/// Modes of firmware before 1.8.0, which does not end a velocity after a time.
 const MODES_WITHOUT_VELOCITY: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition];
 
-/// How often a controller with firmware 2.1.0 or newer reports [Hz]. Older ones do 100 times a second.
+/// Rate of the reports with firmware 2.1.0 or newer [Hz]. Older ones report at 100 Hz.
 const NATIVE_RATE: f64 = 250.0;
 
 /// Whether the arm keeps its pose when its motors are off: it has brakes.
@@ -77,7 +80,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(adapter::XArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::XArmEmulator::start(config, place)?))),
 };
@@ -113,21 +116,21 @@ impl Default for Options {
     }
 }
 
-/// The model says how many joints there are, and what their limits are.
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+/// Returns the limits of the configured model.
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     let options: Options = config.options()?;
     let limits = model_of(&options, config.dof)?.limits();
     options.sim.check(&limits)?;
-    Ok(Fit { limits })
+    Ok(Checked { limits })
 }
 
-/// The model that options and number of joints say; or why they do not go together.
-fn model_of(options: &Options, dof: usize) -> Result<Model, Misfit> {
+/// Returns the model of options and number of joints, or why they conflict.
+fn model_of(options: &Options, dof: usize) -> Result<Model, ConfigError> {
     let model = options.model.or(Model::of_dof(dof));
-    let model = model.ok_or_else(|| Misfit::new("", format!("no xArm has {dof} joints")))?;
+    let model = model.ok_or_else(|| ConfigError::new("", format!("no xArm has {dof} joints")))?;
     match model.axes() {
         axes if axes == dof => Ok(model),
-        axes => Err(Misfit::new("model", format!("{} has {axes} joints, not {dof}", model.name()))
+        axes => Err(ConfigError::new("model", format!("{} has {axes} joints, not {dof}", model.name()))
             .hint(format!("give the arm {axes} joints, or leave `model` out for the xArm with {dof}"))),
     }
 }

@@ -1,6 +1,6 @@
-//! Changing the mode. The firmware silently lands in mode 0 when it goes from one streaming mode to another while it
-//! is ready; so the arm is stopped first, then gets its mode, then is made ready, and each step is seen in the reports
-//! before the next one is made.
+//! Changing the mode. The firmware silently falls back to mode 0 when it changes between streaming modes while it is
+//! ready. Therefore the arm is stopped, then its mode is set, then it is made ready; each step must show in the reports
+//! before the next.
 
 use std::time::Duration;
 
@@ -8,19 +8,19 @@ use super::protocol::commands::{Command, READY, STOP};
 use super::protocol::report::Motion;
 use crate::clock::Mono;
 
-/// How long a step may take to show in the reports: the reply timeout of what it sends.
+/// Timeout of a step to show in the reports: the reply timeout of its command.
 const STEP_LIMIT: Duration = Duration::from_secs(2);
-/// Rest between the steps of a second attempt, as the vendor advises.
-const REST: Duration = Duration::from_millis(100);
-/// Attempts before it is given up.
+/// Pause between the steps of further attempts, as the vendor advises.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Maximum number of attempts.
 const ATTEMPTS: u32 = 3;
 
-/// Whether this state accepts motion: 1 moving, 2 standing.
+/// Returns whether the arm accepts motion in this state: 1 moving, 2 ready.
 pub fn is_ready(state: u8) -> bool {
     state <= 2
 }
 
-/// Whether this state is a stop: 4 stopped, 5 changed and to be made ready.
+/// Returns whether this state is a stop: 4 stopped, 5 mode changed.
 fn is_stopped(state: u8) -> bool {
     state == 4 || state == 5
 }
@@ -33,27 +33,27 @@ enum Step {
     Readying,
 }
 
-/// What to do next.
+/// The next step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Next {
-    /// Send this.
+    /// Send this command.
     Send(Command),
-    /// Look at the next report.
+    /// Wait for the next report.
     Wait,
     /// The arm is ready in its mode.
     Done,
-    /// Another client brings the arm into a mode.
+    /// Another client changes the mode.
     TakenOver,
-    /// The arm does not get there; what it did not do.
+    /// The change has failed; why.
     GiveUp(&'static str),
 }
 
 /// A change of mode under way.
 #[derive(Debug, Clone, Copy)]
 pub struct ModeChange {
-    /// The mode it is to be in.
+    /// The target mode.
     pub target: u8,
-    /// The mode that it was in.
+    /// The mode before the change.
     from: Option<u8>,
     detect: bool,
     step: Step,
@@ -62,19 +62,20 @@ pub struct ModeChange {
 }
 
 impl ModeChange {
-    /// Towards a mode. `detect`: the firmware takes the parameter about collision detection.
+    /// Starts a change of mode. `detect`: the firmware has the parameter for collision detection.
     pub fn new(target: u8, detect: bool, now: Mono) -> Self {
         Self { target, from: None, detect, step: Step::Begin, since: now, attempt: 1 }
     }
 
-    /// The next step, from what the newest report says.
+    /// Returns the next step, given the newest report.
     pub fn advance(&mut self, motion: &Motion, now: Mono) -> Next {
         let waited = now.since(self.since);
-        if self.attempt > 1 && waited < REST {
+        if self.attempt > 1 && waited < PAUSE {
             return Next::Wait;
         }
         let there = motion.mode == self.target;
-        // The way leads from the mode it was in to the target, or silently to 0. Any other is not ours to undo.
+        // The mode is the old one, the target, or silently 0. Any other one was set by another client and is not
+        // undone.
         if !there && motion.mode != 0 && motion.mode != *self.from.get_or_insert(motion.mode) {
             return Next::TakenOver;
         }
@@ -134,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mode_of_another_client_is_left_alone() {
+    fn a_mode_of_another_client_is_not_undone() {
         let now = Mono(1);
         let mut change = ModeChange::new(4, true, now);
         assert_eq!(change.advance(&reported(2, 1), now), Next::Send(Command::SetState(STOP)));
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_silent_mode_0_is_seen_and_tried_again_with_rests_and_given_up() {
+    fn a_silent_mode_0_is_retried_with_pauses_and_then_given_up() {
         let mut now = Mono(1);
         let mut change = ModeChange::new(1, false, now);
         let mut sent = 0;

@@ -1,4 +1,4 @@
-//! The models: how they introduce themselves, and their joint limits.
+//! The models: their identities and joint limits.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -21,7 +21,7 @@ pub enum Model {
     Xarm850,
 }
 
-/// What a controller says that its arm is.
+/// What a controller reports about its arm.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Identity {
     /// Number of joints.
@@ -61,7 +61,7 @@ const XARM6_1305: [(f64, f64); 6] = [TURN, SHOULDER_1305, ELBOW_1305, TURN, WRIS
 const XARM7_1305: [(f64, f64); 7] = [TURN, SHOULDER_1305, TURN, (-0.10472, 3.92699), TURN, WRIST, TURN];
 
 impl Model {
-    /// The model that an arm with so many joints is unless somebody says otherwise.
+    /// Returns the default model with this number of joints.
     pub fn of_dof(dof: usize) -> Option<Self> {
         match dof {
             5 => Some(Self::Xarm5),
@@ -71,7 +71,7 @@ impl Model {
         }
     }
 
-    /// The model of an arm that introduces itself.
+    /// Returns the model of an identity.
     pub fn of(identity: &Identity) -> Option<Self> {
         match (identity.axes, identity.kind) {
             (6, 9) => Some(Self::Lite6),
@@ -83,7 +83,7 @@ impl Model {
         }
     }
 
-    /// Number of joints.
+    /// Returns the number of joints.
     pub fn axes(self) -> usize {
         match self {
             Self::Xarm5 => 5,
@@ -92,7 +92,7 @@ impl Model {
         }
     }
 
-    /// The name on the arm.
+    /// Returns the name on the arm.
     pub fn name(self) -> &'static str {
         match self {
             Self::Xarm5 => "xArm 5",
@@ -103,12 +103,12 @@ impl Model {
         }
     }
 
-    /// What goes before the name in a sentence.
+    /// Returns the article for the name in a sentence.
     pub fn article(self) -> &'static str {
         if self == Self::Lite6 { "a" } else { "an" }
     }
 
-    /// The name in a blueprint.
+    /// Returns the name in a blueprint.
     pub fn option(self) -> &'static str {
         match self {
             Self::Xarm5 => "xarm5",
@@ -119,12 +119,12 @@ impl Model {
         }
     }
 
-    /// Top speed of the tool point in planned moves [mm/s].
+    /// Returns the top speed of the TCP in planned moves [mm/s].
     pub fn line_speed(self) -> f64 {
         if self == Self::Lite6 { 500.0 } else { 1000.0 }
     }
 
-    /// Where the flange is when all joints are at zero: x, z [mm]; it points down, and y is 0.
+    /// Returns the position of the flange with all joints at zero: x, z [mm]; it points down, and y is 0.
     pub fn zero_pose(self) -> (f64, f64) {
         match self {
             Self::Xarm5 | Self::Xarm6 => (207.0, 112.0),
@@ -134,8 +134,8 @@ impl Model {
         }
     }
 
-    /// Joint limits of the usual arm of this model: the narrower ones where series differ. Arms of another kind, such
-    /// as a mirrored one, have others: [`Identity::limits`].
+    /// Returns the joint limits of this model: the narrower ones if series differ. Variants, such as mirrored arms,
+    /// have others: [`Identity::limits`].
     pub fn limits(self) -> JointLimits {
         limits_of(match self {
             Self::Xarm5 => &XARM5_1305,
@@ -148,7 +148,7 @@ impl Model {
 }
 
 impl Identity {
-    /// Joint limits of this very arm; `None` for an unknown one.
+    /// Returns the joint limits of this arm; `None` for an unknown variant.
     pub fn limits(&self) -> Option<JointLimits> {
         let newer = self.is_of_series_1305();
         Some(limits_of(match (Model::of(self)?, self.kind) {
@@ -167,7 +167,7 @@ impl Identity {
         }))
     }
 
-    /// Whether the digits three to six of the serial number are those of the xArms with newer ranges.
+    /// Returns whether digits three to six of the serial number are those of the newer series.
     fn is_of_series_1305(&self) -> bool {
         let digits = self.serial.get(2..6).and_then(|digits| digits.parse().ok());
         digits.is_some_and(|series: u16| (1305..8500).contains(&series))

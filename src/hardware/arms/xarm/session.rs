@@ -1,5 +1,5 @@
-//! A connection to a controller, from connecting to its end: what is known of the arm, kept up to date without ever
-//! asking for the joints, and what can be asked of it. Units of the wire; the adapter converts.
+//! A connection to a controller: keeps the arm's state up to date from reports, without polling the joints, and sends
+//! requests. Units of the wire; the adapter converts.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
@@ -8,36 +8,35 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::condition::Condition;
 use super::control::{Control, Counts, Purpose};
-use super::errors::warning_text;
 use super::gripper::Gripper;
 use super::mode::{ModeChange, is_ready};
 use super::model::{Model, VELOCITY};
 use super::protocol::commands::{Command, QUICK, SLOW};
-use super::protocol::frame::{Response, Status};
+use super::protocol::frame::Response;
 use super::protocol::identity::Firmware;
 use super::protocol::report::{Health, Motion};
 use super::stream::Stream;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::device_time::DeviceTime;
 use crate::joint::JointLimits;
 
-/// A controller that lives reports 100 or 250 times a second: after so much silence, also on a connection that
-/// looks well, it is gone.
-pub const SILENCE: Duration = Duration::from_millis(500);
-/// Reports from before an answer may still be on the way for so long after it: two periods of the slower kind.
-const ON_THE_WAY: Duration = Duration::from_millis(20);
-/// Which motors are on is told five times a second, and by nothing else: after so much silence that is not known.
-const CONDITION_SILENCE: Duration = Duration::from_millis(1000);
-/// Setpoints were streamed lately: a gripper that shares their connection is left alone as far as it can be.
-const STREAMING: Duration = Duration::from_secs(2);
-/// Joint positions that jump further than the arm can move, and this much [rad], are believed only when the next
-/// report agrees.
-const JUMP: f64 = 0.1;
+/// A live controller reports 100 or 250 times per second. Without a report for this time the connection is lost, even
+/// if the socket is open.
+pub const REPORT_TIMEOUT: Duration = Duration::from_millis(500);
+/// How long after a response older reports may still arrive: two periods of the slower kind.
+const REPORT_DELAY: Duration = Duration::from_millis(20);
+/// Only a 5 Hz report shows which motors are on. Without one for this time that is unknown.
+const CONDITION_TIMEOUT: Duration = Duration::from_millis(1000);
+/// For this time after a setpoint, a gripper on the same connection is polled less.
+const STREAMING_TIME: Duration = Duration::from_secs(2);
+/// Joint positions that jump by more than the arm can move plus this [rad] are accepted only when the next report
+/// agrees.
+const MAX_JUMP: f64 = 0.1;
 
 /// What the arm is.
 pub struct Device {
-    /// Which model.
+    /// Model.
     pub model: Model,
     /// Firmware of the controller.
     pub firmware: Firmware,
@@ -45,15 +44,15 @@ pub struct Device {
     pub serial: String,
     /// Joint limits.
     pub limits: JointLimits,
-    /// Whether reports hold torques, and not currents.
+    /// Whether reports contain torques rather than currents.
     pub torques: bool,
 }
 
-/// What responses and reports are told to, besides the joints.
+/// State other than joints that responses and reports update.
 pub(super) struct Known {
     pub(super) condition: Condition,
     pub(super) gripper: Gripper,
-    /// The newest answer to a request that a caller waits for.
+    /// The newest response that a caller waits for.
     pub(super) answer: Option<Response>,
 }
 
@@ -69,7 +68,7 @@ impl Known {
     }
 }
 
-/// What this run ordered last: an arm that is ready for motion in a mode.
+/// The arm is ready for motion in a mode that this run ordered.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Ready {
     pub(super) mode: u8,
@@ -81,36 +80,36 @@ pub struct Session {
     /// What it is.
     pub device: Device,
     pub(super) control: Control,
-    /// The second control connection, for the gripper; without one its telegrams share `control`.
+    /// The second control connection, for the gripper. Without it, the gripper's telegrams share `control`.
     bus: Option<Control>,
     reports: Stream<Motion>,
     normal: Stream<Health>,
     pub(super) known: Known,
     pub(super) motion: Motion,
-    /// When the newest positions were measured, and when they came.
+    /// When the newest positions were measured, and when they arrived.
     stamp: Mono,
     pub(super) fresh_at: Mono,
     device_time: DeviceTime,
     suspect: bool,
-    /// `None`: the arm was stopped, by this run or by another client: only an activation makes it ready again.
+    /// `None`: the arm was stopped, by this run or another client, and needs an activation.
     pub(super) ready: Option<Ready>,
-    /// The mode that was ordered when another client changed the mode, the state or the motors.
+    /// The ordered mode, after another client changed the mode, the state or the motors.
     pub(super) foreign: Option<u8>,
-    /// When a setpoint was refused: no more are sent before a report tells why.
-    refused_at: Option<Mono>,
+    /// When a setpoint was refused. No more are sent until a newer report arrives.
+    pub(super) refused_at: Option<Mono>,
     /// When the last setpoint was sent.
-    streamed_at: Mono,
-    /// A change of mode under way: it goes on with every report, whoever asks.
+    pub(super) streamed_at: Mono,
+    /// A change of mode under way; it advances with every report.
     pub(super) change: Option<ModeChange>,
-    /// The mode that the last change did not reach, and why, until a caller takes it.
+    /// The mode that the last change did not reach, and why, until a call reports it.
     pub(super) failed: Option<(u8, &'static str)>,
-    /// When the force/torque sensor was switched on: before that its place in the reports holds zeros.
+    /// When the force/torque sensor was switched on: before that, reports contain zeros for it.
     pub(super) wrench_since: Option<Mono>,
     updated: Mono,
 }
 
 impl Session {
-    /// Begins with a first report. The arm counts as stopped until it is activated.
+    /// Starts from a first report. The arm counts as stopped until it is activated.
     pub fn new(
         device: Device,
         (control, bus): (Control, Option<Control>),
@@ -146,22 +145,22 @@ impl Session {
         }
     }
 
-    /// Becomes readable when a report has come.
+    /// Returns the descriptor that becomes readable when a report has arrived.
     pub fn fd(&self) -> BorrowedFd<'_> {
         self.reports.as_fd()
     }
 
-    /// The newest report, and when its positions were measured.
+    /// Returns the newest report, and when its positions were measured.
     pub fn motion(&self) -> (&Motion, Mono) {
         (&self.motion, self.stamp)
     }
 
-    /// How often it reports [Hz].
+    /// Returns the rate of the reports [Hz].
     pub fn rate(&self) -> f64 {
         self.reports.kind().rate()
     }
 
-    /// How the controller is.
+    /// Returns the controller's condition.
     pub fn condition(&self) -> &Condition {
         &self.known.condition
     }
@@ -171,45 +170,45 @@ impl Session {
         &mut self.known.gripper
     }
 
-    /// What became of requests so far.
+    /// Returns the counts of requests.
     pub fn counts(&self) -> Counts {
         self.control.counts()
     }
 
-    /// Force and torque at the sensor [N, Nm], once that is switched on.
+    /// Returns force and torque at the sensor [N, Nm], once it is switched on.
     pub fn wrench(&self) -> Option<[f64; 6]> {
-        let measured = |since| self.fresh_at.since(since) > ON_THE_WAY;
+        let measured = |since| self.fresh_at.since(since) > REPORT_DELAY;
         self.motion.wrench.filter(|_| self.wrench_since.is_some_and(measured))
     }
 
-    /// Whether all motors are on.
+    /// Returns whether all motors are on.
     pub fn enabled(&self) -> bool {
         self.known.condition.all_enabled(self.device.model.axes())
     }
 
-    /// Closes the connections and discards what has not left this computer.
+    /// Closes the connections and discards unsent bytes.
     pub fn abort(self) {
         self.control.abort();
         self.bus.into_iter().for_each(Control::abort);
     }
 
-    /// Takes up all that has arrived, without waiting, and asks what is due. Does nothing within `age` of the last
-    /// time.
+    /// Processes all that has arrived, without waiting, and sends requests that are due. Does nothing within `age` of
+    /// the previous call.
     pub fn update(&mut self, age: Duration) -> AdapterResult<()> {
         let now = MonotonicClock.now();
         if now.since(self.updated) < age {
             return Ok(());
         }
         self.updated = now;
-        self.take_up()?;
-        if MonotonicClock.now().since(self.fresh_at) > SILENCE {
-            return Err(AdapterError::Io(format!("{} sent nothing new for {SILENCE:?}", self.reports.peer())));
+        self.receive()?;
+        if MonotonicClock.now().since(self.fresh_at) > REPORT_TIMEOUT {
+            return Err(AdapterError::Io(format!("{} sent nothing new for {REPORT_TIMEOUT:?}", self.reports.peer())));
         }
-        if MonotonicClock.now().since(self.normal.arrived) > CONDITION_SILENCE {
-            return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_SILENCE:?}", self.normal.peer())));
+        if MonotonicClock.now().since(self.normal.arrived) > CONDITION_TIMEOUT {
+            return Err(AdapterError::Io(format!("{} sent nothing for {CONDITION_TIMEOUT:?}", self.normal.peer())));
         }
         self.advance_change()?;
-        // What is asked behind something slow waits for it, and so would the next setpoint.
+        // The controller answers in order: a request behind a slow one would delay the next setpoint.
         if !self.control.waits()
             && let Some(question) = self.known.condition.due(now, self.control.last_sent())
         {
@@ -218,8 +217,8 @@ impl Session {
         self.ask_gripper(now)
     }
 
-    /// Takes up all that has arrived, without waiting.
-    fn take_up(&mut self) -> AdapterResult<()> {
+    /// Processes all that has arrived, without waiting.
+    pub(super) fn receive(&mut self) -> AdapterResult<()> {
         if let Some(motion) = self.reports.newest()? {
             self.take(motion);
         }
@@ -235,8 +234,8 @@ impl Session {
         Ok(())
     }
 
-    /// Sends the gripper its next telegram and takes up its answers. A box may close the second connection: then the
-    /// gripper has the first one, like that of an older box.
+    /// Sends the gripper's next telegram and processes its responses. If the control box closes the second connection,
+    /// the gripper uses the first one, as with older boxes.
     fn ask_gripper(&mut self, now: Mono) -> AdapterResult<()> {
         let Known { gripper, .. } = &mut self.known;
         if let Some(bus) = &mut self.bus {
@@ -253,7 +252,7 @@ impl Session {
             }
             return Ok(());
         }
-        let streams = now.since(self.streamed_at) < STREAMING;
+        let streams = now.since(self.streamed_at) < STREAMING_TIME;
         match gripper.due(now, streams) {
             Some(telegram) => self.control.post(&Command::Tool(telegram), Purpose::Gripper).map(drop),
             None => Ok(()),
@@ -262,10 +261,10 @@ impl Session {
 
     fn take(&mut self, motion: Motion) {
         if motion.time_us.is_some() && motion.time_us == self.motion.time_us {
-            return; // the same measurement once more is nothing new
+            return; // the same measurement again
         }
         let arrived = self.reports.arrived;
-        let reach = JUMP + 1.5 * VELOCITY * arrived.since(self.fresh_at).as_secs_f64();
+        let reach = MAX_JUMP + 1.5 * VELOCITY * arrived.since(self.fresh_at).as_secs_f64();
         let jumps = motion.position.iter().zip(&self.motion.position).any(|(new, old)| (new - old).abs() > reach);
         if jumps && !self.suspect {
             self.suspect = true;
@@ -283,21 +282,21 @@ impl Session {
         }
     }
 
-    /// The arm is not as this run ordered: nothing is commanded any more, and nothing is undone. Register 15 tells
-    /// whether the device itself is the cause.
+    /// Records that the arm is not as this run ordered. Nothing more is commanded, and nothing is undone. Register 15
+    /// shows whether the device itself is the cause.
     pub(super) fn changed_by_another_client(&mut self) {
         self.foreign = self.ready.take().map(|ready| ready.mode);
         self.known.condition.doubt(MonotonicClock.now());
     }
 
-    /// Waits for the next report or response, a few ms at most.
+    /// Waits for the next report or response, at most 5 ms.
     fn pause(&self) {
         let timeout = Timespec { tv_sec: 0, tv_nsec: 5_000_000 };
         let fds = [self.fd(), self.control.fd()];
         let _ = poll(&mut fds.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)), Some(&timeout));
     }
 
-    /// Takes up what arrives until `done` has what it looks for; `None` when it has not within `limit`.
+    /// Processes what arrives until `done` returns a value; `None` after `limit`.
     pub(super) fn wait<T>(
         &mut self,
         limit: Duration,
@@ -316,20 +315,20 @@ impl Session {
         }
     }
 
-    /// Sends a request whose answer a caller waits for.
+    /// Sends a request whose response a caller waits for, and returns its number.
     pub(super) fn request(&mut self, command: &Command) -> AdapterResult<u16> {
-        self.known.answer = None; // numbers come again
+        self.known.answer = None; // numbers repeat
         self.control.post(command, Purpose::Answer)
     }
 
-    /// The answer to the request with this number, once it is there.
+    /// Returns the response with this number, if it has arrived.
     pub(super) fn answer(&self, number: u16) -> Option<Response> {
         self.known.answer.filter(|answer| answer.transaction == number)
     }
 
-    /// Asks and waits for the answer. Reports are taken up meanwhile where it may take long.
+    /// Sends a request and waits for the response. Processes reports meanwhile if the request may be slow.
     pub(super) fn ask(&mut self, command: &Command) -> AdapterResult<Response> {
-        // A quick answer comes after that to something slow that was asked before.
+        // The response comes after that of a slow request that is still outstanding.
         let limit = if self.control.waits() { command.timeout().max(SLOW) } else { command.timeout() };
         if limit <= QUICK {
             let known = &mut self.known;
@@ -344,107 +343,18 @@ impl Session {
         })
     }
 
-    /// Asks for the error, and answers it as such when there is one.
+    /// Requests the error code; `Fault` if there is an error.
     pub fn check_error(&mut self) -> AdapterResult<()> {
         let answer = self.ask(&Command::GetError)?;
         self.known.condition.take(&answer);
         self.fault()
     }
 
-    /// The known error, as such.
+    /// Returns `Fault` if an error is known.
     pub(super) fn fault(&self) -> AdapterResult<()> {
         match self.known.condition.error {
             0 => Ok(()),
             code => Err(AdapterError::Fault { code: code.into(), text: self.known.condition.text() }),
         }
-    }
-
-    // --- Motion ---
-
-    pub(super) fn may_be_commanded(&self) -> AdapterResult<()> {
-        if !self.enabled() {
-            Err(AdapterError::Rejected("the motors are disabled".into()))
-        } else if self.ready.is_none() || !is_ready(self.motion.state) {
-            let why = self.foreign_change().unwrap_or("the arm was stopped");
-            Err(AdapterError::Rejected(format!("{why}: enable it again")))
-        } else {
-            Ok(())
-        }
-    }
-
-    fn may_move(&mut self, mode: u8) -> AdapterResult<()> {
-        self.fault()?;
-        if self.change.is_some() {
-            return Err(AdapterError::Rejected("the change of mode is under way".into()));
-        }
-        self.may_be_commanded()?;
-        if self.motion.mode != mode {
-            return Err(AdapterError::Rejected(format!("the arm is in mode {}, not {mode}", self.motion.mode)));
-        }
-        Ok(())
-    }
-
-    /// Sends a command of a stream (a setpoint, velocities) and does not wait for its response. Not when the newest
-    /// report or response says that the arm is not as it was ordered to be, and not while two are on their way
-    /// (`Busy`).
-    pub fn stream(&mut self, mode: u8, command: &Command) -> AdapterResult<()> {
-        self.take_up()?;
-        self.heed_refusal()?;
-        self.may_move(mode)?;
-        if self.refused_at.is_some_and(|refused| self.fresh_at <= refused) {
-            return Err(AdapterError::Busy);
-        }
-        self.control.post(command, Purpose::Motion)?;
-        self.streamed_at = self.control.last_sent();
-        Ok(())
-    }
-
-    /// Reports a setpoint that was refused. The response may say that the arm is not ready before the report does.
-    pub(super) fn heed_refusal(&mut self) -> AdapterResult<()> {
-        let Some((status, sent)) = self.control.take_refusal() else { return Ok(()) };
-        if self.ready.is_none_or(|ready| sent < ready.since) && self.foreign.is_none() {
-            return Ok(()); // of a setpoint before a stop or a change of mode that this run ordered
-        }
-        self.refused_at = Some(MonotonicClock.now());
-        Err(self.refused(status))
-    }
-
-    /// Whether a move that the controller plans would be sent.
-    pub fn may_plan(&mut self) -> AdapterResult<()> {
-        self.may_move(0)
-    }
-
-    /// Sends a move that the controller plans, and hears what it makes of it.
-    pub fn plan(&mut self, command: &Command) -> AdapterResult<()> {
-        self.may_move(0)?;
-        let status = self.ask(command)?.status;
-        if status.error() || status.warning() {
-            self.check_error()?;
-        }
-        if status.warning() && self.known.condition.warning != 0 {
-            let code = self.known.condition.warning;
-            self.ask(&Command::ClearWarning)?;
-            self.known.condition.warning = 0;
-            return Err(AdapterError::Rejected(format!("xarm refuses the move: {} ({code})", warning_text(code))));
-        }
-        if status.not_ready() && self.ready.is_some() {
-            self.changed_by_another_client();
-        }
-        if status.not_ready() || status.invalid() { Err(self.refused(status)) } else { Ok(()) }
-    }
-
-    fn refused(&self, status: Status) -> AdapterError {
-        if let Err(fault) = self.fault() {
-            return fault;
-        }
-        if let Some(what) = self.foreign_change() {
-            return AdapterError::Rejected(format!("{what}: enable it again"));
-        }
-        let why = match status {
-            status if status.error() => "it is in error",
-            status if status.not_ready() => "it is not ready to move",
-            _ => "the command is not valid now",
-        };
-        AdapterError::Rejected(format!("xarm refuses to move: {why} (state {})", self.motion.state))
     }
 }

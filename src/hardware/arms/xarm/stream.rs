@@ -6,10 +6,10 @@ use std::time::Duration;
 use super::address::Address;
 use super::protocol::report::{Kind, scan};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::transport::tcp::TcpLink;
 
-/// A connection on which the controller reports by itself.
+/// A connection on which the controller streams reports.
 pub struct Stream<T> {
     link: TcpLink,
     kind: Kind,

@@ -6,22 +6,22 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
+use super::SPEC;
 use super::adapter::XArmAdapter;
-use super::emulator::{Withhold, XArmEmulator};
-use super::{MODES_WITHOUT_VELOCITY, SPEC};
+use super::emulator::XArmEmulator;
 use crate::arm::Pose;
+use crate::hardware::adapter::{AdapterError, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::conformance::{Outcome, Subject, checks, run_on};
-use crate::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, Place};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
-fn config(address: &str, dof: usize, options: Value) -> AdapterConfig {
+pub(super) fn config(address: &str, dof: usize, options: Value) -> AdapterConfig {
     AdapterConfig { hardware_id: "arm".into(), address: address.into(), dof, options }
 }
 
 pub(super) fn pair(dof: usize, options: Value) -> (XArmEmulator, XArmAdapter) {
-    let emulator = XArmEmulator::start(&config("", dof, options.clone()), &Place::InProcess).unwrap();
+    let emulator = XArmEmulator::start(&config("", dof, options.clone()), &EmulatorAddress::InProcess).unwrap();
     let adapter = XArmAdapter::new(&config(&emulator.address(), dof, options)).unwrap();
     (emulator, adapter)
 }
@@ -36,7 +36,7 @@ pub(super) fn ready(options: Value, mode: ControlMode) -> (XArmEmulator, XArmAda
 }
 
 /// Changes the mode as the device thread does: `Rejected` is asked again.
-fn set(arm: &mut XArmAdapter, mode: ControlMode) -> Result<(), AdapterError> {
+pub(super) fn set(arm: &mut XArmAdapter, mode: ControlMode) -> Result<(), AdapterError> {
     arm.set_control_mode(mode)
 }
 
@@ -66,40 +66,6 @@ fn floats(payload: &[u8]) -> Vec<f32> {
 pub(super) fn sent(emulator: &XArmEmulator, register: u8) -> Vec<Vec<u8>> {
     let trace = emulator.trace().into_iter();
     trace.filter(|request| request.register == register).map(|request| request.payload).collect()
-}
-
-#[test]
-fn other_models_options_and_firmwares_conform_too() {
-    for (dof, options) in [
-        (6, json!({"gripper": "xarm", "force_torque": true})),
-        (6, json!({"model": "lite6"})),
-        (5, json!({"sim": {"firmware": "1.12.10"}, "gripper": "xarm_g2"})),
-        (6, json!({"model": "xarm850", "sim": {"firmware": "1.5.20"}})),
-    ] {
-        let old = options["sim"].is_object();
-        let subject = Subject { config: config("", dof, options.clone()), ..Subject::emulated(&SPEC) };
-        // Reports before firmware 2.1.0 have no time: a measurement that is repeated cannot be told from an arm that
-        // stands still. Before 1.8.0 there is no velocity mode.
-        let old_modes = options["sim"]["firmware"] == "1.5.20";
-        let modes = if old_modes { MODES_WITHOUT_VELOCITY } else { SPEC.modes };
-        let subject = Subject { row: AdapterSpec { modes, ..SPEC }, ..subject };
-        let differs = |name: &str| match name {
-            "frozen_state_is_noticed" => old,
-            "modes_are_what_it_says" => old_modes, // velocity mode is refused with more words than Unsupported
-            _ => false,
-        };
-        let all: Vec<_> = checks().filter(|check| !differs(check.name)).collect();
-        // Some at a time: each has an emulator of its own that reports 250 times a second.
-        for some in all.chunks(16) {
-            std::thread::scope(|scope| {
-                let threads: Vec<_> = some.iter().map(|c| (c.name, scope.spawn(|| run_on(&subject, c).0))).collect();
-                for (name, thread) in threads {
-                    let outcome = thread.join().unwrap();
-                    assert!(!matches!(outcome, Outcome::Failed(_)), "{options} {name}: {outcome:?}");
-                }
-            });
-        }
-    }
 }
 
 #[test]
@@ -206,7 +172,7 @@ fn why_a_mode_was_not_reached_is_told_by_whichever_call_comes_next() {
     emulator.keep_mode(true);
     let under_way = set(&mut arm, ControlMode::Velocity).unwrap_err();
     assert_eq!(under_way, AdapterError::Rejected("the change of mode is under way".into()));
-    // The change goes on with every reading, and comes to nothing in one of them.
+    // The change continues with every reading, and fails in one of them.
     let end = Instant::now() + Duration::from_secs(3);
     while Instant::now() < end {
         read(&mut arm).unwrap();
@@ -215,7 +181,7 @@ fn why_a_mode_was_not_reached_is_told_by_whichever_call_comes_next() {
     let error = set(&mut arm, ControlMode::Velocity).unwrap_err();
     assert_eq!(error, AdapterError::Protocol("xarm did not change to mode 4: it does not take the mode".into()));
     let refused = set(&mut arm, ControlMode::Velocity).unwrap_err().to_string();
-    assert_eq!(refused, "the arm was stopped: enable it again", "told once");
+    assert_eq!(refused, "the arm was stopped: enable it again", "reported once");
     emulator.keep_mode(false);
     arm.activate().unwrap();
     until("velocity mode", || set(&mut arm, ControlMode::Velocity).is_ok());
@@ -295,7 +261,7 @@ fn errors_are_told_with_what_to_do_and_stay_until_they_are_cleared() {
 fn an_error_shows_at_once_and_refuses_set_points() {
     let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
     let hold = six(&mut arm);
-    // A stop shows in the next report, and register 15 is asked then: nobody waits for the 5 Hz report.
+    // A stop shows in the next report and triggers a request of register 15: no need to wait for the 5 Hz report.
     emulator.mute_condition(true);
     emulator.inject(Fault::new(FaultKind::ErrorCode).code(24)).unwrap();
     until("the error", || {
@@ -319,32 +285,6 @@ fn what_is_known_of_the_motors_does_not_outlive_its_reports() {
     emulator.mute_condition(false);
     arm.connect().unwrap();
     assert_eq!(arm.read_enabled(), Ok(true));
-}
-
-#[test]
-fn old_firmware_has_no_velocity_mode_because_it_would_not_end_a_velocity() {
-    let (emulator, mut arm) = ready(json!({"sim": {"firmware": "1.7.9"}}), ControlMode::ServoPosition);
-    assert_eq!(arm.get_info().modes, [ControlMode::Position, ControlMode::ServoPosition]);
-    emulator.record();
-    let refused = set(&mut arm, ControlMode::Velocity).unwrap_err().to_string();
-    assert!(refused.contains("needs firmware 1.8.0 or newer") && refused.contains("has 1.7.9"), "{refused}");
-    assert!(arm.write_joint_velocities(&[0.1; 6]).is_err());
-    assert_eq!((sent(&emulator, 81).len(), sent(&emulator, 19).len()), (0, 0));
-    let (_emulator, mut arm) = ready(json!({"sim": {"firmware": "1.8.0"}}), ControlMode::Velocity);
-    assert!(arm.get_info().modes.contains(&ControlMode::Velocity));
-    arm.write_joint_velocities(&[0.0; 6]).unwrap();
-}
-
-#[test]
-fn without_port_30000_the_reports_of_30003_are_used() {
-    for withhold in [Withhold::Close, Withhold::Silence] {
-        let (emulator, mut arm) = pair(6, json!({}));
-        emulator.withhold_full_reports(withhold);
-        arm.connect().unwrap();
-        assert_eq!(arm.get_info().native_rate, 100.0);
-        arm.activate().unwrap();
-        assert!(read(&mut arm).unwrap().velocity.is_none());
-    }
 }
 
 #[test]
@@ -382,19 +322,6 @@ fn motors_that_are_switched_on_make_the_arm_ready() {
 }
 
 #[test]
-fn old_firmware_has_no_velocities_and_gets_no_new_parameters() {
-    let (emulator, mut arm) = pair(6, json!({"sim": {"firmware": "1.5.20"}}));
-    emulator.record();
-    arm.connect().unwrap();
-    arm.activate().unwrap();
-    assert_eq!(arm.get_info().native_rate, 100.0);
-    let reading = read(&mut arm).unwrap();
-    assert!(reading.velocity.is_none() && reading.effort.is_some() && reading.stamp.is_some());
-    assert!(sent(&emulator, 19).iter().all(|payload| payload.len() == 1));
-    assert!(emulator.trace().iter().all(|received| received.protocol == 2), "not watched before 1.8.6");
-}
-
-#[test]
 fn silence_ends_the_connection_and_a_jump_is_not_believed_at_once() {
     let (emulator, mut arm) = ready(json!({}), ControlMode::ServoPosition);
     let before = six(&mut arm);
@@ -426,34 +353,6 @@ fn an_arm_in_error_is_disabled_all_the_same() {
     assert_eq!(arm.write_enable(false), Ok(()));
     assert_eq!((arm.read_enabled(), arm.read_error().unwrap().0), (Ok(false), 31));
     assert!(matches!(arm.write_enable(true), Err(AdapterError::Fault { code: 31, .. })));
-}
-
-#[test]
-fn a_wrong_arm_is_refused_before_anything_else_is_asked() {
-    let (emulator, mut arm) = pair(6, json!({}));
-    emulator.inject(Fault::new(FaultKind::WrongModel)).unwrap();
-    emulator.record();
-    let error = arm.connect().unwrap_err().to_string();
-    let expected = "expected the model xArm 6 with 6 joints, found a Lite 6 with 6 joints\nhint: is the address right? \
-                    Else set the arm's options to {model: lite6}";
-    assert!(error.ends_with(expected), "{error}");
-    assert_eq!(emulator.trace().len(), 1, "nothing but the version was asked");
-}
-
-#[test]
-fn wrong_configurations_are_refused() {
-    for (config, part) in [
-        (config("192.168.1.185", 8, json!({})), "arm: no xArm has 8 joints"),
-        (config("192.168.1.185", 6, json!({"model": "xarm7"})), "arm: xArm 7 has 7 joints, not 6"),
-        (config("192.168.1.185", 6, json!({"model": "xarm9"})), "xarm9"),
-        (config("192.168.1.185:502:x", 6, json!({})), "not a report port"),
-        (config("", 6, json!({})), "host is missing"),
-        (config("::1", 6, json!({"speed_scale": 0})), "is not above 0 and at most 1"),
-        (config("::1", 6, json!({"speed": 1.0})), "unknown field"),
-    ] {
-        let error = (SPEC.create)(&config).err().unwrap().to_string();
-        assert!(error.contains(part), "{error}");
-    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::tests::{pair, read, ready, sent, six, until};
-use crate::hardware::spec::{AdapterError, Gripper, ManipulatorAdapter, Stop};
+use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode::ServoPosition;
 
 #[test]

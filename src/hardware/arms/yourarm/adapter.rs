@@ -10,28 +10,28 @@ use std::time::Duration;
 
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
-use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, fit, limits};
+use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
 use crate::arm::Pose;
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::kit::{fault, fill, finite};
-use crate::hardware::registry::AdapterConfig;
-use crate::hardware::spec::{
+use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
     Stop,
 };
+use crate::hardware::adapter_util::{fault, fill, finite};
+use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::device_time::DeviceTime;
-use crate::hardware::transport::dialogue::{Dialogue, Patience};
+use crate::hardware::transport::request_reply::{RequestReply, Retry};
 use crate::hardware::transport::tcp::{Endpoint, TcpLink};
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
 /// Longest wait for the connection and for the controller's introduction: together below 3 s.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(1500);
-const HELLO: Patience = Patience::once(Duration::from_millis(1000));
+const HELLO: Retry = Retry::once(Duration::from_millis(1000));
 /// Longest wait for the reply to an order. The controller answers within 1 ms; the rest is for a busy host.
-const REPLY: Patience = Patience::once(Duration::from_millis(100));
+const REPLY: Retry = Retry::once(Duration::from_millis(100));
 /// Longest wait for measurements, and for the reply to a setpoint. One lost reply is asked for again, and both tries
 /// together stay below `stale_after`: a single lost packet must not hold the arm.
-const CYCLE: Patience = Patience { each: Duration::from_millis(22), times: 2 };
+const CYCLE: Retry = Retry { each: Duration::from_millis(22), times: 2 };
 /// A packet answers further questions for one period of the controller.
 const PACKET_AGE: Duration = Duration::from_millis(2);
 
@@ -42,11 +42,11 @@ pub struct YourArmAdapter {
     endpoint: Endpoint,
     options: Options,
     /// The connection, and who is at its other end.
-    line: Dialogue<TcpLink>,
+    line: RequestReply<TcpLink>,
     hello: Option<Hello>,
     /// Number of the last command; its reply carries the same.
     sequence: u16,
-    /// The last packet, and when it arrived; `Mono::ZERO` when it must not answer anything any more.
+    /// The last packet, and when it arrived; `Mono::ZERO`: it is outdated.
     state: protocol::State,
     state_at: Mono,
     device_time: DeviceTime,
@@ -55,11 +55,11 @@ pub struct YourArmAdapter {
 impl YourArmAdapter {
     /// An adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        config.fit(fit)?;
+        config.check(check)?;
         Ok(Self {
             endpoint: config.parse_address(|address| Endpoint::parse(address, protocol::PORT))?,
             options: config.options()?,
-            line: Dialogue::default(),
+            line: RequestReply::default(),
             hello: None,
             sequence: 0,
             state: protocol::State::default(),
@@ -72,14 +72,14 @@ impl YourArmAdapter {
     fn request<T>(
         &mut self,
         command: &Command,
-        patience: Patience,
+        timeout: Retry,
         decode: impl Fn(&[u8]) -> Option<T>,
     ) -> AdapterResult<T> {
         self.sequence = self.sequence.wrapping_add(1);
         let (sequence, opcode) = (self.sequence, command.opcode());
         let mut frame = [0; MAX_FRAME];
         let frame = protocol::encode(command, sequence, &mut frame);
-        self.line.request(frame, patience, |bytes| {
+        self.line.request(frame, timeout, |bytes| {
             frame::scan(bytes, opcode, sequence).map(|reply| read_reply(command, &reply, &decode))
         })?
     }
@@ -337,7 +337,7 @@ impl Gripper for YourArmAdapter {
         Ok(state.gripper_fitted.then_some(state.gripper / MM_PER_M))
     }
 
-    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
         Some((0.0, super::GRIPPER_MAX))
     }
 

@@ -132,7 +132,7 @@ impl<'a> Reader<'a> {
         self.0.is_empty()
     }
 
-    /// So many bytes.
+    /// Takes N bytes.
     pub fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
         let (taken, rest) = self.0.split_first_chunk::<N>()?;
         self.0 = rest;
@@ -145,7 +145,7 @@ impl<'a> Reader<'a> {
         value.is_finite().then_some(f64::from(value))
     }
 
-    /// So many f32, which must be finite.
+    /// Takes N finite f32 values.
     pub fn floats<const N: usize>(&mut self) -> Option<[f64; N]> {
         let mut values = [0.0; N];
         for value in &mut values {

@@ -16,7 +16,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::hardware::fit::{Fit, Misfit};
+use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::transport::tcp::Endpoint;
@@ -55,7 +55,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     holds_when_disabled: HOLDS_WHEN_DISABLED,
     gripper: true,
     options: OptionsSpec::of::<Options>(),
-    fit,
+    check,
     create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
 };
@@ -75,11 +75,11 @@ const JERK: f64 = 100.0;
 
 /// Whether number of joints and options go together: what the type of the options cannot say. All arms have the same
 /// limits; where they depend on an option, like a model, this is the place.
-fn fit(config: &AdapterConfig) -> Result<Fit, Misfit> {
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("yourarm", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
     options.sim.check("yourarm", &limits, emulator::PLAYABLE)?;
-    Ok(Fit { limits })
+    Ok(Checked { limits })
 }
 
 /// The joint limits in SI units.

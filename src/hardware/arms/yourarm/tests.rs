@@ -7,9 +7,9 @@ use super::emulator::{SimOptions, YourArmEmulator};
 use super::{SPEC, protocol::DOF};
 use crate::arm::Pose;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
 
 const START: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
@@ -143,7 +143,7 @@ fn modes_change_at_standstill_only_and_velocities_time_out() {
     assert_eq!(arm.get_control_mode(), ControlMode::Velocity);
     assert_eq!(arm.set_control_mode(ControlMode::Torque), Err(AdapterError::Unsupported));
     arm.write_joint_velocities(&[0.5, 0.0, 0.0, 0.0, 0.0, -1.0]).unwrap();
-    // No further velocity: the controller stops by itself after 200 ms.
+    // No further velocity: the controller stops after 200 ms.
     until("standstill", || emulator.joints().0[0] > 0.01 && emulator.joints().1.iter().all(|v| *v == 0.0));
     let moved = emulator.joints().0[0];
     assert!(moved > 0.01 && moved < 0.5 * 0.2 + 0.5 * 0.5 / 10.0 + 1e-3, "{moved}");
@@ -295,5 +295,5 @@ fn wrong_configurations_are_refused() {
         assert!(error.contains(part), "{error}");
     }
     let sim = serde_json::json!({"sim": {"initial_positions": [0, 0, 0, 0, 0, 9]}});
-    assert!(YourArmEmulator::start(&config("sim", 6, sim), &Place::InProcess).is_err());
+    assert!(YourArmEmulator::start(&config("sim", 6, sim), &EmulatorAddress::InProcess).is_err());
 }

@@ -1,15 +1,15 @@
-//! Where a CAN bus is reached.
+//! Address of a CAN bus.
 
 use std::fmt;
 
-/// Bit rate where an address names none [bit/s].
+/// Default bit rate [bit/s].
 pub const BIT_RATE: u32 = 1_000_000;
-/// The bit rates that slcan knows [bit/s]; its command is `S` and the place in this list.
+/// The bit rates of slcan [bit/s]; the command is `S` and the index in this list.
 pub const SLCAN_RATES: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
-/// The forms, for usage lines.
+/// The forms of an address, for usage texts.
 pub const FORMS: &str = "INTERFACE | slcan:/dev/ttyX[@BITRATE]";
 
-/// The bus of an arm.
+/// Address of an arm's bus.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CanAddress {
     /// A CAN interface of the system: `can0`.
@@ -18,7 +18,7 @@ pub enum CanAddress {
     Slcan {
         /// The serial device, or a pseudo-terminal.
         path: String,
-        /// Of the CAN bus, not of the serial line [bit/s].
+        /// Bit rate of the CAN bus, not of the serial line [bit/s].
         bit_rate: u32,
     },
     /// A bus in this process: `memory:1`.
@@ -26,7 +26,7 @@ pub enum CanAddress {
 }
 
 impl CanAddress {
-    /// Reads an address; asks nobody. What is wrong with it, in a sentence without full stop.
+    /// Parses an address without opening it; the error is a sentence without full stop.
     pub fn parse(text: &str) -> Result<Self, String> {
         if let Some(number) = text.strip_prefix("memory:") {
             let number = number.parse().map_err(|_| format!("{number:?} is not the number of a bus in memory"))?;
@@ -46,7 +46,7 @@ impl CanAddress {
             }
             return Ok(Self::Slcan { path: path.to_owned(), bit_rate });
         }
-        // The kernel's own rule for names of interfaces.
+        // The kernel's rule for interface names.
         let bad = |c: char| c == '/' || c == ':' || c.is_whitespace() || c.is_control();
         match text {
             "" => Err("the CAN interface is missing".to_owned()),

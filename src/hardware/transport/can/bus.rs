@@ -1,9 +1,9 @@
-//! A CAN bus in memory: for `--sim`, and for tests of what no kernel can be made to do on demand.
+//! A CAN bus in memory, for `--sim` and for tests of conditions that a kernel cannot produce on request.
 //!
-//! A [`Bus`] stands for two things at once: the wire, and the CAN controller of the computer, with its queue of frames
-//! to be sent. Ports from [`open`] are programs on that computer, those from [`Bus::attach`] other nodes on the wire.
-//! So a test can withhold the acknowledgement, and what the programs send then stays in the queue, as with real
-//! controllers: also when the program closes its port.
+//! A [`Bus`] contains both the wire and the computer's CAN controller with its send queue. Ports from [`open`] are
+//! programs on that computer, those from [`Bus::attach`] other nodes on the wire. A test can withhold the
+//! acknowledgement; frames of programs then stay in the queue, as with real controllers, even after the program has
+//! closed its port.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -11,18 +11,18 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 use super::{CanAddress, CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 
-/// Events that wait for a port at most; then they are lost, and the port hears of it.
+/// Maximum number of unread events of a port. Further ones are lost, and the port is informed.
 pub const RECEIVE_QUEUE: usize = 4096;
-/// Frames that wait for an acknowledgement at most, where a test says nothing else.
+/// Default maximum number of frames that wait for an acknowledgement.
 pub const SEND_QUEUE: usize = 16;
 
 /// The buses of this process, by number.
 static BUSES: Mutex<BTreeMap<u32, Weak<Hub>>> = Mutex::new(BTreeMap::new());
-/// The number of the next bus. None is used twice, so that an address never leads to another bus than before.
+/// Number of the next bus. Numbers are not reused, so an address never leads to another bus than before.
 static NEXT: AtomicU32 = AtomicU32::new(1);
 
 type Hub = Mutex<State>;
@@ -34,13 +34,13 @@ struct State {
     /// The owner has dropped the bus.
     gone: bool,
     down: bool,
-    /// How often the interface went down: ports from before stay broken.
+    /// How often the interface went down: ports opened before stay broken.
     downs: u64,
-    /// So many frames more are not taken.
+    /// Number of further frames to refuse.
     refuse: usize,
-    /// Nobody acknowledges; so many frames may wait.
+    /// While no node acknowledges: maximum number of waiting frames.
     withheld: Option<usize>,
-    /// Ports cannot take back what waits.
+    /// Whether ports cannot take back waiting frames.
     kept: bool,
     /// Frames that wait for an acknowledgement.
     queue: VecDeque<(u64, CanFrame)>,
@@ -48,7 +48,7 @@ struct State {
 
 struct Member {
     number: u64,
-    /// Another node on the wire, not a program on this computer.
+    /// Whether this is another node on the wire, not a program on this computer.
     remote: bool,
     filters: Vec<CanFilter>,
     events: VecDeque<CanEvent>,
@@ -62,7 +62,7 @@ impl Member {
         }
         match self.events.len() + 1 {
             room if room < RECEIVE_QUEUE => self.events.push_back(event),
-            // The last place is kept for the news that something was lost.
+            // The last slot is reserved for the event that something was lost.
             RECEIVE_QUEUE => self.events.push_back(CanEvent::Trouble(CanTrouble::Overflow)),
             _ => {}
         }
@@ -70,13 +70,13 @@ impl Member {
 }
 
 impl State {
-    /// Brings a frame to everybody but its sender.
+    /// Delivers a frame to all ports but its sender's.
     fn deliver(&mut self, from: u64, frame: CanFrame) {
         let wants = |member: &&mut Member| member.number != from && CanFilter::any(&member.filters, frame.id);
         self.members.iter_mut().filter(wants).for_each(|member| member.push(CanEvent::Frame(frame)));
     }
 
-    /// Takes a frame from a program on this computer; `false` where there is no room.
+    /// Takes a frame from a program on this computer; `false` if there is no room.
     fn take(&mut self, from: u64, frame: CanFrame) -> bool {
         if self.refuse > 0 {
             self.refuse -= 1;
@@ -95,14 +95,14 @@ impl State {
     }
 }
 
-/// A bus. It exists, and is found under its address, until this is dropped.
+/// A bus. It exists, and has its address, until it is dropped.
 pub struct Bus {
     hub: Arc<Hub>,
     number: u32,
 }
 
 impl Bus {
-    /// A new bus with an address of its own.
+    /// Creates a bus with its own address.
     #[expect(clippy::new_without_default, reason = "every bus is another one")]
     pub fn new() -> Self {
         let hub = Arc::new(Hub::default());
@@ -111,42 +111,43 @@ impl Bus {
         Self { hub, number }
     }
 
-    /// Where [`open`](super::open) finds it: `memory:N`.
+    /// Returns the address for [`open`](super::open): `memory:N`.
     pub fn address(&self) -> CanAddress {
         CanAddress::Memory(self.number)
     }
 
-    /// The port of another node on the wire, such as an arm: it hears every frame, and no trouble.
+    /// Opens the port of another node on the wire, such as an arm: it receives every frame, and no trouble.
     pub fn attach(&self) -> AdapterResult<BusPort> {
         join(&self.hub, format!("memory:{}", self.number), true, &[])
     }
 
-    /// Lets the computer's controller report trouble to the programs.
+    /// Reports trouble of the computer's controller to the programs.
     pub fn trouble(&self, trouble: CanTrouble) {
         let programs = |member: &&mut Member| !member.remote;
         lock(&self.hub).members.iter_mut().filter(programs).for_each(|m| m.push(CanEvent::Trouble(trouble)));
     }
 
-    /// The next `frames` that programs send are not taken, as if the controller's queue were full.
+    /// Refuses the next `frames` of programs, as if the controller's queue were full.
     pub fn refuse(&self, frames: usize) {
         lock(&self.hub).refuse = frames;
     }
 
-    /// The other nodes lose their power: nobody acknowledges, and what the programs send waits, `limit` frames at most.
-    /// What the others send is lost.
+    /// The other nodes lose power: none acknowledges, and frames of programs wait, `limit` at most. Frames of the other
+    /// nodes are lost.
     pub fn withhold(&self, limit: usize) {
         let mut state = lock(&self.hub);
         state.queue.reserve(limit);
         state.withheld = Some(limit);
     }
 
-    /// Whether ports can take back what waits for an acknowledgement. They can, unless told otherwise; those on an
-    /// interface of the system cannot.
+    /// Sets whether ports can take back frames that wait for an acknowledgement (the default). Those on an interface of
+    /// the system cannot.
     pub fn keep_waiting(&self, keep: bool) {
         lock(&self.hub).kept = keep;
     }
 
-    /// The other nodes are back: they hear what has waited, in order, and then whatever comes. Answers how many frames
+    /// The other nodes are back: they receive the waiting frames in order, then new ones. Returns how many frames had
+    /// waited.
     /// had waited.
     pub fn acknowledge(&self) -> usize {
         let mut state = lock(&self.hub);
@@ -158,7 +159,7 @@ impl Bus {
         waited
     }
 
-    /// Takes the interface down, or up again. Going down breaks the ports of the programs and throws away what waits.
+    /// Takes the interface down, or up again. Going down breaks the programs' ports and discards waiting frames.
     pub fn set_up(&self, up: bool) {
         let mut state = lock(&self.hub);
         if !up && !state.down {
@@ -186,7 +187,7 @@ pub struct BusPort {
     remote: bool,
     downs: u64,
     wake: Wake,
-    /// The device and its address, for messages.
+    /// Device and address, for messages.
     peer: String,
 }
 
@@ -215,7 +216,7 @@ fn join(hub: &Arc<Hub>, peer: String, remote: bool, filters: &[CanFilter]) -> Ad
 }
 
 impl BusPort {
-    /// The bus, if it still works for this port.
+    /// Returns the bus, if this port still works.
     fn state(&self) -> AdapterResult<MutexGuard<'_, State>> {
         let state = lock(&self.hub);
         let why = match &*state {
@@ -231,7 +232,7 @@ impl CanPort for BusPort {
     fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
         let mut state = self.state()?;
         if self.remote {
-            // Where nobody acknowledges, this node has no power; where the interface is down, nobody listens.
+            // Without an acknowledgement this node has no power; with the interface down, no program receives.
             if state.withheld.is_none() && !state.down {
                 frames.iter().for_each(|frame| state.deliver(self.number, *frame));
             }

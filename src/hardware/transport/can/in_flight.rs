@@ -1,30 +1,30 @@
-//! Frames that were handed over and are not known to have been transmitted.
+//! Frames that were sent and are not known to have been transmitted.
 //!
-//! A confirmation (the echo of a frame from the kernel) takes its frame off the list. Controllers with several
-//! mailboxes send a frame with a lower identifier first, so confirmations may overtake each other a little.
+//! A confirmation (the kernel's echo of a frame) removes its frame. Controllers with several mailboxes send frames with
+//! lower identifiers first, so confirmations may be slightly out of order.
 
 use std::collections::VecDeque;
 
 use super::CanFrame;
 
-/// Frames that are followed at most.
+/// Maximum number of tracked frames.
 const CAPACITY: usize = 64;
-/// A frame that so many later ones have overtaken will not be confirmed any more: its confirmation was lost.
+/// A frame that this many later ones have overtaken will not be confirmed: its confirmation was lost.
 const OVERTAKEN: usize = 8;
 
-/// The frames of one port, the oldest first.
+/// Frames in flight of one port, the oldest first.
 #[derive(Debug)]
 pub struct InFlight {
     frames: VecDeque<CanFrame>,
 }
 
 impl InFlight {
-    /// None.
+    /// Returns an empty list.
     pub fn new() -> Self {
         Self { frames: VecDeque::with_capacity(CAPACITY) }
     }
 
-    /// A frame was handed over.
+    /// Adds a frame that was sent.
     pub fn handed_over(&mut self, frame: CanFrame) {
         if self.frames.len() == CAPACITY {
             self.frames.pop_front();
@@ -32,7 +32,7 @@ impl InFlight {
         self.frames.push_back(frame);
     }
 
-    /// A frame was transmitted.
+    /// Removes a frame that was transmitted.
     pub fn confirmed(&mut self, frame: &CanFrame) {
         if let Some(at) = self.frames.iter().position(|waiting| waiting == frame) {
             self.frames.remove(at);
@@ -40,12 +40,12 @@ impl InFlight {
         }
     }
 
-    /// Confirmations were lost, or frames were taken back.
+    /// Clears the list: confirmations were lost, or frames were taken back.
     pub fn clear(&mut self) {
         self.frames.clear();
     }
 
-    /// How many frames are not known to have been transmitted.
+    /// Returns how many frames are not known to have been transmitted.
     pub fn len(&self) -> usize {
         self.frames.len()
     }

@@ -1,8 +1,7 @@
-//! CAN: frames, and the ports that carry them. What an arm's adapter and its emulator see of a bus, whichever kind it
-//! is: an interface of the system ([`socket`]), a serial adapter that speaks slcan ([`slcan`]), or a bus in memory
-//! ([`bus`]).
+//! CAN frames and ports. Adapters and emulators use the same interface for every kind of bus: an interface of the
+//! system ([`socket`]), a serial adapter with slcan ([`slcan`]), or a bus in memory ([`bus`]).
 //!
-//! Ports never wait: a caller that has nothing to do waits for [`CanPort::fd`] to become readable.
+//! Ports never block; a caller waits for [`CanPort::fd`] to become readable.
 
 pub mod address;
 pub mod bus;
@@ -15,7 +14,7 @@ pub mod socket;
 
 use std::os::fd::BorrowedFd;
 
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 pub use address::CanAddress;
 pub use bus::Bus;
 pub use slcan_pty::SlcanPty;
@@ -32,37 +31,37 @@ pub struct CanFrame {
 }
 
 impl CanFrame {
-    /// A frame with these data bytes; those past the eighth are left out.
+    /// Creates a frame with these data bytes; those past the eighth are dropped.
     pub fn new(id: u16, bytes: &[u8]) -> Self {
         let mut data = [0; 8];
         data.iter_mut().zip(bytes).for_each(|(to, from)| *to = *from);
         Self { id, len: bytes.len().min(8) as u8, data }
     }
 
-    /// The data bytes.
+    /// Returns the data bytes.
     pub fn bytes(&self) -> &[u8] {
         self.data.get(..usize::from(self.len)).unwrap_or(&self.data)
     }
 }
 
-/// What the controller of the bus reports beside frames.
+/// Events that the bus controller reports besides frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanTrouble {
-    /// The controller has left the bus after too many errors. What is sent from now on is swallowed without a word.
+    /// Bus-off: the controller has left the bus after too many errors. Frames sent from now on are lost silently.
     BusOff,
-    /// Nobody acknowledges what is sent: no other node, no power, a wrong bit rate.
+    /// No node acknowledges: no other node, no power, or a wrong bit rate.
     NoAcknowledge,
-    /// Many errors: the controller still takes part, passively.
+    /// Error-passive: many errors, but the controller still takes part.
     Passive,
-    /// The controller is back.
+    /// The controller is active again.
     Restarted,
-    /// Frames were lost because they were not fetched in time.
+    /// Frames were lost because they were not read in time.
     Overflow,
     /// Another error frame, by its class bits.
     Other(u32),
 }
 
-/// What has arrived.
+/// An event of a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CanEvent {
     /// A frame.
@@ -71,55 +70,55 @@ pub enum CanEvent {
     Trouble(CanTrouble),
 }
 
-/// Which frames a port wants: those whose identifier agrees with `id` in the bits that are set in `mask`.
+/// Filter of a port: receives frames whose identifier equals `id` in the bits set in `mask`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CanFilter {
     /// Identifier, 11 bits.
     pub id: u16,
-    /// The bits of it that count; `0x7FF` for one identifier alone.
+    /// Significant bits; `0x7FF` for exactly one identifier.
     pub mask: u16,
 }
 
 impl CanFilter {
-    /// Whether a frame with this identifier is wanted.
+    /// Returns whether the filter accepts this identifier.
     pub fn passes(&self, id: u16) -> bool {
         id & self.mask == self.id & self.mask
     }
 
-    /// Whether one of `filters` wants it; without filters every frame is wanted.
+    /// Returns whether any of `filters` accepts the identifier; without filters all are accepted.
     pub fn any(filters: &[Self], id: u16) -> bool {
         filters.is_empty() || filters.iter().any(|filter| filter.passes(id))
     }
 }
 
-/// One end of a bus. Nothing here waits or allocates.
+/// One end of a bus. Its methods neither block nor allocate.
 ///
-/// A port that has answered `Io` stays broken, also when the interface comes back: open another one.
+/// A port that has returned `Io` stays broken even when the interface comes back: open another one.
 pub trait CanPort: Send {
-    /// Hands frames to the bus, in order. Answers how many it took: fewer than all where its queue is full, and the
-    /// rest is dropped. `Io` when the interface is gone or down.
+    /// Sends frames in order. Returns how many the bus took: fewer than all if its queue is full; the rest is dropped.
+    /// `Io` if the interface is gone or down.
     fn send(&mut self, frames: &[CanFrame]) -> AdapterResult<usize>;
-    /// The next event, if one has arrived. `Io` when the interface is gone or down.
+    /// Returns the next event, if one has arrived. `Io` if the interface is gone or down.
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>>;
-    /// Readable when something has arrived. Fetch until there is nothing before waiting for it.
+    /// Becomes readable when an event has arrived. Receive until there is none before waiting.
     fn fd(&self) -> BorrowedFd<'_>;
-    /// About how many frames of this port still wait for the bus, where that can be known; what was transmitted since
-    /// the last [`CanPort::receive`] may be among them. A number that stays above 0 says that no node acknowledges:
-    /// those frames go out later, when one does.
+    /// Returns approximately how many frames of this port wait for the bus, if known; frames transmitted since the last
+    /// [`CanPort::receive`] may be included. If the number stays above 0, no node acknowledges: the frames are sent
+    /// later, when one does.
     fn waiting(&self) -> usize {
         0
     }
-    /// Takes back the frames of this port that have not left this computer, where that is possible. Answers how many
-    /// still wait: those go out when a node acknowledges, so send nothing new before [`CanPort::waiting`] is 0.
+    /// Takes back the frames of this port that have not left this computer, if possible. Returns how many still wait:
+    /// those are sent when a node acknowledges, so send nothing new before [`CanPort::waiting`] is 0.
     fn discard(&mut self) -> AdapterResult<usize> {
         Ok(self.waiting())
     }
 }
 
-/// Opens a port on the bus at `address`. It hears what `filters` want of the frames that others send, everything
-/// without filters, and trouble always. On an interface of the system, frames that it sends itself are followed until
-/// they are transmitted if `filters` want them: name the identifiers of setpoints too. `device` names the arm in
-/// messages. Errors say what to do.
+/// Opens a port on the bus at `address`. It receives the frames of other nodes that `filters` accept (all without
+/// filters), and always trouble. On an interface of the system, its own frames are tracked until they are transmitted
+/// if `filters` accept them, so include the identifiers of setpoints. `device` names the arm in messages. Errors
+/// contain a hint.
 pub fn open(device: &str, address: &CanAddress, filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
     match address {
         CanAddress::Memory(number) => Ok(Box::new(bus::open(device, *number, filters)?)),
@@ -128,10 +127,10 @@ pub fn open(device: &str, address: &CanAddress, filters: &[CanFilter]) -> Adapte
     }
 }
 
-/// Whether this build reaches CAN interfaces of the system.
+/// Whether this build supports CAN interfaces of the system.
 const INTERFACES: bool = cfg!(all(feature = "can", target_os = "linux"));
 
-/// The address in full, for the adapter table; refuses what this build cannot reach. Asks nobody.
+/// Returns the complete address, for the adapter table; refuses what this build does not support. Opens nothing.
 pub fn check(address: &str) -> Result<String, String> {
     match CanAddress::parse(address)? {
         CanAddress::Interface(name) if !INTERFACES => Err(format!(
@@ -149,7 +148,7 @@ fn open_interface(device: &str, name: &str, filters: &[CanFilter]) -> AdapterRes
 
 #[cfg(not(all(feature = "can", target_os = "linux")))]
 fn open_interface(device: &str, name: &str, _filters: &[CanFilter]) -> AdapterResult<Box<dyn CanPort>> {
-    Err(crate::hardware::spec::AdapterError::Io(format!(
+    Err(crate::hardware::adapter::AdapterError::Io(format!(
         "cannot open CAN interface {name} for {device}: this build has no CAN\nhint: build with --features can, on Linux"
     )))
 }

@@ -1,9 +1,9 @@
-//! Serial CAN adapters that speak slcan, the ASCII protocol of LAWICEL's adapters: every frame is a line, `t` with the
+//! Serial CAN adapters with slcan, the ASCII protocol of LAWICEL's adapters: every frame is a line, `t` with the
 //! identifier, the number of bytes and the bytes in hexadecimal digits, ended by a carriage return.
 //!
-//! Such an adapter tells of no trouble on the bus: that nobody acknowledges shows only in that nobody answers. What it
-//! replies to commands (a carriage return, or a bell for "no") is not read, since many models do not reply; the `z`
-//! that some reply to a frame is counted, and bounds what waits.
+//! Such an adapter reports no trouble on the bus: missing acknowledgements only show in missing answers. Its replies to
+//! commands (a carriage return, or a bell for "no") are ignored, since many models do not reply. The `z` that some send
+//! for each frame is counted, and limits the number of waiting frames.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
@@ -14,21 +14,21 @@ use rustix::termios::{QueueSelector, tcflush};
 
 use super::address::SLCAN_RATES;
 use super::{CanEvent, CanFilter, CanFrame, CanPort};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::transport::incoming::{Incoming, Scan};
 use crate::hardware::transport::serial::{broken, open_line, read_line, wait};
 
 /// Rate of the serial line [bit/s]: adapters on USB take any and ignore it.
 const BAUD: u32 = 115_200;
-/// The longest line of the protocol: an extended frame with eight bytes and a time stamp.
-pub(super) const LONGEST: usize = 32;
-/// A frame's line without its data: `tIIIL`.
+/// Maximum line length: an extended frame with eight bytes and a time stamp.
+pub(super) const MAX_LINE: usize = 32;
+/// Length of a frame's line without its data: `tIIIL`.
 const HEAD: usize = 5;
-/// Replies that are passed over at most before a frame is looked for again.
+/// Maximum number of replies that are skipped in search of a frame.
 const REPLIES: usize = 64;
-/// A reply that has not come after this time was lost.
+/// A reply that is missing for this time was lost.
 const REPLY_LOST: Duration = Duration::from_millis(200);
-/// So many frames wait at least when the kernel has no room for more.
+/// Minimum number of waiting frames when the kernel has no room for more.
 const BACKLOG: usize = 16;
 const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
 
@@ -36,16 +36,15 @@ const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
 pub struct SlcanPort {
     line: Lines<OwnedFd>,
     filters: Vec<CanFilter>,
-    /// What opens the channel.
+    /// Commands that open the channel.
     opening: [u8; 8],
-    /// Frames that were written and have no reply yet, whether the adapter replies to frames at all, and when the last
-    /// one was written.
+    /// Frames without a reply, whether the adapter replies to frames at all, and when the last one was written.
     unanswered: usize,
     replies: bool,
     written_at: Instant,
 }
 
-/// What an adapter says.
+/// A message of an adapter.
 enum Said {
     Frame(CanFrame),
     /// A frame was taken.
@@ -58,7 +57,8 @@ pub fn open(device: &str, path: &str, bit_rate: u32, filters: &[CanFilter]) -> A
     let code = SLCAN_RATES.iter().position(|rate| *rate == bit_rate);
     let code = code.ok_or_else(|| failed(&format!("slcan has no bit rate {bit_rate}")))?;
     let mut line = Lines::new(open_line(device, path, BAUD)?, format!("{device} at {path}"));
-    // The first carriage return ends whatever another program left unfinished. Only a closed channel takes a rate.
+    // The first carriage return ends any unfinished line of another program. The rate can only be set on a closed
+    // channel.
     let opening = [b'\r', b'C', b'\r', b'S', b'0' + code as u8, b'\r', b'O', b'\r'];
     if !line.put(&opening)? {
         return Err(failed("it takes no bytes"));
@@ -86,7 +86,7 @@ impl CanPort for SlcanPort {
                 None => break,
                 Some(Said::Taken) => (self.replies, self.unanswered) = (true, self.unanswered.saturating_sub(1)),
                 Some(Said::Frame(frame)) => {
-                    // An adapter that hands on frames has long looked at what was written to it: the reply was lost.
+                    // An adapter that passes on frames has processed earlier lines: the reply was lost.
                     if self.unanswered > 0 && self.written_at.elapsed() > REPLY_LOST {
                         self.unanswered = 0;
                     }
@@ -101,8 +101,8 @@ impl CanPort for SlcanPort {
         self.line.fd.as_fd()
     }
 
-    /// Frames without a reply, of an adapter that replies. Of another one: the kernel says when some 256 bytes wait for
-    /// it.
+    /// Returns the number of frames without a reply, for an adapter that replies. For others, the kernel reports when
+    /// about 256 bytes wait.
     fn waiting(&self) -> usize {
         let room = || wait(&self.line.fd, PollFlags::OUT, Duration::ZERO).unwrap_or(false);
         if self.replies {
@@ -114,8 +114,7 @@ impl CanPort for SlcanPort {
         }
     }
 
-    /// Throws away what the serial line has not sent, and what the adapter has not: it forgets that with its channel
-    /// closed.
+    /// Discards what neither the serial line nor the adapter has sent; closing its channel clears the adapter's queue.
     fn discard(&mut self) -> AdapterResult<usize> {
         tcflush(&self.line.fd, QueueSelector::OFlush).map_err(|e| broken(&self.line.peer, e))?;
         self.line.rest.1 = 0;
@@ -127,23 +126,23 @@ impl CanPort for SlcanPort {
 
 impl Drop for SlcanPort {
     fn drop(&mut self) {
-        // So that the adapter does not go on talking to nobody.
+        // Stops the adapter from sending further.
         let _ = self.line.put(b"C\r");
     }
 }
 
-/// The line of a frame: its bytes, and how many of them count. `None` for an identifier over 11 bits.
-pub(super) fn encode(frame: &CanFrame) -> Option<([u8; LONGEST], usize)> {
+/// Returns the line of a frame and its length; `None` for an identifier over 11 bits.
+pub(super) fn encode(frame: &CanFrame) -> Option<([u8; MAX_LINE], usize)> {
     let digit = |value: usize| DIGITS.get(value & 0xF).copied().unwrap_or(b'0');
     let (id, bytes) = (usize::from(frame.id), frame.bytes());
     let head = [b't', digit(id >> 8), digit(id >> 4), digit(id), digit(bytes.len())];
     let data = bytes.iter().flat_map(|byte| [digit(usize::from(byte >> 4)), digit(usize::from(*byte))]);
-    let mut line = [0; LONGEST];
+    let mut line = [0; MAX_LINE];
     line.iter_mut().zip(head.into_iter().chain(data).chain([b'\r'])).for_each(|(to, from)| *to = from);
     (id <= 0x7FF).then_some((line, HEAD + 2 * bytes.len() + 1))
 }
 
-/// The frame in a line without its end; `None` when it is something else. A time stamp behind it is left out.
+/// Parses the frame in a line without its end; `None` for anything else. A time stamp behind it is ignored.
 pub(super) fn decode(line: &[u8]) -> Option<CanFrame> {
     let digit = |at: usize| char::from(*line.get(at)?).to_digit(16);
     if line.first() != Some(&b't') {
@@ -162,23 +161,23 @@ pub(super) fn decode(line: &[u8]) -> Option<CanFrame> {
     Some(CanFrame { id: id as u16, len: len as u8, data })
 }
 
-/// Lines that go both ways over a descriptor that does not wait.
+/// Lines in both directions over a non-blocking descriptor.
 pub(super) struct Lines<F> {
     pub(super) fd: F,
-    /// What is at the other end, for messages.
+    /// Name of the other end, for messages.
     peer: String,
     incoming: Incoming,
-    /// The rest of a line that was begun: it goes out before anything else.
-    rest: ([u8; LONGEST], usize),
+    /// The rest of a partly written line; it is sent before anything else.
+    rest: ([u8; MAX_LINE], usize),
 }
 
 impl<F: AsFd> Lines<F> {
     pub(super) fn new(fd: F, peer: String) -> Self {
-        Self { fd, peer, incoming: Incoming::new(), rest: ([0; LONGEST], 0) }
+        Self { fd, peer, incoming: Incoming::new(), rest: ([0; MAX_LINE], 0) }
     }
 
-    /// Writes lines of [`LONGEST`] bytes at most altogether; `false` when there is no room. A begun line counts as
-    /// written.
+    /// Writes lines of at most [`MAX_LINE`] bytes in total; `false` if there is no room. A partly written line counts
+    /// as written.
     pub(super) fn put(&mut self, bytes: &[u8]) -> AdapterResult<bool> {
         let (rest, len) = self.rest;
         if len > 0 {
@@ -223,7 +222,7 @@ impl<F: AsFd> Lines<F> {
                 None => Scan::Skip(end + 1),
             },
             // No line is as long: noise, up to the next end of a line.
-            None if bytes.len() > LONGEST => Scan::Skip(bytes.len()),
+            None if bytes.len() > MAX_LINE => Scan::Skip(bytes.len()),
             None => Scan::More,
         };
         if let Some(found) = incoming.next(scan) {
@@ -247,6 +246,6 @@ impl<F: AsFd> Lines<F> {
     fn keep(&mut self, bytes: &[u8], written: usize) {
         let rest = bytes.get(written..).unwrap_or_default();
         self.rest.0.iter_mut().zip(rest).for_each(|(to, from)| *to = *from);
-        self.rest.1 = rest.len().min(LONGEST);
+        self.rest.1 = rest.len().min(MAX_LINE);
     }
 }

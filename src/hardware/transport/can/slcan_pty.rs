@@ -1,61 +1,61 @@
 //! A serial CAN adapter without hardware: the far end of slcan on a pseudo-terminal, for emulators.
 //!
-//! Clients, such as this program or a vendor's SDK, open its path as they would open `/dev/ttyACM0`.
+//! Clients, such as this program or a vendor's SDK, open its path like `/dev/ttyACM0`.
 
 use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
 use super::slcan::{Lines, decode};
 use super::{CanAddress, CanEvent, CanFrame, CanPort};
-use crate::hardware::spec::AdapterResult;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::transport::pty::Pty;
 
-/// The adapter, and at once the port of the arm behind it: what clients send is received here.
+/// The adapter, and the port of the arm behind it: it receives what clients send.
 ///
-/// Frames sent while no client has opened the channel are lost, as on a bus that nobody listens to. Dropping it looks
-/// to clients as if the adapter were unplugged.
+/// Frames sent while no client has opened the channel are lost, as on a bus without receivers. Dropping it looks to
+/// clients as if the adapter were unplugged.
 pub struct SlcanPty {
     line: Lines<Pty>,
     path: String,
     channel_open: bool,
 }
 
-/// What a client says.
+/// A message of a client.
 enum Said {
     Frame(CanFrame),
     Command(u8, Option<u8>),
 }
 
 impl SlcanPty {
-    /// Makes a new one.
+    /// Opens a new adapter.
     pub fn open() -> AdapterResult<Self> {
         let pty = Pty::open()?;
         let path = pty.path().to_owned();
         Ok(Self { line: Lines::new(pty, format!("the client of {path}")), path, channel_open: false })
     }
 
-    /// What clients open: `/dev/pts/3`.
+    /// Returns the path for clients: `/dev/pts/3`.
     pub fn path(&self) -> &str {
         &self.path
     }
 
-    /// Where this program's adapters find it.
+    /// Returns the address for this program's adapters.
     pub fn address(&self) -> CanAddress {
         CanAddress::Slcan { path: self.path.clone(), bit_rate: super::address::BIT_RATE }
     }
 
-    /// Whether a client has opened the channel.
+    /// Returns whether a client has opened the channel.
     pub fn channel_open(&self) -> bool {
         self.channel_open
     }
 
-    /// Does as the client says; `false` where it cannot be done.
-    fn obey(&mut self, command: u8, argument: Option<u8>) -> bool {
+    /// Executes a client's command; `false` if that is not possible.
+    fn execute(&mut self, command: u8, argument: Option<u8>) -> bool {
         match (command, argument) {
             (b'C', None) => self.channel_open = false,
-            // A rate is set on a closed channel only.
+            // The rate can only be set on a closed channel.
             (b'S', Some(b'0'..=b'8')) if !self.channel_open => {}
-            // A second opening is no mistake: a vendor's SDK opens twice, once to send and once to receive.
+            // Opening twice is allowed: a vendor's SDK opens once to send and once to receive.
             (b'O', None) => self.channel_open = true,
             _ => return false,
         }
@@ -82,7 +82,7 @@ impl CanPort for SlcanPty {
                     self.line.put(b"z\r")?;
                     return Ok(Some(CanEvent::Frame(frame)));
                 }
-                Said::Command(command, argument) if self.obey(command, argument) => b"\r",
+                Said::Command(command, argument) if self.execute(command, argument) => b"\r",
                 _ => b"\x07",
             };
             self.line.put(reply)?;

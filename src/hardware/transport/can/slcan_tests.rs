@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::super::slcan::{encode, open};
 use super::*;
-use crate::hardware::spec::AdapterError;
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::transport::can::CanFilter;
 
 const WAIT: Duration = Duration::from_secs(10);
@@ -170,7 +170,7 @@ fn a_peer_that_reads_nothing_gets_whole_lines_later() {
 #[test]
 fn both_ends_understand_each_other() {
     let mut adapter = SlcanPty::open().unwrap();
-    assert_eq!(adapter.send(&[CanFrame::new(1, &[1])]), Ok(1), "lost: nobody has opened the channel");
+    assert_eq!(adapter.send(&[CanFrame::new(1, &[1])]), Ok(1), "lost: no client has opened the channel");
     let CanAddress::Slcan { path, bit_rate } = adapter.address() else { panic!() };
     let mut port = open("arm", &path, bit_rate, &[]).unwrap();
     let frames = golden().map(|(frame, _)| frame);
@@ -252,7 +252,7 @@ fn frames_without_a_reply_are_counted_where_the_adapter_replies() {
     pty.write(b"z\rz\rt0001F0\rZ\r").unwrap();
     assert_eq!(events(&mut port, 1), [CanFrame::new(0, &[0xF0])]);
     assert_eq!(port.waiting(), 2);
-    // A reply was lost: an adapter that hands on frames later on has taken everything.
+    // A reply was lost: an adapter that passes on later frames has processed everything.
     std::thread::sleep(Duration::from_millis(250));
     pty.write(b"t0001F0\r").unwrap();
     assert_eq!(events(&mut port, 1).len(), 1);

@@ -1,17 +1,15 @@
 //! A CAN interface of the system, over a raw socket of Linux's SocketCAN.
 //!
-//! Two things bound what can go wrong while no node acknowledges (the arm has lost its power): the socket may have
-//! [`SEND_QUEUE`] frames in the kernel's queues at a time, and [`CanPort::waiting`] tells how many have not been
-//! transmitted. Closing the socket does not take them back: the kernel sends them when a node acknowledges again. What
-//! takes them back is the interface going down (`ip link set can0 down`, a privilege), or a controller in one-shot
-//! mode.
+//! While no node acknowledges (the arm has lost power), the socket may have at most [`SEND_QUEUE`] frames in the
+//! kernel's queues, and [`CanPort::waiting`] returns how many are not transmitted. Closing the socket does not take
+//! them back: the kernel sends them when a node acknowledges again. Only taking the interface down (`ip link set can0
+//! down`, a privilege) or a controller in one-shot mode discards them.
 //!
-//! The memory that the kernel charges the socket for a frame shows only what waits in the interface's queue: since
-//! Linux
-//! 5.10 it is released when the driver takes the frame, and drivers have room for 10 and more. So the socket also hears
-//! its own frames (`CAN_RAW_RECV_OWN_MSGS`, marked `MSG_CONFIRM`): drivers of real controllers echo a frame when it was
-//! transmitted. Interfaces without such a driver (vcan, vxcan, serial lines) echo it at once, and there the memory
-//! shows what waits.
+//! The memory that the kernel charges the socket for a frame covers only the interface's queue: since Linux 5.10 it is
+//! released when the driver takes the frame, and drivers have room for 10 and more. Therefore the socket also receives
+//! its own frames (`CAN_RAW_RECV_OWN_MSGS`, marked `MSG_CONFIRM`): drivers of real controllers echo a frame after its
+//! transmission. Interfaces without such a driver (vcan, vxcan, serial lines) echo it at once, but there the memory
+//! shows the waiting frames.
 
 use std::io::{Error, ErrorKind, IoSliceMut};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -22,15 +20,15 @@ use socketcan::{CanDataFrame, CanSocket, EmbeddedFrame, Socket, SocketOptions, S
 
 use super::in_flight::InFlight;
 use super::{CanEvent, CanFilter, CanFrame, CanPort, CanTrouble};
-use crate::hardware::spec::{AdapterError, AdapterResult};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 
-/// About how many frames of one socket may wait in the kernel to be sent.
+/// Approximate maximum number of one socket's frames that wait in the kernel.
 pub const SEND_QUEUE: usize = 16;
-/// What the kernel charges a socket for a classic frame [bytes].
+/// Memory that the kernel charges a socket for a classic frame [bytes].
 const FRAME_MEMORY: usize = 768;
 /// Asked for as the receive buffer [bytes]: a Piper fills it in about a second. The system may grant less.
 const RECEIVE_BUFFER: usize = 1 << 20;
-/// Where the kernel tells of its interfaces.
+/// Directory of the kernel's network interfaces.
 const INTERFACES: &str = "/sys/class/net";
 /// A protocol error at this place is a missing acknowledgement (`linux/can/error.h`).
 const LOCATION_ACK: u8 = 0x19;
@@ -70,7 +68,7 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
         let wanted = if filters.is_empty() { &[everything] } else { filters };
         socket.set_filters(&wanted.iter().map(filter).collect::<Vec<_>>())?;
         socket.set_error_filter_accept_all()?;
-        // Programs on this computer hear each other, so that an emulator can stand in for an arm.
+        // Programs on this computer receive each other's frames, so that an emulator can replace an arm.
         socket.set_loopback(true)?;
         socket.set_recv_own_msgs(!filters.is_empty())?;
         socket.set_nonblocking(true)?;
@@ -201,7 +199,7 @@ impl CanPort for SocketPort {
 
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
         self.usable()?;
-        // What it has sent itself is passed over: no more than can be in flight.
+        // Its own frames are skipped: at most as many as can be in flight.
         for _ in 0..=SEND_QUEUE {
             match self.read() {
                 Ok(frame) if frame.id & libc::CAN_ERR_FLAG != 0 => {

@@ -12,13 +12,13 @@ use super::kinematics::Links;
 use super::wire::{self, Request};
 use super::{SimOptions, stops};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
 use crate::hardware::sim::can_server::CanController;
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::reach::{self, Chain};
 use crate::hardware::sim::trace::Trace;
-use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::{CanFilter, CanFrame};
 use crate::joint::Joints;
 
@@ -132,7 +132,7 @@ impl Controller {
                 self.lose_power();
             }
             Request::Halt { teach, .. } => self.teach(teach),
-            // Standby; a mode that this emulator has not; whoever is being taught does not listen.
+            // Standby; a mode that is not emulated; an arm in teaching ignores commands.
             Request::Control { control: 0, .. } => self.control = 0,
             Request::Control { mode: 2.., .. } | Request::Mit(_) => self.cannot(),
             Request::Control { .. } if self.teaching => {}
@@ -187,7 +187,7 @@ impl Controller {
         }
     }
 
-    /// A mode that is not emulated: said, not passed over.
+    /// Reports a mode that is not emulated as an error.
     fn cannot(&mut self) {
         let other = if self.arm.error() == 0 { state::OTHER } else { self.arm.error() };
         self.arm.fail(other);
@@ -259,7 +259,7 @@ impl Controller {
 }
 
 impl CanController for Controller {
-    fn hear(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
+    fn on_frame(&mut self, frame: &CanFrame, now: Mono, answers: &mut Vec<CanFrame>) {
         self.advance(now);
         self.arm.client_came();
         self.trace.push(|| (now, *frame));

@@ -1,4 +1,4 @@
-//! What the controller sends by itself, in every period.
+//! Frames that the controller sends in every period.
 
 use super::super::protocol::DOF;
 use super::controller::{Controller, first, millidegrees};

@@ -1,8 +1,8 @@
-//! The emulator: plays a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface
-//! or a serial line.
+//! Emulator of a Piper on a CAN bus, for `address: sim`, for tests, and for other programs on a CAN interface or a
+//! serial line.
 //!
-//! Like the arm it sends its state by itself, at the arm's rates (3 040 frames/s in all), whether somebody listens or
-//! not, and takes commands from every node on its bus. The bus and the joints are those of the simulation kit
+//! Like the arm it streams its state at the arm's rates (3 040 frames/s in all), whether or not a program receives it,
+//! and takes commands from every node on its bus. The bus and the joints are those of the simulation kit
 //! ([`crate::hardware::sim`]).
 
 mod controller;
@@ -19,12 +19,12 @@ use serde::{Deserialize, Deserializer, Serialize};
 
 use super::{GripperKind, NATIVE_RATE, Options, limits};
 use crate::clock::{Clock, Mono, MonotonicClock};
-use crate::hardware::fit::Misfit;
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::AdapterResult;
+use crate::hardware::check::ConfigError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm::{self, HasArm};
 use crate::hardware::sim::can_server::{CanController, CanServer};
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::can::CanFrame;
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
@@ -54,8 +54,8 @@ const ANYWHERE: usize = PLAYABLE.len() - 3;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
-    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an arm may rest
-    /// that nobody holds; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
+    /// Joint positions at power-up [rad], one per joint, up to 0.05 rad outside the joint limits, as an unsupported arm
+    /// may rest; `[0.1, 0.6, -0.7, 0.05, 0.4, -0.1]` when empty.
     pub initial_positions: Vec<f64>,
     /// How often it sends its state, 20 to 200 [Hz]: an arm's 200, or less for a client that cannot keep up.
     #[serde(deserialize_with = "rate")]
@@ -87,12 +87,12 @@ impl Default for SimOptions {
 }
 
 impl SimOptions {
-    /// Refuses a pose outside the joint limits, firmware that cannot be told, and faults that are not among `playable`.
-    pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), Misfit> {
+    /// Refuses a pose outside the joint limits, an invalid firmware version, and faults that are not among `playable`.
+    pub(super) fn check(&self, playable: &[FaultKind]) -> Result<(), ConfigError> {
         self.common().check("piper", &stops(), playable)?;
         match self.firmware.len() {
             8 => Ok(()),
-            _ => Err(Misfit::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
+            _ => Err(ConfigError::new("sim.firmware", "firmware must have 8 characters, as S-V1.8-5 has")),
         }
     }
 
@@ -128,14 +128,15 @@ pub struct PiperEmulator {
 
 impl PiperEmulator {
     /// Starts an emulator at `place`, with the adapter's options.
-    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+    pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         let options = config.options::<Options>()?;
         Self::with(&options.sim, options.gripper, place)
     }
 
     /// Starts an emulator at `place`.
-    pub fn with(options: &SimOptions, gripper: GripperKind, place: &Place) -> AdapterResult<Self> {
-        let playable = if *place == Place::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
+    pub fn with(options: &SimOptions, gripper: GripperKind, place: &EmulatorAddress) -> AdapterResult<Self> {
+        let playable =
+            if *place == EmulatorAddress::InProcess { PLAYABLE } else { PLAYABLE.get(..ANYWHERE).unwrap_or_default() };
         options.check(playable)?;
         let controller = Controller::new(options, gripper, playable, MonotonicClock.now())?;
         let period = Duration::from_secs_f64(1.0 / options.feedback_hz);
@@ -152,15 +153,15 @@ impl PiperEmulator {
         self.server.with(|controller, _| controller.arm().enabled())
     }
 
-    /// Whether it refuses targets outside its limits (it does, unless told otherwise) or takes them.
+    /// Sets whether it refuses targets outside its limits (the default) or takes them.
     pub fn refuse_outside(&self, refuse: bool) {
         self.server.with(|controller, _| controller.lenient = !refuse);
     }
 
     /// Does as a frame says that a program sends which other programs on this computer do not hear, as the vendor's SDK
     /// does (it switches local loopback off).
-    pub fn obey_unheard(&self, frame: &CanFrame) {
-        self.server.with(|controller, now| controller.hear(frame, now, &mut Vec::new()));
+    pub fn execute_unheard(&self, frame: &CanFrame) {
+        self.server.with(|controller, now| controller.on_frame(frame, now, &mut Vec::new()));
     }
 
     /// How often a client has let the motors lose their power by a reset (0x150).
@@ -168,7 +169,7 @@ impl PiperEmulator {
         self.server.with(|controller, _| controller.power_drops)
     }
 
-    /// Lets it leave out the frames with these identifiers, or none again; all others go on.
+    /// Suppresses the frames with these identifiers, or none; all others continue.
     pub fn mute(&self, identifiers: Option<RangeInclusive<u16>>) {
         self.server.with(|controller, _| controller.muted = identifiers);
     }

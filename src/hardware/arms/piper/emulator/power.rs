@@ -83,7 +83,7 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    /// An E-stop that ends by itself leaves no error.
+    /// An E-stop that ends after its duration leaves no error.
     fn advance(&mut self, now: Mono) {
         let (before, open) = (self.arm.now(), self.arm.estop_open());
         self.arm.integrate(now);

@@ -3,7 +3,7 @@
 
 use crate::hardware::transport::can::CanFrame;
 
-/// What a client told or asked, in wire units. Joints count from 1.
+/// A request of a client, in wire units. Joints count from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Request {
     /// 0x150: stop (0 nothing, 1 E-stop, 2 reset) and drag-teaching (1 start, 2 stop).

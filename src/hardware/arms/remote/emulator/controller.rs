@@ -5,11 +5,11 @@ use serde_json::{Map, Value, json};
 use super::wire::{self, Command, Request};
 use super::{PLAYABLE, SILENCE_TIMEOUT};
 use crate::clock::Mono;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::sim::arm::{Delivery, ESTOP, HasArm, Measured, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::stream;
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
@@ -63,7 +63,7 @@ impl Controller {
         self.gripper.advance(self.arm.now().seconds_since(before));
     }
 
-    /// Stops an arm that is not commanded any more. From then on it has to be enabled again.
+    /// Stops an arm that is no longer commanded. It must then be enabled again.
     fn stop_unasked(&mut self, why: &'static str) {
         self.stop();
         self.held = Some(why);
@@ -226,7 +226,7 @@ impl Controller {
             return Err(AdapterError::Rejected(format!("a command for {} in {} mode", command.mode, mode.name())));
         }
         if values.len() != dof || !values.iter().all(|value| value.is_finite()) {
-            return Err(AdapterError::Rejected(format!("{dof} finite values are needed, one per joint")));
+            return Err(AdapterError::Rejected(format!("expected {dof} finite values, one per joint")));
         }
         self.commanded = true;
         match mode {
@@ -260,7 +260,7 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    /// A client that was commanding and has fallen silent may be stuck: the arm does not go on without it.
+    /// A client that has commanded and fallen silent may hang: the arm is stopped.
     fn advance(&mut self, now: Mono) {
         let deadline = self.heard.after(SILENCE_TIMEOUT);
         if self.commanded && now >= deadline {

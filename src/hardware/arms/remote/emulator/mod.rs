@@ -8,10 +8,10 @@ use std::time::Duration;
 
 use super::{Options, limits};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::AdapterResult;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::tcp_server::TcpServer;
-use crate::hardware::spec::AdapterResult;
 use controller::Controller;
 
 /// Without a request for this long, the server stops an arm that was commanded.
@@ -34,8 +34,8 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
 ];
 
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
-pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Box<dyn Emulator>> {
-    config.fit(super::fit)?;
+pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Box<dyn Emulator>> {
+    config.check(super::check)?;
     let sim = config.options::<Options>()?.sim;
     let controller = Controller::new(&limits(config.dof), &sim, MonotonicClock.now())?;
     Ok(Box::new(TcpServer::start("remote", controller, place.tcp(PORT)?)?))

@@ -3,7 +3,7 @@
 
 use serde_json::{Map, Value, json};
 
-use crate::hardware::spec::AdapterError;
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::transport::Scan;
 
 /// Longest line of a client [bytes].

@@ -12,10 +12,10 @@ use super::kinematics::Links;
 use super::tool::Tool;
 use super::{PLAYABLE, SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{HasArm, SimArm};
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::trace::Trace;
-use crate::hardware::spec::AdapterResult;
 use crate::joint::Joints;
 
 /// Acceleration of the emulated joints [rad/s²]: a real arm does less than its limit.
@@ -85,7 +85,7 @@ pub struct Controller {
     pub(super) settings: Settings,
     /// It answers to a change of mode, and stays in the mode that it is in.
     pub keeps_mode: bool,
-    /// It sends no reports of how it is; all others go on.
+    /// Suppresses the reports of the condition; all others continue.
     pub condition_muted: bool,
     /// What becomes of the full reports.
     pub withhold: Withhold,

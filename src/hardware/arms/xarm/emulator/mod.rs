@@ -28,12 +28,12 @@ use super::protocol::gripper::GripperKind;
 use super::protocol::identity::Firmware;
 use super::{Options, model_of};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::fit::Misfit;
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::check::ConfigError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm::{self, HasArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
-use crate::hardware::spec::{AdapterError, AdapterResult};
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 pub use controller::Received;
@@ -67,7 +67,7 @@ const REPORT_PORTS: u16 = Kind::ALL.len() as u16;
 const SECOND: usize = Kind::ALL.len() + 1;
 /// Most control connections at once.
 const CLIENTS: usize = 16;
-/// Attempts to find so many free ports in a row.
+/// Attempts to find consecutive free ports.
 const ATTEMPTS: u32 = 200;
 
 /// What the emulator does.
@@ -121,10 +121,10 @@ pub struct SlowReply {
 
 impl SimOptions {
     /// Refuses a pose outside `limits`, firmware that has no version, and faults that the emulator cannot play.
-    pub(super) fn check(&self, limits: &JointLimits) -> Result<(), Misfit> {
+    pub(super) fn check(&self, limits: &JointLimits) -> Result<(), ConfigError> {
         self.common().check("xarm", limits, PLAYABLE)?;
         if let Some(i) = self.slow_replies.iter().position(|slow| !(0.0..=3600.0).contains(&slow.delay)) {
-            return Err(Misfit::new(format!("sim.slow_replies.{i}.delay"), "a delay is between 0 and 3600 s"));
+            return Err(ConfigError::new(format!("sim.slow_replies.{i}.delay"), "a delay is between 0 and 3600 s"));
         }
         self.firmware().map(drop)
     }
@@ -135,9 +135,10 @@ impl SimOptions {
         arm::SimOptions { initial_positions, lag, droop, faults }
     }
 
-    fn firmware(&self) -> Result<[u16; 3], Misfit> {
+    fn firmware(&self) -> Result<[u16; 3], ConfigError> {
         let what = || format!("firmware {:?} is not a version like 2.5.1", self.firmware);
-        let Firmware(version) = Firmware::parse(&self.firmware).ok_or_else(|| Misfit::new("sim.firmware", what()))?;
+        let Firmware(version) =
+            Firmware::parse(&self.firmware).ok_or_else(|| ConfigError::new("sim.firmware", what()))?;
         Ok(version)
     }
 }
@@ -150,11 +151,11 @@ pub struct XArmEmulator {
 
 impl XArmEmulator {
     /// Starts an emulator at `place` of the arm that a configuration describes.
-    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+    pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         let options: Options = config.options()?;
         let model = model_of(&options, config.dof)?;
         let control = place.tcp(CONTROL_PORT)?;
-        let in_process = *place == Place::InProcess;
+        let in_process = *place == EmulatorAddress::InProcess;
         Self::listen(model, options.gripper, &options.sim, control.ip(), in_process)
     }
 
@@ -206,17 +207,17 @@ impl XArmEmulator {
         self.server.with(|controller, _| controller.arm().release_estop());
     }
 
-    /// Lets it stay in its mode whatever it is told, or obey again.
+    /// Makes the controller ignore changes of the mode, or accept them again.
     pub fn keep_mode(&self, keep: bool) {
         self.server.with(|controller, _| controller.keeps_mode = keep);
     }
 
-    /// Lets port 30001 fall silent while its connections stay open and all other ports go on, or report again.
+    /// Mutes port 30001 while its connections stay open and all other ports continue, or unmutes it.
     pub fn mute_condition(&self, mute: bool) {
         self.server.with(|controller, _| controller.condition_muted = mute);
     }
 
-    /// Lets the replies to a register take so long [s] from now on.
+    /// Delays the responses to a register by this time [s].
     pub fn slow_down(&self, register: u8, delay: f64) {
         self.server.with(|controller, _| controller.slow_down(SlowReply { register, delay }));
     }

@@ -113,7 +113,7 @@ impl stream::Controller for Controller {
         }
     }
 
-    /// The arm goes on.
+    /// The arm continues.
     fn client_gone(&mut self, _now: Mono) {}
 
     fn damage(&self, delivery: Delivery, packet: &mut Vec<u8>) {
@@ -133,7 +133,7 @@ impl stream::Controller for Controller {
             _ => {}
         }
         kind.write(&self.snapshot(now), packet);
-        // Damage strikes where it matters: at the reports with the joints.
+        // Faults of reports affect the ports with joint positions.
         Some(if matches!(kind, Kind::Full | Kind::Real) { self.delivery() } else { self.lasting() })
     }
 }

@@ -178,18 +178,21 @@ fn wrong_requests_raise_what_the_sheet_says() {
     arm.arm.release_estop();
     ask(&mut arm, 16, &[], 0.0);
     ask(&mut arm, 124, &[9, 7, 3, 0, 0, 0, 1], 0.0);
-    assert_eq!(arm.error(), 19, "nobody of that number at the tool");
+    assert_eq!(arm.error(), 19, "no device with that number at the tool");
 }
 
 #[test]
 fn wrong_options_are_refused() {
     let start = |options: serde_json::Value, dof| {
         let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof, options };
-        XArmEmulator::start(&config, &Place::InProcess).err().map(|e| e.to_string()).unwrap_or_default()
+        XArmEmulator::start(&config, &EmulatorAddress::InProcess).err().map(|e| e.to_string()).unwrap_or_default()
     };
     assert_eq!(start(serde_json::json!({}), 6), "");
     assert!(start(serde_json::json!({"model": "xarm7"}), 6).contains("xArm 7 has 7 joints, not 6"));
-    assert!(start(serde_json::json!({"sim": {"initial_positions": [0, 0, 9, 0, 0, 0]}}), 6).contains("6 angles"));
+    assert!(
+        start(serde_json::json!({"sim": {"initial_positions": [0, 0, 9, 0, 0, 0]}}), 6)
+            .contains("initial_positions must be 6 positions [rad] within the joint limits: joint 3")
+    );
     assert!(start(serde_json::json!({"sim": {"firmware": "new"}}), 6).contains("not a version"));
     assert!(start(serde_json::json!({"sim": {"faults": [{"kind": "panic"}]}}), 6).contains("cannot play"));
     let denied = std::io::Error::from(io::ErrorKind::PermissionDenied);
@@ -197,6 +200,6 @@ fn wrong_options_are_refused() {
     assert!(text.contains("\nhint: ") && text.contains("ip_unprivileged_port_start=502"), "{text}");
     let config =
         AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options: serde_json::json!({}) };
-    let outside = XArmEmulator::start(&config, &Place::Bind("10.0.0.1".parse().unwrap()));
+    let outside = XArmEmulator::start(&config, &EmulatorAddress::Bind("10.0.0.1".parse().unwrap()));
     assert!(outside.err().unwrap().to_string().contains("not a loopback address"));
 }

@@ -5,7 +5,7 @@ use crate::hardware::sim::gripper::Gripper;
 
 /// Index of 2 Mbit/s among the baud rates.
 const TWO_MBIT: i32 = 11;
-/// The gripper's version, as it tells.
+/// The gripper's version.
 const VERSION: [u16; 3] = [3, 4, 3];
 
 /// The tool flange.
@@ -48,7 +48,7 @@ impl Tool {
         }
     }
 
-    /// The answer to a telegram; `None` when nobody answers.
+    /// Returns the answer to a telegram; `None` if no device answers.
     pub fn telegram(&mut self, telegram: &[u8]) -> Option<Vec<u8>> {
         if self.kind == GripperKind::None || self.baud != TWO_MBIT {
             return None;

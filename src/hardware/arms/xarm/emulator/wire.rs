@@ -47,7 +47,7 @@ pub fn number(payload: &[u8], skip: usize, n: usize) -> Option<f32> {
     Some(f32::from_bits(u32::from(d) << 24 | u32::from(c) << 16 | u32::from(b) << 8 | u32::from(a)))
 }
 
-/// So many numbers from the beginning of a payload.
+/// Returns the first N numbers of a payload.
 pub fn numbers<const N: usize>(payload: &[u8]) -> Option<[f32; N]> {
     let mut values = [0.0; N];
     for (n, value) in values.iter_mut().enumerate() {

@@ -8,7 +8,7 @@ use super::gripper::Rtu;
 /// One value per joint on the wire: seven, whatever the arm; those that it lacks are zero.
 pub type WireJoints = [f64; 7];
 
-/// The joint number that stands for all joints.
+/// Joint number for all joints.
 const ALL_JOINTS: u8 = 8;
 /// The number of the tool flange among the devices behind the controller.
 const TOOL: u8 = 0x09;
@@ -50,7 +50,7 @@ pub enum Command {
     SetMode {
         /// 0 planned, 1 servo, 4 joint velocity.
         mode: u8,
-        /// Firmware that knows the parameter is told to detect collisions in this mode too.
+        /// Enables collision detection in this mode too, for firmware with this parameter.
         detect: bool,
     },
     /// Plans and makes a move of the tool in a straight line.

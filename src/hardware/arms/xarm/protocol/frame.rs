@@ -6,7 +6,7 @@ use crate::hardware::transport::tcp::Scan;
 
 /// The private protocol.
 pub const PRIVATE: u16 = 2;
-/// The private protocol, with the controller watching that its client lives.
+/// The private protocol with a heartbeat of the client.
 pub const WATCHED: u16 = 3;
 /// Bytes before the register.
 const HEADER: usize = 6;
@@ -16,7 +16,7 @@ pub const MAX_REQUEST: usize = 64;
 const MAX_RESPONSE: usize = 512;
 /// Most bytes of a response that are kept.
 const KEPT: usize = 64;
-/// In the place of the register: the controller tells of a task by itself.
+/// In place of the register: unsolicited feedback about a task.
 const FEEDBACK: u8 = 0xFF;
 
 /// What the controller says of itself in every response.
@@ -65,7 +65,7 @@ impl Response {
     }
 }
 
-/// What stands at the front of what has arrived.
+/// The front of the received bytes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Arrived {
     /// A response to a request that was made.

@@ -128,7 +128,7 @@ impl Rtu {
         Self::write(SPEED, &SPEED_G1.to_be_bytes())
     }
 
-    /// Goes to so many pulses.
+    /// Moves to a position [pulses].
     pub fn go(kind: GripperKind, pulses: i32) -> Self {
         let [a, b, c, d] = pulses.to_be_bytes();
         match kind {

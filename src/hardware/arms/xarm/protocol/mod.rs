@@ -14,7 +14,7 @@ mod tests;
 
 /// Takes numbers from fixed places of a packet; `None` beyond its end.
 pub(super) mod take {
-    /// So many bytes at a place.
+    /// Returns N bytes at an offset.
     pub fn bytes<const N: usize>(packet: &[u8], at: usize) -> Option<[u8; N]> {
         packet.get(at..)?.first_chunk().copied()
     }
@@ -25,7 +25,7 @@ pub(super) mod take {
         value.is_finite().then_some(f64::from(value))
     }
 
-    /// So many of them.
+    /// Returns N f32 values at an offset.
     pub fn floats<const N: usize>(packet: &[u8], at: usize) -> Option<[f64; N]> {
         let mut values = [0.0; N];
         for (i, value) in values.iter_mut().enumerate() {

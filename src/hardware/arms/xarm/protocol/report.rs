@@ -1,5 +1,5 @@
-//! The reports that the controller sends by itself, each at a port of its own. Every report begins with its length
-//! (u32, big-endian), which stays the same on a connection; floats are little-endian.
+//! Reports that the controller streams, each on its own port. Every report begins with its length (u32, big-endian),
+//! which is constant on a connection; floats are little-endian.
 
 use super::take;
 use crate::hardware::transport::tcp::Scan;
@@ -51,7 +51,7 @@ impl Kind {
 /// Where the joints are.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
-    /// Time of the measurement on the controller's clock [µs], where it tells.
+    /// Time of the measurement on the controller's clock [µs], if reported.
     pub time_us: Option<u64>,
     /// 1 moving, 2 standing, 3 paused, 4 stopped, 5 to be made ready, 6 stopping.
     pub state: u8,
@@ -59,13 +59,13 @@ pub struct Motion {
     pub mode: u8,
     /// Joint positions [rad].
     pub position: [f64; 7],
-    /// Joint velocities [rad/s], where it tells.
+    /// Joint velocities [rad/s], if reported.
     pub velocity: Option<[f64; 7]>,
-    /// Joint torques [Nm]; motor currents [A] where the controller was told so.
+    /// Joint torques [Nm], or motor currents [A] if the controller is configured so.
     pub torque: [f64; 7],
     /// Tool x, y, z [mm], roll, pitch, yaw [rad].
     pub pose: [f64; 6],
-    /// Filtered force and torque at the sensor [N, Nm], where it tells.
+    /// Filtered force and torque at the sensor [N, Nm], if reported.
     pub wrench: Option<[f64; 6]>,
 }
 

@@ -5,13 +5,13 @@ use super::super::{GRIPPER_MAX, limits, protocol::DOF};
 use super::kinematics::Links;
 use super::wire::{self, Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::reach::{self, Chain};
 use crate::hardware::sim::stream;
 use crate::hardware::sim::trace::Trace;
-use crate::hardware::spec::AdapterResult;
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, Joints};
 

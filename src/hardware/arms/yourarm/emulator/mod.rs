@@ -11,12 +11,12 @@ use std::net::SocketAddr;
 
 use super::protocol::PORT;
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::registry::{AdapterConfig, Emulator, Place};
+use crate::hardware::adapter::AdapterResult;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm::HasArm;
 pub use crate::hardware::sim::arm::SimOptions;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::tcp_server::TcpServer;
-use crate::hardware::spec::AdapterResult;
 use crate::joint::Joints;
 use controller::Controller;
 pub use controller::Received;
@@ -48,13 +48,13 @@ pub struct YourArmEmulator {
 
 impl YourArmEmulator {
     /// Starts an emulator at `place`, with the `sim` part of an adapter's options.
-    pub fn start(config: &AdapterConfig, place: &Place) -> AdapterResult<Self> {
+    pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
         Self::listen(&config.options::<super::Options>()?.sim, place.tcp(PORT)?)
     }
 
     /// Starts an emulator on a free loopback port.
     pub fn with(options: &SimOptions) -> AdapterResult<Self> {
-        Self::listen(options, Place::InProcess.tcp(PORT)?)
+        Self::listen(options, EmulatorAddress::InProcess.tcp(PORT)?)
     }
 
     fn listen(options: &SimOptions, address: SocketAddr) -> AdapterResult<Self> {
@@ -95,7 +95,7 @@ impl YourArmEmulator {
         self.server.with(|controller, _| controller.trace.entries())
     }
 
-    /// How many clients were turned away because another one was connected.
+    /// Returns how many clients were rejected because another one was connected.
     pub fn refused_clients(&self) -> u64 {
         self.server.refused()
     }

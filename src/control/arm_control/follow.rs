@@ -1,0 +1,142 @@
+//! How an arm follows the requests of tasks: in the mode that they need, each joint within its limits.
+
+use super::{ArmControl, Ask, Routed};
+use crate::control::limit::Refusal;
+use crate::control::task_body::Demand;
+use crate::joint::{ControlMode, MAX_DOF};
+use crate::telemetry::LimitKind;
+
+impl ArmControl {
+    /// Makes a command from requests. `report` gets the limits that begin to change a command.
+    pub(super) fn follow(
+        &mut self,
+        demand: Demand,
+        ask: impl Fn(usize) -> Option<Ask>,
+        dt: f64,
+        mut report: impl FnMut(usize, LimitKind, f64),
+    ) -> Routed {
+        let Some(mode) = self.mode_for(demand) else {
+            // The arm lacks the mode: it stops in its present one.
+            if let Some(present) = self.command.mode {
+                self.hold(present, dt);
+            }
+            return Routed::NotReady;
+        };
+        if let Some(present) = self.command.mode.filter(|present| *present != mode) {
+            if !self.at_standstill() {
+                self.hold(present, dt);
+                return Routed::Waiting;
+            }
+            // Each mode has its own start: positions from where the arm is, velocities from zero.
+            self.holds_written &= present.is_position();
+            self.start();
+        }
+        self.command.mode = Some(mode);
+        if self.feedback.state().mode != mode || self.starting.is_some() {
+            self.hold(mode, dt);
+            return Routed::Waiting;
+        }
+        if self.gap_since.is_some() {
+            return self.wait_in_gap(mode, ask, dt);
+        }
+        if let Some((j, refusal)) = self.refused(mode, &ask) {
+            self.hold(mode, dt);
+            return Routed::Refused(j, refusal);
+        }
+        let ahead = if mode == ControlMode::Velocity { self.ahead(dt) } else { None };
+        for (j, limiter) in self.limiters.iter_mut().enumerate() {
+            let at = self.feedback.state().position.get(j).copied().unwrap_or_default();
+            let value = match ask(j) {
+                None if mode == ControlMode::Velocity => limiter.hold_velocity(at, dt),
+                None => limiter.hold_position(dt),
+                Some(ask) => {
+                    if ask.new_task {
+                        limiter.hand_over();
+                    }
+                    let limited = match mode {
+                        ControlMode::Velocity => {
+                            let within = ahead.as_ref().and_then(|a| a.get(j)).copied().unwrap_or((at, at));
+                            limiter.follow_velocity(ask.value, within, dt)
+                        }
+                        _ => limiter.follow_position(ask.value, dt),
+                    };
+                    match limited {
+                        Ok(limited) => {
+                            if let Some(was) = self.limited.get_mut(j) {
+                                if let (Some((kind, asked)), false) = (limited.by, *was) {
+                                    report(j, kind, asked);
+                                }
+                                *was = limited.by.is_some();
+                            }
+                            limited.value
+                        }
+                        // Checked above.
+                        Err(refusal) => return Routed::Refused(j, refusal),
+                    }
+                }
+            };
+            if let Some(out) = self.command.values.get_mut(j) {
+                *out = value;
+            }
+        }
+        Routed::Sent
+    }
+
+    /// Nothing reaches the arm: repeats the last written setpoint. Requests are still checked for jumps.
+    fn wait_in_gap(&mut self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>, dt: f64) -> Routed {
+        let mut refused = None;
+        for (j, limiter) in self.limiters.iter_mut().enumerate() {
+            if let (Some(ask), true) = (ask(j), mode.is_position()) {
+                refused = refused.or(limiter.pass(ask.value).err().map(|refusal| (j, refusal)));
+            }
+            if let Some(out) = self.command.values.get_mut(j) {
+                *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
+            }
+        }
+        match refused {
+            Some((j, refusal)) => {
+                self.hold(mode, dt);
+                Routed::Refused(j, refusal)
+            }
+            None => Routed::Waiting,
+        }
+    }
+
+    /// Returns the lowest and highest position that each joint may have when a velocity command takes effect [rad]: the
+    /// measurement is old, and the joint still follows earlier commands.
+    fn ahead(&self, dt: f64) -> Option<[(f64, f64); MAX_DOF]> {
+        let state = self.feedback.state();
+        let range = self.tracking.range(state)?;
+        let age = self.feedback.freshness().age;
+        let age = f64::from(age.age_us + age.own_us) * 1e-6;
+        let time = self.config.supervision.lag + age + dt;
+        let mut out = [(0.0, 0.0); MAX_DOF];
+        for (out, (q, (low, high))) in out.iter_mut().zip(state.position.iter().zip(range.low.iter().zip(&range.high)))
+        {
+            *out = (q + low.min(0.0) * time, q + high.max(0.0) * time);
+        }
+        Some(out)
+    }
+
+    /// Returns the first request that must be refused, and the reason.
+    fn refused(&self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>) -> Option<(usize, Refusal)> {
+        self.limiters.iter().enumerate().find_map(|(j, limiter)| {
+            let ask = ask(j)?;
+            let refusal = match mode {
+                ControlMode::Velocity => (!ask.value.is_finite()).then_some(Refusal::NonFinite),
+                _ => limiter.refuses(ask.value, ask.new_task),
+            };
+            Some((j, refusal?))
+        })
+    }
+
+    /// Returns the mode for a demand; without one, the present mode. `None`: the arm lacks it.
+    fn mode_for(&self, demand: Demand) -> Option<ControlMode> {
+        let velocity = self.config.modes.contains(&ControlMode::Velocity).then_some(ControlMode::Velocity);
+        match demand {
+            Demand::Velocities => velocity,
+            Demand::Positions => self.config.position_mode(),
+            Demand::Nothing => self.command.mode.or_else(|| self.config.position_mode()).or(velocity),
+        }
+    }
+}

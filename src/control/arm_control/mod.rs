@@ -1,0 +1,275 @@
+//! One arm inside the tick: its feedback, its phase, the limiters of its joints, and how its commands are made: one
+//! mode at a time, a hold per mode, a change of mode at standstill only.
+//!
+//! ```text
+//! state ─▶ feedback ─▶ tracking ─▶ failsafe ─▶ phase ─┬─ ready ────────▶ follow ──┬─▶ command
+//!                                                     └─ held, standby ▶ rest ────┘
+//! ```
+
+mod delivery;
+mod follow;
+mod rest;
+
+use std::time::Duration;
+
+use super::config::ArmConfig;
+use super::failsafe::{Failsafe, Freshness};
+use super::feedback::Feedback;
+use super::limit::{Bounds, Limiter, Refusal};
+use super::plausibility::Verdict;
+use super::stalls::Stalls;
+use super::task_body::Demand;
+use super::tracking::{Tracking, furthest};
+use super::written::Written;
+use crate::arm::{ArmCommand, ArmState, Link};
+use crate::clock::Mono;
+use crate::joint::{ControlMode, Joints, MAX_DOF};
+use crate::telemetry::{Cause, LimitKind, Outcome, Phase};
+use rest::Rest;
+
+/// A joint that moves this far while its arm is being enabled is moved by something else [rad].
+const ENABLING_TOLERANCE: f64 = 0.02;
+
+/// One arm inside the tick.
+#[derive(Debug)]
+pub struct ArmControl {
+    config: ArmConfig,
+    /// Index of its first joint over all arms.
+    first: usize,
+    feedback: Feedback,
+    tracking: Tracking,
+    /// Its phase.
+    pub failsafe: Failsafe,
+    limiters: Vec<Limiter>,
+    /// Whether a limit changed the joint's command in the last tick.
+    limited: Vec<bool>,
+    command: ArmCommand,
+    written: Written,
+    /// Whether the arm still holds the positions that were written last: it has been under power since.
+    holds_written: bool,
+    /// Measured positions when the arm was enabled [rad].
+    enabled_at: Joints,
+    /// While the first setpoint after a start is not written: the number of its first command.
+    starting: Option<u64>,
+    /// While there is a gap in what is written: the number of the first command made from what had been written.
+    gap_since: Option<u64>,
+    rest: Rest,
+}
+
+/// Request to one joint in this tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ask {
+    /// [rad] or [rad/s], by the arm's demand.
+    pub value: f64,
+    /// Whether another task won the joint in the previous tick.
+    pub new_task: bool,
+}
+
+/// Result of an arm's requests.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Routed {
+    /// They were commanded, within limits.
+    Sent,
+    /// Not commanded yet: the arm changes its mode, starts, or nothing reaches it.
+    Waiting,
+    /// The arm takes no requests in its phase.
+    NotReady,
+    /// A request was refused: the joint of the arm, and the reason. The arm holds.
+    Refused(usize, Refusal),
+}
+
+impl ArmControl {
+    /// Creates the control of an arm without a state so far. `first`: index of its first joint over all arms.
+    pub fn new(config: ArmConfig, first: usize, period: Duration) -> Self {
+        let l = &config.limits;
+        let bound = |j: usize| {
+            let at = |list: &[f64], otherwise: f64| list.get(j).copied().unwrap_or(otherwise);
+            Bounds::inside(
+                at(&l.position_lower, 0.0),
+                at(&l.position_upper, 0.0),
+                at(&l.velocity_max, 0.0),
+                at(&l.acceleration_max, crate::joint::DEFAULT_ACCELERATION),
+            )
+        };
+        Self {
+            limiters: (0..config.dof).map(|j| Limiter::new(bound(j))).collect(),
+            limited: vec![false; config.dof],
+            feedback: Feedback::new(&config),
+            tracking: Tracking::new(&config, period),
+            written: Written::new(period, config.write_period),
+            config,
+            first,
+            failsafe: Failsafe::default(),
+            command: ArmCommand::default(),
+            holds_written: false,
+            enabled_at: [0.0; MAX_DOF],
+            starting: None,
+            gap_since: None,
+            rest: Rest::default(),
+        }
+    }
+
+    /// Returns its configuration.
+    pub fn config(&self) -> &ArmConfig {
+        &self.config
+    }
+
+    /// Returns the index of its first joint over all arms.
+    pub fn first(&self) -> usize {
+        self.first
+    }
+
+    /// Returns the limiters of its joints.
+    pub fn limiters(&self) -> &[Limiter] {
+        &self.limiters
+    }
+
+    /// Returns the latest accepted state, with estimated velocities.
+    pub fn state(&self) -> &ArmState {
+        self.feedback.state()
+    }
+
+    /// Returns the state as it was read, for the log.
+    pub fn measured(&self) -> ArmState {
+        self.feedback.measured()
+    }
+
+    /// Returns whether the state is recent enough to act on, with its age.
+    pub fn freshness(&self) -> Freshness {
+        self.feedback.freshness()
+    }
+
+    /// Returns the distance of a joint from the range of its setpoints of the last `lag` seconds [rad].
+    pub fn tracking_error(&self, joint: usize) -> f64 {
+        self.tracking.error(joint)
+    }
+
+    /// Returns the last command.
+    pub fn command(&self) -> &ArmCommand {
+        &self.command
+    }
+
+    /// Returns whether no command moves the arm.
+    pub fn at_rest(&self) -> bool {
+        self.command.mode.is_none() || self.limiters.iter().all(Limiter::at_rest)
+    }
+
+    /// Takes the latest state. `stalls`: when the tick could not run. Returns whether the phase or its cause changed.
+    pub fn read(&mut self, state: &ArmState, now: Mono, stalls: &Stalls, dt: f64) -> bool {
+        let before = (self.failsafe.phase(), self.failsafe.cause());
+        let verdict = self.feedback.read(state, now, stalls);
+        self.take_written(now);
+        self.failsafe.update(self.feedback.state(), self.feedback.freshness(), now);
+        if let Verdict::Jumped(joint, step) = verdict {
+            self.failsafe.hold(Cause::PositionJump(joint as u16, step), now);
+        }
+        if let Some(cause) = self.unexpected_motion(dt) {
+            self.failsafe.hold(cause, now);
+        }
+        before != (self.failsafe.phase(), self.failsafe.cause())
+    }
+
+    /// Returns the cause for a hold if the arm moves without a command.
+    fn unexpected_motion(&mut self, dt: f64) -> Option<Cause> {
+        let (state, usable) = (self.feedback.state(), self.feedback.is_usable());
+        let supervised = usable && self.command.mode == Some(state.mode) && self.tracking.has_setpoints();
+        match self.failsafe.phase() {
+            Phase::Activating if usable => {
+                let limit = ENABLING_TOLERANCE.max(2.0 * self.config.supervision.accuracy);
+                let moved = state.position.iter().zip(&self.enabled_at).take(self.config.dof);
+                let (joint, by) = furthest(moved.map(|(q, before)| q - before))?;
+                (by.abs() > limit).then_some(Cause::MovedWhileActivating(joint, by))
+            }
+            Phase::Ready if supervised => {
+                let velocity = self.command.mode == Some(ControlMode::Velocity);
+                self.tracking.supervise(velocity, state, dt)
+            }
+            _ => {
+                self.tracking.pause();
+                None
+            }
+        }
+    }
+
+    /// Clears the latched hold, unless its cause persists. `arm`: the arm's index, for the outcome.
+    pub fn reset(&mut self, arm: u16, now: Mono) -> Outcome {
+        self.failsafe.reset(arm, self.feedback.state(), self.feedback.freshness(), now)
+    }
+
+    /// The arm was enabled: starts to hold it. An arm that still decelerates continues to do so. `arm`: the arm's
+    /// index, for the outcome.
+    pub fn activate(&mut self, arm: u16, now: Mono) -> Outcome {
+        let before = self.failsafe.phase();
+        let outcome = self.failsafe.ready(arm, self.feedback.state(), self.feedback.freshness(), now);
+        let begins = outcome == Outcome::Accepted && !matches!(before, Phase::Activating | Phase::Ready);
+        if begins && self.command.mode.is_none() {
+            self.start();
+            self.enabled_at = self.feedback.state().position;
+            self.rest.stop_pending = false;
+        }
+        outcome
+    }
+
+    /// Sets a new gripper opening [m].
+    pub fn set_gripper(&mut self, opening: f64) {
+        self.command.gripper = opening;
+        self.command.gripper_seq = self.command.gripper_seq.wrapping_add(1);
+    }
+
+    /// Makes the arm's next command. `ask` gives the request to each of its joints; `report` gets the joint, the limit
+    /// and the request whenever a limit begins to change a command.
+    pub fn route(
+        &mut self,
+        demand: Demand,
+        ask: impl Fn(usize) -> Option<Ask>,
+        dt: f64,
+        now: Mono,
+        next_tick: Mono,
+        report: impl FnMut(usize, LimitKind, f64),
+    ) -> Routed {
+        self.command.seq += 1;
+        (self.command.at, self.command.next_tick) = (now, next_tick);
+        let phase = self.failsafe.phase();
+        let held = phase == Phase::Held;
+        // An arm that another program controls gets neither a setpoint nor a stop.
+        let foreign = held && self.failsafe.cause().is_foreign();
+        self.rest.enter(held, foreign);
+        self.check_gap(now);
+        let routed = match phase {
+            Phase::Unknown | Phase::Disabled => {
+                self.command.mode = None;
+                Routed::NotReady
+            }
+            _ if !self.feedback.state().enabled || foreign => {
+                self.command.mode = None;
+                Routed::NotReady
+            }
+            _ if matches!(self.feedback.state().link, Link::Down | Link::Faulted) => {
+                // It may still follow the last command: the device thread sends the stop as soon as it can.
+                if self.command.mode.take().is_some() {
+                    self.stop();
+                }
+                Routed::NotReady
+            }
+            Phase::Held | Phase::Standby => {
+                self.come_to_rest(now, dt);
+                Routed::NotReady
+            }
+            Phase::Activating => {
+                self.follow(Demand::Nothing, ask, dt, report);
+                Routed::NotReady
+            }
+            Phase::Ready => self.follow(demand, ask, dt, report),
+        };
+        self.issue(now);
+        routed
+    }
+
+    /// Returns the cause of the latched hold for a refusal.
+    pub fn cause_of(refusal: Refusal) -> Cause {
+        match refusal {
+            Refusal::NonFinite => Cause::NonFinite,
+            Refusal::Jump(_) => Cause::Jump,
+        }
+    }
+}

@@ -1,0 +1,296 @@
+//! The coordinator: `tick` turns the states of the arms and the pending requests into one command per arm. It neither
+//! sleeps nor does I/O, takes no lock, allocates and frees nothing. The same states, requests and times give the same
+//! commands, bit for bit.
+
+mod requests;
+mod tick_output;
+
+use std::time::Duration;
+
+use super::arbitrate::Arbiter;
+use super::arm_control::{ArmControl, Ask, Routed};
+use super::config::CoordinatorConfig;
+use super::limit::Refusal;
+use super::request::Envelope;
+use super::stalls::Stalls;
+use super::task::Task;
+use super::task_body::JointView;
+use crate::arm::ArmState;
+use crate::clock::Mono;
+use crate::telemetry::{ArmSample, Cause, Event, Phase, Reason, TaskState};
+
+pub use tick_output::{TickOutput, TickTime};
+
+/// Maximum number of requests handled in one tick: the capacity of the ring, so that a flood of targets never delays a
+/// stop.
+const REQUESTS_PER_TICK: usize = 256;
+/// Time since the previous tick after which all arms are held [s].
+const LOST_TIME: f64 = 0.1;
+/// Consecutive overruns that are reported as degraded.
+const DEGRADED_AFTER: u32 = 10;
+
+/// The coordinator of all arms of a run.
+#[derive(Debug)]
+pub struct Coordinator {
+    /// [s]
+    period: f64,
+    /// [ns]
+    period_ns: u64,
+    arms: Vec<ArmControl>,
+    tasks: Vec<Task>,
+    arbiter: Arbiter,
+    /// The arm of each joint.
+    arm_of: Vec<u16>,
+    joints: Vec<JointView>,
+    overruns_in_a_row: u32,
+    stalls: Stalls,
+    shutting_down: bool,
+    started: bool,
+    output: TickOutput,
+}
+
+impl Coordinator {
+    /// Creates a coordinator with the tasks that [`TaskTable::build`](super::task_spec::TaskTable::build) made of the
+    /// configuration. Allocates all memory that it will need.
+    pub fn new(config: &CoordinatorConfig, tasks: Vec<Task>) -> Self {
+        let mut arm_of = Vec::new();
+        let arms: Vec<ArmControl> = (config.arms.iter().enumerate())
+            .map(|(i, arm)| {
+                let first = arm_of.len();
+                arm_of.extend(std::iter::repeat_n(i as u16, arm.dof));
+                ArmControl::new(arm.clone(), first, config.period())
+            })
+            .collect();
+        let priorities: Vec<i32> = tasks.iter().map(|t| t.priority).collect();
+        // Each request has an outcome and may change a task; arms, tasks and joints report a few events at most.
+        let events = 2 * REQUESTS_PER_TICK + 4 * (arms.len() + tasks.len()) + arm_of.len();
+        Self {
+            period: 1.0 / config.rate,
+            period_ns: Duration::from_secs_f64(1.0 / config.rate).as_nanos().max(1) as u64,
+            arbiter: Arbiter::new(&priorities, arm_of.clone(), arms.len()),
+            joints: vec![JointView::default(); arm_of.len()],
+            output: TickOutput::new(arms.len(), tasks.len(), events, 2 * tasks.len() + REQUESTS_PER_TICK),
+            arms,
+            tasks,
+            arm_of,
+            overruns_in_a_row: 0,
+            stalls: Stalls::default(),
+            shutting_down: false,
+            started: false,
+        }
+    }
+
+    /// Returns the tasks as of the last tick.
+    pub fn tasks(&self) -> &[Task] {
+        &self.tasks
+    }
+
+    /// Returns whether no command moves an arm.
+    pub fn at_rest(&self) -> bool {
+        self.arms.iter().all(ArmControl::at_rest) && !self.tasks.iter().any(Task::is_active)
+    }
+
+    /// Runs one tick. `states`: the latest state of each arm; `inbox`: returns the next pending request.
+    pub fn tick(
+        &mut self,
+        time: TickTime,
+        states: &[ArmState],
+        mut inbox: impl FnMut() -> Option<Envelope>,
+    ) -> &mut TickOutput {
+        self.output.arms.clear();
+        self.output.events.clear();
+        // The caller has taken the motions, to free them on another thread; the rest did not fit its ring.
+        self.output.retired.clear();
+        let late = Duration::from_nanos(time.woke_late_ns);
+        self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % self.period_ns)), late);
+        self.read(time, states);
+        self.account_for_lost_time(time);
+        for _ in 0..REQUESTS_PER_TICK {
+            let Some(envelope) = inbox() else { break };
+            self.handle(time.now, envelope);
+        }
+        self.auto_start(time.now);
+        self.compute(time.now);
+        let output = &mut self.output;
+        let mut retired = std::mem::take(&mut output.retired);
+        self.arbiter.decide(&mut self.tasks, |event| output.report(event), |motion| retired.push(motion));
+        output.retired = retired;
+        self.route(time);
+        self.publish();
+        &mut self.output
+    }
+
+    fn read(&mut self, time: TickTime, states: &[ArmState]) {
+        for (i, arm) in self.arms.iter_mut().enumerate() {
+            let Some(state) = states.get(i) else { continue };
+            if arm.read(state, time.now, &self.stalls, self.period) {
+                let (phase, cause) = (arm.failsafe.phase(), arm.failsafe.cause());
+                self.output.report(Event::Arm(i as u16, phase, cause));
+            }
+            let views = self.joints.iter_mut().skip(arm.first()).zip(arm.limiters());
+            for (j, (view, limiter)) in views.enumerate() {
+                *view = JointView {
+                    position: arm.state().position.get(j).copied().unwrap_or_default(),
+                    velocity: arm.state().velocity.get(j).copied().unwrap_or_default(),
+                    commanded: limiter.position(),
+                    commanded_velocity: limiter.velocity(),
+                    lower: limiter.bounds().lower,
+                    upper: limiter.bounds().upper,
+                    acceleration: limiter.bounds().acceleration,
+                    velocity_limit: limiter.bounds().velocity,
+                    jerk: arm.config().limits.jerk_max.get(j).copied().unwrap_or(crate::joint::DEFAULT_JERK),
+                    tracking_error: arm.tracking_error(j),
+                };
+            }
+        }
+        self.end_tasks_of_held_arms();
+    }
+
+    fn account_for_lost_time(&mut self, time: TickTime) {
+        if time.skipped == 0 {
+            self.overruns_in_a_row = 0;
+            return;
+        }
+        self.output.report(Event::Overrun(time.skipped, time.late_ns));
+        self.overruns_in_a_row += 1;
+        if self.overruns_in_a_row == DEGRADED_AFTER {
+            self.output.report(Event::Degraded);
+        }
+        let since_last = time.late_ns as f64 * 1e-9 + self.period;
+        if since_last >= LOST_TIME.max(3.0 * self.period) {
+            for i in 0..self.arms.len() {
+                self.hold(i, Cause::Overrun, time.now);
+            }
+        }
+    }
+
+    /// Latches an arm's hold and ends its tasks.
+    fn hold(&mut self, arm: usize, cause: Cause, now: Mono) {
+        if let Some(a) = self.arms.get_mut(arm) {
+            let before = (a.failsafe.phase(), a.failsafe.cause());
+            a.failsafe.hold(cause, now);
+            if before != (a.failsafe.phase(), a.failsafe.cause()) {
+                self.output.report(Event::Arm(arm as u16, a.failsafe.phase(), a.failsafe.cause()));
+            }
+        }
+        self.end_tasks_of_held_arms();
+    }
+
+    fn end_tasks_of_held_arms(&mut self) {
+        for t in 0..self.tasks.len() {
+            let Some(task) = self.tasks.get(t).filter(|t| t.is_active()) else { continue };
+            let held = task.joints.iter().find_map(|&joint| {
+                let arm = self.arm_of.get(joint as usize).copied()?;
+                let failsafe = &self.arms.get(arm as usize)?.failsafe;
+                (failsafe.phase() != Phase::Ready).then_some((arm, failsafe.cause()))
+            });
+            if let Some((arm, cause)) = held {
+                self.end_task(t, TaskState::Aborted, Reason::ArmHeld(arm, cause));
+            }
+        }
+    }
+
+    fn end_task(&mut self, task: usize, state: TaskState, reason: Reason) {
+        if let Some(t) = self.tasks.get_mut(task) {
+            let motion = t.end(state, reason);
+            self.output.retired.extend(motion);
+            self.output.report(Event::Task(task as u16, state, reason));
+        }
+    }
+
+    /// Starts tasks with `auto_start` and a first target as soon as all arms are ready.
+    fn auto_start(&mut self, now: Mono) {
+        if self.started || self.shutting_down || !self.arms.iter().all(|a| a.failsafe.phase() == Phase::Ready) {
+            return;
+        }
+        self.started = true;
+        for t in 0..self.tasks.len() {
+            let Some(target) = self.tasks.get(t).and_then(Task::first_target) else { continue };
+            let outcome = self.offer(now, t as u16, &target);
+            self.output.report(Event::Request(0, outcome));
+        }
+    }
+
+    fn compute(&mut self, now: Mono) {
+        for (t, task) in self.tasks.iter_mut().enumerate() {
+            let before = (task.state, task.reason);
+            let motion = task.compute(now, self.period, &self.joints);
+            self.output.retired.extend(motion);
+            if before != (task.state, task.reason) {
+                self.output.report(Event::Task(t as u16, task.state, task.reason));
+            }
+        }
+    }
+
+    fn route(&mut self, time: TickTime) {
+        for task in &mut self.tasks {
+            task.granted = !task.claims.is_empty();
+        }
+        for i in 0..self.arms.len() {
+            let Some(arm) = self.arms.get_mut(i) else { continue };
+            let (first, dof) = (arm.first(), arm.config().dof);
+            let arbiter = &self.arbiter;
+            let output = &mut self.output;
+            let routed = arm.route(
+                arbiter.demand(i),
+                |j| {
+                    let (_, value) = arbiter.winner(first + j)?;
+                    Some(Ask { value, new_task: arbiter.winner_changed(first + j) })
+                },
+                self.period,
+                time.now,
+                time.next,
+                |j, kind, asked| output.report(Event::Limited((first + j) as u16, kind, asked)),
+            );
+            if routed != Routed::Sent {
+                for joint in first..first + dof {
+                    if let Some((task, _)) = arbiter.winner(joint)
+                        && let Some(t) = self.tasks.get_mut(task as usize)
+                    {
+                        t.granted = false;
+                    }
+                }
+            }
+            if let Some(at) = arm.gap() {
+                for task in self.tasks.iter_mut().filter(|t| t.is_active()) {
+                    if task.joints.iter().any(|&joint| (first..first + dof).contains(&usize::from(joint))) {
+                        task.rewind(at, time.now);
+                    }
+                }
+            }
+            if let Routed::Refused(j, refusal) = routed {
+                self.refuse(i, first + j, refusal, time.now);
+            }
+        }
+    }
+
+    /// Ends the task whose request was refused with a fault, and holds the arm.
+    fn refuse(&mut self, arm: usize, joint: usize, refusal: Refusal, now: Mono) {
+        if let Some((task, _)) = self.arbiter.winner(joint) {
+            let reason = match refusal {
+                Refusal::NonFinite => Reason::NonFinite(joint as u16),
+                Refusal::Jump(step) => Reason::Jump(joint as u16, step),
+            };
+            self.end_task(task as usize, TaskState::Fault, reason);
+        }
+        self.hold(arm, ArmControl::cause_of(refusal), now);
+    }
+
+    fn publish(&mut self) {
+        for (i, arm) in self.arms.iter().enumerate() {
+            if let Some(command) = self.output.commands.get_mut(i) {
+                *command = *arm.command();
+            }
+            self.output.arms.push(ArmSample {
+                arm: i as u16,
+                state: arm.measured(),
+                command: *arm.command(),
+                phase: arm.failsafe.phase(),
+                cause: arm.failsafe.cause(),
+            });
+        }
+        for (view, task) in self.output.tasks.iter_mut().zip(&self.tasks) {
+            *view = task.view();
+        }
+    }
+}

@@ -1,0 +1,142 @@
+//! How the coordinator handles requests, each with one outcome.
+
+use super::Coordinator;
+use crate::clock::Mono;
+use crate::control::arm_control::ArmControl;
+use crate::control::request::{Envelope, Motion, Request};
+use crate::control::task_body::Target;
+use crate::telemetry::{Cause, Event, Outcome, Reason, TaskState};
+
+impl Coordinator {
+    /// Handles a request and reports its outcome.
+    pub(super) fn handle(&mut self, now: Mono, envelope: Envelope) {
+        let outcome = match envelope.request {
+            Request::Shutdown => {
+                self.shutting_down = true;
+                self.cancel(None)
+            }
+            Request::Stop { arm } => self.stop(arm, now),
+            Request::Cancel { task } => self.cancel(task),
+            Request::Execute { motion, .. } if self.shutting_down => {
+                self.output.retired.push(motion);
+                Outcome::ShuttingDown
+            }
+            _ if self.shutting_down => Outcome::ShuttingDown,
+            Request::Execute { task, motion } => self.execute(now, task, motion),
+            Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
+            Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
+            Request::Steer { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
+            Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
+            Request::Ready { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
+            Request::Park { arm } => {
+                let outcome = self.with_arm(arm, |a| {
+                    a.failsafe.park(now);
+                    Outcome::Accepted
+                });
+                self.end_tasks_of_held_arms();
+                outcome
+            }
+            Request::Gripper { arm, opening } => self.gripper(arm, opening),
+        };
+        self.output.report(Event::Request(envelope.id, outcome));
+    }
+
+    /// Changes an arm and reports a change of its phase.
+    fn with_arm(&mut self, arm: u16, act: impl FnOnce(&mut ArmControl) -> Outcome) -> Outcome {
+        let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
+        let before = a.failsafe.phase();
+        let outcome = act(a);
+        if a.failsafe.phase() != before {
+            self.output.report(Event::Arm(arm, a.failsafe.phase(), a.failsafe.cause()));
+        }
+        outcome
+    }
+
+    fn stop(&mut self, arm: Option<u16>, now: Mono) -> Outcome {
+        match arm {
+            Some(arm) if arm as usize >= self.arms.len() => return Outcome::StartStateUnavailable(arm),
+            Some(arm) => self.hold(arm as usize, Cause::Operator, now),
+            None => (0..self.arms.len()).for_each(|i| self.hold(i, Cause::Operator, now)),
+        }
+        Outcome::Accepted
+    }
+
+    fn cancel(&mut self, which: Option<u16>) -> Outcome {
+        if let Some(task) = which.filter(|&t| t as usize >= self.tasks.len()) {
+            return Outcome::WrongTask(task);
+        }
+        let mut outcome = Outcome::AlreadyStopped;
+        for t in 0..self.tasks.len() {
+            if which.is_some_and(|w| w as usize != t) {
+                continue;
+            }
+            if let Some(task) = self.tasks.get_mut(t)
+                && let Some(motion) = task.cancel()
+            {
+                self.output.retired.extend(motion);
+                outcome = Outcome::Cancelled;
+                let event = Event::Task(t as u16, task.state, task.reason);
+                self.output.report(event);
+            }
+        }
+        outcome
+    }
+
+    fn execute(&mut self, now: Mono, task: u16, motion: Box<Motion>) -> Outcome {
+        let outcome = self.offer(now, task, &Target::Trajectory(&motion));
+        let done = match self.tasks.get_mut(task as usize) {
+            Some(t) if outcome == Outcome::Accepted => t.keep(motion),
+            _ => Some(motion),
+        };
+        self.output.retired.extend(done);
+        outcome
+    }
+
+    /// Offers a target to a task.
+    pub(super) fn offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Outcome {
+        self.try_offer(now, task, target).err().unwrap_or(Outcome::Accepted)
+    }
+
+    fn try_offer(&mut self, now: Mono, task: u16, target: &Target<'_>) -> Result<(), Outcome> {
+        let t = self.tasks.get(task as usize).ok_or(Outcome::WrongTask(task))?;
+        t.check(target)?;
+        self.admit(match target {
+            Target::Trajectory(motion) => &motion.joints,
+            _ => &t.joints,
+        })?;
+        let t = self.tasks.get_mut(task as usize).ok_or(Outcome::WrongTask(task))?;
+        if t.accept(now, self.period, &self.joints, target)? {
+            self.output.report(Event::Task(task, TaskState::Executing, Reason::None));
+        }
+        Ok(())
+    }
+
+    fn admit(&self, joints: &[u16]) -> Result<(), Outcome> {
+        for &joint in joints {
+            let arm = self.arm_of.get(joint as usize).copied().unwrap_or(u16::MAX);
+            let Some(a) = self.arms.get(arm as usize) else { return Err(Outcome::StartStateUnavailable(arm)) };
+            a.failsafe.admits(arm)?;
+            if !a.freshness().fresh {
+                return Err(Outcome::StartStateUnavailable(arm));
+            }
+        }
+        Ok(())
+    }
+
+    fn gripper(&mut self, arm: u16, opening: f64) -> Outcome {
+        let Some(a) = self.arms.get_mut(arm as usize) else { return Outcome::StartStateUnavailable(arm) };
+        if !a.config().gripper {
+            return Outcome::NoGripper(arm);
+        }
+        if !opening.is_finite() || opening < 0.0 {
+            return Outcome::OutOfLimits(a.first() as u16, opening);
+        }
+        match a.failsafe.admits(arm) {
+            Ok(()) => {
+                a.set_gripper(opening);
+                Outcome::Accepted
+            }
+            Err(outcome) => outcome,
+        }
+    }
+}

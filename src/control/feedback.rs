@@ -1,0 +1,133 @@
+//! The state of one arm as the tick uses it: implausible readings are left out, missing velocities are estimated, and
+//! the state's age excludes the time in which this computer could not read a newer one.
+
+use std::time::Duration;
+
+use super::config::ArmConfig;
+use super::estimate::VelocityEstimator;
+use super::failsafe::Freshness;
+use super::plausibility::{Plausibility, Verdict};
+use super::stalls::Stalls;
+use crate::arm::{ArmState, Link, VelocitySource};
+use crate::clock::Mono;
+use crate::joint::Joints;
+use crate::telemetry::Age;
+
+/// A longer delay of this computer is not subtracted from a state's age.
+const MAX_OWN_DELAY: Duration = Duration::from_millis(100);
+/// Number of readings that an arm has to confirm a position that looks like a jump.
+const CONFIRMATIONS: u32 = 3;
+
+/// The latest state of one arm.
+#[derive(Debug)]
+pub struct Feedback {
+    dof: usize,
+    read_period: Duration,
+    /// Maximum age of a fresh state.
+    max_age: Duration,
+    /// The latest accepted state, with estimated velocities if the arm reports none.
+    state: ArmState,
+    /// The latest reading, while its positions are rejected.
+    rejected: Option<ArmState>,
+    plausibility: Plausibility,
+    estimator: VelocityEstimator,
+    freshness: Freshness,
+}
+
+impl Feedback {
+    /// Creates the feedback of an arm without a state so far.
+    pub fn new(config: &ArmConfig) -> Self {
+        let l = &config.limits;
+        let own = if config.own_velocity.len() == config.dof { &config.own_velocity } else { &l.velocity_max };
+        let read = config.read_period.max(Duration::from_micros(100));
+        Self {
+            dof: config.dof,
+            read_period: config.read_period,
+            max_age: config.supervision.stale_after.max(3 * config.read_period),
+            state: ArmState::default(),
+            rejected: None,
+            plausibility: Plausibility::new(own, &l.position_lower, &l.position_upper, read.as_secs_f64()),
+            estimator: VelocityEstimator::default(),
+            freshness: Freshness::default(),
+        }
+    }
+
+    /// Returns the latest accepted state.
+    pub fn state(&self) -> &ArmState {
+        &self.state
+    }
+
+    /// Returns whether the state is recent enough to act on, with its age.
+    pub fn freshness(&self) -> Freshness {
+        self.freshness
+    }
+
+    /// Returns whether the latest reading was rejected as implausible.
+    pub fn is_rejected(&self) -> bool {
+        self.plausibility.rejected() > 0
+    }
+
+    /// Returns whether the state is fresh and plausible.
+    pub fn is_usable(&self) -> bool {
+        self.freshness.fresh && !self.is_rejected()
+    }
+
+    /// Returns the state as it was read, with rejected positions and estimated velocities: for the log.
+    pub fn measured(&self) -> ArmState {
+        match &self.rejected {
+            Some(read) if self.is_finite(&read.position) => {
+                ArmState { velocity: self.state.velocity, velocity_source: self.state.velocity_source, ..*read }
+            }
+            _ => self.state,
+        }
+    }
+
+    /// Takes the latest reading. `stalls`: when the tick could not run.
+    pub fn read(&mut self, state: &ArmState, now: Mono, stalls: &Stalls) -> Verdict {
+        let verdict = self.accept(state);
+        self.estimator.fill(&mut self.state);
+        self.freshness = self.age(now, stalls);
+        verdict
+    }
+
+    fn accept(&mut self, state: &ArmState) -> Verdict {
+        // Positions that are not numbers are no measurement.
+        let verdict = if self.is_finite(&state.position) { self.plausibility.take(state) } else { Verdict::Rejected };
+        if verdict == Verdict::Rejected || (verdict == Verdict::Same && self.is_rejected()) {
+            // The last accepted measurement stays, and ages.
+            self.rejected = Some(*state);
+            let before = std::mem::replace(&mut self.state, *state);
+            (self.state.seq, self.state.stamp) = (before.seq, before.stamp);
+            (self.state.position, self.state.velocity) = (before.position, before.velocity);
+            (self.state.velocity_source, self.state.effort) = (before.velocity_source, before.effort);
+            return verdict;
+        }
+        self.rejected = None;
+        self.state = *state;
+        if !self.is_finite(&state.velocity) {
+            self.state.velocity_source = VelocitySource::Absent;
+        }
+        verdict
+    }
+
+    fn is_finite(&self, values: &Joints) -> bool {
+        values.iter().take(self.dof).all(|v| v.is_finite())
+    }
+
+    /// Returns the age of the accepted state, without the time in which this computer could not read a newer one.
+    fn age(&self, now: Mono, stalls: &Stalls) -> Freshness {
+        // An arm whose readings are rejected still answers: its age counts from the latest of them until it had the
+        // time to confirm a jump.
+        let confirmation = CONFIRMATIONS * self.read_period.max(Duration::from_millis(1));
+        let waits = self.is_rejected() && now.since(self.plausibility.stamp()) <= self.max_age + confirmation;
+        let stamp = self.rejected.as_ref().filter(|_| waits).map_or(self.state.stamp, |read| read.stamp);
+        let age = now.since(stamp);
+        let device = Duration::from_nanos(self.state.own_delay_ns);
+        let device = if device < MAX_OWN_DELAY { device } else { Duration::ZERO };
+        let own = stalls.between(stamp, now).max(device).min(age);
+        let seen = age - own;
+        let us = |d: Duration| d.as_micros().min(u128::from(u32::MAX)) as u32;
+        let fresh = self.state.seq != 0 && self.state.link == Link::Up && seen <= self.max_age;
+        Freshness { fresh, age: Age { age_us: us(seen), limit_us: us(self.max_age), own_us: us(own) } }
+    }
+}

@@ -1,0 +1,301 @@
+//! The protocol between this program and an arm: [`ManipulatorAdapter`], the guide's interface in Rust.
+//!
+//! Everything that crosses it is in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a
+//! default body and those of the rest that its device can do; the defaults say "no" in the agreed way, so the
+//! absence of a feature is never an error. What only some arms have is a small trait of its own: [`Gripper`],
+//! [`ForceTorque`], [`Cartesian`].
+//!
+//! A device is either polled, or streams its state. For the second kind, [`ManipulatorAdapter::state_fd`] returns the
+//! descriptor on which the state arrives: the device thread then reads when data has arrived, so the age of the state
+//! depends on the device only.
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use crate::arm::Pose;
+use crate::clock::Mono;
+use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
+
+/// Why an adapter could not do what it was asked.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum AdapterError {
+    /// The connection failed or broke.
+    #[error("{0}")]
+    Io(String),
+    /// The device did not answer in time.
+    #[error("{0}")]
+    Timeout(String),
+    /// The device answered what it should not.
+    #[error("{0}")]
+    Protocol(String),
+    /// The device is in error.
+    #[error("fault {code}: {text}")]
+    Fault {
+        /// The device's own code.
+        code: i32,
+        /// What the code means.
+        text: String,
+    },
+    /// The device refused a command.
+    #[error("{0}")]
+    Rejected(String),
+    /// Two setpoints are on their way and not acknowledged: this one was not sent. No failure of the device.
+    #[error("two setpoints are still unacknowledged")]
+    Busy,
+    /// The device has no such feature.
+    #[error("not supported by this arm")]
+    Unsupported,
+    /// Called before `connect` or after the connection was lost.
+    #[error("not connected")]
+    NotConnected,
+}
+
+/// Result of an adapter call.
+pub type AdapterResult<T> = Result<T, AdapterError>;
+
+/// Description of an arm.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ManipulatorInfo {
+    /// Vendor.
+    pub vendor: String,
+    /// Model.
+    pub model: String,
+    /// Number of joints.
+    pub dof: usize,
+    /// Firmware version, if the device reports it.
+    pub firmware_version: Option<String>,
+    /// Serial number, if the device reports it.
+    pub serial_number: Option<String>,
+    /// Rate at which the device can deliver its state [Hz].
+    pub native_rate: f64,
+    /// The modes that `set_control_mode` accepts.
+    pub modes: &'static [ControlMode],
+    /// Whether the arm keeps its pose when its motors are disabled (brakes), or falls.
+    pub holds_when_disabled: bool,
+    /// Whether `read_joints` gets the whole state, so that the other reads are answered from memory. Otherwise each
+    /// costs a round trip, and one of them is made per cycle.
+    pub whole_state_at_once: bool,
+}
+
+/// Joint positions, velocities and efforts from one reading.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct JointReading {
+    /// When the device measured, if it reports that (translated to the monotonic clock).
+    pub stamp: Option<Mono>,
+    /// Joint positions [rad].
+    pub position: Joints,
+    /// Joint velocities [rad/s], if the device has them.
+    pub velocity: Option<Joints>,
+    /// Joint torques [Nm], if the device has them.
+    pub effort: Option<Joints>,
+    /// Whether the device confirms that the positions are measured: `Some(false)` means not yet, `None` that the device
+    /// cannot tell. Without a confirmation, exactly zero on all joints counts as missing when the motors are to be
+    /// enabled.
+    pub valid: Option<bool>,
+}
+
+/// The device's own state codes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RobotState {
+    /// The device's state code.
+    pub state: i32,
+    /// The device's mode code.
+    pub mode: i32,
+}
+
+/// Result of `write_stop`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stop {
+    /// The device confirmed the stop.
+    Confirmed,
+    /// The stop was sent; the device has no way to confirm it.
+    Sent,
+}
+
+/// Interface of the program to an arm. One device thread owns it and makes all calls.
+///
+/// Methods that fill a slice get one of length dof and must not allocate: they run every cycle.
+pub trait ManipulatorAdapter: Send {
+    // --- Lifecycle ---
+
+    /// Connects and verifies the device. Moves and enables nothing.
+    fn connect(&mut self) -> AdapterResult<()>;
+    /// Closes the connection. Never fails; has no effect when not connected.
+    fn disconnect(&mut self);
+    /// Returns whether the connection is up, without asking the device.
+    fn is_connected(&self) -> bool;
+    /// Prepares for commanded motion: enables the motors and holds the current position.
+    fn activate(&mut self) -> AdapterResult<()> {
+        self.write_enable(true)
+    }
+    /// Ends commanded motion in a regular way, before `disconnect`. Motor power does not change.
+    fn deactivate(&mut self) -> AdapterResult<()> {
+        self.write_stop().map(|_| ())
+    }
+
+    // --- Identity ---
+
+    /// Returns vendor, model, dof, versions, rate, modes.
+    fn get_info(&self) -> ManipulatorInfo;
+    /// Returns the number of joints.
+    fn get_dof(&self) -> usize;
+    /// Returns the joint limits, known or read from the device.
+    fn get_limits(&mut self) -> AdapterResult<JointLimits>;
+
+    // --- Mode ---
+
+    /// Sets the control mode; `Unsupported` for one that the device lacks.
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()>;
+    /// Returns the mode of the device, as it reports it if it can.
+    fn get_control_mode(&self) -> ControlMode;
+
+    /// Returns what another client of the device, or a person at its panel, changed since the last `activate` or
+    /// `set_control_mode`: a stop, a pause, another mode, motors off. `None`: no change, or the device itself is the
+    /// cause (`read_error`). An adapter never undoes such a change. Must not allocate.
+    fn foreign_change(&self) -> Option<&'static str> {
+        None
+    }
+
+    // --- State ---
+
+    /// For a device that streams its state: returns the descriptor that becomes readable when data has arrived. The
+    /// device thread then calls [`ManipulatorAdapter::read_joints`] at once, which must process everything that has
+    /// arrived without waiting, and return the newest state with its own `stamp`, the same as before if there is no
+    /// newer one. After a silence that is too long for a live device it returns an error. `None`: the device is polled.
+    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
+        None
+    }
+    /// Fills in the joint positions [rad].
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()>;
+    /// Fills in the joint velocities [rad/s]; `false` if the device has none (the coordinator estimates them).
+    fn read_joint_velocities(&mut self, _velocities: &mut [f64]) -> AdapterResult<bool> {
+        Ok(false)
+    }
+    /// Fills in the joint torques [Nm]; `false` if the device has none.
+    fn read_joint_efforts(&mut self, _efforts: &mut [f64]) -> AdapterResult<bool> {
+        Ok(false)
+    }
+    /// Reads all three. Override it for a device that sends them in one packet.
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        let dof = self.get_dof().min(MAX_DOF);
+        let mut buffer = [0.0; MAX_DOF];
+        let slice = buffer.get_mut(..dof).unwrap_or_default();
+        reading.stamp = None;
+        self.read_joint_positions(slice)?;
+        reading.position = buffer;
+        let mut buffer = [0.0; MAX_DOF];
+        let slice = buffer.get_mut(..dof).unwrap_or_default();
+        reading.velocity = self.read_joint_velocities(slice)?.then_some(buffer);
+        let mut buffer = [0.0; MAX_DOF];
+        let slice = buffer.get_mut(..dof).unwrap_or_default();
+        reading.effort = self.read_joint_efforts(slice)?.then_some(buffer);
+        Ok(())
+    }
+    /// Returns the device's own state and mode codes.
+    fn read_state(&mut self) -> AdapterResult<RobotState>;
+    /// Returns the device's error: code and text; `(0, "")` without an error. The text is built only for an error, so a
+    /// healthy cycle allocates nothing.
+    fn read_error(&mut self) -> AdapterResult<(i32, String)>;
+    /// Returns whether the motors are enabled.
+    fn read_enabled(&mut self) -> AdapterResult<bool>;
+
+    // --- Motion ---
+
+    /// Commands joint positions [rad]. `velocity` is a fraction of the device's top speed (0–1], used where the device
+    /// plans the motion.
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()>;
+    /// Commands joint velocities [rad/s].
+    fn write_joint_velocities(&mut self, _velocities: &[f64]) -> AdapterResult<()> {
+        Err(AdapterError::Unsupported)
+    }
+    /// Stops all motion at once with the device's own stop; the motors stay powered. An operational stop. The device
+    /// thread holds a gripper that still moves afterwards at its current position.
+    fn write_stop(&mut self) -> AdapterResult<Stop>;
+    /// Enables or disables the motors.
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()>;
+    /// Clears the device's error state. Moves and enables nothing.
+    fn write_clear_errors(&mut self) -> AdapterResult<()>;
+    /// Returns the longest regular time between two setpoints, known once connected. `None`: one per tick or, if
+    /// longer, per period of the states.
+    fn set_point_period(&self) -> Option<Duration> {
+        None
+    }
+    /// Discards setpoints that have not left this computer. Called when the arm stopped answering, before anything else
+    /// is sent: a queued setpoint must not reach the arm later. By default the connection is dropped, and the device
+    /// thread reconnects. A TCP connection is reset, not closed, which discards its send buffer.
+    fn discard_pending(&mut self) {
+        self.disconnect();
+    }
+
+    // --- Optional parts: an adapter writes only those that its arm has ---
+
+    /// Returns the arm's gripper; `None` if there is none. Does not change while the arm is connected.
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        None
+    }
+    /// Returns the force/torque sensor at the flange; `None` if there is none. Does not change while the arm is
+    /// connected.
+    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
+        None
+    }
+    /// Returns the device's own kinematics; `None` if it has none. Does not change while the arm is connected.
+    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        None
+    }
+}
+
+/// A gripper whose fingers move along one axis. The adapter usually implements it itself, and
+/// [`ManipulatorAdapter::gripper`] returns `Some(self)`.
+///
+/// ```
+/// use dimos::hardware::adapter::{AdapterError, AdapterResult, Gripper};
+///
+/// struct Fingers {
+///     opening: f64,
+/// }
+///
+/// impl Gripper for Fingers {
+///     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+///         Ok(Some(self.opening))
+///     }
+///     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+///         if !(0.0..=0.08).contains(&position) {
+///             return Err(AdapterError::Rejected(format!("the gripper opens 0 to 0.08 m, not {position} m")));
+///         }
+///         self.opening = position;
+///         Ok(())
+///     }
+/// }
+///
+/// let mut fingers = Fingers { opening: 0.0 };
+/// fingers.write_gripper_position(0.05).unwrap();
+/// assert_eq!(fingers.read_gripper_position(), Ok(Some(0.05)));
+/// assert!(fingers.write_gripper_position(0.09).is_err());
+/// ```
+pub trait Gripper {
+    /// Returns the opening [m]; `None` while it is unknown. Must not allocate.
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>>;
+    /// Commands the opening [m].
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()>;
+    /// Returns the opening when closed and when open [m], according to the data sheet; `None` if unknown.
+    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+        None
+    }
+}
+
+/// A force/torque sensor.
+pub trait ForceTorque {
+    /// Returns force and torque [N, N, N, Nm, Nm, Nm]; `None` while the sensor is not ready. Must not allocate.
+    fn read_force_torque(&mut self) -> AdapterResult<Option<[f64; 6]>>;
+}
+
+/// The device's own kinematics.
+pub trait Cartesian {
+    /// Returns the end-effector pose; `None` while it is unknown. Must not allocate.
+    fn read_cartesian_position(&mut self) -> AdapterResult<Option<Pose>>;
+    /// Commands an end-effector pose; the device plans the motion. `velocity` as in
+    /// [`ManipulatorAdapter::write_joint_positions`].
+    fn write_cartesian_position(&mut self, _pose: &Pose, _velocity: f64) -> AdapterResult<()> {
+        Err(AdapterError::Unsupported)
+    }
+}

@@ -1,0 +1,85 @@
+//! Checks whether an arm's number of joints and options are consistent, and derives its limits, without the device.
+//! Each row provides this as [`AdapterSpec::check`](super::registry::AdapterSpec); `dimos check` reports an error at
+//! its position in the blueprint, and no adapter or emulator is created from such a configuration.
+
+use std::fmt;
+
+use serde::de::DeserializeOwned;
+
+use super::adapter::{AdapterError, AdapterResult};
+use super::registry::AdapterConfig;
+use crate::joint::JointLimits;
+use crate::message::Message;
+
+/// What a valid configuration implies.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Checked {
+    /// Nominal joint limits. A connected arm may narrow them.
+    pub limits: JointLimits,
+}
+
+/// An invalid configuration, and where. As text it is a sentence without full stop, without the hint.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ConfigError {
+    /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty for the number
+    /// of joints, or for all options.
+    pub option: String,
+    /// What is wrong with it.
+    pub what: String,
+    /// What to do.
+    pub hint: Option<String>,
+}
+
+impl ConfigError {
+    /// Creates an error at an option.
+    pub fn new(option: impl Into<String>, what: impl Into<String>) -> Self {
+        Self { option: option.into(), what: what.into(), hint: None }
+    }
+
+    /// Adds a hint.
+    pub fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+
+    /// Puts the option into the group `group`: `faults.0` of `sim` becomes `sim.faults.0`.
+    pub fn within(mut self, group: &str) -> Self {
+        self.option = format!("{group}.{}", self.option);
+        self
+    }
+}
+
+impl fmt::Display for ConfigError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)
+    }
+}
+
+impl From<ConfigError> for AdapterError {
+    fn from(error: ConfigError) -> Self {
+        Self::Rejected(Message { what: error.what, hint: error.hint }.to_string())
+    }
+}
+
+impl AdapterConfig {
+    /// Returns the options as the adapter's own type.
+    pub fn options<T: DeserializeOwned>(&self) -> Result<T, ConfigError> {
+        let given = if self.options.is_null() { serde_json::json!({}) } else { self.options.clone() };
+        serde_json::from_value(given).map_err(|e| ConfigError::new("", format!("options: {e}")))
+    }
+
+    /// Refuses a number of joints that the adapter `name` cannot have.
+    pub fn check_dof(&self, name: &str, (fewest, most): (usize, usize)) -> Result<(), ConfigError> {
+        match self.dof {
+            dof if (fewest..=most).contains(&dof) => Ok(()),
+            dof if fewest == most => Err(ConfigError::new("", format!("{name} has {most} joints, not {dof}"))),
+            dof => Err(ConfigError::new("", format!("{name} has {fewest} to {most} joints, not {dof}"))),
+        }
+    }
+
+    /// Runs `check`; the error names the arm.
+    pub fn check(&self, check: fn(&Self) -> Result<Checked, ConfigError>) -> AdapterResult<Checked> {
+        check(self)
+            .map_err(|error| ConfigError { what: format!("{}: {}", self.hardware_id, error.what), ..error }.into())
+    }
+}

@@ -1,0 +1,176 @@
+//! Connecting, reconnecting, enabling and disconnecting an arm.
+
+use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
+
+use super::commands::MAX_IN_FLIGHT;
+use super::{BACK_OFF, MAX_FAILURES, TURNS, Worker};
+use crate::arm::{Interference, Link};
+use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
+use crate::hardware::device::Connected;
+use crate::joint::{JointLimits, STANDSTILL};
+
+/// How long `activate` waits for plausible states, and again for the motors to come on.
+const ACTIVATION_TIMEOUT: Duration = Duration::from_secs(1);
+/// How long a stopped arm may take to be at rest before its motors are disabled anyway.
+const REST_TIMEOUT: Duration = Duration::from_secs(1);
+/// How long all joints must be below the standstill velocity to count as at rest [s].
+const REST_TIME: f64 = 0.03;
+
+impl Worker {
+    pub(super) fn connect(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<Connected> {
+        adapter.connect()?;
+        let info = adapter.get_info();
+        if info.dof != self.config.dof {
+            adapter.disconnect();
+            let (expected, found) = (self.config.dof, info.dof);
+            let what = format!("expected an arm with {expected} joints, found {} with {found}", info.model);
+            return Err(AdapterError::Rejected(what));
+        }
+        let limits = adapter.get_limits().inspect_err(|_| adapter.disconnect())?;
+        self.whole_state_at_once = info.whole_state_at_once;
+        // An older controller may deliver less often than its kind.
+        self.config.native_rate = self.config.native_rate.min(info.native_rate);
+        self.should_reconnect = true;
+        self.connected = true;
+        self.write_errors = 0;
+        self.reconnect.1 = BACK_OFF.0;
+        self.plausible.reset();
+        self.expect_nothing(None);
+        self.guard.forget();
+        self.in_flight = 0;
+        if self.speed == 0.0 {
+            self.set_limits(&limits);
+        }
+        self.skip_command();
+        self.read(adapter);
+        let write_period = self.config.write_period(adapter.set_point_period());
+        self.guard.set_period(write_period);
+        let read_period = self.config.read_period();
+        let gripper_range = adapter.gripper().and_then(|gripper| gripper.get_gripper_range());
+        Ok(Connected { info, limits, gripper_range, read_period, write_period })
+    }
+
+    pub(super) fn set_limits(&mut self, limits: &JointLimits) {
+        self.speed = limits.velocity_max.iter().copied().fold(0.1, f64::max);
+        self.guard.set_limits(limits);
+    }
+
+    /// Resets what the arm's state is compared with: no mode, and the motors as in `power`.
+    pub(super) fn expect_nothing(&mut self, power: Option<bool>) {
+        (self.ordered_mode, self.ordered_power, self.disagreeing) = (None, power, 0);
+        self.state.interference = Interference::None;
+    }
+
+    pub(super) fn reconnect_arm(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        self.state.self_held = true; // only `enable` allows motion again
+        match self.connect(adapter) {
+            Ok(_) => {
+                self.health.reconnects.fetch_add(1, Relaxed);
+                self.clear_trouble();
+            }
+            Err(_) => {
+                let wait = self.reconnect.1;
+                self.reconnect = (self.config.clock.now().after(wait), (wait * 2).min(BACK_OFF.1));
+            }
+        }
+    }
+
+    /// Enables the motors, given fresh states that agree with each other, and verifies that they are on.
+    pub(super) fn activate(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
+        if !self.connected {
+            return Err(AdapterError::NotConnected);
+        }
+        let limit = self.config.clock.now().after(ACTIVATION_TIMEOUT);
+        while !self.plausible.stable(self.state.stamp) {
+            if self.config.clock.now() >= limit {
+                return Err(AdapterError::Rejected(self.plausible.objection(&self.config.hardware_id)));
+            }
+            std::thread::sleep(self.config.read_period().min(Duration::from_millis(10)));
+            self.read(adapter);
+            if !self.connected {
+                return Err(AdapterError::NotConnected);
+            }
+        }
+        self.expect_nothing(None);
+        adapter.activate()?;
+        let limit = self.config.clock.now().after(ACTIVATION_TIMEOUT);
+        while !adapter.read_enabled()? {
+            if self.config.clock.now() >= limit {
+                return Err(AdapterError::Timeout("the motors did not come on within 1 s".to_owned()));
+            }
+            std::thread::sleep(Duration::from_millis(5));
+            self.read(adapter);
+        }
+        self.ordered_power = Some(true);
+        self.state.self_held = false;
+        self.stop_pending = false;
+        self.gripper_stop.end();
+        self.write_errors = 0;
+        self.turn = 0;
+        for _ in 0..TURNS {
+            self.read(adapter);
+        }
+        Ok(())
+    }
+
+    pub(super) fn finish(&mut self, adapter: &mut dyn ManipulatorAdapter, disable: bool) -> AdapterResult<()> {
+        let mut result = Ok(());
+        // An arm that another program has taken over is not stopped.
+        if self.connected && self.state.interference != Interference::Mode {
+            result = adapter.deactivate();
+            if disable {
+                self.wait_for_standstill(adapter);
+                result = result.and(adapter.write_enable(false));
+            }
+        }
+        adapter.disconnect();
+        self.connected = false;
+        self.should_reconnect = false;
+        self.state.link = Link::Down;
+        self.states.write(&self.state);
+        result
+    }
+
+    /// Waits until the arm is at rest, at most [`REST_TIMEOUT`]: brakes and disabled motors should not meet a moving
+    /// arm.
+    pub(super) fn wait_for_standstill(&mut self, adapter: &mut dyn ManipulatorAdapter) {
+        let limit = self.config.clock.now().after(REST_TIMEOUT);
+        let mut rest_time = 0.0;
+        loop {
+            let before = (self.state.position, self.state.stamp);
+            std::thread::sleep(self.config.read_period());
+            self.read(adapter);
+            let past = self.state.stamp.seconds_since(before.1).max(1e-3);
+            let moved = self.state.position.iter().zip(before.0).take(self.config.dof);
+            let still = moved.map(|(now, then)| (now - then).abs() / past).all(|v| v <= STANDSTILL);
+            // One sample is not enough: a reversing joint is slow too.
+            rest_time = if still { rest_time + self.state.stamp.seconds_since(before.1) } else { 0.0 };
+            if !self.connected || rest_time >= REST_TIME || self.config.clock.now() >= limit {
+                return;
+            }
+        }
+    }
+
+    /// Marks the connection as lost and schedules the first attempt to reconnect.
+    pub(super) fn mark_lost(&mut self) {
+        self.connected = false;
+        self.plausible.reset();
+        self.state.link = Link::Faulted;
+        self.reconnect = (self.config.clock.now().after(BACK_OFF.0), BACK_OFF.0);
+    }
+
+    /// Decides what an error means for the connection.
+    pub(super) fn after_error(&mut self, adapter: &mut dyn ManipulatorAdapter, error: &AdapterError) {
+        if matches!(error, AdapterError::NotConnected) || !adapter.is_connected() {
+            adapter.discard_pending();
+            adapter.disconnect();
+            self.mark_lost();
+        } else if self.in_flight >= MAX_IN_FLIGHT {
+            self.discard(adapter);
+        } else if self.write_errors >= MAX_FAILURES {
+            self.state.link = Link::Faulted;
+        }
+        self.states.write(&self.state);
+    }
+}

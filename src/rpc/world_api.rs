@@ -1,0 +1,158 @@
+//! Parameters and replies of the methods that read and change the planner's world.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::planner_api::PoseSpec;
+
+/// Shape of an obstacle. Every shape's frame is at its middle; the axis of a cylinder is z.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum ShapeSpec {
+    /// Edge lengths x, y, z [m].
+    Box([f64; 3]),
+    /// Radius [m].
+    Sphere(f64),
+    /// Radius and length [m].
+    Cylinder([f64; 2]),
+    /// A mesh file (STL, OBJ, DAE), as an absolute path.
+    Mesh(String),
+    /// A point cloud file (PLY), as an absolute path.
+    Cloud(String),
+}
+
+impl ShapeSpec {
+    fn valid(&self) -> Result<(), String> {
+        let sizes: &[f64] = match self {
+            Self::Box(size) => size,
+            Self::Sphere(radius) => std::slice::from_ref(radius),
+            Self::Cylinder(size) => size,
+            Self::Mesh(path) | Self::Cloud(path) if path.starts_with('/') => &[],
+            Self::Mesh(path) | Self::Cloud(path) => return Err(format!("{path:?} is not an absolute path")),
+        };
+        match sizes.iter().find(|size| !(**size > 0.0 && size.is_finite())) {
+            Some(size) => Err(format!("a size of the shape is {size}, and must be above 0")),
+            None => Ok(()),
+        }
+    }
+}
+
+/// An object of the world.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct WorldObject {
+    /// Its name.
+    pub name: String,
+    /// What it is.
+    pub shape: ShapeSpec,
+    /// Where it is; of an attached object, in the frame of the link that holds it.
+    #[serde(default)]
+    pub pose: PoseSpec,
+    /// How much it is thickened all around [m].
+    #[serde(default)]
+    pub padding: f64,
+    /// The robot and the link that hold it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub held_by: Option<[String; 2]>,
+}
+
+/// Parameters of `world_add`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(transparent)]
+pub struct WorldAdd(pub WorldObject);
+
+impl WorldAdd {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        let Self(object) = self;
+        if object.name.is_empty() || object.held_by.is_some() {
+            return Err("an object needs a name, and is held by `attach` only".into());
+        }
+        if !(0.0..=1.0).contains(&object.padding) {
+            return Err(format!("padding is {}, and must be within 0–1 m", object.padding));
+        }
+        object.shape.valid()?;
+        object.pose.valid("pose")
+    }
+}
+
+/// An object as written under its name, in a blueprint's `planner.world` and in files.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct WorldEntry {
+    /// What it is.
+    pub shape: ShapeSpec,
+    /// Where it is, in the frame `map`.
+    #[serde(default)]
+    pub pose: PoseSpec,
+    /// How much it is thickened all around [m].
+    #[serde(default)]
+    pub padding: f64,
+}
+
+impl WorldEntry {
+    /// The object of that name.
+    pub fn named(self, name: String) -> WorldObject {
+        WorldObject { name, shape: self.shape, pose: self.pose, padding: self.padding, held_by: None }
+    }
+}
+
+/// Parameters of `world`: none.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct World {}
+
+/// The world that is planned in.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct WorldReport {
+    /// Its objects, by name.
+    pub objects: Vec<WorldObject>,
+}
+
+/// Parameters of `world_move`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct WorldMove {
+    /// The object's name.
+    pub name: String,
+    /// Where it is from now on.
+    pub pose: PoseSpec,
+}
+
+impl WorldMove {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        self.pose.valid("pose")
+    }
+}
+
+/// Parameters of `world_remove`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct WorldRemove {
+    /// The object's name; without it, all objects go.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+}
+
+/// Parameters of `attach`: from now on the robot holds the object where it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Attach {
+    /// The object's name.
+    pub name: String,
+    /// The robot that holds it.
+    pub robot: String,
+    /// The link that holds it; default: the end effector's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<String>,
+    /// Links that may touch it, beside that one.
+    #[serde(default)]
+    pub touch_links: Vec<String>,
+}
+
+/// Parameters of `detach`: the object stays where it is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Detach {
+    /// The object's name.
+    pub name: String,
+}
