@@ -139,8 +139,8 @@ fn checkout(at: &Path) {
         ),
         (
             "src/lib.rs",
-            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{fit, kit, registry, sim, spec, \
-             transport};\n}\n"
+            "pub use real::{clock, joint};\npub mod hardware {\n    pub mod arms;\n    pub use real::hardware::{adapter, adapter_util, check, \
+             registry, sim, transport};\n}\n"
                 .into(),
         ),
         (
