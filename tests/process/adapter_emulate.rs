@@ -74,7 +74,7 @@ fn the_faults_of_an_arm_are_listed() {
     let (yourarm, remote) = (listed("yourarm"), listed("remote"));
     assert!(yourarm.contains("power_loss") && yourarm.contains("garbage") && !yourarm.contains("leader"), "{yourarm}");
     assert!(
-        remote.contains("frozen") && !remote.contains("garbage") && remote.contains("time stamps and all"),
+        remote.contains("frozen") && !remote.contains("garbage") && remote.contains("time stamps included"),
         "{remote}"
     );
     if cfg!(feature = "can") {
@@ -140,6 +140,6 @@ fn a_program_finds_the_address_and_an_end() {
     // Its port is free again, and taken while it is used.
     let first = emulate(&home, &format!("yourarm --bind {address}"));
     let again = format!("adapter emulate yourarm --bind {address} --duration 1s");
-    home.dimos(&again).with(3).says(&["cannot listen at", "hint: take another address"]);
+    home.dimos(&again).with(3).says(&["cannot listen at", "hint: use another loopback address"]);
     first.end(Signal::INT).with(130);
 }
