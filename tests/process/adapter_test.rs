@@ -268,7 +268,9 @@ fn a_pose_too_near_a_limit_is_refused() {
     let (emulator, address) = arm(&near);
     let home = Home::new();
     let line = format!("adapter test yourarm --address {address} --only row --allow-motion --yes");
-    home.dimos(&line).with(1).says(&["joint 3 at 149.00° has 1.00° to its upper limit", "hint: move the arm to the middle of its range"]);
+    home.dimos(&line)
+        .with(1)
+        .says(&["joint 3 at 149.00° has 1.00° to its upper limit", "hint: move the arm to the middle of its range"]);
     assert!(!requests(&emulator).iter().any(|request| matches!(request, Request::Enable(_))));
 }
 
