@@ -16,9 +16,19 @@ use crate::joint::ControlMode;
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Faults, "cut_when_disabled", "a cut connection is noticed and reconnects while disabled", when_disabled),
-    Check::new(Faults, "cut_when_enabled", "a cut connection reconnects while enabled, and the arm holds", when_enabled),
+    Check::new(
+        Faults,
+        "cut_when_enabled",
+        "a cut connection reconnects while enabled, and the arm holds",
+        when_enabled,
+    ),
     Check::new(Faults, "cut_in_motion", "a cut connection reconnects in motion, and the arm can be stopped", in_motion),
-    Check::new(Faults, "cut_while_streaming", "a cut connection reconnects between setpoints, and the arm stops", while_streaming),
+    Check::new(
+        Faults,
+        "cut_while_streaming",
+        "a cut connection reconnects between setpoints, and the arm stops",
+        while_streaming,
+    ),
     Check::new(Faults, "cut_in_error", "a cut connection reconnects in error, and no error is cleared", in_error),
     Check::new(Faults, "power_cut", "after a loss of power the motors stay off", power),
     Check::new(Faults, "stop_into_the_void", "no stop is confirmed without a connection", stop_into_the_void),

@@ -111,9 +111,7 @@ pub fn run_on(subject: &Subject, check: &Check) -> (Outcome, Option<String>) {
         Ok(Ok((None, found))) => (Outcome::Passed, found),
         Ok(Ok((Some(why), _))) => (Outcome::Skipped(why), None),
         Ok(Err(why)) => (Outcome::Failed(why), None),
-        Err(panic) => {
-            (Outcome::Failed(format!("panicked: {}", panic_text(&*panic))), None)
-        }
+        Err(panic) => (Outcome::Failed(format!("panicked: {}", panic_text(&*panic))), None),
     }
 }
 

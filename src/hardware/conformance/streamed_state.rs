@@ -45,7 +45,7 @@ fn readable(context: &Context, limit: Duration) -> Result<bool, String> {
 }
 
 /// Waits for the next state as the device thread does, which also reads after a period without a new state.
-pub(super) fn await_news(context: &mut Context) -> Result<(), String> {
+pub(super) fn await_state(context: &mut Context) -> Result<(), String> {
     let period = Duration::from_secs_f64(1.0 / context.adapter.get_info().native_rate);
     let end = MonotonicClock.now().after(STATE_TIMEOUT);
     while !readable(context, period)? {
@@ -70,7 +70,7 @@ fn wakes(context: &mut Context) -> Result<(), String> {
     let first = stamp(context)?;
     let (mut last, mut newer) = (first, 0);
     for _ in 0..TRIES {
-        await_news(context)?;
+        await_state(context)?;
         let now = stamp(context)?;
         newer += usize::from(now > last);
         last = now;
@@ -90,7 +90,7 @@ fn drains(context: &mut Context) -> Result<(), String> {
     let mut quiet = 0;
     for _ in 0..TRIES / 3 {
         std::thread::sleep(period.clamp(Duration::from_millis(5), Duration::from_millis(100)));
-        await_news(context)?;
+        await_state(context)?;
         // The second read takes what arrived during the first one, or the reply to its request.
         for _ in 0..2 {
             stamp(context)?;
@@ -108,7 +108,7 @@ fn never_waits(context: &mut Context) -> Result<(), String> {
     }
     let (mut same, mut times) = (0, Vec::with_capacity(TRIES));
     for _ in 0..TRIES {
-        await_news(context)?;
+        await_state(context)?;
         let before = stamp(context)?;
         let began = MonotonicClock.now();
         let after = stamp(context)?;

@@ -75,7 +75,12 @@ impl<C: Controller> TcpServer<C> {
 
     /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in their order
     /// here.
-    pub fn with_ports(name: &str, controller: C, ports: Vec<(TcpListener, Port)>, max_clients: usize) -> io::Result<Self> {
+    pub fn with_ports(
+        name: &str,
+        controller: C,
+        ports: Vec<(TcpListener, Port)>,
+        max_clients: usize,
+    ) -> io::Result<Self> {
         let addresses = ports.iter().map(|(listener, port)| Ok((listener.local_addr()?, *port)));
         let inner = Arc::new(Inner {
             name: name.to_owned(),
