@@ -179,8 +179,8 @@ impl Trace {
 
     /// Returns the part of a wave's time in gaps; 1 for a wave without readings.
     fn gaps(&self, wave: Range<usize>) -> f64 {
-        let looks = self.readings.get(wave).unwrap_or_default();
-        let pairs = looks.iter().zip(looks.iter().skip(1));
+        let readings = self.readings.get(wave).unwrap_or_default();
+        let pairs = readings.iter().zip(readings.iter().skip(1));
         let intervals: Vec<f64> = pairs.map(|((from, _), (to, _))| to.seconds_since(*from)).collect();
         let Some(median) = median(&mut intervals.clone()) else { return 1.0 };
         let gap = MIN_GAP.max(GAP_IN_MEDIANS * median);

@@ -47,8 +47,8 @@ impl SimOptions {
         self
     }
 
-    /// Returns an error for a pose outside `limits`, for values out of range, and for faults that are not in `playable`.
-    /// `name` is the name of the adapter.
+    /// Returns an error for a pose outside `limits`, values out of range, and faults that are not in `playable`. `name`
+    /// is the name of the adapter.
     pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), ConfigError> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))

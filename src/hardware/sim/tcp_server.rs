@@ -73,8 +73,7 @@ impl<C: Controller> TcpServer<C> {
         Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1).map_err(failed)
     }
 
-    /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in their order
-    /// here.
+    /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in this order.
     pub fn with_ports(
         name: &str,
         controller: C,

@@ -132,8 +132,8 @@ impl Bus {
         lock(&self.hub).refuse = frames;
     }
 
-    /// Simulates a loss of power of the other nodes: none acknowledges, and at most `limit` frames of programs wait. Frames
-    /// of the other nodes are lost.
+    /// Simulates a loss of power of the other nodes: none acknowledges, and at most `limit` frames of programs wait.
+    /// Frames of the other nodes are lost.
     pub fn withhold(&self, limit: usize) {
         let mut state = lock(&self.hub);
         state.queue.reserve(limit);

@@ -219,7 +219,7 @@ impl CanPort for SocketPort {
                     let fresh = lost != self.lost;
                     self.lost = lost;
                     if fresh {
-                        // Echoes may be among the lost frames. A bus that fills the buffer has transmitted earlier frames.
+                        // Echoes may be among the lost frames; a busy bus has transmitted what was sent before.
                         self.in_flight.clear();
                     }
                     return Ok(fresh.then_some(CanEvent::Trouble(CanTrouble::Overflow)));
