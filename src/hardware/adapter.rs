@@ -1,9 +1,8 @@
-//! The protocol between this program and an arm: [`ManipulatorAdapter`], the guide's interface in Rust.
+//! The interface between this program and an arm: [`ManipulatorAdapter`].
 //!
-//! Everything that crosses it is in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a
-//! default body and those of the rest that its device can do; the defaults say "no" in the agreed way, so the
-//! absence of a feature is never an error. What only some arms have is a small trait of its own: [`Gripper`],
-//! [`ForceTorque`], [`Cartesian`].
+//! All values are in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a default body, and
+//! overrides the others if its device has the feature; the defaults report a missing feature. Features that only some
+//! arms have are separate traits: [`Gripper`], [`ForceTorque`], [`Cartesian`].
 //!
 //! A device is either polled, or streams its state. For the second kind, [`ManipulatorAdapter::state_fd`] returns the
 //! descriptor on which the state arrives: the device thread then reads when data has arrived, so the age of the state
@@ -16,7 +15,7 @@ use crate::arm::Pose;
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
 
-/// Why an adapter could not do what it was asked.
+/// Why an adapter call failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum AdapterError {
     /// The connection failed or broke.
@@ -25,7 +24,7 @@ pub enum AdapterError {
     /// The device did not answer in time.
     #[error("{0}")]
     Timeout(String),
-    /// The device answered what it should not.
+    /// The device sent an invalid or unexpected reply.
     #[error("{0}")]
     Protocol(String),
     /// The device is in error.
@@ -39,7 +38,7 @@ pub enum AdapterError {
     /// The device refused a command.
     #[error("{0}")]
     Rejected(String),
-    /// Two setpoints are on their way and not acknowledged: this one was not sent. No failure of the device.
+    /// Two setpoints are still unacknowledged, so this one was not sent. Not a failure of the device.
     #[error("two setpoints are still unacknowledged")]
     Busy,
     /// The device has no such feature.
@@ -128,7 +127,7 @@ pub trait ManipulatorAdapter: Send {
     fn activate(&mut self) -> AdapterResult<()> {
         self.write_enable(true)
     }
-    /// Ends commanded motion in a regular way, before `disconnect`. Motor power does not change.
+    /// Ends commanded motion in a regular way, before `disconnect`. The motors stay on or off.
     fn deactivate(&mut self) -> AdapterResult<()> {
         self.write_stop().map(|_| ())
     }
@@ -161,7 +160,7 @@ pub trait ManipulatorAdapter: Send {
     /// For a device that streams its state: returns the descriptor that becomes readable when data has arrived. The
     /// device thread then calls [`ManipulatorAdapter::read_joints`] at once, which must process everything that has
     /// arrived without waiting, and return the newest state with its own `stamp`, the same as before if there is no
-    /// newer one. After a silence that is too long for a live device it returns an error. `None`: the device is polled.
+    /// newer one. It returns an error once the device has been silent for too long. `None`: the device is polled.
     fn state_fd(&self) -> Option<BorrowedFd<'_>> {
         None
     }
@@ -175,7 +174,7 @@ pub trait ManipulatorAdapter: Send {
     fn read_joint_efforts(&mut self, _efforts: &mut [f64]) -> AdapterResult<bool> {
         Ok(false)
     }
-    /// Reads all three. Override it for a device that sends them in one packet.
+    /// Reads positions, velocities and torques. Override it for a device that sends them in one packet.
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         let dof = self.get_dof().min(MAX_DOF);
         let mut buffer = [0.0; MAX_DOF];

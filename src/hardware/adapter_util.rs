@@ -3,12 +3,12 @@
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::AdapterConfig;
 
-/// Copies the first values into `out`, which has length dof.
+/// Copies the first values into `out`, which has one element per joint.
 pub fn fill(out: &mut [f64], values: &[f64]) {
     out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
 }
 
-/// Returns the values of a command: one finite number for each of N joints, otherwise `Rejected`.
+/// Returns the values of a command for N joints; `Rejected` unless there is one finite value per joint.
 pub fn finite<const N: usize>(values: &[f64]) -> AdapterResult<[f64; N]> {
     match <[f64; N]>::try_from(values) {
         Ok(values) if values.iter().all(|value| value.is_finite()) => Ok(values),

@@ -18,13 +18,13 @@ pub struct Checked {
     pub limits: JointLimits,
 }
 
-/// An invalid configuration, and where. As text it is a sentence without full stop, without the hint.
+/// An invalid configuration and its location. `Display` prints `what`, without the hint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConfigError {
-    /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty for the number
-    /// of joints, or for all options.
+    /// The option, as a path with dots: `model`, `sim.faults.0.kind`. Empty for the number of joints, or for all
+    /// options.
     pub option: String,
-    /// What is wrong with it.
+    /// What is wrong: a sentence without full stop.
     pub what: String,
     /// What to do.
     pub hint: Option<String>,
@@ -68,7 +68,7 @@ impl AdapterConfig {
         serde_json::from_value(given).map_err(|e| ConfigError::new("", format!("options: {e}")))
     }
 
-    /// Refuses a number of joints that the adapter `name` cannot have.
+    /// Returns an error for a number of joints that the adapter `name` cannot have.
     pub fn check_dof(&self, name: &str, (fewest, most): (usize, usize)) -> Result<(), ConfigError> {
         match self.dof {
             dof if (fewest..=most).contains(&dof) => Ok(()),

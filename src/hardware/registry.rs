@@ -14,7 +14,7 @@ use crate::named::named;
 use crate::yaml;
 
 named! {
-    /// How far an adapter is proven without its hardware.
+    /// How an adapter was tested without its hardware.
     #[derive(Debug, Clone, Copy, PartialEq, Eq)]
     pub enum Level {
         /// Passes the conformance suite against a mock at its SDK or wire boundary.
@@ -29,7 +29,7 @@ named! {
 pub struct AddressForm {
     /// Usage text: `HOST[:PORT]`.
     pub form: &'static str,
-    /// Whether a blueprint must have one.
+    /// Whether a blueprint must state an address.
     pub required: bool,
     /// Returns the complete address, with defaults filled in; the error is a sentence without full stop. Never uses the
     /// network.
@@ -70,7 +70,7 @@ pub struct AdapterConfig {
 pub trait Emulator: Send {
     /// Returns the address for the adapter.
     fn address(&self) -> String;
-    /// Injects a fault that begins `fault.at` seconds from now; the error lists the kinds that it can play.
+    /// Injects a fault that begins `fault.at` seconds from now; the error lists the faults that the emulator can play.
     fn inject(&self, fault: Fault) -> Result<(), String>;
     /// Returns the true joint positions [rad], for checks and for display; `None` if unknown.
     fn true_positions(&self) -> Option<Joints> {
@@ -118,7 +118,7 @@ pub struct AdapterSpec {
     pub name: &'static str,
     /// Which arms this is for, in one line.
     pub about: &'static str,
-    /// How far it is proven.
+    /// How it was tested without the hardware.
     pub level: Level,
     /// `tcp`, `can`, `serial`, `memory` …
     pub transport: &'static str,
@@ -130,7 +130,7 @@ pub struct AdapterSpec {
     pub wire_units: &'static str,
     /// Rate at which the device delivers its state [Hz].
     pub native_rate: f64,
-    /// Maximum distance of a joint at rest from its setpoint under load [rad].
+    /// Maximum position error of a joint at rest under load [rad].
     pub accuracy: f64,
     /// Time from a setpoint to the measured motion that follows it [s]; `dimos adapter test --lag` measures it.
     pub lag: f64,
@@ -148,14 +148,14 @@ pub struct AdapterSpec {
     pub check: fn(&AdapterConfig) -> Result<Checked, ConfigError>,
     /// Creates an adapter. Does not connect.
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
-    /// Starts an emulator of the arm, for `address: sim`; `None` when the adapter is its own plant.
+    /// Starts an emulator of the arm, for `address: sim`; `None` if the adapter simulates the arm itself.
     pub emulate: Option<Emulate>,
 }
 
 /// An adapter that this build lacks: of another operating system, or of a disabled cargo feature.
 #[derive(Debug, Clone, Copy)]
 pub struct Absent {
-    /// What its `adapter_type` would be.
+    /// Its `adapter_type`.
     pub name: &'static str,
     /// Which arms it is for, in one line.
     pub about: &'static str,
@@ -223,8 +223,8 @@ pub fn available() -> Vec<&'static str> {
     Registry::builtin().names()
 }
 
-/// Creates a built-in adapter by name, as a run does; it is not connected yet. The address is in the adapter's own form
-/// (`dimos list-adapters` shows it). The error lists the adapters, or says what is wrong with the address.
+/// Creates a built-in adapter by name, as a run does; it is not connected yet. The address has the adapter's own form
+/// (`dimos list-adapters` shows it). The error lists the adapters, or describes what is wrong with the address.
 ///
 /// ```
 /// use dimos::hardware::registry;
@@ -240,7 +240,7 @@ pub fn create(name: &str, address: &str, dof: usize) -> AdapterResult<Box<dyn Ma
 }
 
 /// Starts the emulator of a built-in adapter, which connects to it at [`Emulator::address`]. `Unsupported` if the
-/// adapter is its own plant.
+/// adapter simulates its arm itself.
 ///
 /// ```
 /// use dimos::hardware::registry;
@@ -265,7 +265,7 @@ fn builtin(name: &str) -> AdapterResult<&'static AdapterSpec> {
         let absent = crate::hardware::arms::ABSENT.iter().find(|absent| absent.name == name);
         AdapterError::Rejected(match absent {
             Some(absent) => format!("adapter {name} is not in this build\nhint: {}", absent.remedy),
-            None => format!("no adapter named {name:?}; there are {}", available().join(", ")),
+            None => format!("no adapter named {name:?}; available: {}", available().join(", ")),
         })
     })
 }

@@ -1,11 +1,11 @@
-//! A stop that an arm does not take at once is retried, whether the tick requested it or the device thread did
-//! because no tick came.
+//! The device thread and commands that an arm does not take: a stop is retried, whether the tick requested it or the
+//! device thread did because no tick came; other refusals are reported as such.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
 use std::time::{Duration, Instant};
 
-use dimos::arm::{ArmCommand, ArmState, Link, Supervision};
+use dimos::arm::{ArmCommand, ArmState, Interference, Link, Supervision};
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
@@ -162,6 +162,48 @@ fn a_change_of_mode_that_a_moving_arm_refuses_is_asked_for_again_and_is_no_fault
     }
     bench.tick(|c| c.mode = Some(ControlMode::Velocity));
     bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    bench.end();
+}
+
+#[test]
+fn a_mode_refused_in_an_earlier_motion_does_not_count_in_the_next_one() {
+    let mut bench = bench(100.0);
+    let requests = |b: &Bench| b.mock.calls().iter().filter(|c| c.name() == "set_control_mode").count();
+    let refuse = |b: &Bench| b.mock.fail("set_control_mode", AdapterError::Rejected("the arm is moving".into()));
+    refuse(&bench);
+    bench.tick(|c| c.mode = Some(ControlMode::Velocity));
+    bench.until("the first request", |b| requests(b) == 1);
+    bench.tick(|c| c.mode = None);
+    // Longer than an arm may refuse a change of mode.
+    std::thread::sleep(Duration::from_millis(1100));
+    refuse(&bench);
+    bench.tick(|c| c.mode = Some(ControlMode::Velocity));
+    bench.until("the second request", |b| requests(b) == 2);
+    bench.tick(|c| c.mode = Some(ControlMode::Velocity));
+    bench.until("the velocity", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    assert_eq!(bench.device.health().write_errors.load(Relaxed), 0);
+    bench.end();
+}
+
+#[test]
+fn motors_that_stay_on_after_a_refused_disable_are_no_interference() {
+    let mut bench = bench(100.0);
+    bench.mock.fail("write_enable", AdapterError::Rejected("the arm is moving".into()));
+    assert!(bench.device.disable().wait(LIMIT).is_err());
+    let seq = bench.states.read().seq;
+    bench.until("five readings", |b| b.states.read().seq >= seq + 5);
+    assert_eq!(bench.states.read().interference, Interference::None);
+    bench.end();
+}
+
+#[test]
+fn the_reason_for_a_refused_reconnect_is_reported() {
+    let mut bench = bench(100.0);
+    bench.mock.fail("connect", AdapterError::Rejected("another arm".into()));
+    bench.mock.fail("read_joint_positions", AdapterError::NotConnected);
+    bench.until("the new connection", |b| b.device.health().reconnects.load(Relaxed) == 1);
+    let texts: Vec<_> = bench.device.health().episodes().into_iter().map(|episode| episode.text).collect();
+    assert!(texts.iter().any(|text| text == "cannot reconnect: another arm"), "{texts:?}");
     bench.end();
 }
 

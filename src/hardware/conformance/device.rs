@@ -87,7 +87,7 @@ fn no_allocation(context: &mut Context) -> Result<(), String> {
         // A streamed state must arrive before a cycle has anything to process.
         let pushed = context.adapter.state_fd().is_some();
         if pushed {
-            streamed_state::await_news(context)?;
+            streamed_state::await_state(context)?;
         }
         let before = allocations();
         let adapter = &mut context.adapter;

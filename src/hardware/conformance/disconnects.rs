@@ -16,10 +16,20 @@ use crate::joint::ControlMode;
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Faults, "cut_when_disabled", "a cut connection is noticed and reconnects while disabled", when_disabled),
-    Check::new(Faults, "cut_when_enabled", "the same while enabled, and the arm holds", when_enabled),
-    Check::new(Faults, "cut_in_motion", "the same in motion, and the arm can be stopped", in_motion),
-    Check::new(Faults, "cut_while_streaming", "the same between setpoints, and the arm stops", while_streaming),
-    Check::new(Faults, "cut_in_error", "the same in error: reconnecting clears nothing", in_error),
+    Check::new(
+        Faults,
+        "cut_when_enabled",
+        "a cut connection reconnects while enabled, and the arm holds",
+        when_enabled,
+    ),
+    Check::new(Faults, "cut_in_motion", "a cut connection reconnects in motion, and the arm can be stopped", in_motion),
+    Check::new(
+        Faults,
+        "cut_while_streaming",
+        "a cut connection reconnects between setpoints, and the arm stops",
+        while_streaming,
+    ),
+    Check::new(Faults, "cut_in_error", "a cut connection reconnects in error, and no error is cleared", in_error),
     Check::new(Faults, "power_cut", "after a loss of power the motors stay off", power),
     Check::new(Faults, "stop_into_the_void", "no stop is confirmed without a connection", stop_into_the_void),
 ];
@@ -44,7 +54,7 @@ fn cut(context: &mut Context) -> Result<(), String> {
 }
 
 /// Reconnects with retries, as the device thread does. Returns the joint positions [rad] after that.
-fn mend(context: &mut Context) -> Result<Vec<f64>, String> {
+fn reconnect(context: &mut Context) -> Result<Vec<f64>, String> {
     let mut began = MonotonicClock.now();
     context.until("the connection", |context| {
         began = MonotonicClock.now();
@@ -69,7 +79,7 @@ fn when_disabled(context: &mut Context) -> Result<(), String> {
     context.connect()?;
     let start = context.positions()?;
     cut(context)?;
-    mend(context)?;
+    reconnect(context)?;
     context.stays(&start, context.rest())?;
     require(!context.enabled()?, || "reconnecting switched the motors on".into())
 }
@@ -81,7 +91,7 @@ fn when_enabled(context: &mut Context) -> Result<(), String> {
     context.ready(context.first_mode())?;
     let start = context.positions()?;
     cut(context)?;
-    mend(context)?;
+    reconnect(context)?;
     context.stays(&start, 0.005)
 }
 
@@ -92,16 +102,16 @@ fn in_motion(context: &mut Context) -> Result<(), String> {
     context.ready(ControlMode::Position)?;
     set_off(context)?;
     cut(context)?;
-    mend(context)?;
+    reconnect(context)?;
     // An arm that stops on its own needs some time.
     std::thread::sleep(Duration::from_millis(300));
     let here = context.positions()?;
     std::thread::sleep(Duration::from_millis(100));
-    let went_on = farthest(&context.positions()?, &here) > 0.002;
+    let continued = farthest(&context.positions()?, &here) > 0.002;
     context.stop()?;
     let stopped = context.standstill()?;
     context.stays(&stopped, 1e-3)?;
-    context.found(if went_on {
+    context.found(if continued {
         "the arm continues its move without a client; a stop after reconnecting ends it"
     } else {
         "the arm stops when its client disconnects"
@@ -132,7 +142,7 @@ fn while_streaming(context: &mut Context) -> Result<(), String> {
     cut(context)?;
     let refused = context.adapter.write_joint_positions(&point, 1.0);
     require(refused == Err(AdapterError::NotConnected), || format!("a setpoint after the cut: {refused:?}"))?;
-    let here = mend(context)?;
+    let here = reconnect(context)?;
     let off = farthest(&here, &point);
     require(off < 0.02, || format!("it is {off:.4} rad from its last setpoint"))?;
     context.stays(&here, 0.005)
@@ -148,7 +158,7 @@ fn in_error(context: &mut Context) -> Result<(), String> {
     context.until("the error", |context| Ok(context.error()?.0 != 0))?;
     let (error, start) = (context.error()?, context.standstill()?);
     cut(context)?;
-    mend(context)?;
+    reconnect(context)?;
     context.stays(&start, 0.005)?;
     let after = context.error()?;
     require(after == error, || format!("reconnecting turned the error {error:?} into {after:?}"))
@@ -160,7 +170,7 @@ fn power(context: &mut Context) -> Result<(), String> {
     }
     context.ready(context.first_mode())?;
     cut(context)?;
-    let start = mend(context)?;
+    let start = reconnect(context)?;
     if context.row.holds_when_disabled {
         context.stays(&start, 0.005)?;
     }

@@ -79,12 +79,12 @@ fn survives(context: &mut Context, kind: FaultKind) -> Result<(), String> {
     }
     context.connect()?;
     let start = context.positions()?;
-    let struck = MonotonicClock.now();
+    let began = MonotonicClock.now();
     context.trigger_faults()?;
     // The damage may affect the next reading, or one of the streamed states.
     let mut failures = 0;
     let mut reading = JointReading::default();
-    while MonotonicClock.now().since(struck) < OBSERVATION_TIME {
+    while MonotonicClock.now().since(began) < OBSERVATION_TIME {
         match context.adapter.read_joints(&mut reading) {
             Ok(()) => {
                 let position = reading.position.get(..start.len()).unwrap_or_default();

@@ -136,7 +136,7 @@ pub struct Trace {
     written: Vec<Point>,
     measured: Vec<Point>,
     /// Time of each reading, and the number of measurements before it.
-    looks: Vec<(Mono, usize)>,
+    readings: Vec<(Mono, usize)>,
     /// Index of the first reading of each wave.
     waves: Vec<usize>,
 }
@@ -144,7 +144,7 @@ pub struct Trace {
 impl Trace {
     /// Begins a wave.
     pub fn begin_wave(&mut self) {
-        self.waves.push(self.looks.len());
+        self.waves.push(self.readings.len());
     }
 
     /// Records a setpoint.
@@ -154,7 +154,7 @@ impl Trace {
 
     /// Records a reading at `now` of a position measured at `at`. A repeated measurement is ignored.
     pub fn saw(&mut self, now: Mono, at: Mono, value: f64) {
-        self.looks.push((now, self.measured.len()));
+        self.readings.push((now, self.measured.len()));
         if self.measured.last().is_none_or(|last| last.at < at) {
             self.measured.push(Point { at, value });
         }
@@ -163,13 +163,13 @@ impl Trace {
     /// Estimates the lag [s] from the waves without gaps. If there are none, from those with the shortest gaps; `None`
     /// if these are too long.
     pub fn lag(&self) -> Option<f64> {
-        let ends = self.waves.iter().skip(1).copied().chain([self.looks.len()]);
+        let ends = self.waves.iter().skip(1).copied().chain([self.readings.len()]);
         let waves: Vec<Range<usize>> = self.waves.iter().zip(ends).map(|(first, end)| *first..end).collect();
         let kept = |most: f64| {
             let even = waves.iter().filter(|wave| self.gaps((*wave).clone()) <= most);
             let measured = even.filter_map(|wave| {
-                let first = self.looks.get(wave.start)?.1;
-                let end = self.looks.get(wave.end).map_or(self.measured.len(), |look| look.1);
+                let first = self.readings.get(wave.start)?.1;
+                let end = self.readings.get(wave.end).map_or(self.measured.len(), |look| look.1);
                 self.measured.get(first..end)
             });
             measured.flatten().copied().collect::<Vec<_>>()
@@ -179,8 +179,8 @@ impl Trace {
 
     /// Returns the part of a wave's time in gaps; 1 for a wave without readings.
     fn gaps(&self, wave: Range<usize>) -> f64 {
-        let looks = self.looks.get(wave).unwrap_or_default();
-        let pairs = looks.iter().zip(looks.iter().skip(1));
+        let readings = self.readings.get(wave).unwrap_or_default();
+        let pairs = readings.iter().zip(readings.iter().skip(1));
         let intervals: Vec<f64> = pairs.map(|((from, _), (to, _))| to.seconds_since(*from)).collect();
         let Some(median) = median(&mut intervals.clone()) else { return 1.0 };
         let gap = MIN_GAP.max(GAP_IN_MEDIANS * median);

@@ -148,7 +148,7 @@ fn a_state_that_is_read_twice_counts_once_and_slow_reads_are_no_gaps() {
             trace.saw(point.at, measured.at, value);
         }
     }
-    assert!(trace.measured.len() < trace.looks.len() * 6 / 10);
+    assert!(trace.measured.len() < trace.readings.len() * 6 / 10);
     close(trace.lag(), 0.06, 0.002);
 }
 

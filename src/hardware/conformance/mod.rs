@@ -24,6 +24,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use crate::hardware::registry::AdapterSpec;
+use crate::sync::{lock, panic_text};
 
 /// Effect of a check on the arm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -110,11 +111,7 @@ pub fn run_on(subject: &Subject, check: &Check) -> (Outcome, Option<String>) {
         Ok(Ok((None, found))) => (Outcome::Passed, found),
         Ok(Ok((Some(why), _))) => (Outcome::Skipped(why), None),
         Ok(Err(why)) => (Outcome::Failed(why), None),
-        Err(panic) => {
-            let text = panic.downcast_ref::<String>().map(String::as_str);
-            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
-            (Outcome::Failed(format!("panicked: {text}")), None)
-        }
+        Err(panic) => (Outcome::Failed(format!("panicked: {}", panic_text(&*panic))), None),
     }
 }
 
@@ -124,12 +121,12 @@ const MAX_PARALLEL: usize = 12;
 /// A check, its result, and its finding for the report.
 pub type Made = (&'static Check, Outcome, Option<String>);
 
-/// Runs checks on a subject until `interrupted` returns true. `tell` is called after each check, from any thread.
+/// Runs checks on a subject until `interrupted` returns true. Calls `report` after each check, from any thread.
 /// Results are in the order of the checks.
 pub fn run_all(
     subject: &Subject,
     checks: &[&'static Check],
-    tell: &(dyn Fn(&Check, &Outcome) + Sync),
+    report: &(dyn Fn(&Check, &Outcome) + Sync),
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Vec<Made> {
     let next = AtomicUsize::new(0);
@@ -143,8 +140,8 @@ pub fn run_all(
                     let index = next.fetch_add(1, Ordering::Relaxed);
                     let Some(check) = checks.get(index).filter(|_| !interrupted()) else { return };
                     let (outcome, found) = run_on(subject, check);
-                    tell(check, &outcome);
-                    made.lock().unwrap_or_else(|e| e.into_inner()).push((index, (*check, outcome, found)));
+                    report(check, &outcome);
+                    lock(&made).push((index, (*check, outcome, found)));
                 }
             });
         }

@@ -44,9 +44,9 @@ fn look(context: &mut Context) -> Result<Result<Option<Mono>, ()>, String> {
 
 /// Waits until delayed states have arrived. Returns the final stamp, or `None` when readings fail.
 fn settle(context: &mut Context) -> Result<Option<Mono>, String> {
-    let struck = MonotonicClock.now();
-    let mut last = (Mono::ZERO, struck);
-    while MonotonicClock.now().since(struck) < MAX_DELAY {
+    let began = MonotonicClock.now();
+    let mut last = (Mono::ZERO, began);
+    while MonotonicClock.now().since(began) < MAX_DELAY {
         let now = MonotonicClock.now();
         match look(context)? {
             Err(()) => return Ok(None),

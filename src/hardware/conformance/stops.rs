@@ -170,7 +170,7 @@ fn stop_gripper_on_its_way(context: &mut Context, target: f64) -> Result<Option<
     let mut rest = (context.gripper()?, MonotonicClock.now());
     context.until("the gripper's rest", |context| {
         let (opening, now) = (context.gripper()?, MonotonicClock.now());
-        if let Some(here) = opening.and_then(|opening| stop.look(opening, now)) {
+        if let Some(here) = opening.and_then(|opening| stop.observe(opening, now)) {
             context.command_gripper(here).map_err(|e| format!("holding the gripper: {e}"))?;
         }
         if left(opening) != left(rest.0) {

@@ -29,33 +29,33 @@ pub const CHECKS: &[Check] = &[
 ];
 
 const ASKED: &str = "its state is polled";
-/// How often each thing is tried. The limits below leave room for news that come at the wrong moment and for a
-/// machine that is busy: an adapter that is wrong is wrong nearly every time.
+/// Attempts per check. The limits below tolerate states that arrive between two calls, and a busy machine: a faulty
+/// adapter fails nearly every attempt.
 const TRIES: usize = 60;
 /// Longest wait for the next state.
 const STATE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Whether the adapter's descriptor becomes readable within `limit`.
+/// Returns whether the adapter's descriptor becomes readable within `limit`.
 fn readable(context: &Context, limit: Duration) -> Result<bool, String> {
-    let state = context.adapter.state_fd().ok_or("state_fd is None all of a sudden")?;
+    let state = context.adapter.state_fd().ok_or("state_fd has become None")?;
     let timeout = Timespec { tv_sec: limit.as_secs() as i64, tv_nsec: i64::from(limit.subsec_nanos()) };
     let borrowed = state.as_fd();
     let mut fds = [PollFd::new(&borrowed, PollFlags::IN)];
     poll(&mut fds, Some(&timeout)).map(|n| n > 0).map_err(|e| format!("poll of state_fd: {e}"))
 }
 
-/// Waits for the next state as the device thread does, which also reads when a period has passed without news.
-pub(super) fn await_news(context: &mut Context) -> Result<(), String> {
+/// Waits for the next state as the device thread does, which also reads after a period without a new state.
+pub(super) fn await_state(context: &mut Context) -> Result<(), String> {
     let period = Duration::from_secs_f64(1.0 / context.adapter.get_info().native_rate);
     let end = MonotonicClock.now().after(STATE_TIMEOUT);
     while !readable(context, period)? {
-        require(MonotonicClock.now() < end, || format!("nothing came for {STATE_TIMEOUT:?}"))?;
+        require(MonotonicClock.now() < end, || format!("no new state within {STATE_TIMEOUT:?}"))?;
         stamp(context)?;
     }
     Ok(())
 }
 
-/// One reading's stamp, which such a device must give.
+/// Returns the stamp of a reading; a device that streams its state must have one.
 fn stamp(context: &mut Context) -> Result<Mono, String> {
     let mut reading = JointReading::default();
     context.adapter.read_joints(&mut reading).map_err(|e| format!("read_joints: {e}"))?;
@@ -70,12 +70,12 @@ fn wakes(context: &mut Context) -> Result<(), String> {
     let first = stamp(context)?;
     let (mut last, mut newer) = (first, 0);
     for _ in 0..TRIES {
-        await_news(context)?;
+        await_state(context)?;
         let now = stamp(context)?;
         newer += usize::from(now > last);
         last = now;
     }
-    // A bus may bring one state in several frames, each of which wakes.
+    // On a bus, one state may arrive in several frames, each of which wakes the reader.
     require(newer >= TRIES / 20, || format!("of {TRIES} wake-ups {newer} brought a new stamp"))?;
     context.found(format!("{:.0} states a second", newer as f64 / last.seconds_since(first)))
 }
@@ -85,20 +85,20 @@ fn drains(context: &mut Context) -> Result<(), String> {
     if context.adapter.state_fd().is_none() {
         return context.skip(ASKED);
     }
-    // Room for several packets to be waiting.
+    // Long enough for several packets to arrive.
     let period = Duration::from_secs_f64(8.0 / context.adapter.get_info().native_rate);
     let mut quiet = 0;
     for _ in 0..TRIES / 3 {
         std::thread::sleep(period.clamp(Duration::from_millis(5), Duration::from_millis(100)));
-        await_news(context)?;
-        // A second read is for what came during the first, or is the answer to a question that it asked.
+        await_state(context)?;
+        // The second read takes what arrived during the first one, or the reply to its request.
         for _ in 0..2 {
             stamp(context)?;
         }
         quiet += usize::from(!readable(context, Duration::ZERO)?);
     }
     let loud = TRIES / 3 - quiet;
-    require(quiet >= TRIES / 12, || format!("after {loud} of {} reads there was still something to read", TRIES / 3))
+    require(quiet >= TRIES / 12, || format!("after {loud} of {} reads the descriptor was still readable", TRIES / 3))
 }
 
 fn never_waits(context: &mut Context) -> Result<(), String> {
@@ -108,7 +108,7 @@ fn never_waits(context: &mut Context) -> Result<(), String> {
     }
     let (mut same, mut times) = (0, Vec::with_capacity(TRIES));
     for _ in 0..TRIES {
-        await_news(context)?;
+        await_state(context)?;
         let before = stamp(context)?;
         let began = MonotonicClock.now();
         let after = stamp(context)?;
@@ -119,5 +119,5 @@ fn never_waits(context: &mut Context) -> Result<(), String> {
     times.sort();
     let median = times.get(TRIES / 2).copied().unwrap_or_default();
     let period = Duration::from_secs_f64(1.0 / context.adapter.get_info().native_rate);
-    require(median < period / 3, || format!("a read without news takes {median:?} of a period of {period:?}"))
+    require(median < period / 3, || format!("a read without a new state takes {median:?} of a period of {period:?}"))
 }

@@ -30,8 +30,9 @@ impl GripperStop {
         self.until = None;
     }
 
-    /// Takes an opening [m] read after the stop. Returns where to hold the gripper, once it is seen moving.
-    pub fn look(&mut self, opening: f64, now: Mono) -> Option<f64> {
+    /// Takes an opening [m] read after the stop. Returns the opening at which to hold the gripper, once it is seen
+    /// moving.
+    pub fn observe(&mut self, opening: f64, now: Mono) -> Option<f64> {
         self.until = self.until.filter(|until| now < *until);
         self.until?;
         let Some(last) = self.last else {
@@ -55,29 +56,32 @@ impl GripperStop {
 mod tests {
     use super::*;
 
-    fn looks(openings: &[f64]) -> Option<f64> {
+    fn held_at(openings: &[f64]) -> Option<f64> {
         let mut stop = GripperStop::default();
         stop.begin(Mono(0));
-        openings.iter().zip(1..).find_map(|(opening, i)| stop.look(*opening, Mono(i * 10_000_000)))
+        openings.iter().zip(1..).find_map(|(opening, i)| stop.observe(*opening, Mono(i * 10_000_000)))
     }
 
     #[test]
     fn a_moving_gripper_is_held_where_it_is() {
-        assert_eq!(looks(&[0.05, 0.049, 0.048, 0.047]), Some(0.048));
+        assert_eq!(held_at(&[0.05, 0.049, 0.048, 0.047]), Some(0.048));
         // Slow motion with noise.
-        assert_eq!(looks(&[0.05, 0.0501, 0.0502, 0.0503, 0.0504, 0.0505, 0.0506, 0.0507]), Some(0.0506));
+        assert_eq!(held_at(&[0.05, 0.0501, 0.0502, 0.0503, 0.0504, 0.0505, 0.0506, 0.0507]), Some(0.0506));
     }
 
     #[test]
     fn a_gripper_at_rest_gets_no_target() {
-        assert_eq!(looks(&[0.05, 0.0501, 0.0499, 0.0501, 0.05]), None, "noise");
-        assert_eq!(looks(&[0.05, 0.04, 0.04, 0.04]), None, "it was at rest before the first reading after the stop");
-        assert_eq!(looks(&[0.05, 0.0497, 0.05, 0.0497]), None, "give");
+        assert_eq!(held_at(&[0.05, 0.0501, 0.0499, 0.0501, 0.05]), None, "noise");
+        assert_eq!(held_at(&[0.05, 0.04, 0.04, 0.04]), None, "it came to a stop before the second reading");
+        assert_eq!(held_at(&[0.05, 0.0497, 0.05, 0.0497]), None, "compliance");
         let mut stop = GripperStop::default();
-        assert_eq!((stop.look(0.05, Mono(1)), stop.look(0.04, Mono(2)), stop.look(0.03, Mono(3))), (None, None, None));
+        assert_eq!(
+            (stop.observe(0.05, Mono(1)), stop.observe(0.04, Mono(2)), stop.observe(0.03, Mono(3))),
+            (None, None, None)
+        );
         stop.begin(Mono(0));
-        assert_eq!(stop.look(0.05, Mono(1)), None);
-        assert_eq!(stop.look(0.04, Mono(3_000_000_000)), None, "too late: this may be motion by hand");
-        assert_eq!(stop.look(0.03, Mono(3_000_000_001)), None);
+        assert_eq!(stop.observe(0.05, Mono(1)), None);
+        assert_eq!(stop.observe(0.04, Mono(3_000_000_000)), None, "too late: this may be motion by hand");
+        assert_eq!(stop.observe(0.03, Mono(3_000_000_001)), None);
     }
 }

@@ -14,7 +14,7 @@ const EPISODES: usize = 16;
 /// Maximum log lines per episode.
 const MAX_LINES_PER_EPISODE: usize = 8;
 
-/// A period of trouble of one kind.
+/// A period during which one kind of trouble lasted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// When it began.
@@ -55,7 +55,7 @@ pub struct Health {
     pub stop_confirmed: AtomicU32,
     /// `ArmCommand::stop_seq` of the last stop that was sent.
     pub stop_sent: AtomicU32,
-    /// Mean time between states [ns]; a mean of rates would count short pauses for too much.
+    /// Moving average of the time between states [ns]. An average of rates would give short intervals too much weight.
     interval_ns: AtomicU64,
     text: Mutex<Text>,
     codes: Mutex<Option<RobotState>>,
@@ -69,8 +69,8 @@ pub struct Health {
 struct Text {
     error: String,
     episodes: VecDeque<Episode>,
-    /// Log lines since the last time without trouble.
-    told: Vec<String>,
+    /// Texts logged since the last time without trouble.
+    logged: Vec<String>,
 }
 
 impl Health {
@@ -92,7 +92,7 @@ impl Health {
         }
     }
 
-    /// Raises `wake` whenever a stop or a gripper command is answered.
+    /// Sets the event to raise whenever a stop or a gripper command is answered. Only the first call has an effect.
     pub fn wake_on_answers(&self, wake: Wake) {
         let _ = self.listener.set(wake);
     }
@@ -115,7 +115,7 @@ impl Health {
         self.answered();
     }
 
-    /// A stop or a gripper command was answered.
+    /// Raises the listener's event: a stop or a gripper command was answered.
     pub(super) fn answered(&self) {
         if let Some(listener) = self.listener.get() {
             listener.raise();
@@ -145,18 +145,18 @@ impl Health {
         lock(&self.text).episodes.iter().cloned().collect()
     }
 
-    /// Counts trouble. Returns `true` if it deserves a log line. Trouble that repeats before the end of the episode
-    /// does not, even if other trouble came between: on a lost arm, reads and writes fail in turn.
+    /// Counts trouble. Returns whether it is to be logged: each text once until the trouble is over, because on a lost
+    /// arm reads and writes fail in turn.
     pub(super) fn trouble(&self, now: Mono, text: &str) -> bool {
         let mut all = lock(&self.text);
         let open = all.episodes.back_mut().filter(|e| e.until.is_none());
         if let Some(open) = open {
             open.count += 1;
-            if all.told.iter().any(|told| told == text) || all.told.len() == MAX_LINES_PER_EPISODE {
+            if all.logged.iter().any(|logged| logged == text) || all.logged.len() == MAX_LINES_PER_EPISODE {
                 return false;
             }
         }
-        all.told.push(text.to_owned());
+        all.logged.push(text.to_owned());
         if let Some(before) = all.episodes.back_mut().filter(|e| e.until.is_none()) {
             before.until = Some(now);
         }
@@ -173,7 +173,7 @@ impl Health {
         let last = all.episodes.back_mut().filter(|e| e.until.is_none())?;
         last.until = Some(now);
         let text = last.text.clone();
-        all.told.clear();
+        all.logged.clear();
         Some(text)
     }
 }
@@ -200,14 +200,14 @@ mod tests {
     #[test]
     fn trouble_is_logged_once_per_episode() {
         let health = Health::default();
-        let told = |text: &str| health.trouble(Mono(1), text);
-        assert!(told("no state") && told("no command"));
-        assert!((0..9).all(|_| !told("no state") && !told("no command")), "alternating trouble is not new");
+        let logged = |text: &str| health.trouble(Mono(1), text);
+        assert!(logged("no state") && logged("no command"));
+        assert!((0..9).all(|_| !logged("no state") && !logged("no command")), "alternating trouble is not new");
         let counts: Vec<u64> = health.episodes().iter().map(|e| e.count).collect();
         assert_eq!(counts, [2, 19], "the first episode, and the second that replaced it");
         assert_eq!(health.over(Mono(2)).as_deref(), Some("no command"));
         assert_eq!(health.over(Mono(3)), None);
-        assert!(told("no state"), "a new episode is logged");
-        assert_eq!((0..99).filter(|n| told(&format!("trouble {n}"))).count(), MAX_LINES_PER_EPISODE - 1);
+        assert!(logged("no state"), "a new episode is logged");
+        assert_eq!((0..99).filter(|n| logged(&format!("trouble {n}"))).count(), MAX_LINES_PER_EPISODE - 1);
     }
 }

@@ -144,7 +144,7 @@ impl Device {
         self.wake.clone()
     }
 
-    /// Returns the thread's counters and texts.
+    /// Returns the thread's counters, and its texts for status and log.
     pub fn health(&self) -> &Arc<Health> {
         &self.health
     }

@@ -13,7 +13,7 @@ const STABLE_FOR: Duration = Duration::from_millis(100);
 const READINGS: u32 = 3;
 /// Measurement noise [rad].
 const NOISE: f64 = 0.02;
-/// Tolerated apparent speed, as a factor of the top speed.
+/// Tolerated apparent speed, as a factor of the velocity limit.
 const SPEED_MARGIN: f64 = 1.5;
 
 /// Why positions are not plausible.
@@ -37,12 +37,12 @@ pub struct Plausible {
 }
 
 impl Plausible {
-    /// Starts over: a reading failed, or the connection is new.
+    /// Discards earlier readings: a reading failed, or the connection is new.
     pub fn reset(&mut self) {
         *self = Self::default();
     }
 
-    /// Adds a reading that follows `before`. `speed` is the top speed of the fastest joint [rad/s].
+    /// Adds a reading; `before` is the previous state. `speed` is the velocity limit of the fastest joint [rad/s].
     pub fn take(&mut self, reading: &JointReading, stamp: Mono, before: &ArmState, speed: f64, config: &Supervision) {
         let dof = before.dof;
         let zero = reading.position.iter().take(dof).all(|q| *q == 0.0);

@@ -22,6 +22,7 @@ use crate::rt::due::Due;
 use crate::rt::host;
 use crate::rt::slot::{SlotReader, SlotWriter};
 use crate::rt::wake::Wake;
+use crate::sync::panic_text;
 
 /// Consecutive failures before the connection is `Stale` (reads) or `Faulted` (writes).
 const MAX_FAILURES: u32 = 3;
@@ -85,8 +86,10 @@ pub(super) struct Worker {
     last_read: Mono,
     next_read: Mono,
     read_time: f64,
+    /// Time of the next attempt to reconnect, and the wait after it.
     reconnect: (Mono, Duration),
 }
+
 impl Worker {
     pub(super) fn new(
         config: DeviceConfig,
@@ -138,9 +141,7 @@ impl Worker {
         host::enter_realtime(host::DEVICE_PRIORITY);
         let outcome = catch_unwind(AssertUnwindSafe(|| while !self.cycle(&mut *adapter, &orders) {}));
         if let Err(panic) = outcome {
-            let what = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
-            let what = what.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
-            self.trouble(&format!("the adapter panicked: {what}"));
+            self.trouble(&format!("the adapter panicked: {}", panic_text(&*panic)));
             self.state.link = Link::Faulted;
             self.states.write(&self.state);
             let _ = catch_unwind(AssertUnwindSafe(|| adapter.write_stop()));
@@ -211,8 +212,9 @@ impl Worker {
                 let _ = reply.send(self.activate(adapter));
             }
             Order::Disable(reply) => {
-                self.expect_nothing(Some(false));
                 let result = self.while_connected(adapter, |a| a.write_enable(false));
+                // After a refusal the motors are still on, which is no interference.
+                self.expect_nothing(result.is_ok().then_some(false));
                 self.turn = ENABLED_TURN;
                 self.read(adapter);
                 let _ = reply.send(result);

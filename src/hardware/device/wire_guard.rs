@@ -7,7 +7,7 @@ use crate::arm::{ArmCommand, ArmState, Supervision};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
-/// Number of periods that one step may cover.
+/// Maximum time that one step may cover, in periods.
 const PERIODS: u32 = 2;
 /// Tolerance for rounding, relative to a step and absolute [rad, rad/s].
 const ROUNDING: (f64, f64) = (1e-6, 1e-6);
@@ -98,16 +98,16 @@ impl WireGuard {
         }
     }
 
-    /// Returns whether the first position is where the arm is, or where it was commanded last and still is.
+    /// Returns whether the first setpoint is at the measured position, or repeats the last setpoint while the arm is
+    /// still there.
     fn starts_at(&self, command: &ArmCommand, state: &ArmState) -> bool {
         // Slightly more than the tick allows, which used an earlier reading.
         let seed = self.supervision.seed_tolerance().max(2.0 * self.supervision.accuracy);
-        let standing = self.last.filter(|last| last.mode.is_position());
+        let last = self.last.filter(|last| last.mode.is_position());
         (0..self.dof).all(|j| {
             let (Some(value), Some(q)) = (command.values.get(j), state.position.get(j)) else { return false };
-            let stands = standing.and_then(|last| last.values.get(j).copied());
-            let near = stands.is_some_and(|s| s == *value && (s - q).abs() <= 2.0 * self.supervision.accuracy + seed);
-            (value - q).abs() <= seed || near
+            let repeats = last.is_some_and(|last| last.values.get(j) == Some(value));
+            (value - q).abs() <= if repeats { 2.0 * self.supervision.accuracy + seed } else { seed }
         })
     }
 

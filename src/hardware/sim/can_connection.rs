@@ -138,7 +138,7 @@ impl CanConnection {
     }
 
     /// Ends faults whose time is over.
-    pub fn mend(&mut self, now: Mono) {
+    pub fn end_faults(&mut self, now: Mono) {
         let Kind::Memory(bus) = &self.kind else { return };
         if self.dark.take_if(|dark| now >= *dark).is_some() {
             bus.acknowledge();

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use super::arm::{Delivery, HasArm};
 use super::can_connection::CanConnection;
+use super::delivery::MIN_CUT;
 use super::events::{self, SimEvent};
 use super::faults::{Fault, FaultKind};
 use crate::clock::{Clock, Mono, MonotonicClock};
@@ -20,8 +21,6 @@ use crate::rt::host;
 use crate::rt::wake::Wake;
 use crate::sync::lock;
 
-/// Minimum duration of a fault that cuts the wire: longer than any adapter tolerates silence.
-const MIN_CUT: Duration = Duration::from_millis(800);
 /// Maximum number of missed periods that are sent late after this computer has stalled.
 const MAX_LATE_PERIODS: u32 = 10;
 
@@ -104,9 +103,9 @@ impl<C: CanController> CanServer<C> {
             period,
             frames: Vec::with_capacity(64),
             stalled: Mono::ZERO,
-            deaf: Mono::ZERO,
+            offline_until: Mono::ZERO,
             silent: false,
-            heard: false,
+            client_seen: false,
         };
         let builder = std::thread::Builder::new().name(format!("{name}-sim"));
         let thread = builder.spawn(move || arm.run()).map_err(failed)?;
@@ -118,7 +117,7 @@ impl<C: CanController> CanServer<C> {
         &self.address
     }
 
-    /// Calls `act` with the controller and the current time.
+    /// Calls `f` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         let mut controller = self.shared.controller();
         f(&mut controller, MonotonicClock.now())
@@ -168,11 +167,11 @@ struct Arm<C> {
     /// The arm is stalled until then; arriving frames wait.
     stalled: Mono,
     /// The arm neither receives nor sends until then.
-    deaf: Mono,
+    offline_until: Mono,
     /// In this period the arm sends nothing.
     silent: bool,
-    /// A frame has arrived.
-    heard: bool,
+    /// Whether a client has sent a frame.
+    client_seen: bool,
 }
 
 impl<C: CanController> Arm<C> {
@@ -200,8 +199,8 @@ impl<C: CanController> Arm<C> {
 
     /// Runs once per period: begins and ends faults, and sends the state.
     fn tick(&mut self, now: Mono) {
-        self.connection.mend(now);
-        if now < self.stalled || now < self.deaf {
+        self.connection.end_faults(now);
+        if now < self.stalled || now < self.offline_until {
             return;
         }
         self.frames.clear();
@@ -223,15 +222,15 @@ impl<C: CanController> Arm<C> {
             }
             Delivery::Stall(time) => self.stalled = now.after(time),
             Delivery::PowerLoss(time) => {
-                self.deaf = now.after(time.max(controller.start_time()));
-                self.connection.lose_power(self.deaf);
+                self.offline_until = now.after(time.max(controller.start_time()));
+                self.connection.lose_power(self.offline_until);
             }
             Delivery::Disconnect(time) => self.disconnect(now, time),
             Delivery::BusOff => self.connection.bus_off(),
             _ => {}
         }
         drop(controller);
-        if now >= self.stalled && now >= self.deaf {
+        if now >= self.stalled && now >= self.offline_until {
             self.send();
         }
     }
@@ -239,7 +238,7 @@ impl<C: CanController> Arm<C> {
     /// Takes the interface down; if that is not possible, the arm neither receives nor sends.
     fn disconnect(&mut self, now: Mono, time: Duration) {
         if !self.connection.go_down(now, time) {
-            self.deaf = now.after(time.max(MIN_CUT));
+            self.offline_until = now.after(time.max(MIN_CUT));
         }
     }
 
@@ -249,9 +248,9 @@ impl<C: CanController> Arm<C> {
         self.connection.open(now);
         while let Some(event) = self.connection.receive(now) {
             if let CanEvent::Frame(frame) = event
-                && now >= self.deaf
+                && now >= self.offline_until
             {
-                if !std::mem::replace(&mut self.heard, true) {
+                if !std::mem::replace(&mut self.client_seen, true) {
                     events::note(SimEvent::Connected);
                 }
                 self.shared.controller().on_frame(&frame, now, &mut self.frames);

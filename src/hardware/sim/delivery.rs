@@ -2,6 +2,9 @@
 
 use std::time::Duration;
 
+/// Minimum duration of a fault that cuts the connection: longer than any adapter tolerates silence.
+pub(super) const MIN_CUT: Duration = Duration::from_millis(800);
+
 /// How a response or report is delivered.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Delivery {

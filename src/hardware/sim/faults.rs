@@ -86,13 +86,13 @@ impl FaultKind {
 #[serde(deny_unknown_fields)]
 pub struct Fault {
     /// When it begins: time since the first connection [s].
-    #[serde(default, deserialize_with = "seconds")]
+    #[serde(default, deserialize_with = "non_negative")]
     #[schemars(range(min = 0))]
     pub at: f64,
     /// What goes wrong.
     pub kind: FaultKind,
     /// How long it stays active [s]; 0 = until it has been played `count` times.
-    #[serde(default, deserialize_with = "seconds")]
+    #[serde(default, deserialize_with = "non_negative")]
     #[schemars(range(min = 0))]
     pub duration: f64,
     /// How often it is played; 0 = without limit during `duration`.
@@ -103,7 +103,7 @@ pub struct Fault {
     #[schemars(range(min = 1))]
     pub code: u16,
     /// How far the arm sinks, for `sag` [rad].
-    #[serde(default = "default_amount", deserialize_with = "seconds")]
+    #[serde(default = "default_amount", deserialize_with = "non_negative")]
     pub amount: f64,
     /// Number of the joint, from 1, for `blocked`.
     #[serde(default = "default_joint")]
@@ -125,16 +125,16 @@ fn default_joint() -> usize {
 
 /// Duration of a stall that states none.
 pub const DEFAULT_STALL: Duration = Duration::from_secs(1);
-/// Latest time in a script [s]: eleven days.
-const LONGEST: f64 = 1e6;
+/// Largest number in a script [s or rad].
+const LARGEST: f64 = 1e6;
 
 /// Reads a number that is neither negative nor too large.
-fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+fn non_negative<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     let value = f64::deserialize(deserializer)?;
-    if (0.0..=LONGEST).contains(&value) {
+    if (0.0..=LARGEST).contains(&value) {
         Ok(value)
     } else {
-        Err(serde::de::Error::custom(format!("{value} is not between 0 and {LONGEST}")))
+        Err(serde::de::Error::custom(format!("{value} is not between 0 and {LARGEST}")))
     }
 }
 
@@ -178,7 +178,7 @@ impl Fault {
 
     /// Returns how long from `now` [s since the first connection] the fault still lasts, if it has a duration.
     pub fn left(&self, now: f64) -> Option<Duration> {
-        let left = (self.at + self.duration - now).clamp(0.0, LONGEST);
+        let left = (self.at + self.duration - now).clamp(0.0, LARGEST);
         (self.duration > 0.0).then(|| Duration::from_secs_f64(left))
     }
 

@@ -1,7 +1,7 @@
 //! The simulation kit for emulators. An emulator is a device model, the controller's side of its protocol, built on
 //! these parts:
 //!
-//! s/| part | what it is |/| part | contains |/
+//! | part | contents |
 //! |---|---|
 //! | [`arm`] | [`SimArm`](arm::SimArm): joints with a motor each, modes, error, E-stop line, uptime; its options `sim` |
 //! | [`plant`] | how the joints move: limits, lag, droop under load, falling without power, blocked and sagging joints |

@@ -15,6 +15,8 @@ const MAX_LAG: f64 = 0.5;
 const MAX_DROOP: f64 = 0.1;
 
 /// Settings of an emulator: the `sim` part of an arm's options. Arms with more settings there have these too.
+// Arms with more settings repeat these fields instead of using serde's `flatten`, which would lose the position of a
+// mistake in the blueprint and the arm's own defaults, and does not work with `deny_unknown_fields`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimOptions {
@@ -45,8 +47,8 @@ impl SimOptions {
         self
     }
 
-    /// Refuses a pose outside `limits`, values out of range, and faults that are not in `playable`. `name` is the name
-    /// of the adapter.
+    /// Returns an error for a pose outside `limits`, values out of range, and faults that are not in `playable`. `name`
+    /// is the name of the adapter.
     pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), ConfigError> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))
@@ -56,7 +58,7 @@ impl SimOptions {
     }
 }
 
-/// Refuses `initial_positions` [rad] that are neither empty nor a pose within `limits`.
+/// Returns an error for `initial_positions` [rad] that are neither empty nor a pose within `limits`.
 pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), ConfigError> {
     let (dof, given) = (limits.position_lower.len(), positions.len());
     let needed = format!("initial_positions must be {dof} positions [rad] within the joint limits");

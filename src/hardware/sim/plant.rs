@@ -18,6 +18,7 @@ const FRICTION: f64 = 0.5;
 const HEADROOM: f64 = 2.0;
 /// Largest first-order part of a lag [s]; the rest is dead time.
 const FIRST_ORDER: f64 = 0.02;
+
 /// How joints follow servo setpoints and velocities.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Tracking {
@@ -55,12 +56,12 @@ pub struct Plant {
     droop: f64,
     /// Fraction of the top speed in drive `Position` (0–1].
     speed: f64,
-    /// Speed at which joints fall to their lower limits when disabled [rad/s]; 0 = brakes hold.
+    /// Speed at which joints without power fall to their rest positions [rad/s]; 0 = brakes hold.
     fall: f64,
     /// How far the second joint still has to sink [rad].
     sag: f64,
     /// Time since the last servo setpoint, and between the two before it [s].
-    since_set_point: f64,
+    since_setpoint: f64,
     interval: f64,
     /// How far the integration is ahead of the present [s]: less than a step.
     ahead: f64,
@@ -92,7 +93,7 @@ impl Plant {
             speed: 1.0,
             fall,
             sag: 0.0,
-            since_set_point: 0.0,
+            since_setpoint: 0.0,
             interval: 0.0,
             ahead: 0.0,
         }
@@ -114,7 +115,7 @@ impl Plant {
         Self { droop, ..self }
     }
 
-    /// Joint positions [rad].
+    /// Returns the joint positions [rad].
     pub fn positions(&self) -> Joints {
         // Interpolates back from the end of the last step to the present; an ideal servo is at its setpoint.
         let exact = self.drive == Drive::Servo && self.tracking == Tracking::Ideal;
@@ -122,12 +123,12 @@ impl Plant {
         self.joints.map(|joint| joint.position - joint.velocity * back)
     }
 
-    /// Joint velocities [rad/s].
+    /// Returns the joint velocities [rad/s].
     pub fn velocities(&self) -> Joints {
         self.joints.map(|joint| joint.velocity)
     }
 
-    /// Joint torques [Nm]: friction only.
+    /// Returns the joint torques [Nm]: friction only.
     pub fn efforts(&self) -> Joints {
         self.joints.map(|joint| joint.velocity * FRICTION)
     }
@@ -191,18 +192,18 @@ impl Plant {
             return;
         }
         if let Some(target) = self.delayed.push(target) {
-            self.follow_set_point(&target);
+            self.follow_setpoint(&target);
         }
     }
 
-    fn follow_set_point(&mut self, target: &[f64]) {
+    fn follow_setpoint(&mut self, target: &[f64]) {
         let following = self.drive == Drive::Servo;
         let before = self.joints.map(|joint| joint.target);
         if !self.drive_to(Drive::Servo, target) {
             return;
         }
-        self.interval = (self.since_set_point - self.ahead).clamp(1e-3, CREDIT);
-        self.since_set_point = self.ahead;
+        self.interval = (self.since_setpoint - self.ahead).clamp(1e-3, CREDIT);
+        self.since_setpoint = self.ahead;
         let (interval, ahead) = (self.interval, self.ahead);
         for (joint, before) in self.active_mut().iter_mut().zip(before) {
             joint.pace = if following { (joint.target - before) / interval } else { 0.0 };
@@ -250,7 +251,7 @@ impl Plant {
         let mut left = if dt.is_finite() { dt.max(0.0) } else { 0.0 };
         while let Some((wait, target)) = self.delayed.pass(left) {
             self.integrate(wait);
-            self.follow_set_point(&target);
+            self.follow_setpoint(&target);
             left -= wait;
         }
         self.integrate(left);
@@ -262,7 +263,7 @@ impl Plant {
         while self.ahead < -1e-6 * STEP {
             if self.at_rest() {
                 let passed = -self.ahead;
-                self.since_set_point += passed;
+                self.since_setpoint += passed;
                 self.active_mut().iter_mut().for_each(|joint| joint.credit = (joint.credit + passed).min(CREDIT));
                 self.ahead = 0.0;
                 return;
@@ -311,8 +312,8 @@ impl Plant {
     }
 
     fn step(&mut self, h: f64) {
-        self.since_set_point += h;
-        let pause = self.since_set_point > 1.5 * self.interval;
+        self.since_setpoint += h;
+        let pause = self.since_setpoint > 1.5 * self.interval;
         let (drive, tracking, speed, fall) = (self.drive, self.tracking, self.speed, self.fall);
         for joint in self.active_mut() {
             if joint.blocked {

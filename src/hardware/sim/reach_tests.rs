@@ -1,4 +1,4 @@
-//! Checks of the arms' kinematic chains.
+//! Test of a kinematic chain, for the arms' tests.
 
 use super::*;
 

@@ -6,6 +6,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::arm::HasArm;
+use super::delivery::MIN_CUT;
 use super::events::{self, SimEvent};
 use super::faults::Fault;
 use super::stream::{Controller, Ending, Shared};
@@ -17,8 +18,6 @@ use crate::joint::Joints;
 use crate::rt::host;
 use crate::sync::lock;
 
-/// Minimum duration of a fault that cuts the line: longer than any adapter tolerates silence.
-const MIN_CUT: Duration = Duration::from_millis(800);
 /// How often the thread checks whether the emulator ends, while nothing arrives.
 const CHECK_PERIOD: Duration = Duration::from_millis(50);
 
@@ -42,7 +41,7 @@ impl<C: Controller> SerialServer<C> {
         let for_thread = shared.clone();
         let builder = std::thread::Builder::new().name(format!("{name}-sim"));
         let thread = builder
-            .spawn(move || live(&for_thread, pty))
+            .spawn(move || run_controller(&for_thread, pty))
             .map_err(|e| AdapterError::Io(format!("{name} emulator: {e}")))?;
         Ok(Self { shared, path, thread: Some(thread) })
     }
@@ -52,7 +51,7 @@ impl<C: Controller> SerialServer<C> {
         &self.path
     }
 
-    /// Calls `act` with the controller and the current time.
+    /// Calls `f` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         self.shared.with(f)
     }
@@ -82,10 +81,10 @@ impl<C: Controller> Drop for SerialServer<C> {
     }
 }
 
-/// The controller's thread.
-fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
+/// Serves clients until the emulator ends.
+fn run_controller<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
     host::enter_realtime(host::EMULATOR_PRIORITY);
-    let mut line = Line { pty, shared, heard: false };
+    let mut line = Line { pty, shared, client_seen: false };
     while !shared.closing() {
         let silence = match shared.serve(0, &mut line) {
             Ending::Closed => CHECK_PERIOD,
@@ -104,8 +103,8 @@ fn live<C: Controller>(shared: &Shared<C, ()>, pty: Pty) {
 struct Line<'a, C> {
     pty: Pty,
     shared: &'a Shared<C, ()>,
-    /// A client has written to it.
-    heard: bool,
+    /// Whether a client has written to it.
+    client_seen: bool,
 }
 
 impl<C: Controller> Read for Line<'_, C> {
@@ -114,7 +113,7 @@ impl<C: Controller> Read for Line<'_, C> {
             match self.pty.read(room, CHECK_PERIOD) {
                 Ok(0) => {}
                 Ok(n) => {
-                    if !std::mem::replace(&mut self.heard, true) {
+                    if !std::mem::replace(&mut self.client_seen, true) {
                         events::note(SimEvent::Connected);
                     }
                     return Ok(n);

@@ -83,7 +83,7 @@ impl<C: Controller, Client> Shared<C, Client> {
         lock(&self.line).closing
     }
 
-    /// Calls `act` with the controller and the current time.
+    /// Calls `f` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         let mut controller = lock(&self.controller);
         f(&mut controller, MonotonicClock.now())

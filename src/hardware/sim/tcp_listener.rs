@@ -19,7 +19,7 @@ use crate::sync::lock;
 const RETRY: Duration = Duration::from_millis(20);
 
 /// State of the listening thread.
-pub(super) struct Floor<C> {
+pub(super) struct ListenerThread<C> {
     inner: Arc<Inner<C>>,
     /// `None` while the controller has no power.
     listeners: Option<Vec<TcpListener>>,
@@ -37,7 +37,7 @@ struct Reader {
     last: Vec<u8>,
 }
 
-impl<C: Controller> Floor<C> {
+impl<C: Controller> ListenerThread<C> {
     pub fn new(inner: Arc<Inner<C>>, listeners: Vec<TcpListener>) -> Self {
         Self { inner, listeners: Some(listeners), sessions: Vec::new(), readers: Vec::new() }
     }
@@ -59,7 +59,7 @@ impl<C: Controller> Floor<C> {
                 self.listeners = None;
                 inner.shared.wait(|line| line.dark_until);
             } else if let Some(listeners) = self.listeners.take() {
-                self.look(&listeners);
+                self.accept_clients(&listeners);
                 self.listeners = Some(listeners);
                 self.send_reports();
             } else {
@@ -74,7 +74,7 @@ impl<C: Controller> Floor<C> {
     }
 
     /// Accepts clients until a report is due.
-    fn look(&mut self, listeners: &[TcpListener]) {
+    fn accept_clients(&mut self, listeners: &[TcpListener]) {
         let due = self.readers.iter().map(|reader| reader.due).min();
         let left = due.map_or(Duration::from_secs(1), |due| due.saturating_duration_since(Instant::now()));
         let timeout = Timespec { tv_sec: left.as_secs() as i64, tv_nsec: left.subsec_nanos().into() };
@@ -92,13 +92,13 @@ impl<C: Controller> Floor<C> {
         }
         for (port, listener) in listeners.iter().enumerate().filter(|(port, _)| ready.get(*port) == Some(&true)) {
             match listener.accept() {
-                Ok((stream, _)) => self.let_in(stream, port),
+                Ok((stream, _)) => self.add_client(stream, port),
                 Err(_) => std::thread::sleep(Duration::from_millis(10)), // for example, no descriptors left: do not spin
             }
         }
     }
 
-    fn let_in(&mut self, stream: TcpStream, port: usize) {
+    fn add_client(&mut self, stream: TcpStream, port: usize) {
         let _ = stream.set_nodelay(true);
         match self.inner.ports.get(port) {
             Some((_, Port::Requests)) => {

@@ -19,7 +19,7 @@ use super::arm::HasArm;
 use super::events::{self, SimEvent};
 use super::faults::Fault;
 use super::stream::{Controller, Ending, Line, Shared};
-use super::tcp_listener::Floor;
+use super::tcp_listener::ListenerThread;
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::Emulator;
@@ -52,7 +52,7 @@ pub(super) struct Inner<C> {
     pub name: String,
     pub ports: Vec<(SocketAddr, Port)>,
     /// Maximum number of clients that send requests.
-    seats: usize,
+    max_clients: usize,
     pub shared: Shared<C, Client>,
     /// All connections were closed, including those of report readers.
     pub ended: AtomicBool,
@@ -73,25 +73,29 @@ impl<C: Controller> TcpServer<C> {
         Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1).map_err(failed)
     }
 
-    /// Serves several ports, and at most `seats` clients with requests at a time. Ports are numbered in their order
-    /// here.
-    pub fn with_ports(name: &str, controller: C, ports: Vec<(TcpListener, Port)>, seats: usize) -> io::Result<Self> {
+    /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in this order.
+    pub fn with_ports(
+        name: &str,
+        controller: C,
+        ports: Vec<(TcpListener, Port)>,
+        max_clients: usize,
+    ) -> io::Result<Self> {
         let addresses = ports.iter().map(|(listener, port)| Ok((listener.local_addr()?, *port)));
         let inner = Arc::new(Inner {
             name: name.to_owned(),
             ports: addresses.collect::<io::Result<_>>()?,
-            seats,
+            max_clients,
             shared: Shared::new(controller),
             ended: AtomicBool::new(false),
             wake: Wake::new()?,
             next_client: AtomicU64::new(0),
             refused: AtomicU64::new(0),
         });
-        let floor = Floor::new(inner.clone(), ports.into_iter().map(|(listener, _)| listener).collect());
+        let listening = ListenerThread::new(inner.clone(), ports.into_iter().map(|(listener, _)| listener).collect());
         let builder = std::thread::Builder::new().name(format!("{name}-sim"));
         let thread = builder.spawn(move || {
             host::enter_realtime(host::EMULATOR_PRIORITY);
-            floor.run();
+            listening.run();
         })?;
         Ok(Self { inner, thread: Some(thread) })
     }
@@ -101,7 +105,7 @@ impl<C: Controller> TcpServer<C> {
         self.inner.ports.first().map_or(SocketAddr::from(([0; 4], 0)), |(address, _)| *address)
     }
 
-    /// Calls `act` with the controller and the current time.
+    /// Calls `f` with the controller and the current time.
     pub fn with<T>(&self, f: impl FnOnce(&mut C, Mono) -> T) -> T {
         self.inner.shared.with(f)
     }
@@ -152,7 +156,7 @@ impl<C: Controller> Inner<C> {
     pub fn attend(&self, mut stream: TcpStream, port: usize) {
         host::enter_realtime(host::EMULATOR_PRIORITY);
         self.shared.wait(|line| line.stalled_until);
-        let Some(number) = self.take_seat(&stream) else {
+        let Some(number) = self.register(&stream) else {
             self.refused.fetch_add(1, Ordering::Relaxed);
             events::note(SimEvent::Rejected);
             return self.turn_away(stream);
@@ -170,13 +174,13 @@ impl<C: Controller> Inner<C> {
     }
 
     /// Waits up to [`GRACE`] for another client to disconnect; `None` if none does.
-    fn take_seat(&self, stream: &TcpStream) -> Option<u64> {
+    fn register(&self, stream: &TcpStream) -> Option<u64> {
         let copy = stream.try_clone().ok()?;
         let line = lock(&self.shared.line);
-        let full = |line: &mut Line<Client>| line.clients.len() >= self.seats && !line.closing;
+        let full = |line: &mut Line<Client>| line.clients.len() >= self.max_clients && !line.closing;
         let waited = self.shared.changed.wait_timeout_while(line, GRACE, full);
         let mut line = waited.unwrap_or_else(PoisonError::into_inner).0;
-        if line.clients.len() >= self.seats || line.dead() {
+        if line.clients.len() >= self.max_clients || line.dead() {
             return None;
         }
         let number = self.next_client.fetch_add(1, Ordering::Relaxed);

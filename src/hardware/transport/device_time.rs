@@ -54,7 +54,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restarted_device_begins_anew_and_never_stamps_the_future() {
+    fn a_restarted_device_gets_a_new_offset_and_no_stamp_in_the_future() {
         let mut time = DeviceTime::default();
         time.translate(900 * MS, Mono(1000 * MS));
         assert_eq!(time.translate(0, Mono(5000 * MS)), Mono(5000 * MS));

@@ -44,9 +44,7 @@ impl SerialAddress {
                 _ => return Err(format!("{rate:?} is not a rate (1200 to 4000000 bit/s)")),
             },
         };
-        if !path.starts_with('/') || path.ends_with('/') {
-            return Err(format!("{path:?} is not the path of a serial device, such as /dev/ttyUSB0"));
-        }
+        check_path(path)?;
         Ok(Self { path: path.to_owned(), baud })
     }
 }
@@ -55,6 +53,14 @@ impl std::fmt::Display for SerialAddress {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}@{}", self.path, self.baud)
     }
+}
+
+/// Checks that a path can be that of a serial device; the error is a sentence without full stop. Opens nothing.
+pub(super) fn check_path(path: &str) -> Result<(), String> {
+    if path.starts_with('/') && !path.ends_with('/') && !path.contains('\0') {
+        return Ok(());
+    }
+    Err(format!("{path:?} is not the path of a serial device, such as /dev/ttyUSB0"))
 }
 
 /// A serial line with frames in both directions.
@@ -132,13 +138,13 @@ impl AsFd for SerialLink {
 pub(super) fn open_line(device: &str, path: &str, baud: u32) -> AdapterResult<OwnedFd> {
     let failed = |why: String| AdapterError::Io(format!("cannot open serial device {path} for {device}: {why}"));
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    let line = open(path, flags, Mode::empty()).map_err(|e| failed(why_not(e)))?;
+    let line = open(path, flags, Mode::empty()).map_err(|e| failed(open_error(e)))?;
     if !isatty(&line) {
         return Err(failed("it is not a serial device".to_owned()));
     }
     // The first lock excludes programs without locks, except those of root; the second excludes programs that check it.
     ioctl_tiocexcl(&line).map_err(|e| failed(e.to_string()))?;
-    flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|e| failed(why_not(e)))?;
+    flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|e| failed(open_error(e)))?;
     let prepare = || -> rustix::io::Result<u32> {
         let mut settings = tcgetattr(&line)?;
         make_raw(&mut settings);
@@ -154,7 +160,7 @@ pub(super) fn open_line(device: &str, path: &str, baud: u32) -> AdapterResult<Ow
     Ok(line)
 }
 
-/// 8N1, no flow control, no modem lines, raw bytes; DTR stays up on closing.
+/// Sets 8N1, no flow control, no modem lines, raw bytes; DTR stays up when the line is closed.
 pub(super) fn make_raw(settings: &mut Termios) {
     use ControlModes as C;
     settings.make_raw();
@@ -193,9 +199,9 @@ pub(super) fn broken(peer: &str, error: Errno) -> AdapterError {
 }
 
 /// Returns why a serial device cannot be opened, with a hint.
-fn why_not(error: Errno) -> String {
+fn open_error(error: Errno) -> String {
     match error {
-        Errno::NOENT | Errno::NODEV | Errno::NXIO => format!("there is no such device\nhint: {}", others()),
+        Errno::NOENT | Errno::NODEV | Errno::NXIO => format!("there is no such device\nhint: {}", list_devices()),
         Errno::ACCESS | Errno::PERM => "permission denied\nhint: join the group that owns serial devices: \
                                         sudo usermod -aG dialout $USER; then log in again"
             .to_owned(),
@@ -205,15 +211,15 @@ fn why_not(error: Errno) -> String {
 }
 
 /// Lists the serial devices of this computer.
-fn others() -> String {
+fn list_devices() -> String {
     let entries = std::fs::read_dir("/dev").into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
     let mut found: Vec<_> = names.filter(|name| NAMES.iter().any(|known| name.starts_with(known))).collect();
     found.sort();
     match found.as_slice() {
-        [] => "no serial device is there; is it plugged in?".to_owned(),
+        [] => "this computer has no serial device; check that the adapter is plugged in".to_owned(),
         found => format!(
-            "the serial devices here are {}",
+            "available serial devices: {}",
             found.iter().map(|n| format!("/dev/{n}")).collect::<Vec<_>>().join(", ")
         ),
     }
@@ -306,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn bytes_from_before_the_opening_are_thrown_away() {
+    fn bytes_from_before_the_opening_are_discarded() {
         let pty = Pty::open().unwrap();
         pty.write(b"old\n").unwrap();
         let mut link = link(&pty, 9600);
@@ -356,6 +362,6 @@ mod tests {
             missing.starts_with("cannot open serial device /dev/ttyUSB77 for test: there is no such device\nhint: ")
         );
         assert_eq!(error("/dev/null"), "cannot open serial device /dev/null for test: it is not a serial device");
-        assert!(why_not(Errno::ACCESS).contains("\nhint: ") && why_not(Errno::ACCESS).contains("dialout"));
+        assert!(open_error(Errno::ACCESS).contains("\nhint: ") && open_error(Errno::ACCESS).contains("dialout"));
     }
 }

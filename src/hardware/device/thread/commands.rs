@@ -69,7 +69,10 @@ impl Worker {
     }
 
     pub(super) fn write(&mut self, adapter: &mut dyn ManipulatorAdapter, command: &ArmCommand) -> AdapterResult<()> {
-        let Some(mode) = command.mode else { return Ok(()) };
+        let Some(mode) = command.mode else {
+            self.mode_refused_since = None;
+            return Ok(());
+        };
         // Another client changed the mode: do not change it back. The next state reports it.
         let foreign = self.ordered_mode == Some(mode) && adapter.get_control_mode() != mode;
         if foreign || self.state.interference != Interference::None {
@@ -165,7 +168,7 @@ impl Worker {
     /// Holds a gripper that continues to move after a stop of the joints.
     pub(super) fn hold_gripper(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         let now = self.config.clock.now();
-        let Some(here) = self.state.gripper.and_then(|opening| self.gripper_stop.look(opening, now)) else { return };
+        let Some(here) = self.state.gripper.and_then(|opening| self.gripper_stop.observe(opening, now)) else { return };
         let Some(gripper) = adapter.gripper() else { return };
         let (closed, open) = gripper.get_gripper_range().unwrap_or((0.0, f64::MAX));
         if let Err(error) = gripper.write_gripper_position(here.max(closed).min(open)) {

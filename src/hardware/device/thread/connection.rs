@@ -59,17 +59,24 @@ impl Worker {
     /// Resets what the arm's state is compared with: no mode, and the motors as in `power`.
     pub(super) fn expect_nothing(&mut self, power: Option<bool>) {
         (self.ordered_mode, self.ordered_power, self.disagreeing) = (None, power, 0);
+        self.mode_refused_since = None;
         self.state.interference = Interference::None;
     }
 
     pub(super) fn reconnect_arm(&mut self, adapter: &mut dyn ManipulatorAdapter) {
         self.state.self_held = true; // only `enable` allows motion again
         match self.connect(adapter) {
-            Ok(_) => {
+            Ok(_) if self.connected => {
                 self.health.reconnects.fetch_add(1, Relaxed);
                 self.clear_trouble();
             }
-            Err(_) => {
+            // Lost again in the first read, which has scheduled the next attempt.
+            Ok(_) => {}
+            Err(error) => {
+                // That the arm cannot be reached has been logged; that it is another arm, or in error, has not.
+                if matches!(error, AdapterError::Rejected(_) | AdapterError::Fault { .. }) {
+                    self.trouble(&format!("cannot reconnect: {error}"));
+                }
                 let wait = self.reconnect.1;
                 self.reconnect = (self.config.clock.now().after(wait), (wait * 2).min(BACK_OFF.1));
             }

@@ -20,7 +20,7 @@ impl Worker {
         if overdue.is_zero() { left } else { left.max(MAX_DELAY.saturating_sub(overdue)) }
     }
 
-    /// Adds a late wake-up of this thread to the tolerated silence: the computer was stalled, and the tick with it.
+    /// Adds a late wake-up of this thread to the tolerated silence: the computer was stalled, including the tick.
     pub(super) fn add_delay(&mut self, late: Duration) {
         let beat = self.config.beat.last();
         if self.delay.0 != beat {

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use crate::hardware::transport::serial::check_path;
+
 /// Default bit rate [bit/s].
 pub const BIT_RATE: u32 = 1_000_000;
 /// The bit rates of slcan [bit/s]; the command is `S` and the index in this list.
@@ -41,9 +43,7 @@ impl CanAddress {
                     (path, known.ok_or_else(|| format!("{rate:?} is not a bit rate of slcan ({})", names()))?)
                 }
             };
-            if !path.starts_with('/') || path.ends_with('/') || path.contains('\0') {
-                return Err(format!("{path:?} is not the path of a serial device"));
-            }
+            check_path(path)?;
             return Ok(Self::Slcan { path: path.to_owned(), bit_rate });
         }
         // The kernel's rule for interface names.

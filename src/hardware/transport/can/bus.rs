@@ -132,8 +132,8 @@ impl Bus {
         lock(&self.hub).refuse = frames;
     }
 
-    /// The other nodes lose power: none acknowledges, and frames of programs wait, `limit` at most. Frames of the other
-    /// nodes are lost.
+    /// Simulates a loss of power of the other nodes: none acknowledges, and at most `limit` frames of programs wait.
+    /// Frames of the other nodes are lost.
     pub fn withhold(&self, limit: usize) {
         let mut state = lock(&self.hub);
         state.queue.reserve(limit);
@@ -146,9 +146,8 @@ impl Bus {
         lock(&self.hub).kept = keep;
     }
 
-    /// The other nodes are back: they receive the waiting frames in order, then new ones. Returns how many frames had
-    /// waited.
-    /// had waited.
+    /// Ends [`Bus::withhold`]: the other nodes receive the waiting frames in order, then new ones. Returns how many
+    /// frames had waited.
     pub fn acknowledge(&self) -> usize {
         let mut state = lock(&self.hub);
         state.withheld = None;

@@ -25,7 +25,7 @@ impl InFlight {
     }
 
     /// Adds a frame that was sent.
-    pub fn handed_over(&mut self, frame: CanFrame) {
+    pub fn sent(&mut self, frame: CanFrame) {
         if self.frames.len() == CAPACITY {
             self.frames.pop_front();
         }
@@ -62,8 +62,8 @@ mod tests {
     #[test]
     fn what_is_confirmed_is_not_in_flight() {
         let mut frames = InFlight::new();
-        (0..4).for_each(|n| frames.handed_over(frame(n)));
-        frames.handed_over(frame(0));
+        (0..4).for_each(|n| frames.sent(frame(n)));
+        frames.sent(frame(0));
         for (n, left) in [(1, 4), (0, 3), (9, 3), (3, 2), (2, 1), (2, 1), (0, 0)] {
             frames.confirmed(&frame(n));
             assert_eq!(frames.len(), left, "{n}");
@@ -73,12 +73,12 @@ mod tests {
     #[test]
     fn a_lost_confirmation_is_forgotten() {
         let mut frames = InFlight::new();
-        (0..20).for_each(|n| frames.handed_over(frame(n)));
+        (0..20).for_each(|n| frames.sent(frame(n)));
         (1..8).for_each(|n| frames.confirmed(&frame(n)));
         assert_eq!(frames.len(), 13, "the first may still come");
         frames.confirmed(&frame(15));
         assert_eq!(frames.len(), 11, "7 before it may still come");
-        (0..200).for_each(|n| frames.handed_over(frame(n)));
+        (0..200).for_each(|n| frames.sent(frame(n)));
         assert_eq!(frames.len(), CAPACITY);
         frames.clear();
         assert_eq!(frames.len(), 0);

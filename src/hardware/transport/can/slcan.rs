@@ -25,7 +25,7 @@ pub(super) const MAX_LINE: usize = 32;
 /// Length of a frame's line without its data: `tIIIL`.
 const HEAD: usize = 5;
 /// Maximum number of replies that are skipped in search of a frame.
-const REPLIES: usize = 64;
+const MAX_REPLIES: usize = 64;
 /// A reply that is missing for this time was lost.
 const REPLY_LOST: Duration = Duration::from_millis(200);
 /// Minimum number of waiting frames when the kernel has no room for more.
@@ -45,7 +45,7 @@ pub struct SlcanPort {
 }
 
 /// A message of an adapter.
-enum Said {
+enum Reply {
     Frame(CanFrame),
     /// A frame was taken.
     Taken,
@@ -78,14 +78,14 @@ impl CanPort for SlcanPort {
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
         let filters = &self.filters;
         let wanted = |line: &[u8]| match line {
-            [b'z' | b'Z'] => Some(Said::Taken),
-            line => decode(line).filter(|frame| CanFilter::any(filters, frame.id)).map(Said::Frame),
+            [b'z' | b'Z'] => Some(Reply::Taken),
+            line => decode(line).filter(|frame| CanFilter::any(filters, frame.id)).map(Reply::Frame),
         };
-        for _ in 0..REPLIES {
+        for _ in 0..MAX_REPLIES {
             match self.line.next(wanted, read_line)? {
                 None => break,
-                Some(Said::Taken) => (self.replies, self.unanswered) = (true, self.unanswered.saturating_sub(1)),
-                Some(Said::Frame(frame)) => {
+                Some(Reply::Taken) => (self.replies, self.unanswered) = (true, self.unanswered.saturating_sub(1)),
+                Some(Reply::Frame(frame)) => {
                     // An adapter that passes on frames has processed earlier lines: the reply was lost.
                     if self.unanswered > 0 && self.written_at.elapsed() > REPLY_LOST {
                         self.unanswered = 0;
@@ -195,7 +195,7 @@ impl<F: AsFd> Lines<F> {
         Ok(n > 0 || bytes.is_empty())
     }
 
-    /// Writes frames; answers for how many there was room.
+    /// Writes frames. Returns for how many there was room.
     pub(super) fn put_frames(&mut self, frames: &[CanFrame]) -> AdapterResult<usize> {
         for (taken, frame) in frames.iter().enumerate() {
             let Some((line, len)) = encode(frame) else {
@@ -208,8 +208,8 @@ impl<F: AsFd> Lines<F> {
         Ok(frames.len())
     }
 
-    /// The first thing that `wanted` finds in a line, without its end, of those that have arrived. Reads once at most,
-    /// so that no flood holds the caller up.
+    /// Returns the first value that `wanted` finds in an arrived line (passed without its end). Reads at most once, so
+    /// that a flood of bytes does not block the caller.
     pub(super) fn next<T>(
         &mut self,
         wanted: impl Fn(&[u8]) -> Option<T>,
@@ -221,7 +221,7 @@ impl<F: AsFd> Lines<F> {
                 Some(found) => Scan::Take(end + 1, found),
                 None => Scan::Skip(end + 1),
             },
-            // No line is as long: noise, up to the next end of a line.
+            // Longer than any line: noise, up to the next end of a line.
             None if bytes.len() > MAX_LINE => Scan::Skip(bytes.len()),
             None => Scan::More,
         };
@@ -242,7 +242,7 @@ impl<F: AsFd> Lines<F> {
         }
     }
 
-    /// Remembers what of `bytes` is not written yet.
+    /// Keeps the part of `bytes` that is not written yet.
     fn keep(&mut self, bytes: &[u8], written: usize) {
         let rest = bytes.get(written..).unwrap_or_default();
         self.rest.0.iter_mut().zip(rest).for_each(|(to, from)| *to = *from);

@@ -21,7 +21,7 @@ pub struct SlcanPty {
 }
 
 /// A message of a client.
-enum Said {
+enum ClientMessage {
     Frame(CanFrame),
     Command(u8, Option<u8>),
 }
@@ -70,19 +70,19 @@ impl CanPort for SlcanPty {
 
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
         let said = |line: &[u8]| match line {
-            [b't', ..] => decode(line).map(Said::Frame),
-            [command] => Some(Said::Command(*command, None)),
-            [command, argument] => Some(Said::Command(*command, Some(*argument))),
+            [b't', ..] => decode(line).map(ClientMessage::Frame),
+            [command] => Some(ClientMessage::Command(*command, None)),
+            [command, argument] => Some(ClientMessage::Command(*command, Some(*argument))),
             [] => None,
-            [command, ..] => Some(Said::Command(*command, Some(0))),
+            [command, ..] => Some(ClientMessage::Command(*command, Some(0))),
         };
         while let Some(said) = self.line.next(said, |pty, _, room| pty.read(room, Duration::ZERO))? {
             let reply: &[u8] = match said {
-                Said::Frame(frame) if self.channel_open => {
+                ClientMessage::Frame(frame) if self.channel_open => {
                     self.line.put(b"z\r")?;
                     return Ok(Some(CanEvent::Frame(frame)));
                 }
-                Said::Command(command, argument) if self.execute(command, argument) => b"\r",
+                ClientMessage::Command(command, argument) if self.execute(command, argument) => b"\r",
                 _ => b"\x07",
             };
             self.line.put(reply)?;

@@ -26,10 +26,10 @@ use crate::hardware::adapter::{AdapterError, AdapterResult};
 pub const SEND_QUEUE: usize = 16;
 /// Memory that the kernel charges a socket for a classic frame [bytes].
 const FRAME_MEMORY: usize = 768;
-/// Asked for as the receive buffer [bytes]: a Piper fills it in about a second. The system may grant less.
+/// Requested size of the receive buffer [bytes]: a Piper fills it in about a second. The system may grant less.
 const RECEIVE_BUFFER: usize = 1 << 20;
 /// Directory of the kernel's network interfaces.
-const INTERFACES: &str = "/sys/class/net";
+const INTERFACES_DIR: &str = "/sys/class/net";
 /// A protocol error at this place is a missing acknowledgement (`linux/can/error.h`).
 const LOCATION_ACK: u8 = 0x19;
 
@@ -38,17 +38,17 @@ pub struct SocketPort {
     socket: CanSocket,
     /// The device and its interface, for messages.
     peer: String,
-    /// Why this port works no more.
+    /// Error of a broken port.
     broken: Option<AdapterError>,
     /// Frames that the socket had no room for, as counted by the kernel.
     lost: u32,
-    /// What others send that the device wants, and what is followed until it is transmitted; everything is wanted where
-    /// there are none, and nothing is followed.
+    /// Frames to receive, and own frames to track until they are transmitted. Without filters: all frames are received,
+    /// none are tracked.
     filters: Vec<CanFilter>,
     in_flight: InFlight,
 }
 
-/// A frame as the kernel hands it over (`struct can_frame`), and whether this socket has sent it.
+/// A frame of the kernel (`struct can_frame`), and whether this socket sent it.
 struct Raw {
     id: u32,
     len: u8,
@@ -59,9 +59,9 @@ struct Raw {
 /// Opens a port on the CAN interface `name`.
 pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<SocketPort> {
     let failed = |why: &str| AdapterError::Io(format!("cannot open CAN interface {name} for {device}: {why}"));
-    let socket = CanSocket::open(name).map_err(|e| failed(&why_not(name, &e)))?;
+    let socket = CanSocket::open(name).map_err(|e| failed(&open_error(name, &e)))?;
     let prepare = || -> std::io::Result<()> {
-        // A frame must agree with its filter in these flags too: no extended identifiers, no remote requests.
+        // The filter also covers these flags: no extended identifiers, no remote requests.
         let flags = libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
         let filter = |f: &CanFilter| (u32::from(f.id), u32::from(f.mask) | flags);
         let everything = CanFilter { id: 0, mask: 0 };
@@ -79,14 +79,14 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
         Ok(())
     };
     prepare().map_err(|e| failed(&e.to_string()))?;
-    // Binding to an interface that is down succeeds; the kernel leaves word of it with the socket.
+    // Binding to an interface that is down succeeds; the socket then has a pending error.
     if let Ok(Err(errno)) = sockopt::socket_error(&socket) {
-        return Err(failed(&why_not(name, &errno.into())));
+        return Err(failed(&open_error(name, &errno.into())));
     }
-    // Without a carrier the kernel swallows what is sent, and says that it was sent.
-    if std::fs::read_to_string(format!("{INTERFACES}/{name}/carrier")).is_ok_and(|carrier| carrier.trim() == "0") {
+    // Without a carrier the kernel drops frames and reports them as sent.
+    if std::fs::read_to_string(format!("{INTERFACES_DIR}/{name}/carrier")).is_ok_and(|carrier| carrier.trim() == "0") {
         return Err(failed(&format!(
-            "it has no carrier: its controller is bus-off, or the other end of a virtual pair is down\nhint: look at the \
+            "it has no carrier: its controller is bus-off, or the other end of a virtual pair is down\nhint: check the \
              wiring, the terminators and the bit rate; then ip link set {name} down; ip link set {name} up (as root)"
         )));
     }
@@ -94,20 +94,20 @@ pub fn open(device: &str, name: &str, filters: &[CanFilter]) -> AdapterResult<So
     Ok(SocketPort { socket, peer, broken: None, lost: 0, filters, in_flight: InFlight::new() })
 }
 
-/// Why an interface cannot be opened, with the remedy.
-fn why_not(name: &str, error: &Error) -> String {
+/// Returns why an interface cannot be opened, with a hint.
+fn open_error(name: &str, error: &Error) -> String {
     match error.raw_os_error() {
         Some(ENETDOWN) => format!(
             "the interface is down\nhint: ip link set {name} up type can bitrate 1000000 (as root; for a virtual \
              interface: ip link set {name} up)"
         ),
-        Some(ENODEV) if std::path::Path::new(INTERFACES).join(name).exists() => {
-            format!("it is no CAN interface\nhint: {}", others())
+        Some(ENODEV) if std::path::Path::new(INTERFACES_DIR).join(name).exists() => {
+            format!("it is no CAN interface\nhint: {}", list_interfaces())
         }
         Some(ENODEV) if name.starts_with("vcan") => {
             format!("there is no such interface\nhint: ip link add {name} type vcan && ip link set {name} up (as root)")
         }
-        Some(ENODEV) => format!("there is no such interface\nhint: {}", others()),
+        Some(ENODEV) => format!("there is no such interface\nhint: {}", list_interfaces()),
         Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
             "this kernel has no CAN\nhint: modprobe can-raw (as root), or a kernel with CAN".to_owned()
         }
@@ -115,14 +115,14 @@ fn why_not(name: &str, error: &Error) -> String {
     }
 }
 
-/// Names the CAN interfaces that there are.
-fn others() -> String {
+/// Lists the CAN interfaces of this computer.
+fn list_interfaces() -> String {
     /// `ARPHRD_CAN` of the kernel.
     const CAN_TYPE: &str = "280";
     let is_can = |entry: &std::fs::DirEntry| {
         std::fs::read_to_string(entry.path().join("type")).is_ok_and(|kind| kind.trim() == CAN_TYPE)
     };
-    let entries = std::fs::read_dir(INTERFACES).into_iter().flatten().flatten();
+    let entries = std::fs::read_dir(INTERFACES_DIR).into_iter().flatten().flatten();
     let mut names: Vec<_> =
         entries.filter(is_can).map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
     names.sort();
@@ -148,7 +148,7 @@ impl SocketPort {
         error
     }
 
-    /// The next frame in the socket's buffer.
+    /// Returns the next frame in the socket's buffer.
     fn read(&self) -> std::io::Result<Raw> {
         /// Identifier (4 bytes), length (1), padding (3), data (8).
         const SIZE: usize = 16;
@@ -160,7 +160,7 @@ impl SocketPort {
         Ok(Raw { id: u32::from_ne_bytes([a, b, c, d]), len: len.min(8), data, own })
     }
 
-    /// The kernel's figures about the socket: its send memory [bytes], and how many frames it had no room for.
+    /// Returns the kernel's figures of the socket: its send memory [bytes], and how many frames it had no room for.
     fn figures(&self) -> Option<(usize, u32)> {
         let mut bytes = [0; 9 * 4];
         let read = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes).ok()?;
@@ -186,10 +186,10 @@ impl CanPort for SocketPort {
             }
             match self.socket.write_frame(&data) {
                 Ok(()) if !self.filters.is_empty() && CanFilter::any(&self.filters, frame.id) => {
-                    self.in_flight.handed_over(CanFrame::new(frame.id, frame.bytes()));
+                    self.in_flight.sent(CanFrame::new(frame.id, frame.bytes()));
                 }
                 Ok(()) => {}
-                // The socket's own bound, and that of the interface.
+                // The queue of the socket, or of the interface, is full.
                 Err(e) if e.kind() == ErrorKind::WouldBlock || e.raw_os_error() == Some(ENOBUFS) => return Ok(taken),
                 Err(e) => return Err(self.break_down(&e)),
             }
@@ -214,12 +214,12 @@ impl CanPort for SocketPort {
                     self.in_flight.confirmed(&heard);
                 }
                 Err(e) if e.kind() == ErrorKind::WouldBlock => {
-                    // Now that everything is fetched: was that everything?
+                    // All frames are read: check whether some were lost.
                     let lost = self.figures().map_or(self.lost, |(_, lost)| lost);
                     let fresh = lost != self.lost;
                     self.lost = lost;
                     if fresh {
-                        // Echoes may be among the lost; a bus that fills the buffer has taken what was sent before.
+                        // Echoes may be among the lost frames; a busy bus has transmitted what was sent before.
                         self.in_flight.clear();
                     }
                     return Ok(fresh.then_some(CanEvent::Trouble(CanTrouble::Overflow)));
@@ -241,7 +241,7 @@ impl CanPort for SocketPort {
     }
 }
 
-/// What an error frame says. Where it says several things, the worst.
+/// Returns the trouble that an error frame reports; the worst if it reports several.
 fn trouble(id: u32, data: [u8; 8]) -> CanTrouble {
     let class = id & libc::CAN_ERR_MASK;
     let [_, controller, _, location, ..] = data;
@@ -264,23 +264,23 @@ mod tests {
 
     /// Error frames as drivers make them: class bits, then the data bytes (`linux/can/error.h`).
     #[test]
-    fn error_frames_are_told_apart() {
-        let told = |class: u32, data: [u8; 8]| {
+    fn error_frames_are_distinguished() {
+        let reported = |class: u32, data: [u8; 8]| {
             let made = socketcan::CanErrorFrame::new_error(class, &data).unwrap();
             let frame: &libc::can_frame = made.as_ref();
             trouble(frame.can_id, frame.data)
         };
-        assert_eq!(told(0x40, [0; 8]), CanTrouble::BusOff);
-        assert_eq!(told(0x20, [0; 8]), CanTrouble::NoAcknowledge);
-        assert_eq!(told(0x08, [0, 0, 0, 0x19, 0, 0, 0, 0]), CanTrouble::NoAcknowledge);
-        assert_eq!(told(0x08, [0, 0, 4, 0x08, 0, 0, 0, 0]), CanTrouble::Other(0x08));
-        assert_eq!(told(0x204, [0, 0x20, 0, 0, 0, 0, 128, 0]), CanTrouble::Passive);
-        assert_eq!(told(0x204, [0, 0x10, 0, 0, 0, 0, 0, 128]), CanTrouble::Passive);
-        assert_eq!(told(0x204, [0, 0x08, 0, 0, 0, 0, 97, 0]), CanTrouble::Other(0x204), "a warning");
-        assert_eq!(told(0x04, [0, 0x01, 0, 0, 0, 0, 0, 0]), CanTrouble::Overflow);
-        assert_eq!(told(0x204, [0, 0x40, 0, 0, 0, 0, 0, 0]), CanTrouble::Restarted);
-        assert_eq!(told(0x100, [0; 8]), CanTrouble::Restarted);
-        assert_eq!(told(0x44 | 0x20, [0, 0x20, 0, 0, 0, 0, 0, 0]), CanTrouble::BusOff, "the worst of them");
+        assert_eq!(reported(0x40, [0; 8]), CanTrouble::BusOff);
+        assert_eq!(reported(0x20, [0; 8]), CanTrouble::NoAcknowledge);
+        assert_eq!(reported(0x08, [0, 0, 0, 0x19, 0, 0, 0, 0]), CanTrouble::NoAcknowledge);
+        assert_eq!(reported(0x08, [0, 0, 4, 0x08, 0, 0, 0, 0]), CanTrouble::Other(0x08));
+        assert_eq!(reported(0x204, [0, 0x20, 0, 0, 0, 0, 128, 0]), CanTrouble::Passive);
+        assert_eq!(reported(0x204, [0, 0x10, 0, 0, 0, 0, 0, 128]), CanTrouble::Passive);
+        assert_eq!(reported(0x204, [0, 0x08, 0, 0, 0, 0, 97, 0]), CanTrouble::Other(0x204), "a warning");
+        assert_eq!(reported(0x04, [0, 0x01, 0, 0, 0, 0, 0, 0]), CanTrouble::Overflow);
+        assert_eq!(reported(0x204, [0, 0x40, 0, 0, 0, 0, 0, 0]), CanTrouble::Restarted);
+        assert_eq!(reported(0x100, [0; 8]), CanTrouble::Restarted);
+        assert_eq!(reported(0x44 | 0x20, [0, 0x20, 0, 0, 0, 0, 0, 0]), CanTrouble::BusOff, "the worst of them");
     }
 
     #[test]
@@ -294,7 +294,7 @@ mod tests {
     fn an_interface_of_another_kind_is_named() {
         let error = open("piper", "lo", &[]).err().unwrap().to_string();
         assert!(error.contains("\nhint: "), "{error}");
-        // Where the kernel has CAN, it says what `lo` is not; elsewhere, that it has no CAN.
+        // A kernel with CAN reports that `lo` is no CAN interface; one without, that it has no CAN.
         assert!(error.contains("no CAN"), "{error}");
     }
 }
