@@ -7,7 +7,7 @@ use super::limits;
 use super::options::{Options, PLAYABLE};
 use crate::clock::{Clock, Mono};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::sim::arm::{Delivery, ESTOP, Refusal, SimArm};
+use crate::hardware::sim::arm::{Delivery, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Plant, Tracking};
@@ -107,37 +107,12 @@ impl Device {
     /// What a write of motion begins with: it needs the motors on and no error.
     pub fn write_motion(&mut self) -> AdapterResult<()> {
         self.write()?;
-        self.arm.ready().map_err(|refusal| self.refused(refusal))
+        self.arm.ready().map_err(|refusal| self.arm.rejected(refusal))
     }
 
     /// Joint positions as reported: as they are, or spoiled by a fault.
     pub fn reported_positions(&mut self) -> Joints {
         self.arm.measured().positions
-    }
-
-    /// A refusal as the answer to a command.
-    pub fn refused(&self, refusal: Refusal) -> AdapterError {
-        AdapterError::Rejected(match refusal {
-            Refusal::InError => return self.fault(),
-            Refusal::Disabled => "the motors are disabled".to_owned(),
-            Refusal::Moving => "the mode cannot change while the arm moves".to_owned(),
-            Refusal::WrongMode => format!("not in {} mode", self.arm.mode().name()),
-            Refusal::OutOfRange => "a target is outside the joint limits".to_owned(),
-        })
-    }
-
-    /// The error as the answer to a command that it forbids.
-    fn fault(&self) -> AdapterError {
-        AdapterError::Fault { code: self.arm.error().into(), text: self.error_text() }
-    }
-
-    /// What the error means; empty when there is none.
-    pub fn error_text(&self) -> String {
-        match self.arm.error() {
-            0 => String::new(),
-            ESTOP => "E-stop line open".to_owned(),
-            code => format!("scripted error {code}"),
-        }
     }
 
     /// Brings joints and gripper up to the present.

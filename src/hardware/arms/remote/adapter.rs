@@ -15,6 +15,7 @@ use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
 };
+use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
@@ -37,9 +38,8 @@ pub struct RemoteAdapter {
 impl RemoteAdapter {
     /// An adapter for the peer at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
         config.check(check)?;
-        let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        let address = config.parse_address(Address::parse)?;
         let (mode, assumed_enabled) = (ControlMode::Position, false);
         Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })
     }
@@ -101,11 +101,6 @@ impl RemoteAdapter {
             }
         })
     }
-}
-
-/// Copies the first values; `out` has length dof.
-fn fill(out: &mut [f64], values: &[f64]) {
-    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
 }
 
 impl ManipulatorAdapter for RemoteAdapter {

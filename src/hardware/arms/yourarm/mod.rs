@@ -14,11 +14,12 @@ mod tests;
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
+use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::sim::arm::SimOptions;
+use crate::hardware::sim::arm::{PLAYABLE, SimOptions};
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
 
@@ -78,7 +79,7 @@ const JERK: f64 = 100.0;
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("yourarm", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
-    options.sim.check("yourarm", &limits, emulator::PLAYABLE)?;
+    options.sim.check("yourarm", &limits, PLAYABLE)?;
     Ok(Checked { limits })
 }
 
@@ -108,15 +109,5 @@ pub struct Options {
 impl Default for Options {
     fn default() -> Self {
         Self { speed_scale: 1.0, gripper: true, sim: SimOptions::default() }
-    }
-}
-
-/// A number above 0, up to 1.
-fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    let value = f64::deserialize(deserializer)?;
-    if value > 0.0 && value <= 1.0 {
-        Ok(value)
-    } else {
-        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most 1")))
     }
 }

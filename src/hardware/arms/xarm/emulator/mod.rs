@@ -31,33 +31,13 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
-use crate::hardware::sim::arm::{self, HasArm};
-use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::arm::{self, HasArm, PLAYABLE};
+use crate::hardware::sim::faults::Fault;
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 pub use controller::Received;
 use report::Kind;
-
-/// The faults that the emulator can play.
-const PLAYABLE: &[FaultKind] = &[
-    FaultKind::Stall,
-    FaultKind::Silent,
-    FaultKind::Frozen,
-    FaultKind::Disconnect,
-    FaultKind::ErrorCode,
-    FaultKind::Estop,
-    FaultKind::PowerLoss,
-    FaultKind::Nan,
-    FaultKind::ZeroState,
-    FaultKind::Garbage,
-    FaultKind::Corrupt,
-    FaultKind::Truncated,
-    FaultKind::WrongDof,
-    FaultKind::WrongModel,
-    FaultKind::Sag,
-    FaultKind::Blocked,
-];
 
 /// Who speaks in messages.
 const WHO: &str = "xarm emulator";

@@ -6,7 +6,7 @@ use super::kinematics::Links;
 use super::wire::{self, Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
-use crate::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
+use crate::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::reach::{self, Chain};
@@ -47,9 +47,9 @@ pub struct Controller {
 
 impl Controller {
     /// A controller that was just switched on: disabled, in position mode.
-    pub fn new(options: &SimOptions, playable: &'static [FaultKind], now: Mono) -> AdapterResult<Self> {
+    pub fn new(options: &SimOptions, now: Mono) -> AdapterResult<Self> {
         let options = options.clone().starting_at(&INITIAL);
-        let arm = SimArm::new("yourarm", &limits(), &options, playable, now)?;
+        let arm = SimArm::new("yourarm", &limits(), &options, PLAYABLE, now)?;
         Ok(Self {
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
@@ -131,16 +131,10 @@ impl Controller {
         let measured = arm.measured();
         let floats = |values: &Joints| first(values).map(|v| v as f32);
         let degrees = |values: &Joints| floats(&values.map(f64::to_degrees));
-        let state = match (arm.error(), arm.enabled()) {
-            (0, false) => 0,
-            (0, true) if !arm.moving() => 1,
-            (0, true) => 2,
-            _ => 3,
-        };
         let [x, y, z, roll, pitch, yaw] = reach::to_values(&Links.forward(&first(&arm.joints().0)));
         let report = Report {
             time_us: arm.uptime().as_micros() as u64,
-            state,
+            state: arm.state_code(),
             mode: MODES.iter().position(|mode| *mode == arm.mode()).unwrap_or_default() as u8,
             enabled: arm.enabled(),
             estop: arm.estop_open(),
