@@ -1,7 +1,7 @@
 //! The emulator: the controller's side of the protocol, for `address: sim` and for tests.
 //!
 //! It is written from the sheet in `protocol.rs` and shares no code with it: two sides that share an encoder share its
-//! mistakes. YOUR ARM: change it as you change `protocol.rs`. `SimArm` is the arm itself: joints, motors, errors, faults.
+//! mistakes. YOUR ARM: change it as you change `protocol.rs`. `SimArm` is the arm: joints, motors, errors, faults.
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::AdapterResult;

@@ -265,7 +265,7 @@ impl stream::Controller for Controller {
     fn client_gone(&mut self, now: Mono) {
         self.advance(now);
         if self.commanded {
-            self.stop_unasked("its client has gone");
+            self.stop_unasked("its client disconnected");
         }
     }
 
