@@ -20,7 +20,7 @@ pub struct MockArm {
     options: Options,
     dof: usize,
     device: Device,
-    /// The last reading, for the fault that shows nothing newer.
+    /// The last reading, for the fault `frozen`.
     measured: Option<JointReading>,
 }
 
@@ -30,14 +30,14 @@ impl MockArm {
         Self::with_clock(config, Arc::new(MonotonicClock))
     }
 
-    /// A mock arm on another clock, for tests. Latency and stalls block in real time all the same.
+    /// A mock arm on another clock, for tests. Latency and stalls still block in real time.
     pub fn with_clock(config: &AdapterConfig, clock: Arc<dyn Clock>) -> AdapterResult<Self> {
         config.check(check)?;
         let (options, dof) = (config.options::<Options>()?, config.dof);
         Ok(Self { device: Device::new(dof, &options, clock)?, options, dof, measured: None })
     }
 
-    /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that can be played.
+    /// Injects a fault that begins `fault.at` seconds from now; the error lists the kinds that it can play.
     pub fn inject(&mut self, fault: Fault) -> Result<(), String> {
         self.device.inject(fault)
     }

@@ -1,4 +1,4 @@
-//! What the server does with a request: one method of an adapter, or one cycle of them. The arm is a [`SimArm`].
+//! Executes requests: a method of an adapter, or a cycle. The arm is a [`SimArm`].
 
 use serde_json::{Map, Value, json};
 
@@ -25,13 +25,13 @@ pub struct Controller {
     arm: SimArm,
     limits: JointLimits,
     gripper: Gripper,
-    /// Why no command is taken before the arm is enabled again.
+    /// Why commands are refused until the arm is enabled again.
     held: Option<&'static str>,
     /// Commands have come since the last stop.
     commanded: bool,
     /// When the last request was answered.
     heard: Mono,
-    /// The last measurement, for the fault that shows nothing newer.
+    /// The last measurement, for the fault `frozen`.
     measured: Option<(Mono, Measured)>,
 }
 
@@ -72,7 +72,7 @@ impl Controller {
         self.gripper.stop();
     }
 
-    /// Does what is asked; answers the content of the reply.
+    /// Executes a request; returns the content of the reply.
     fn answer(&mut self, request: &Request) -> AdapterResult<Map<String, Value>> {
         let content = match request.what.as_str() {
             "hello" => self.hello(),
@@ -127,7 +127,7 @@ impl Controller {
                 Ok(())
             }
             "write_cartesian_position" => Err(AdapterError::Unsupported),
-            _ => Err(AdapterError::Protocol(format!("nothing is known here of {method:?}"))),
+            _ => Err(AdapterError::Protocol(format!("unknown request {method:?}"))),
         }
     }
 
@@ -228,7 +228,7 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    /// A client that has commanded and fallen silent may hang: the arm is stopped.
+    /// Stops a commanded arm when no request arrives within the timeout: the client may hang.
     fn advance(&mut self, now: Mono) {
         let deadline = self.heard.after(SILENCE_TIMEOUT);
         if self.commanded && now >= deadline {
@@ -256,7 +256,7 @@ impl stream::Controller for Controller {
                 Err(error) => wire::refused(answer, request.id, &error),
             }
             let delivery = self.arm.delivery();
-            // While it stalls, the client is not silent: it waits for the answer.
+            // During a stall the client waits for the answer and does not count as silent.
             self.heard = if let Delivery::Stall(time) = delivery { now.after(time) } else { now };
             delivery
         })

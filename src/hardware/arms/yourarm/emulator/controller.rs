@@ -1,5 +1,5 @@
-//! The emulated controller: what it does with a request. The arm behind it is a [`SimArm`]; the gripper and the pose
-//! are its own. Time is passed in and nothing here knows of sockets.
+//! The emulated controller: executes requests. It consists of a [`SimArm`], a gripper and the arm's kinematics. Time is
+//! passed in, and there is no I/O.
 
 use super::super::{GRIPPER_MAX, limits, protocol::DOF};
 use super::kinematics::Links;
@@ -15,7 +15,7 @@ use crate::hardware::sim::trace::Trace;
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, Joints};
 
-/// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
+/// Pose at power-up [rad] if the options give none: not zero, so that mistakes show.
 const INITIAL: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// In velocity mode the arm stops when no velocity arrives for this long [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
@@ -41,7 +41,7 @@ pub struct Controller {
     gripper: Gripper,
     /// Requests that came over the wire.
     pub trace: Trace<Received>,
-    /// The last report, for the fault that shows nothing newer.
+    /// The last report, for the fault `frozen`.
     reported: Option<Report>,
 }
 
@@ -58,7 +58,7 @@ impl Controller {
         })
     }
 
-    /// Does what a frame asks and writes the reply into `out`.
+    /// Executes the request of a frame and writes the reply into `out`.
     fn handle(&mut self, frame: &Frame, now: Mono, out: &mut Vec<u8>) -> Delivery {
         self.advance(now);
         if frame.request == Ok(Request::Hello) {

@@ -1,7 +1,7 @@
-//! The emulator: plays a YourArm controller on a loopback address, for `address: sim` and for tests.
+//! The emulator of a YourArm controller on a loopback address, for `address: sim` and for tests.
 //!
-//! The joints are brought up to date when somebody asks. Like the real controller it serves one client at a time and
-//! turns a second one away.
+//! The joints are advanced at every request. Like the real controller it serves one client at a time and rejects a
+//! second one.
 
 mod controller;
 mod kinematics;
@@ -42,7 +42,7 @@ impl YourArmEmulator {
         Ok(Self { server: TcpServer::start("yourarm", controller, address)? })
     }
 
-    /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
+    /// Presses the E-stop button: error 1, motors off, until it is released, cleared and enabled.
     pub fn press_estop(&self) {
         self.server.with(|controller, now| {
             controller.advance(now);
