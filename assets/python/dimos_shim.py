@@ -8,7 +8,7 @@ READS = ["read_error", "read_enabled", "get_control_mode", "read_state", "read_g
          "read_cartesian_position", "read_force_torque", *FEEDBACK]
 ACTS = ["activate", "deactivate", "write_enable", "set_control_mode", "write_stop", "write_clear_errors"]
 MOTIONS = ["write_gripper_position", "write_cartesian_position"]
-INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these
+INSTEAD = {"activate": ("write_enable", [True]), "deactivate": ("write_stop", [])}  # for adapters without these methods
 DISABLED, MISSING = "it stopped on its own or is not enabled: enable it first", (ModuleNotFoundError, AttributeError)
 
 def control_modes():  # of dimos; where that is not installed, an object replaces what adapters import from it
@@ -28,10 +28,10 @@ class Arm:  # the adapter, called from one thread only
         self.call("connect")
         self.dof, began = dof or adapter.get_dof(), time.monotonic()
         self.read(*READS)
-        self.quick = time.monotonic() - began < 0.5 / hz  # else all but the positions are read in turns, one a cycle
+        self.quick = time.monotonic() - began < 0.5 / hz  # else one read besides the positions per cycle, in turn
     def lost(self):
         return hasattr(self.adapter, "is_connected") and not self.adapter.is_connected()
-    def read(self, *names):  # feedback of nothing but zeros since the start is the guide's word for "not measured"
+    def read(self, *names):  # only zeros since the start: the guide's sign for "not measured"
         for name, answer in [(name, getattr(self.adapter, name)()) for name in names if hasattr(self.adapter, name)]:
             if name.startswith("read_joint_") and answer is not None:
                 odd = [f"{value} for joint {i}" for i, value in enumerate(answer, 1) if not math.isfinite(value)]
@@ -64,9 +64,9 @@ class Arm:  # the adapter, called from one thread only
         try:
             self.call("write_stop")
             self.commanded = False
-        except Exception as e: how = f", which failed and will be tried again: {e!r}"
+        except Exception as e: how = f", which failed and will be retried: {e!r}"
         print(f"{why}: stopping the arm{how}", flush=True)
-    def cycle(self, command=None):  # one command, one reading; its time is when the SDK had read the positions
+    def cycle(self, command=None):  # one command, one reading, timed when the SDK returned the positions
         refused = DISABLED if command and self.held else None
         if command and not refused:
             planned, self.commanded = [command["velocity"]] if command["mode"] != "velocity" else [], True
@@ -74,7 +74,7 @@ class Arm:  # the adapter, called from one thread only
                 self.call("write_joint_positions" if planned else "write_joint_velocities", command["values"], *planned)
             except Exception as e:
                 refused = str(e) or repr(e)
-        time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # who asks again waits for something new
+        time.sleep(0.0 if command else max(0.0, self.due - time.monotonic()))  # asked early: wait for a new state
         if time.monotonic() >= self.due:
             self.read("read_joint_positions")
             self.state["time"], self.due = time.monotonic_ns(), time.monotonic() + 0.5 / self.hz
@@ -100,16 +100,16 @@ def serve(arm, listener):
             try:
                 arrived = client.recv(LONGEST)
                 *lines, data = (data + arrived).split(b"\n")
-                if not arrived or len(data) > LONGEST: raise OSError("a line without end" if arrived else "it has gone")
+                if not arrived or len(data) > LONGEST: raise OSError("a line without end" if arrived else "closed")
                 for line in lines: client.sendall(arm.reply(line))
                 heard = time.monotonic()
-            except Exception as e:  # it has gone, or speaks something else
+            except Exception as e:  # it disconnected, or uses another protocol
                 client.close()
                 client, data = None, b""
                 if arm.commanded: arm.stop(f"the client's connection ended ({e!r})")
         if arm.commanded and time.monotonic() - heard >= SILENCE: arm.stop(f"no request came for {SILENCE} s")
         if listener in ready:
-            with contextlib.suppress(OSError):  # who knocked may have gone already
+            with contextlib.suppress(OSError):  # the client may have disconnected already
                 another = listener.accept()[0]
                 another.settimeout(1.0)
                 if client: another.sendall(b'{"id":1,"error":"rejected","text":"it serves another client already"}\n')
@@ -122,8 +122,9 @@ def listen(at):
         return socket.create_server((host, int(port)))
     refused = socket.socket(socket.AF_UNIX).connect_ex(at[5:]) == errno.ECONNREFUSED  # by a shim that is gone
     if refused and pathlib.Path(at[5:]).is_socket(): os.unlink(at[5:])
-    os.umask(0o177)  # for this user only
-    return socket.create_server(at[5:], family=socket.AF_UNIX)
+    before = os.umask(0o177)  # the socket is for this user only; files and folders of the adapter are as usual
+    try: return socket.create_server(at[5:], family=socket.AF_UNIX)
+    finally: os.umask(before)
 
 def ask_for_short_slices():  # since Linux 6.12 a thread that asks for them runs sooner beside busy programs
     number = {"x86_64": 314, "aarch64": 274}.get(platform.machine())  # of the system call sched_setattr
@@ -152,6 +153,6 @@ if __name__ == "__main__":
     print(f"serving {adapter} at {at}; Ctrl-C ends it", flush=True)
     try:
         serve(arm, listener)
-    finally:  # asked to end, or a mistake in here
-        if arm.commanded: arm.stop("the shim ends")
+    finally:  # a signal, or an error in this file
+        if arm.commanded: arm.stop("the shim exits")
         arm.adapter.disconnect()

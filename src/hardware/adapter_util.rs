@@ -1,5 +1,7 @@
 //! Helpers shared by adapters.
 
+use serde::{Deserialize, Deserializer};
+
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::AdapterConfig;
 
@@ -13,6 +15,21 @@ pub fn finite<const N: usize>(values: &[f64]) -> AdapterResult<[f64; N]> {
     match <[f64; N]>::try_from(values) {
         Ok(values) if values.iter().all(|value| value.is_finite()) => Ok(values),
         _ => Err(AdapterError::Rejected(format!("expected {N} finite values, one per joint"))),
+    }
+}
+
+/// Reads an option that is a fraction above 0 and at most 1, for `#[serde(deserialize_with = "fraction")]`.
+pub fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    above_zero(deserializer, 1.0)
+}
+
+/// Reads an option above 0 and at most `max`.
+pub fn above_zero<'de, D: Deserializer<'de>>(deserializer: D, max: f64) -> Result<f64, D::Error> {
+    let value = f64::deserialize(deserializer)?;
+    if value > 0.0 && value <= max {
+        Ok(value)
+    } else {
+        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most {max}")))
     }
 }
 

@@ -436,6 +436,18 @@ fn what_cannot_be_imported_is_told_in_a_line_with_what_to_do() {
 }
 
 #[test]
+fn folders_that_an_adapter_creates_can_be_entered() {
+    if !has_python() {
+        return;
+    }
+    let home = Home::new();
+    let _shim = served(&home, &[]);
+    // Python caches the adapter's module in a folder that it creates.
+    let cache = home.path().join(in_tree("tests/python").trim_start_matches('/'));
+    assert_eq!(std::fs::metadata(cache).unwrap().permissions().mode() & 0o700, 0o700);
+}
+
+#[test]
 fn one_client_at_a_time() {
     if !has_python() {
         return;

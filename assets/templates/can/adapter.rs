@@ -248,7 +248,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     // `activate` enables and `deactivate` stops: their default bodies do what is right for an arm whose motors hold it
     // where it is. YOUR ARM: if it needs more (release brakes, home), write `activate`. It must not move the arm.
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         ManipulatorInfo {

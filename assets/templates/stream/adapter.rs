@@ -21,7 +21,7 @@ use super::protocol::{self, Command, Hello, MAX_COMMAND, Mode, State, WireJoints
 use super::wire::{self, Address, Link};
 use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
 
-/// The controller is asked who it is until it says so, as it may just be starting. With the connection: below 3 s.
+/// HELLO is retried, as the controller may just be starting. With the connection: below 3 s.
 const HELLO: Retry = Retry { each: Duration::from_millis(250), times: 5 };
 /// Longest wait for any other reply. YOUR ARM: several times what the controller needs.
 const REPLY: Retry = Retry::once(Duration::from_millis(100));
@@ -100,7 +100,7 @@ impl AcmeAdapter {
         self.request(command, REPLY, |_| Some(()))
     }
 
-    /// A setpoint: it may be obeyed twice, so it may be sent again when its reply is lost.
+    /// A setpoint: executing it twice is harmless, so it is sent again when its reply is lost.
     fn set_point(&mut self, command: &Command) -> AdapterResult<()> {
         self.state = None;
         self.request(command, CYCLE, |_| Some(()))
@@ -178,7 +178,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     // `activate` enables and `deactivate` stops: their default bodies do what is right for an arm whose ENABLE holds it
     // where it is. YOUR ARM: if it needs more (release brakes, home), write `activate`. It must not move the arm.
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         ManipulatorInfo {

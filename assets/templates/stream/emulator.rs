@@ -1,32 +1,35 @@
-//! The emulator: plays the controller at the other end of the wire, for `address: sim` and for tests.
+//! The emulator: the controller's side of the protocol, for `address: sim` and for tests.
 //!
-//! It has its own reading of the sheet in `protocol.rs` and shares no code with it: an emulator that shared the adapter's
-//! encoders would share its mistakes. YOUR ARM: change it as you change `protocol.rs`. What the arm itself does, its
-//! joints, motors, errors and faults, is in `SimArm`.
+//! It is written from the sheet in `protocol.rs` and shares no code with it: two sides that share an encoder share its
+//! mistakes. YOUR ARM: change it as you change `protocol.rs`. `SimArm` is the arm: joints, motors, errors, faults.
 
 use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::AdapterResult;
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm};
+use dimos::hardware::sim::faults::FaultKind;
 use dimos::hardware::sim::stream::Controller;
 use dimos::hardware::transport::Scan;
 use dimos::joint::{ControlMode, Joints};
 
 use super::{DOF, Options, limits, wire};
 
-/// In velocity mode the arm stops when no velocity arrives for this long [s].
+/// In velocity mode the arm stops when no velocity arrives within this time [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
 
-/// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.
+/// Starts an emulator at `place`, with the `sim` part of the arm's options. It runs until it is dropped.
 pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Box<dyn Emulator>> {
     let options: Options = config.options()?;
     let arm = SimArm::new("acme", &limits(), &options.sim, PLAYABLE, MonotonicClock.now())?;
-    Ok(Box::new(wire::serve(AcmeController { arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT) }, place)?))
+    let controller = AcmeController { arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT), state: Vec::new() };
+    Ok(Box::new(wire::serve(controller, place)?))
 }
 
-/// The controller: requests in, what the arm makes of them, replies out.
+/// The controller: executes requests and replies.
 struct AcmeController {
     arm: SimArm,
+    /// Data of the last reply to STATE, for the fault `frozen`.
+    state: Vec<u8>,
 }
 
 impl HasArm for AcmeController {
@@ -58,17 +61,22 @@ impl Controller for AcmeController {
 }
 
 impl AcmeController {
-    /// Does what a request asks; an error is the status of the reply.
+    /// Executes a request; an error is the status of the reply.
     fn execute(&mut self, opcode: u8, payload: &[u8], data: &mut Vec<u8>) -> Result<(), u8> {
         let arm = &mut self.arm;
         match (opcode, payload) {
             (0x01, []) => {
                 arm.client_came();
-                put_hello(data, arm.claimed_dof() as u8);
+                let model = 1 + u8::from(arm.take_fault(FaultKind::WrongModel).is_some());
+                put_hello(data, model, arm.claimed_dof() as u8);
                 Ok(())
             }
             (0x02, []) => {
-                put_state(data, arm);
+                if self.state.is_empty() || arm.take_fault(FaultKind::Frozen).is_none() {
+                    self.state.clear();
+                    put_state(&mut self.state, arm);
+                }
+                data.extend(&self.state);
                 Ok(())
             }
             (0x03, [mode @ 0..=2]) => arm.set_mode(match mode {
@@ -111,7 +119,7 @@ struct Request<'a> {
     payload: &'a [u8],
 }
 
-/// Finds a request at the front of what has arrived.
+/// Finds a request at the front of the received bytes.
 fn scan(bytes: &[u8]) -> Scan<Request<'_>> {
     let &[start, opcode, number, length, ref rest @ ..] = bytes else {
         return if matches!(bytes, [] | [0xA5, ..]) { Scan::More } else { Scan::Skip(1) };
@@ -141,7 +149,7 @@ fn checksum<'a>(bytes: impl Iterator<Item = &'a u8>) -> (u8, u8) {
     ((sum >> 8) as u8, sum as u8)
 }
 
-/// Exactly N finite numbers.
+/// Decodes exactly N finite numbers.
 fn numbers<const N: usize>(bytes: &[u8]) -> Result<[f32; N], u8> {
     let (chunks, rest) = bytes.as_chunks::<4>();
     let mut out = [0.0; N];
@@ -149,13 +157,13 @@ fn numbers<const N: usize>(bytes: &[u8]) -> Result<[f32; N], u8> {
     if chunks.len() == N && rest.is_empty() && out.iter().all(|value| value.is_finite()) { Ok(out) } else { Err(2) }
 }
 
-/// A number per joint [deg or deg/s] as [rad or rad/s].
+/// Decodes one number per joint [deg or deg/s] and converts it to [rad or rad/s].
 fn radians(bytes: &[u8]) -> Result<[f64; DOF], u8> {
     Ok(numbers::<DOF>(bytes)?.map(|degrees| f64::from(degrees).to_radians()))
 }
 
-fn put_hello(out: &mut Vec<u8>, dof: u8) {
-    out.extend([0, 1, dof, 2, 1, 0, 0, 0, 42]);
+fn put_hello(out: &mut Vec<u8>, model: u8, dof: u8) {
+    out.extend([0, model, dof, 2, 1, 0, 0, 0, 42]);
 }
 
 fn put_state(out: &mut Vec<u8>, arm: &mut SimArm) {
@@ -213,7 +221,7 @@ mod tests {
             out
         };
         let mut data = Vec::new();
-        put_hello(&mut data, 6);
+        put_hello(&mut data, 1, 6);
         assert_eq!(of(0x01, 1, 0, &data), bytes(golden::HELLO_REPLY));
         assert_eq!(of(0x03, 3, 5, &[]), bytes(golden::MOVING_REPLY));
         let mut data = Vec::new();

@@ -25,7 +25,7 @@ pub const DOF: usize = 6;
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 const HOLDS_WHEN_DISABLED: bool = true;
 
-/// How often the controller measures [Hz]: asking more often brings nothing new.
+/// Rate of the controller's measurements [Hz].
 const NATIVE_RATE: f64 = 250.0; // YOUR ARM
 
 /// The row in the table of adapters: what `list-adapters` shows, and how an arm or its emulator is made.
@@ -54,7 +54,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     emulate: Some(emulator::start),
 };
 
-/// Whether number of joints and options go together, and the joint limits that follow: `dimos check` asks this.
+/// Checks the number of joints and the options, and returns the joint limits; `dimos check` calls it.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("acme", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());

@@ -11,5 +11,5 @@ pub mod yourarm;
 /// The compile-time adapter table.
 pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC, xarm::SPEC, piper::SPEC, remote::SPEC];
 
-/// The adapters that this build does not have: those behind a cargo feature that is off. None of the box is.
+/// Adapters that this build lacks because their cargo feature is off. No built-in adapter has one.
 pub const ABSENT: &[Absent] = &[];

@@ -18,7 +18,8 @@ const STREAM: (f64, f64) = (0.1, 0.1);
 /// Error code of the open E-stop line.
 pub const ESTOP: u16 = 1;
 
-/// The faults that a [`SimArm`] can play on a byte stream: those of the arm and those of [`SimArm::delivery`].
+/// The faults that a [`SimArm`] can play on a byte stream: those of the arm and those of [`SimArm::delivery`]. The
+/// controller itself plays `WrongModel` and `Frozen`.
 pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
@@ -32,6 +33,8 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Corrupt,
     FaultKind::Truncated,
     FaultKind::WrongDof,
+    FaultKind::WrongModel,
+    FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
 ];

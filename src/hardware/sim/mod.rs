@@ -33,6 +33,7 @@ pub mod options;
 pub mod plant;
 mod plant_joint;
 pub mod reach;
+mod refusal;
 pub mod serial_server;
 pub mod stream;
 mod tcp_listener;

@@ -10,16 +10,17 @@ use crate::hardware::adapter::{
     AdapterError, AdapterResult, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
     Stop,
 };
+use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::sim::faults::{Fault, FaultKind};
-use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
+use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
 /// An ideal arm in memory.
 pub struct MockArm {
     options: Options,
     dof: usize,
     device: Device,
-    /// The last reading, for the fault that shows nothing newer.
+    /// The last reading, for the fault `frozen`.
     measured: Option<JointReading>,
 }
 
@@ -29,14 +30,14 @@ impl MockArm {
         Self::with_clock(config, Arc::new(MonotonicClock))
     }
 
-    /// A mock arm on another clock, for tests. Latency and stalls block in real time all the same.
+    /// A mock arm on another clock, for tests. Latency and stalls still block in real time.
     pub fn with_clock(config: &AdapterConfig, clock: Arc<dyn Clock>) -> AdapterResult<Self> {
         config.check(check)?;
         let (options, dof) = (config.options::<Options>()?, config.dof);
         Ok(Self { device: Device::new(dof, &options, clock)?, options, dof, measured: None })
     }
 
-    /// Lets a fault happen `fault.at` seconds from now; an error names the kinds that can be played.
+    /// Injects a fault that begins `fault.at` seconds from now; the error lists the kinds that it can play.
     pub fn inject(&mut self, fault: Fault) -> Result<(), String> {
         self.device.inject(fault)
     }
@@ -47,13 +48,6 @@ impl MockArm {
         } else {
             Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)))
         }
-    }
-}
-
-/// The first dof values of `from`, the rest zero; `into` has length dof.
-fn fill(into: &mut [f64], from: &Joints) {
-    for (to, value) in into.iter_mut().zip(from) {
-        *to = *value;
     }
 }
 
@@ -97,7 +91,7 @@ impl ManipulatorAdapter for MockArm {
             return Err(AdapterError::Unsupported);
         }
         self.device.write()?;
-        self.device.arm.set_mode(mode).map_err(|refusal| self.device.refused(refusal))
+        self.device.arm.set_mode(mode).map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
     fn get_control_mode(&self) -> ControlMode {
@@ -147,19 +141,13 @@ impl ManipulatorAdapter for MockArm {
     fn read_state(&mut self) -> AdapterResult<RobotState> {
         self.device.answer()?;
         let arm = &self.device.arm;
-        let state = match (arm.error(), arm.enabled()) {
-            (0, false) => 0,
-            (0, true) if arm.moving() => 2,
-            (0, true) => 1,
-            _ => 3,
-        };
         let mode = MODES.iter().position(|mode| *mode == arm.mode()).unwrap_or_default();
-        Ok(RobotState { state, mode: mode as i32 })
+        Ok(RobotState { state: arm.state_code().into(), mode: mode as i32 })
     }
 
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
         self.device.answer()?;
-        Ok((self.device.arm.error().into(), self.device.error_text()))
+        Ok((self.device.arm.error().into(), self.device.arm.error_text()))
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
@@ -175,7 +163,7 @@ impl ManipulatorAdapter for MockArm {
             ControlMode::ServoPosition => self.device.arm.servo(positions),
             _ => return Err(AdapterError::Rejected("joint positions in velocity mode".into())),
         };
-        result.map_err(|refusal| self.device.refused(refusal))
+        result.map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
     fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
@@ -185,7 +173,7 @@ impl ManipulatorAdapter for MockArm {
         if mode != ControlMode::Velocity {
             return Err(AdapterError::Rejected(format!("joint velocities in {} mode", mode.name())));
         }
-        self.device.arm.velocity(velocities).map_err(|refusal| self.device.refused(refusal))
+        self.device.arm.velocity(velocities).map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
     fn write_stop(&mut self) -> AdapterResult<Stop> {
@@ -197,12 +185,12 @@ impl ManipulatorAdapter for MockArm {
 
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         self.device.write()?;
-        self.device.arm.enable(enable).map_err(|refusal| self.device.refused(refusal))
+        self.device.arm.enable(enable).map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
     fn write_clear_errors(&mut self) -> AdapterResult<()> {
         self.device.write()?;
-        self.device.arm.clear_error().map_err(|refusal| self.device.refused(refusal))
+        self.device.arm.clear_error().map_err(|refusal| self.device.arm.rejected(refusal))
     }
 
     fn gripper(&mut self) -> Option<&mut dyn Gripper> {

@@ -1,4 +1,4 @@
-//! What would be the mock arm's controller: a [`SimArm`] that is brought up to date with the clock at every call.
+//! The mock arm's controller: a [`SimArm`] that is advanced to the present at every call.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -7,13 +7,13 @@ use super::limits;
 use super::options::{Options, PLAYABLE};
 use crate::clock::{Clock, Mono};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::sim::arm::{Delivery, ESTOP, Refusal, SimArm};
+use crate::hardware::sim::arm::{Delivery, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::plant::{Plant, Tracking};
 use crate::joint::Joints;
 
-/// Widest opening of the gripper [m].
+/// Maximum opening of the gripper [m].
 pub const GRIPPER_MAX: f64 = 0.08;
 /// Speed of the gripper [m/s].
 const GRIPPER_SPEED: f64 = 0.1;
@@ -27,7 +27,7 @@ pub struct Device {
     pub connected: bool,
     clock: Arc<dyn Clock>,
     latency: Duration,
-    /// There is no power until then.
+    /// When the power returns after a scripted loss of power.
     power_off_until: Mono,
 }
 
@@ -39,7 +39,7 @@ impl Device {
         let arm = SimArm::new("mock", &limits(dof), &options.sim(), PLAYABLE, clock.now())?;
         let plant = Plant::new(&limits(dof), &options.initial_positions, tracking, fall);
         Ok(Self {
-            // What is outside its limits it does as far as it can.
+            // Targets outside the limits are accepted; the joints stop at the limits.
             arm: arm.with_plant(plant).with_tolerance(f64::INFINITY),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
             connected: false,
@@ -68,7 +68,7 @@ impl Device {
         Ok(())
     }
 
-    /// The arm stops when its connection ends, as one with a controller does.
+    /// Disconnects and stops the arm, as a controller does.
     pub fn disconnect(&mut self) {
         if self.connected {
             self.advance();
@@ -77,7 +77,7 @@ impl Device {
         }
     }
 
-    /// A part of an answer that needs no exchange with the arm, as if it had come with the last joint positions.
+    /// Begins a read that needs no exchange with the arm, as if its value had arrived with the last joint positions.
     pub fn answer(&mut self) -> AdapterResult<()> {
         if !self.connected {
             return Err(AdapterError::NotConnected);
@@ -86,7 +86,7 @@ impl Device {
         Ok(())
     }
 
-    /// What a read of the joints begins with.
+    /// Begins a read of the joints.
     pub fn read(&mut self) -> AdapterResult<()> {
         self.exchange()?;
         match self.arm.take_fault(FaultKind::ReadError) {
@@ -95,7 +95,7 @@ impl Device {
         }
     }
 
-    /// What a write begins with.
+    /// Begins a write.
     pub fn write(&mut self) -> AdapterResult<()> {
         self.exchange()?;
         match self.arm.take_fault(FaultKind::WriteError) {
@@ -104,50 +104,25 @@ impl Device {
         }
     }
 
-    /// What a write of motion begins with: it needs the motors on and no error.
+    /// Begins a motion command, which requires motors on and no error.
     pub fn write_motion(&mut self) -> AdapterResult<()> {
         self.write()?;
-        self.arm.ready().map_err(|refusal| self.refused(refusal))
+        self.arm.ready().map_err(|refusal| self.arm.rejected(refusal))
     }
 
-    /// Joint positions as reported: as they are, or spoiled by a fault.
+    /// Returns the joint positions [rad] as reported; faults make them NaN or zero.
     pub fn reported_positions(&mut self) -> Joints {
         self.arm.measured().positions
     }
 
-    /// A refusal as the answer to a command.
-    pub fn refused(&self, refusal: Refusal) -> AdapterError {
-        AdapterError::Rejected(match refusal {
-            Refusal::InError => return self.fault(),
-            Refusal::Disabled => "the motors are disabled".to_owned(),
-            Refusal::Moving => "the mode cannot change while the arm moves".to_owned(),
-            Refusal::WrongMode => format!("not in {} mode", self.arm.mode().name()),
-            Refusal::OutOfRange => "a target is outside the joint limits".to_owned(),
-        })
-    }
-
-    /// The error as the answer to a command that it forbids.
-    fn fault(&self) -> AdapterError {
-        AdapterError::Fault { code: self.arm.error().into(), text: self.error_text() }
-    }
-
-    /// What the error means; empty when there is none.
-    pub fn error_text(&self) -> String {
-        match self.arm.error() {
-            0 => String::new(),
-            ESTOP => "E-stop line open".to_owned(),
-            code => format!("scripted error {code}"),
-        }
-    }
-
-    /// Brings joints and gripper up to the present.
+    /// Advances joints and gripper to the present.
     fn advance(&mut self) {
         let before = self.arm.now();
         self.arm.integrate(self.clock.now());
         self.gripper.advance(self.arm.now().seconds_since(before));
     }
 
-    /// An exchange with the arm: it takes its time, and faults strike that are due.
+    /// Exchanges data with the arm: waits for the latency and plays due faults.
     fn exchange(&mut self) -> AdapterResult<()> {
         self.answer()?;
         if !self.latency.is_zero() {

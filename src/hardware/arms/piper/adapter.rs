@@ -24,12 +24,13 @@ use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
     Stop,
 };
+use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::transport::can::CanAddress;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
-/// Timeout of clearing errors; drivers report every 25 ms.
-const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
+/// How long a stop waits for current positions.
+const LIVE_TIMEOUT: Duration = Duration::from_millis(60);
 /// How long a stop waits for the joints to decelerate, and the change of speed that shows it [0.001 rad/s].
 const STOP_TIMEOUT: Duration = Duration::from_millis(20);
 const DECELERATION: i32 = 20;
@@ -54,9 +55,8 @@ pub struct PiperAdapter {
 impl PiperAdapter {
     /// Creates an adapter for the arm on the bus at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
         config.check(check)?;
-        let address = CanAddress::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        let address = config.parse_address(CanAddress::parse)?;
         let options: Options = config.options()?;
         let arm = Session::new(config.hardware_id.clone(), address, options.gripper.stroke().is_some());
         Ok(Self { arm, options, mode: ControlMode::Position })
@@ -106,14 +106,6 @@ impl PiperAdapter {
         Some(joints_of(&efforts))
     }
 }
-
-/// Copies the first values; `out` has length dof.
-fn fill(out: &mut [f64], values: &[f64]) {
-    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
-}
-
-/// How long a stop waits for current positions.
-const LIVE_TIMEOUT: Duration = Duration::from_millis(60);
 
 impl ManipulatorAdapter for PiperAdapter {
     // --- Lifecycle ---
@@ -316,7 +308,7 @@ impl ManipulatorAdapter for PiperAdapter {
         }
         let asked = MonotonicClock.now();
         let cleared = |p: &Feedback| p.drivers_heard(asked) && p.status_at > asked && p.error_code() == 0;
-        if self.arm.watch(CLEAR_TIMEOUT, cleared)? {
+        if self.arm.watch(hold::CLEAR_TIMEOUT, cleared)? {
             if matches!(self.arm.feedback.status.control, 0 | 1) {
                 self.arm.release();
             }

@@ -11,9 +11,10 @@ use crate::hardware::adapter::AdapterResult;
 const WINDOW: f64 = 0.02;
 /// How long contradicting positions may take to agree: about 10 sets if every fifth is wrong.
 const SETTLE_TIMEOUT: Duration = Duration::from_millis(300);
-/// How long the controller may take to refuse a target outside the limits, and to clear that error.
+/// How long the controller may take to refuse a target outside the limits.
 const REFUSAL_TIMEOUT: Duration = Duration::from_millis(100);
-const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
+/// Timeout of clearing errors; drivers report every 25 ms.
+pub const CLEAR_TIMEOUT: Duration = Duration::from_millis(300);
 /// How long the arm may take to report the ordered mode.
 const CONTROL_TIMEOUT: Duration = Duration::from_millis(300);
 /// State of the arm: target beyond the limits.

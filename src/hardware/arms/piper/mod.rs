@@ -28,6 +28,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 
+use crate::hardware::adapter_util::{above_zero, fraction};
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::hardware::transport::can::{self, address::FORMS};
@@ -157,21 +158,7 @@ impl Default for Options {
     }
 }
 
-/// A number above 0, up to 1.
-fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    above_zero(deserializer, 1.0)
-}
-
-/// A number above 0, up to 5.
+/// Reads a torque above 0 and at most 5 Nm.
 fn torque<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     above_zero(deserializer, 5.0)
-}
-
-fn above_zero<'de, D: Deserializer<'de>>(deserializer: D, most: f64) -> Result<f64, D::Error> {
-    let value = f64::deserialize(deserializer)?;
-    if value > 0.0 && value <= most {
-        Ok(value)
-    } else {
-        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most {most}")))
-    }
 }

@@ -295,7 +295,7 @@ impl Session {
         }
         if MonotonicClock.now().since(self.feedback.commanded_at) < STALE_AFTER {
             return Err(self.refuse(
-                "somebody else commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
+                "another program commands this arm\nhint: end the other program, or unplug the leader arm from this bus"
                     .into(),
             ));
         }
@@ -309,7 +309,7 @@ impl Session {
         }
     }
 
-    /// An error when somebody else has changed the arm's mode or power, which is left as it is.
+    /// Returns an error if another client has changed the arm's mode or power. Does not undo the change.
     pub fn ours(&self) -> AdapterResult<()> {
         let what = match (self.feedback.guard.change, self.feedback.guard.lost_power()) {
             (Some(change), _) => change.text(),

@@ -278,7 +278,7 @@ fn two_commanders_do_not_take_turns() {
     other(&emulator).send(&golden::MOVE_JOINTS.map(golden::frame)).unwrap();
     until("the refusal", || {
         let refused = arm.write_joint_positions(&START, 0.1).err();
-        refused.is_some_and(|error| error.to_string().contains("somebody else commands this arm\nhint: "))
+        refused.is_some_and(|error| error.to_string().contains("another program commands this arm\nhint: "))
     });
     assert!(arm.write_stop().is_ok(), "a stop is always sent");
     until("the other to be gone", || {

@@ -81,7 +81,7 @@ fn interfere(calls: Calls, pause: Duration, heard: bool) {
     let before = ours().len();
     let error = arm.write_joint_positions(&START, 1.0).unwrap_err().to_string();
     assert!(
-        ["this run did not order", "somebody else", "motors are disabled", "is controlled by"]
+        ["this run did not order", "another program commands", "motors are disabled", "is controlled by"]
             .iter()
             .any(|part| error.contains(part)),
         "{error}"

@@ -15,6 +15,7 @@ use crate::hardware::adapter::{
     AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
     RobotState, Stop,
 };
+use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
@@ -30,16 +31,15 @@ pub struct RemoteAdapter {
     session: Option<Session>,
     mode: ControlMode,
     assumed_enabled: bool,
-    /// What the peer of the last connection said.
+    /// Description from the peer of the last connection.
     last: Option<Description>,
 }
 
 impl RemoteAdapter {
     /// An adapter for the peer at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
         config.check(check)?;
-        let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        let address = config.parse_address(Address::parse)?;
         let (mode, assumed_enabled) = (ControlMode::Position, false);
         Ok(Self { address, dof: config.dof, session: None, mode, assumed_enabled, last: None })
     }
@@ -48,12 +48,12 @@ impl RemoteAdapter {
         self.session.as_mut().ok_or(AdapterError::NotConnected)
     }
 
-    /// Does something with the session; an error ends it.
+    /// Calls `what` with the session; an error ends it.
     fn with<T>(&mut self, what: impl FnOnce(&mut Session) -> AdapterResult<T>) -> AdapterResult<T> {
         what(self.session()?).inspect_err(|_| self.session = None)
     }
 
-    /// Asks for an act and waits for its answer.
+    /// Requests an act and waits for its answer.
     fn act(&mut self, act: &Act, timeout: Duration) -> AdapterResult<()> {
         let answer = self.with(|session| session.act(act, timeout))?;
         answer.unwrap_or_else(|| {
@@ -67,7 +67,7 @@ impl RemoteAdapter {
         self.session().map(|session| session.late())
     }
 
-    /// Answers something of the newest state, which is of the time after the last act.
+    /// Returns a part of the newest state, measured after the last act.
     fn recent<T>(&mut self, of: impl FnOnce(&Measured) -> T) -> AdapterResult<T> {
         self.with(|session| session.recent().map(|state| state.map(of)))?
     }
@@ -77,7 +77,7 @@ impl RemoteAdapter {
         self.last.as_ref().is_some_and(|description| description.parts.iter().any(|part| part == name))
     }
 
-    /// Refuses what the arm would refuse, and sends the rest.
+    /// Sends a command unless the newest state shows that the arm would refuse it.
     fn command(&mut self, mode: ControlMode, values: &[f64], velocity: f64) -> AdapterResult<()> {
         if values.len() != self.dof || !values.iter().all(|value| value.is_finite()) {
             return Err(AdapterError::Rejected(format!("expected {} finite values, one per joint", self.dof)));
@@ -103,11 +103,6 @@ impl RemoteAdapter {
     }
 }
 
-/// Copies the first values; `out` has length dof.
-fn fill(out: &mut [f64], values: &[f64]) {
-    out.iter_mut().zip(values).for_each(|(to, value)| *to = *value);
-}
-
 impl ManipulatorAdapter for RemoteAdapter {
     // --- Lifecycle ---
 
@@ -116,7 +111,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.assumed_enabled = false;
         let mut session = Session::open(&self.address, self.dof)?;
         self.mode = session.recent()??.mode.unwrap_or_default();
-        session.newest()??; // asks for the next state, which then comes without being asked for
+        session.newest()??; // requests the next state, so that its reply wakes the device thread
         self.last = Some(session.description.clone());
         self.session = Some(session);
         Ok(())
@@ -138,7 +133,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         self.act(&Act::Deactivate, END_TIMEOUT)
     }
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         let said = self.last.as_ref();
@@ -235,8 +230,8 @@ impl ManipulatorAdapter for RemoteAdapter {
     }
 
     fn read_enabled(&mut self) -> AdapterResult<bool> {
-        // An arm that cannot say so is what it was last made. One that its peer holds takes no command, as if its
-        // motors were off.
+        // An arm that does not report it counts as last commanded. One that its peer holds accepts no command, as if
+        // its motors were off.
         let assumed = self.assumed_enabled;
         self.recent(|state| state.enabled.unwrap_or(assumed) && !state.held)
     }

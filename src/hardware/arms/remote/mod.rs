@@ -1,7 +1,7 @@
 //! An arm that another process serves: a vendor's SDK behind a small shim, in Python (`assets/python/dimos_shim.py`)
 //! or anything that has sockets. `docs/remote-adapter.md` is the protocol.
 //!
-//! Here nothing is known of the arm before the peer has said it, so the numbers below are nominal.
+//! The peer describes the arm after the connection; until then the nominal numbers below apply.
 
 mod adapter;
 pub mod address;
@@ -27,7 +27,7 @@ use address::Address;
 /// All modes that the protocol knows.
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 
-/// How often states come at most [Hz]; the peer says how often its arm has one.
+/// Maximum rate of states [Hz]; the peer reports the rate of its arm.
 const NATIVE_RATE: f64 = 1000.0;
 
 /// The row of remote arms in the adapter table.

@@ -1,4 +1,4 @@
-//! One connection to a peer, from its hello on: what was asked, what has been answered, and the newest state.
+//! One connection to a peer, from its hello on: outstanding requests, replies, and the newest state.
 //!
 //! An error of a method here that is not about one act or one reading ends the session; the adapter drops it then.
 
@@ -21,38 +21,38 @@ const HELLO_TIMEOUT: Duration = Duration::from_millis(1500);
 const REPLY_TIMEOUT: (u32, Duration) = (3, Duration::from_millis(100));
 /// The peer is lost when a reply is missing for this many device periods, but at least this long.
 const LOST_AFTER: (u32, Duration) = (10, Duration::from_secs(1));
-/// Longer than any cycle request [bytes].
+/// Capacity for a cycle request [bytes].
 const LINE: usize = 1024;
-/// An act that is asked for again within this time is the same one, still to be answered.
+/// An act repeated within this time is a retry that waits for the same answer.
 const AGAIN: Duration = Duration::from_millis(500);
-/// While commands come in at this pace, they bring the states along, and nothing else is sent.
+/// While commands are at most this far apart, their replies bring the states, and no other cycle is sent.
 const COMMANDED: Duration = Duration::from_millis(15);
 
-/// A connection with a peer that has said what it is.
+/// A connection to a peer that has described its arm.
 pub struct Session {
     link: Link,
-    /// What the peer says of its arm.
+    /// Description of the arm from the peer.
     pub description: Description,
     heard: Heard,
     /// The last request, as it was sent.
     line: Vec<u8>,
     /// Number of the last request.
     sequence: u32,
-    /// Since when the peer owes a reply.
+    /// Since when a reply is outstanding.
     owed_since: Option<Mono>,
     /// When the last command was given.
     commanded: Mono,
     /// When the last cycle was sent.
     asked: Mono,
-    /// The number of the last cycle: a peer gets one at a time.
+    /// Number of the last cycle; only one is outstanding at a time.
     cycling: u32,
     /// The last requested act, until its answer is returned, and when a caller last waited for it.
     act: Option<(Act, Mono)>,
-    /// Number of the last act: a state that is older is of the time before it.
+    /// Number of the last act: states from earlier cycles were measured before it.
     last_act: u32,
 }
 
-/// What the peer has said.
+/// Replies of the peer.
 struct Heard {
     peer: String,
     dof: usize,
@@ -61,7 +61,7 @@ struct Heard {
     /// When it arrived.
     at: Mono,
     device_time: DeviceTime,
-    /// Number of the last request that was answered; those before it are answered with it.
+    /// Number of the last answered request; replies arrive in order.
     answered: u32,
     /// Why there is no newer state.
     trouble: Option<AdapterError>,
@@ -115,7 +115,7 @@ impl Heard {
 }
 
 impl Session {
-    /// Connects, and has the peer say what it is. `dof`: the number of joints that the blueprint names.
+    /// Connects and reads the description of the arm. `dof`: number of joints in the blueprint.
     pub fn open(address: &Address, dof: usize) -> AdapterResult<Self> {
         let mut link = Link::connect(address, CONNECT_TIMEOUT)?;
         let mut line = Vec::with_capacity(LINE);
@@ -156,7 +156,7 @@ impl Session {
             act,
             last_act: 1,
         };
-        session.fresh()??; // so that measurements do come
+        session.fresh()??; // fails unless the peer measures
         Ok(session)
     }
 
@@ -165,7 +165,7 @@ impl Session {
         self.link.fd()
     }
 
-    /// How long a reply may take without being late.
+    /// Returns the reply timeout.
     pub fn late(&self) -> Duration {
         self.periods(REPLY_TIMEOUT)
     }
@@ -174,7 +174,7 @@ impl Session {
         least.max(Duration::from_secs_f64(f64::from(count) / self.description.native_rate))
     }
 
-    /// How often the arm has a new state.
+    /// Returns the period of the arm's states.
     fn period(&self) -> Duration {
         Duration::from_secs_f64(1.0 / self.description.native_rate)
     }
@@ -197,7 +197,7 @@ impl Session {
         after(self.cycling, self.heard.answered)
     }
 
-    /// Takes up all that has arrived, without waiting.
+    /// Processes all that has arrived, without waiting.
     pub fn take_up(&mut self) -> AdapterResult<()> {
         self.link.begin();
         let mut any = false;
@@ -214,8 +214,8 @@ impl Session {
         Ok(())
     }
 
-    /// Sends a command; `Busy` while the peer has not answered the last cycle. Answers why an earlier one was not
-    /// taken, where that is so.
+    /// Sends a command; `Busy` while the peer has not answered the last cycle. Also returns the refusal of an earlier
+    /// command.
     pub fn command(&mut self, command: Command<'_>) -> AdapterResult<()> {
         self.commanded = MonotonicClock.now();
         self.take_up()?;
@@ -243,7 +243,7 @@ impl Session {
             Some(since) if now.since(since) > self.late() => {
                 return Ok(Err(self.unanswered()));
             }
-            // A reply wakes who reads: without a pace, an arm at rest would be asked as fast as its peer answers.
+            // Each reply wakes the device thread; this limits the rate of requests to that of the arm.
             None if now.since(self.commanded) > COMMANDED && now.since(self.asked) > self.period().mul_f64(0.9) => {
                 self.cycle(None)?;
             }
@@ -260,7 +260,7 @@ impl Session {
         }
     }
 
-    /// The newest state, which is of the time after the last act: asks and waits where there is none, or an old one.
+    /// Returns a state measured after the last act; requests one and waits if the newest is older or stale.
     pub fn recent(&mut self) -> AdapterResult<AdapterResult<&Measured>> {
         let old = MonotonicClock.now().since(self.heard.at) > self.late();
         if old || !self.after_last_act() {
@@ -287,7 +287,7 @@ impl Session {
         AdapterError::Timeout(format!("{} did not answer within {:?}", self.heard.peer, self.late()))
     }
 
-    /// A state that is measured from here on: asks and waits for it.
+    /// Requests a new state and waits for it.
     pub fn fresh(&mut self) -> AdapterResult<AdapterResult<(&Measured, Mono)>> {
         if self.is_cycling() {
             self.await_answer(self.cycling)?;
@@ -300,7 +300,7 @@ impl Session {
         Ok(self.known())
     }
 
-    /// Waits until request `number` is answered, and not longer than a reply may take.
+    /// Waits until request `number` is answered, at most for the reply timeout.
     fn await_answer(&mut self, number: u32) -> AdapterResult<()> {
         let end = Instant::now() + self.late();
         loop {
@@ -341,7 +341,7 @@ impl Session {
         }
     }
 
-    /// Who is at the other end, for messages.
+    /// Returns the name and address of the peer, for messages.
     pub fn peer(&self) -> &str {
         &self.heard.peer
     }

@@ -55,11 +55,10 @@ pub struct XArmAdapter {
 impl XArmAdapter {
     /// Creates an adapter for the controller at `config.address`. Does not connect.
     pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
-        let rejected = |text: String| AdapterError::Rejected(format!("{}: {text}", config.hardware_id));
         config.check(check)?;
         let options: Options = config.options()?;
         let model = model_of(&options, config.dof)?;
-        let address = Address::parse(&config.address).map_err(|e| rejected(format!("address: {e}")))?;
+        let address = config.parse_address(Address::parse)?;
         Ok(Self { address, model, options, session: None, target: None })
     }
 

@@ -38,8 +38,9 @@ mod tests_slow;
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
+use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
 use crate::joint::ControlMode;
@@ -132,15 +133,5 @@ fn model_of(options: &Options, dof: usize) -> Result<Model, ConfigError> {
         axes if axes == dof => Ok(model),
         axes => Err(ConfigError::new("model", format!("{} has {axes} joints, not {dof}", model.name()))
             .hint(format!("give the arm {axes} joints, or leave `model` out for the xArm with {dof}"))),
-    }
-}
-
-/// A number above 0, up to 1.
-fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    let value = f64::deserialize(deserializer)?;
-    if value > 0.0 && value <= 1.0 {
-        Ok(value)
-    } else {
-        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most 1")))
     }
 }

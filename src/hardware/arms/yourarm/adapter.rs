@@ -90,7 +90,7 @@ impl YourArmAdapter {
         self.request(command, REPLY, |_| Some(()))
     }
 
-    /// A setpoint: it may be obeyed twice, so it may be sent twice.
+    /// A setpoint: executing it twice is harmless, so it is sent again when its reply is lost.
     fn set_point(&mut self, command: &Command) -> AdapterResult<()> {
         self.state_at = Mono::ZERO;
         self.request(command, CYCLE, |_| Some(()))
@@ -191,7 +191,7 @@ impl ManipulatorAdapter for YourArmAdapter {
     // `activate` and `deactivate`: the default bodies do what is right here. ENABLE holds the arm where it is; STOP
     // leaves the motors on.
 
-    // --- What it is ---
+    // --- Identity ---
 
     fn get_info(&self) -> ManipulatorInfo {
         let hello = self.hello.as_ref();

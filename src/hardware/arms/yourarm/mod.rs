@@ -1,6 +1,8 @@
-//! YourArm, a made-up 6-joint arm: the template for an arm of your own. Copy this folder, then change, in this
-//! order: `frame.rs` and `protocol.rs` (the bytes), `adapter.rs` (the units and the lifecycle), `emulator/` (the other
-//! side of the wire), the numbers below, and add the row to the table in `arms/mod.rs`.
+//! YourArm, a made-up 6-joint arm on TCP: the annotated example of an adapter with a gripper, Cartesian moves and
+//! options. It is not a template: `dimos adapter new` writes the start of an adapter for your arm.
+//!
+//! `frame.rs` and `protocol.rs` have the bytes, `adapter.rs` the units and the lifecycle, `emulator/` the controller's
+//! side of the protocol.
 
 pub mod adapter;
 pub mod emulator;
@@ -14,30 +16,31 @@ mod tests;
 use std::time::Duration;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
+use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::sim::arm::SimOptions;
+use crate::hardware::sim::arm::{PLAYABLE, SimOptions};
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
 
 /// The modes of the arm, in the order of their numbers on the wire.
 const MODES: &[ControlMode] = &[ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 
-/// How often the controller measures [Hz]: asking more often brings nothing new.
+/// Rate of the controller's measurements [Hz].
 const NATIVE_RATE: f64 = 500.0;
 
 /// Whether the arm keeps its pose when its motors are off: it has brakes.
 const HOLDS_WHEN_DISABLED: bool = true;
 
-/// Widest opening of the gripper [m].
+/// Maximum opening of the gripper [m].
 const GRIPPER_MAX: f64 = 0.08;
 
 /// YourArm's row in the adapter table.
 pub const SPEC: AdapterSpec = AdapterSpec {
     name: "yourarm",
-    about: "YourArm YA6, the annotated template",
+    about: "YourArm YA6, the annotated example",
     level: Level::Emulated,
     transport: "tcp",
     dof: (protocol::DOF, protocol::DOF),
@@ -60,7 +63,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
 };
 
-/// The data sheet's joint limits, here in the sheet's units: lowest and highest position [deg], top speed [deg/s].
+/// The data sheet's joint limits: minimum and maximum position [deg], maximum speed [deg/s].
 const DATA_SHEET: [(f64, f64, f64); protocol::DOF] = [
     (-170.0, 170.0, 180.0),
     (-100.0, 130.0, 180.0),
@@ -69,20 +72,20 @@ const DATA_SHEET: [(f64, f64, f64); protocol::DOF] = [
     (-100.0, 120.0, 360.0),
     (-270.0, 270.0, 360.0),
 ];
-/// Highest acceleration [rad/s²] and jerk [rad/s³] of every joint.
+/// Maximum acceleration [rad/s²] and jerk [rad/s³] of every joint.
 const ACCELERATION: f64 = 10.0;
 const JERK: f64 = 100.0;
 
-/// Whether number of joints and options go together: what the type of the options cannot say. All arms have the same
-/// limits; where they depend on an option, like a model, this is the place.
+/// Checks the number of joints and the options, and returns the joint limits. If an option changes the limits (a
+/// model, for example), apply it here.
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
     config.check_dof("yourarm", SPEC.dof)?;
     let (options, limits) = (config.options::<Options>()?, limits());
-    options.sim.check("yourarm", &limits, emulator::PLAYABLE)?;
+    options.sim.check("yourarm", &limits, PLAYABLE)?;
     Ok(Checked { limits })
 }
 
-/// The joint limits in SI units.
+/// Returns the joint limits in SI units.
 fn limits() -> JointLimits {
     JointLimits {
         acceleration_max: vec![ACCELERATION; protocol::DOF],
@@ -108,15 +111,5 @@ pub struct Options {
 impl Default for Options {
     fn default() -> Self {
         Self { speed_scale: 1.0, gripper: true, sim: SimOptions::default() }
-    }
-}
-
-/// A number above 0, up to 1.
-fn fraction<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    let value = f64::deserialize(deserializer)?;
-    if value > 0.0 && value <= 1.0 {
-        Ok(value)
-    } else {
-        Err(serde::de::Error::custom(format!("{value} is not above 0 and at most 1")))
     }
 }

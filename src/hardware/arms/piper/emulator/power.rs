@@ -1,4 +1,4 @@
-//! The controller's motors: how they come on, what faults do to them, and what time does to the joints.
+//! The controller's motors: switching on and off, faults, and the motion of the joints over time.
 
 use std::time::Duration;
 
@@ -8,8 +8,8 @@ use crate::clock::Mono;
 use crate::hardware::sim::arm::{HasArm, SimArm};
 use crate::hardware::sim::faults::FaultKind;
 
-/// How the arm sinks when its motors are off, once they have been on: how fast [rad/s], and where its joints then lie.
-/// Until then somebody holds it.
+/// Speed at which the arm falls when its motors go off [rad/s], and the joint positions at which it rests. Before the
+/// motors are on for the first time the arm is supported.
 const FALL: f64 = 0.3;
 const FOLDED: [Option<f64>; DOF] = [None, Some(0.0), Some(0.0), None, Some(0.0), None];
 /// How long the motors take to come on, one after the other.

@@ -1,22 +1,19 @@
-//! What the server does with a request: one method of an adapter, or one cycle of them. The arm is a [`SimArm`].
+//! Executes requests: a method of an adapter, or a cycle. The arm is a [`SimArm`].
 
 use serde_json::{Map, Value, json};
 
+use super::super::{MODES, NATIVE_RATE, SPEC};
 use super::wire::{self, Command, Request};
 use super::{PLAYABLE, SILENCE_TIMEOUT};
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
-use crate::hardware::sim::arm::{Delivery, ESTOP, HasArm, Measured, Refusal, SimArm, SimOptions};
+use crate::hardware::sim::arm::{Delivery, HasArm, Measured, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::stream;
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, JointLimits, Joints};
 
-/// The modes that the protocol knows.
-const MODES: [ControlMode; 3] = [ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
-/// How often the arm has a new state [Hz].
-const NATIVE_RATE: f64 = 1000.0;
 /// Highest acceleration [rad/s²] and jerk [rad/s³] of every joint.
 const ACCELERATION: f64 = 10.0;
 const JERK: f64 = 100.0;
@@ -28,13 +25,13 @@ pub struct Controller {
     arm: SimArm,
     limits: JointLimits,
     gripper: Gripper,
-    /// Why no command is taken before the arm is enabled again.
+    /// Why commands are refused until the arm is enabled again.
     held: Option<&'static str>,
     /// Commands have come since the last stop.
     commanded: bool,
     /// When the last request was answered.
     heard: Mono,
-    /// The last measurement, for the fault that shows nothing newer.
+    /// The last measurement, for the fault `frozen`.
     measured: Option<(Mono, Measured)>,
 }
 
@@ -75,7 +72,7 @@ impl Controller {
         self.gripper.stop();
     }
 
-    /// Does what is asked; answers the content of the reply.
+    /// Executes a request; returns the content of the reply.
     fn answer(&mut self, request: &Request) -> AdapterResult<Map<String, Value>> {
         let content = match request.what.as_str() {
             "hello" => self.hello(),
@@ -95,7 +92,7 @@ impl Controller {
             "info": { "vendor": "dimos", "model": "simulated", "firmware_version": null, "serial_number": null },
             "native_rate": NATIVE_RATE,
             "modes": MODES,
-            "holds_when_disabled": super::super::SPEC.holds_when_disabled,
+            "holds_when_disabled": SPEC.holds_when_disabled,
             "limits": lists(&self.limits, dof),
             "gripper_range": [0.0, GRIPPER.0],
             "parts": ["read_gripper_position"],
@@ -115,12 +112,12 @@ impl Controller {
             "set_control_mode" => {
                 let mode = serde_json::from_value(first).map_err(|_| malformed())?;
                 let known = MODES.contains(&mode).then_some(mode).ok_or(AdapterError::Unsupported)?;
-                self.arm.set_mode(known).map_err(|refusal| self.refused(refusal))
+                self.arm.set_mode(known).map_err(|refusal| self.arm.rejected(refusal))
             }
-            "write_clear_errors" => self.arm.clear_error().map_err(|refusal| self.refused(refusal)),
+            "write_clear_errors" => self.arm.clear_error().map_err(|refusal| self.arm.rejected(refusal)),
             "write_gripper_position" => {
                 self.may_move()?;
-                self.arm.ready().map_err(|refusal| self.refused(refusal))?;
+                self.arm.ready().map_err(|refusal| self.arm.rejected(refusal))?;
                 let opening = first.as_f64().ok_or_else(malformed)?;
                 if !(0.0..=GRIPPER.0).contains(&opening) {
                     let what = format!("gripper opening {opening} m is not within 0 to {} m", GRIPPER.0);
@@ -130,12 +127,12 @@ impl Controller {
                 Ok(())
             }
             "write_cartesian_position" => Err(AdapterError::Unsupported),
-            _ => Err(AdapterError::Protocol(format!("nothing is known here of {method:?}"))),
+            _ => Err(AdapterError::Protocol(format!("unknown request {method:?}"))),
         }
     }
 
     fn enable(&mut self, on: bool) -> AdapterResult<()> {
-        self.arm.enable(on).map_err(|refusal| self.refused(refusal))?;
+        self.arm.enable(on).map_err(|refusal| self.arm.rejected(refusal))?;
         if on {
             self.held = None;
         } else {
@@ -144,32 +141,9 @@ impl Controller {
         Ok(())
     }
 
-    fn refused(&self, refusal: Refusal) -> AdapterError {
-        let what = match refusal {
-            Refusal::InError => return self.fault(),
-            Refusal::Disabled => "the motors are disabled",
-            Refusal::WrongMode => "the arm is in another mode",
-            Refusal::Moving => "the mode cannot change while the arm moves",
-            Refusal::OutOfRange => "a target is outside the joint limits",
-        };
-        AdapterError::Rejected(what.to_owned())
-    }
-
-    fn fault(&self) -> AdapterError {
-        AdapterError::Fault { code: self.arm.error().into(), text: self.error_text() }
-    }
-
-    fn error_text(&self) -> String {
-        match self.arm.error() {
-            0 => String::new(),
-            ESTOP => "E-stop line open".to_owned(),
-            code => format!("scripted error {code}"),
-        }
-    }
-
     fn may_move(&self) -> AdapterResult<()> {
         match self.held {
-            _ if self.arm.error() != 0 => Err(self.fault()),
+            _ if self.arm.error() != 0 => Err(self.arm.fault()),
             Some(why) => Err(AdapterError::Rejected(why.to_owned())),
             None => Ok(()),
         }
@@ -184,12 +158,6 @@ impl Controller {
         }
         let arm = &self.arm;
         let joints = |values: &Joints| values.iter().take(arm.dof()).copied().collect::<Vec<f64>>();
-        let state = match (arm.error(), arm.enabled()) {
-            (0, false) => 0,
-            (0, true) if !arm.moving() => 1,
-            (0, true) => 2,
-            _ => 3,
-        };
         Ok(json!({
             "state": {
                 "time": time.0,
@@ -198,8 +166,8 @@ impl Controller {
                 "read_joint_efforts": joints(&measured.efforts),
                 "read_enabled": arm.enabled(),
                 "held": self.held.is_some(),
-                "read_error": [json!(arm.error()), json!(self.error_text())],
-                "read_state": { "state": state, "mode": MODES.iter().position(|mode| *mode == arm.mode()) },
+                "read_error": [json!(arm.error()), json!(arm.error_text())],
+                "read_state": { "state": arm.state_code(), "mode": MODES.iter().position(|mode| *mode == arm.mode()) },
                 "get_control_mode": arm.mode(),
                 "read_gripper_position": self.gripper.position,
                 "read_cartesian_position": null,
@@ -234,7 +202,7 @@ impl Controller {
             ControlMode::ServoPosition => self.arm.servo(values),
             _ => self.arm.move_to(values, command.velocity),
         }
-        .map_err(|refusal| self.refused(refusal))
+        .map_err(|refusal| self.arm.rejected(refusal))
     }
 }
 
@@ -260,7 +228,7 @@ impl HasArm for Controller {
         &mut self.arm
     }
 
-    /// A client that has commanded and fallen silent may hang: the arm is stopped.
+    /// Stops a commanded arm when no request arrives within the timeout: the client may hang.
     fn advance(&mut self, now: Mono) {
         let deadline = self.heard.after(SILENCE_TIMEOUT);
         if self.commanded && now >= deadline {
@@ -288,7 +256,7 @@ impl stream::Controller for Controller {
                 Err(error) => wire::refused(answer, request.id, &error),
             }
             let delivery = self.arm.delivery();
-            // While it stalls, the client is not silent: it waits for the answer.
+            // During a stall the client waits for the answer and does not count as silent.
             self.heard = if let Delivery::Stall(time) = delivery { now.after(time) } else { now };
             delivery
         })
@@ -297,7 +265,7 @@ impl stream::Controller for Controller {
     fn client_gone(&mut self, now: Mono) {
         self.advance(now);
         if self.commanded {
-            self.stop_unasked("its client has gone");
+            self.stop_unasked("its client disconnected");
         }
     }
 

@@ -16,10 +16,10 @@ use controller::Controller;
 
 /// Without a request for this long, the server stops an arm that was commanded.
 const SILENCE_TIMEOUT: Duration = Duration::from_millis(500);
-/// Its port on an address of its own.
+/// Default port.
 const PORT: u16 = 7450;
 
-/// The faults that the emulator can play.
+/// The faults that the emulator can play: no damaged bytes, because a local socket delivers none, and no lost power.
 pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,

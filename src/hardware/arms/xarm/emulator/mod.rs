@@ -1,4 +1,4 @@
-//! The emulator: plays the control box of an xArm, Lite 6 or 850 on a loopback address, for `address: sim`, for tests,
+//! The emulator of the control box of an xArm, Lite 6 or 850 on a loopback address, for `address: sim`, for tests,
 //! and for the vendor's own client. It serves any number of clients at once, as the real one does.
 //!
 //! The sockets, the arm and its faults are those of the simulation kit ([`crate::hardware::sim`]); here is what the
@@ -31,35 +31,15 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
-use crate::hardware::sim::arm::{self, HasArm};
-use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::arm::{self, HasArm, PLAYABLE};
+use crate::hardware::sim::faults::Fault;
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 use controller::Controller;
 pub use controller::Received;
 use report::Kind;
 
-/// The faults that the emulator can play.
-const PLAYABLE: &[FaultKind] = &[
-    FaultKind::Stall,
-    FaultKind::Silent,
-    FaultKind::Frozen,
-    FaultKind::Disconnect,
-    FaultKind::ErrorCode,
-    FaultKind::Estop,
-    FaultKind::PowerLoss,
-    FaultKind::Nan,
-    FaultKind::ZeroState,
-    FaultKind::Garbage,
-    FaultKind::Corrupt,
-    FaultKind::Truncated,
-    FaultKind::WrongDof,
-    FaultKind::WrongModel,
-    FaultKind::Sag,
-    FaultKind::Blocked,
-];
-
-/// Who speaks in messages.
+/// Prefix of messages.
 const WHO: &str = "xarm emulator";
 /// The report ports follow one another; they come first among the emulator's ports.
 const REPORT_PORTS: u16 = Kind::ALL.len() as u16;
@@ -194,7 +174,7 @@ impl XArmEmulator {
         Ok(Self { server, address })
     }
 
-    /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
+    /// Presses the E-stop button: error 1, motors off, until it is released, cleared and enabled.
     pub fn press_estop(&self) {
         self.server.with(|controller, now| {
             controller.advance(now);
@@ -222,7 +202,7 @@ impl XArmEmulator {
         self.server.with(|controller, _| controller.slow_down(SlowReply { register, delay }));
     }
 
-    /// Lets port 30000 close its connections, or keep them without a word, in the place of its reports.
+    /// Lets port 30000 close its connections, or keep them open without reports.
     pub fn withhold_full_reports(&self, withhold: Withhold) {
         self.server.with(|controller, _| controller.withhold = withhold);
     }
@@ -270,7 +250,7 @@ impl Emulator for XArmEmulator {
     }
 }
 
-/// What becomes of the reports of port 30000.
+/// Fault of the reports of port 30000.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Withhold {
     /// They are sent.

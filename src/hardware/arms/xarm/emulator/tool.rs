@@ -56,7 +56,7 @@ impl Tool {
         match *telegram {
             [8, 3, a0, a1, _, count] if count <= 16 => {
                 let first = u16::from_be_bytes([a0, a1]);
-                let registers = (0..u16::from(count)).flat_map(|i| self.holding(first + i).to_be_bytes());
+                let registers = (0..u16::from(count)).flat_map(|i| self.holding(first.wrapping_add(i)).to_be_bytes());
                 Some([8, 3, 2 * count].into_iter().chain(registers).collect())
             }
             [8, 16, a0, a1, c0, c1, _, ref data @ ..] => {
@@ -112,5 +112,16 @@ impl Tool {
             _ => f64::from(pulses) / 10.0,
         };
         self.gripper.move_to(millimetres / 1000.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_read_beyond_the_last_register_is_answered() {
+        let answer = Tool::new(GripperKind::Xarm).telegram(&[8, 3, 0xFF, 0xFF, 0, 2]);
+        assert_eq!(answer, Some(vec![8, 3, 4, 0, 0, 0, 0]));
     }
 }

@@ -1,12 +1,12 @@
-//! The emulated controller: what it does with a request. The arm behind it is a [`SimArm`]; the gripper and the pose
-//! are its own. Time is passed in and nothing here knows of sockets.
+//! The emulated controller: executes requests. It consists of a [`SimArm`], a gripper and the arm's kinematics. Time is
+//! passed in, and there is no I/O.
 
 use super::super::{GRIPPER_MAX, limits, protocol::DOF};
 use super::kinematics::Links;
 use super::wire::{self, Frame, Report, Request, put_hello, put_report, reply, status};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
-use crate::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
+use crate::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
 use crate::hardware::sim::reach::{self, Chain};
@@ -15,7 +15,7 @@ use crate::hardware::sim::trace::Trace;
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, Joints};
 
-/// Pose at power-up [rad] where the options give none: not zero, so that nothing works by accident.
+/// Pose at power-up [rad] if the options give none: not zero, so that mistakes show.
 const INITIAL: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 /// In velocity mode the arm stops when no velocity arrives for this long [s].
 const VELOCITY_TIMEOUT: f64 = 0.2;
@@ -41,15 +41,15 @@ pub struct Controller {
     gripper: Gripper,
     /// Requests that came over the wire.
     pub trace: Trace<Received>,
-    /// The last report, for the fault that shows nothing newer.
+    /// The last report, for the fault `frozen`.
     reported: Option<Report>,
 }
 
 impl Controller {
     /// A controller that was just switched on: disabled, in position mode.
-    pub fn new(options: &SimOptions, playable: &'static [FaultKind], now: Mono) -> AdapterResult<Self> {
+    pub fn new(options: &SimOptions, now: Mono) -> AdapterResult<Self> {
         let options = options.clone().starting_at(&INITIAL);
-        let arm = SimArm::new("yourarm", &limits(), &options, playable, now)?;
+        let arm = SimArm::new("yourarm", &limits(), &options, PLAYABLE, now)?;
         Ok(Self {
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
@@ -58,7 +58,7 @@ impl Controller {
         })
     }
 
-    /// Does what a frame asks and writes the reply into `out`.
+    /// Executes the request of a frame and writes the reply into `out`.
     fn handle(&mut self, frame: &Frame, now: Mono, out: &mut Vec<u8>) -> Delivery {
         self.advance(now);
         if frame.request == Ok(Request::Hello) {
@@ -131,16 +131,10 @@ impl Controller {
         let measured = arm.measured();
         let floats = |values: &Joints| first(values).map(|v| v as f32);
         let degrees = |values: &Joints| floats(&values.map(f64::to_degrees));
-        let state = match (arm.error(), arm.enabled()) {
-            (0, false) => 0,
-            (0, true) if !arm.moving() => 1,
-            (0, true) => 2,
-            _ => 3,
-        };
         let [x, y, z, roll, pitch, yaw] = reach::to_values(&Links.forward(&first(&arm.joints().0)));
         let report = Report {
             time_us: arm.uptime().as_micros() as u64,
-            state,
+            state: arm.state_code(),
             mode: MODES.iter().position(|mode| *mode == arm.mode()).unwrap_or_default() as u8,
             enabled: arm.enabled(),
             estop: arm.estop_open(),

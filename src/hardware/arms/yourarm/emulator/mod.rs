@@ -1,7 +1,7 @@
-//! The emulator: plays a YourArm controller on a loopback address, for `address: sim` and for tests.
+//! The emulator of a YourArm controller on a loopback address, for `address: sim` and for tests.
 //!
-//! The joints are brought up to date when somebody asks. Like the real controller it serves one client at a time and
-//! turns a second one away.
+//! The joints are advanced at every request. Like the real controller it serves one client at a time and rejects a
+//! second one.
 
 mod controller;
 mod kinematics;
@@ -15,31 +15,11 @@ use crate::hardware::adapter::AdapterResult;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::arm::HasArm;
 pub use crate::hardware::sim::arm::SimOptions;
-use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::faults::Fault;
 use crate::hardware::sim::tcp_server::TcpServer;
 use crate::joint::Joints;
 use controller::Controller;
 pub use controller::Received;
-
-/// The faults that the emulator can play.
-pub(super) const PLAYABLE: &[FaultKind] = &[
-    FaultKind::Stall,
-    FaultKind::Silent,
-    FaultKind::Disconnect,
-    FaultKind::ErrorCode,
-    FaultKind::Estop,
-    FaultKind::PowerLoss,
-    FaultKind::Nan,
-    FaultKind::ZeroState,
-    FaultKind::Garbage,
-    FaultKind::Corrupt,
-    FaultKind::Truncated,
-    FaultKind::WrongDof,
-    FaultKind::WrongModel,
-    FaultKind::Frozen,
-    FaultKind::Sag,
-    FaultKind::Blocked,
-];
 
 /// A running emulator. Ends when it is dropped.
 pub struct YourArmEmulator {
@@ -58,11 +38,11 @@ impl YourArmEmulator {
     }
 
     fn listen(options: &SimOptions, address: SocketAddr) -> AdapterResult<Self> {
-        let controller = Controller::new(options, PLAYABLE, MonotonicClock.now())?;
+        let controller = Controller::new(options, MonotonicClock.now())?;
         Ok(Self { server: TcpServer::start("yourarm", controller, address)? })
     }
 
-    /// Lets somebody push the E-stop button: error 1, motors off, until it is released, cleared and enabled.
+    /// Presses the E-stop button: error 1, motors off, until it is released, cleared and enabled.
     pub fn press_estop(&self) {
         self.server.with(|controller, now| {
             controller.advance(now);
