@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::assets::{Asset, Cache, split};
-use crate::blueprint::planner::{PlannerConfig, ShapeEntry};
+use crate::blueprint::planner::{PlannerEntry, ShapeEntry};
 use crate::blueprint::resolve::{Checker, UsedAsset};
 use crate::blueprint::schema::{AssetEntry, TaskEntry};
 use crate::robot::Source;
@@ -45,7 +45,7 @@ impl Assets {
 }
 
 /// Reports entries that cannot be fetched, and paths into assets that there are not.
-pub(super) fn check(checker: &mut Checker<'_>, tasks: &[Located<TaskEntry>], planner: Option<&Located<PlannerConfig>>) {
+pub(super) fn check(checker: &mut Checker<'_>, tasks: &[Located<TaskEntry>], planner: Option<&Located<PlannerEntry>>) {
     for (name, entry) in checker.assets.entries.0.clone() {
         checker.check_name(&name, "asset's name");
         address(checker, &entry.url);
@@ -77,7 +77,7 @@ fn reference(checker: &mut Checker<'_>, at: NodeId, path: &str) {
 pub(super) fn resolved(
     checker: &Checker<'_>,
     tasks: &[Located<TaskEntry>],
-    planner: Option<&Located<PlannerConfig>>,
+    planner: Option<&Located<PlannerEntry>>,
 ) -> Vec<UsedAsset> {
     let paths = paths(checker, tasks, planner);
     let used = |name: &str| paths.iter().any(|(_, path)| split(path).is_some_and(|(ours, _)| ours == name));
@@ -100,7 +100,7 @@ pub(super) fn resolved(
 fn paths(
     checker: &Checker<'_>,
     tasks: &[Located<TaskEntry>],
-    planner: Option<&Located<PlannerConfig>>,
+    planner: Option<&Located<PlannerEntry>>,
 ) -> Vec<(NodeId, String)> {
     let tree = &checker.tree;
     let mut all = Vec::new();

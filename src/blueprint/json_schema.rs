@@ -40,7 +40,7 @@ pub(super) fn full_schema(Catalog { adapters, tasks }: Catalog<'_>) -> Value {
         join(task, "type", "params", params);
         if let Some(kind) = task.pointer_mut("/properties/type").and_then(Value::as_object_mut) {
             let about: Vec<String> = tasks.rows().map(|row| format!("`{}` {}", row.name, row.about)).collect();
-            kind.insert("description".to_owned(), json!(format!("What the task does: {}.", about.join(", "))));
+            kind.insert("description".to_owned(), json!(format!("Type of the task: {}.", about.join(", "))));
             kind.insert("enum".to_owned(), json!(tasks.names()));
         }
     }
@@ -76,8 +76,8 @@ const GROUPS: [(&str, &str); 10] = [
     ("/$defs/LimitsEntry", "limits"),
     ("/$defs/TaskEntry", "tasks"),
     ("/$defs/TrajectoryParams", "params"),
-    ("/$defs/PlannerConfig", "planner"),
-    ("/$defs/RobotConfig", "planner.robots"),
+    ("/$defs/PlannerEntry", "planner"),
+    ("/$defs/RobotEntry", "planner.robots"),
     ("/$defs/RecordingConfig", "recording"),
     ("/$defs/ViewConfig", "view"),
 ];
@@ -89,7 +89,7 @@ fn allow_partial_entries(schema: &mut Value) {
     for (definition, id, pointer) in [
         ("HardwareEntry", "hardware_id", &["hardware"][..]),
         ("TaskEntry", "name", &["tasks"]),
-        ("RobotConfig", "name", &["planner", "robots"]),
+        ("RobotEntry", "name", &["planner", "robots"]),
     ] {
         let Some(group) = schema.pointer_mut(&format!("/$defs/{definition}")).and_then(Value::as_object_mut) else {
             continue;

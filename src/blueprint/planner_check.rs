@@ -1,7 +1,7 @@
 //! Checks what `planner` and `view` refer to.
 
 use crate::blueprint::arms::Found;
-use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ShapeEntry, ViewConfig};
+use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry, ViewConfig};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
@@ -10,7 +10,7 @@ use crate::yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(
     checker: &mut Checker<'_>,
-    planner: &Located<PlannerConfig>,
+    planner: &Located<PlannerEntry>,
     described: &[Described],
     view: Option<&Located<ViewConfig>>,
     tasks: &[Located<TaskEntry>],
@@ -80,7 +80,7 @@ fn executes(checker: &Checker<'_>, task: &TaskEntry) -> bool {
 /// The task that executes the robot's motions, when it exists and can.
 fn task<'t>(
     checker: &mut Checker<'_>,
-    robot: &RobotConfig,
+    robot: &RobotEntry,
     tasks: &'t [Located<TaskEntry>],
 ) -> Option<&'t Located<TaskEntry>> {
     let name = robot.coordinator_task_name.as_ref()?;
@@ -106,7 +106,7 @@ fn task<'t>(
 /// Whether the robot's joints are joints of the coordinator, and of the task.
 fn joints(
     checker: &mut Checker<'_>,
-    robot: &Located<RobotConfig>,
+    robot: &Located<RobotEntry>,
     described: &Described,
     found: &Found,
     task: Option<&Located<TaskEntry>>,
@@ -180,7 +180,7 @@ fn joints(
     }
 }
 
-fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, described: &Described) {
+fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, described: &Described) {
     let Some(count) = described.joints.as_ref().map(Vec::len) else { return };
     for (_, pose) in &robot.named_poses.0 {
         if pose.len() != count && !checker.lost.contains(pose.at) {

@@ -6,9 +6,7 @@ use std::time::Duration;
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use crate::blueprint::planner::{
-    ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry,
-};
+use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
@@ -16,7 +14,7 @@ use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
 /// What a planner is made from. Only of use when nothing was reported.
-pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Described]) -> PlannerConfig {
+pub(super) fn resolve(checker: &Checker<'_>, typed: &PlannerEntry, described: &[Described]) -> PlannerConfig {
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
@@ -27,7 +25,7 @@ pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Describ
 }
 
 /// The files of a robot's description.
-pub(super) fn source(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> Source {
+pub(super) fn source(checker: &Checker<'_>, typed: &Located<RobotEntry>) -> Source {
     let path = |path: &Located<String>| file(checker, path.at, path);
     Source {
         path: path(&typed.model_path),
@@ -39,7 +37,7 @@ pub(super) fn source(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> Sour
     }
 }
 
-fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Described) -> RobotConfig {
+fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Described) -> RobotConfig {
     let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
     let source = source(checker, typed);
     let ours = |model: &String| {

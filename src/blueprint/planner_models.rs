@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use crate::blueprint::planner::{PlannerConfig as Typed, RobotConfig as TypedRobot, RobotJoints, ShapeEntry};
+use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints, ShapeEntry};
 use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{ObjectShape, PlannerConfig};
@@ -25,7 +25,7 @@ pub(super) struct Described {
 }
 
 /// Reads the descriptions of all robots, and finds the joints of groups.
-pub(super) fn read(checker: &mut Checker<'_>, typed: &Typed) -> Vec<Described> {
+pub(super) fn read(checker: &mut Checker<'_>, typed: &PlannerEntry) -> Vec<Described> {
     let read = |robot| {
         let (model, semantics) = description(checker, robot);
         let joints = joints(checker, robot, model.as_ref(), &semantics);
@@ -35,7 +35,7 @@ pub(super) fn read(checker: &mut Checker<'_>, typed: &Typed) -> Vec<Described> {
 }
 
 /// Checks robots and objects against the files that they name.
-pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, described: &[Described], config: &PlannerConfig) {
+pub(super) fn check(checker: &mut Checker<'_>, typed: &PlannerEntry, described: &[Described], config: &PlannerConfig) {
     for (robot, described) in typed.robots.iter().zip(described) {
         if let Some(model) = &described.model {
             names(checker, robot, described, model);
@@ -64,7 +64,7 @@ fn file(checker: &mut Checker<'_>, at: NodeId, path: &Path) {
 }
 
 /// The robot's description, where it has no mistakes. Its warnings are passed on.
-fn description(checker: &mut Checker<'_>, robot: &Located<TypedRobot>) -> (Option<RobotModel>, Semantics) {
+fn description(checker: &mut Checker<'_>, robot: &Located<RobotEntry>) -> (Option<RobotModel>, Semantics) {
     let lost = |path: &Located<String>| checker.lost.contains(path.at);
     let optional = [&robot.srdf_path, &robot.joint_limits_path];
     let known = checker.has(robot.at, "model_path") && !lost(&robot.model_path);
@@ -112,7 +112,7 @@ fn command(source: &Source) -> String {
 }
 
 /// The key that names the file of a mistake, and the mistake with its own place in that file.
-fn place(robot: &TypedRobot, source: &Source, report: &Report) -> (NodeId, String) {
+fn place(robot: &RobotEntry, source: &Source, report: &Report) -> (NodeId, String) {
     let what = match (&report.file, report.line, report.column) {
         (Some(file), Some(line), Some(column)) => format!("{file}:{line}:{column}: {}", report.message),
         _ => report.message.clone(),
@@ -126,7 +126,7 @@ fn place(robot: &TypedRobot, source: &Source, report: &Report) -> (NodeId, Strin
 /// The joints that are planned for; those of a group where one is named.
 fn joints(
     checker: &mut Checker<'_>,
-    robot: &Located<TypedRobot>,
+    robot: &Located<RobotEntry>,
     model: Option<&RobotModel>,
     semantics: &Semantics,
 ) -> Option<Vec<Located<String>>> {
@@ -159,7 +159,7 @@ fn joints(
 }
 
 /// Joints and links.
-fn names(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, described: &Described, model: &RobotModel) {
+fn names(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, described: &Described, model: &RobotModel) {
     let joints: Vec<&str> = model.joints.iter().map(|joint| joint.name.as_str()).collect();
     for (number, name) in described.joints.iter().flatten().enumerate() {
         let diag = match model.joint_index(name).and_then(|index| model.joints.get(index)) {
@@ -199,7 +199,7 @@ fn link(checker: &mut Checker<'_>, at: NodeId, name: &str, model: &RobotModel) {
 }
 
 /// The joint that the gripper moves: one that is not planned and has a position of its own, within its limits.
-fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Described, model: &RobotModel) {
+fn gripper_joint(checker: &mut Checker<'_>, robot: &RobotEntry, described: &Described, model: &RobotModel) {
     let Some(gripper) = &robot.gripper_joint else { return };
     let name = &gripper.joint;
     let planned = described.joints.iter().flatten().any(|joint| joint.value == name.value);
@@ -230,7 +230,7 @@ fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Desc
     checker.error(name.at, diag);
 }
 
-fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {
+fn exclusions(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotModel) {
     let Some(at) = checker.tree.get(robot.at, "collision_exclusion_pairs") else { return };
     for (a, b) in &robot.collision_exclusion_pairs {
         link(checker, at, a, model);
@@ -238,13 +238,13 @@ fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &Ro
     }
 }
 
-fn shapes(checker: &mut Checker<'_>, robot: &TypedRobot, model: &RobotModel) {
+fn shapes(checker: &mut Checker<'_>, robot: &RobotEntry, model: &RobotModel) {
     for (name, _) in &robot.collision_shapes.0 {
         link(checker, name.at, &name.value, model);
     }
 }
 
-fn meshes(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {
+fn meshes(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotModel) {
     let Some(at) = checker.tree.get(robot.at, "auto_convert_meshes") else { return };
     if let Some((link, mesh)) = model.collada_collision().filter(|_| !robot.auto_convert_meshes) {
         let diag = Diag::error(format!("the link {} collides by a Collada file: {}", quote(&link.name), mesh.uri));
@@ -253,7 +253,7 @@ fn meshes(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotM
 }
 
 /// Poses with a name, of the blueprint and of the SRDF, must be within the limits.
-fn named_poses(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Described, model: &RobotModel) {
+fn named_poses(checker: &mut Checker<'_>, robot: &RobotEntry, described: &Described, model: &RobotModel) {
     let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
     let outside = |pose: &[f64]| {
         let joint = |name: &String| model.joint_index(name).and_then(|index| model.joints.get(index));
