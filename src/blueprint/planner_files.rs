@@ -1,4 +1,4 @@
-//! The section `planner` as a planner takes it: paths in full, every joint with both its names.
+//! Resolves the section `planner`: full paths, and both names of every joint.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,7 +13,7 @@ use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerCo
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
-/// What a planner is made from. Only of use when nothing was reported.
+/// Returns the configuration of the planner; only valid if nothing was reported.
 pub(super) fn resolve(checker: &Checker<'_>, typed: &PlannerEntry, described: &[Described]) -> PlannerConfig {
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
@@ -24,7 +24,7 @@ pub(super) fn resolve(checker: &Checker<'_>, typed: &PlannerEntry, described: &[
     }
 }
 
-/// The files of a robot's description.
+/// Returns the files of a robot's description.
 pub(super) fn source(checker: &Checker<'_>, typed: &Located<RobotEntry>) -> Source {
     let path = |path: &Located<String>| file(checker, path.at, path);
     Source {

@@ -23,10 +23,10 @@ A blueprint is a YAML file that defines the arms, tasks, planner and log of a ru
 Units are SI: rad, rad/s, m, s, Hz.
 
 `--set path=value` changes one value for one run; entries of lists are addressed by their id:
-`--set hardware.arm.address=192.168.1.100`, `--set coordinator.tick_rate=250`. `--sim` replaces every arm by its emulator.
+`--set hardware.arm.address=192.168.1.100`, `--set coordinator.tick_rate=250`. `--sim` uses every arm's emulator.
 
-Blueprints are YAML 1.2: booleans are `true` and `false` (`yes` is a text). Keys must be unique, numbers finite, files at
-most 1 MiB.
+Blueprints are YAML 1.2: booleans are `true` and `false` (`yes` is a text). Keys must be unique, numbers finite, and a
+file has at most 1 MiB.
 
 This page is generated. Regenerate it with `DIMOS_REGENERATE=1 cargo test --lib blueprint`.
 
