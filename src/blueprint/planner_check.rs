@@ -115,7 +115,7 @@ fn joints(
     let (model, good) = (described.joints.as_deref().unwrap_or_default(), described.joints.is_some());
     if good && model.is_empty() {
         let diag = Diag::error("the robot has no joints");
-        checker.error(robot.joint_names.at, diag.hint("list the planned joints as the model names them, from the base"));
+        checker.error(robot.joint_names.at, diag.hint("list the planned joints by their names in the model"));
     }
     if let (Some(prefix), Some((first, _))) = (&robot.joint_prefix, mapping.0.first()) {
         let also = checker.tree.label(first.at).with_text("given here too");

@@ -247,7 +247,8 @@ fn shapes(checker: &mut Checker<'_>, robot: &RobotEntry, model: &RobotModel) {
 fn meshes(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotModel) {
     let Some(at) = checker.tree.get(robot.at, "auto_convert_meshes") else { return };
     if let Some((link, mesh)) = model.collada_collision().filter(|_| !robot.auto_convert_meshes) {
-        let what = format!("the collision mesh of the link {} is a Collada file: {}", quote(&link.name), mesh.uri);
+        let (name, uri) = (quote(&link.name), &mesh.uri);
+        let what = format!("the collision mesh of the link {name} is a Collada file: {uri}");
         checker.error(at, Diag::error(what).hint("set auto_convert_meshes to true, or give the link an STL or OBJ file"));
     }
 }

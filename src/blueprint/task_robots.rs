@@ -4,7 +4,6 @@
 use std::collections::HashMap;
 use std::path::PathBuf;
 
-use glamx::DQuat;
 use nalgebra::Isometry3;
 use serde::Deserialize;
 
@@ -14,7 +13,7 @@ use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
 use crate::control::task_robot::{FramePose, RobotParams, TaskKinematics};
 use crate::planning::config::{PlannerConfig, RobotConfig};
-use crate::robot::kinematics::{Kinematics, frame};
+use crate::robot::kinematics::Kinematics;
 use crate::robot::model::{JointKind, RobotModel};
 use crate::robot::{Source, load};
 use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
@@ -242,10 +241,10 @@ impl TaskRobot {
         if let Some((base_link, base_pose)) = &self.base {
             let rest = model.positions(&HashMap::new());
             let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
-            let root = frame(&(base_pose * base.inverse()));
-            let turn = DQuat::from_mat3(&root.matrix3).to_array();
-            robot.root = FramePose { position: root.translation.to_array(), orientation: turn };
-            robot.base = DQuat::from_mat3(&frame(&base).matrix3).to_array();
+            let root = base_pose * base.inverse();
+            robot.root =
+                FramePose { position: root.translation.vector.into(), orientation: root.rotation.coords.into() };
+            robot.base = base.rotation.coords.into();
         }
         Ok(robot)
     }
