@@ -10,31 +10,31 @@ use crate::hardware::registry::{AdapterConfig, AdapterSpec, SIM};
 use crate::joint::{JointLimits, MAX_DOF, make_joints};
 use crate::yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
 
-/// The arms, and what tasks may refer to.
-pub(super) struct Found {
-    /// The arms, as far as their adapters are known.
+/// The arms, and the names that tasks may refer to.
+pub(super) struct Hardware {
+    /// The arms with a known adapter.
     pub(super) arms: Vec<Arm>,
     /// Every entry of `hardware`.
     pub(super) entries: Vec<Entry>,
-    /// Whether all ids are known: none was lost to a mistake.
+    /// Whether all ids could be read.
     pub(super) ids_known: bool,
-    /// Whether all joints are known.
+    /// Whether all joint names could be read.
     pub(super) joints_known: bool,
 }
 
-/// An entry of `hardware`, as far as it is understood.
+/// The readable part of an entry of `hardware`.
 pub(super) struct Entry {
-    /// Its id; empty when that was lost.
+    /// Its id; empty if it could not be read.
     pub(super) id: String,
-    /// Where it says so.
+    /// Position of the id.
     pub(super) at: NodeId,
-    /// Its joints.
+    /// Names of its joints.
     pub(super) joints: Vec<String>,
-    /// Its adapter's row, where known.
+    /// The row of its adapter; `None` if the adapter is unknown.
     pub(super) adapter: Option<AdapterSpec>,
 }
 
-pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEntry>]) -> Found {
+pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEntry>]) -> Hardware {
     let whole = !checker.list_lost("hardware");
     if hardware.is_empty() && whole {
         let root = checker.root;
@@ -44,11 +44,11 @@ pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEnt
         checker.error(at, diag.hint(hint));
     }
     let known = whole && !hardware.is_empty();
-    let mut found = Found { arms: Vec::new(), entries: Vec::new(), ids_known: known, joints_known: known };
-    let mut places: Vec<(String, NodeId)> = Vec::new();
+    let mut found = Hardware { arms: Vec::new(), entries: Vec::new(), ids_known: known, joints_known: known };
+    let mut named_at: Vec<(String, NodeId)> = Vec::new();
     for entry in hardware {
-        let (id, twin) = id(checker, entry, &found.entries);
-        let (joints, joints_known) = joints(checker, entry, twin, &mut places);
+        let (id, duplicate) = id(checker, entry, &found.entries);
+        let (joints, joints_known) = joints(checker, entry, duplicate, &mut named_at);
         let adapter = adapter(checker, entry);
         found.ids_known &= !id.is_empty();
         found.joints_known &= joints_known;
@@ -62,23 +62,23 @@ pub(super) fn resolve(checker: &mut Checker<'_>, hardware: &[Located<HardwareEnt
     found
 }
 
-/// The id, empty when it was lost, and whether another arm has it too.
+/// Returns the id (empty if it could not be read), and whether an earlier arm has the same one.
 fn id(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, others: &[Entry]) -> (String, bool) {
     if !checker.has(entry.at, "hardware_id") {
         return (String::new(), false);
     }
     let id = &entry.hardware_id;
     checker.check_name(id, "hardware_id");
-    let twin = others.iter().find(|other| other.id == id.value && !id.is_empty());
-    if let Some(first) = twin {
+    let duplicate = others.iter().find(|other| other.id == id.value && !id.is_empty());
+    if let Some(first) = duplicate {
         let also = checker.tree.label(first.at).with_text("first used here");
         let diag = Diag::error(format!("two arms have the hardware_id {}", quote(id)));
-        checker.error(id.at, diag.also(also).hint("give each arm a name of its own"));
+        checker.error(id.at, diag.also(also).hint("give each arm its own name"));
     }
-    (id.value.clone(), twin.is_some())
+    (id.value.clone(), duplicate.is_some())
 }
 
-/// Checks what depends on the adapter, and puts the arm together.
+/// Checks the settings that depend on the adapter, and builds the arm.
 fn arm(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
@@ -92,7 +92,7 @@ fn arm(
         None | Some(serde_json::Value::Null) => serde_json::json!({}),
         Some(options) => options,
     };
-    let read = options_are_read(checker, entry, &row);
+    let read = check_options(checker, entry, &row);
     let address = address(checker, entry, &row);
     let config = AdapterConfig {
         hardware_id: id.to_owned(),
@@ -100,7 +100,7 @@ fn arm(
         dof: joints.len(),
         options: options.clone(),
     };
-    let own = if counted && read { fit(checker, entry, &row, &config) } else { None };
+    let own = if counted && read { own_limits(checker, entry, &row, &config) } else { None };
     let limits = match joints_known {
         true => limits::resolve(checker, &entry.limits, joints, own.as_ref()),
         false => Vec::new(),
@@ -124,7 +124,7 @@ fn arm(
     }
 }
 
-/// The adapter's figures, with those that the blueprint gives in their place.
+/// Returns the adapter's supervision figures, overridden by those of the blueprint.
 fn supervision(entry: &HardwareEntry, row: &AdapterSpec) -> Supervision {
     Supervision {
         accuracy: entry.accuracy.unwrap_or(row.accuracy),
@@ -135,8 +135,8 @@ fn supervision(entry: &HardwareEntry, row: &AdapterSpec) -> Supervision {
     }
 }
 
-/// Reports every mistake in the options that their type shows; `true` when there is none.
-fn options_are_read(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: &AdapterSpec) -> bool {
+/// Reads the options as the adapter's type and reports every mistake; returns whether there is none.
+fn check_options(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: &AdapterSpec) -> bool {
     if !checker.has(entry.at, "options") {
         return false;
     }
@@ -148,9 +148,8 @@ fn options_are_read(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, r
     mistakes(checker.tree) == before
 }
 
-/// Asks the adapter whether joints and options go together, and reports what does not at the option. The arm's own
-/// limits.
-fn fit(
+/// Runs the adapter's check of joints and options, and reports a mistake at its option. Returns the arm's own limits.
+fn own_limits(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
     row: &AdapterSpec,
@@ -169,12 +168,12 @@ fn fit(
     }
 }
 
-/// The joints' names, and whether they are all known.
+/// Returns the names of the joints, and whether all could be read.
 fn joints(
     checker: &mut Checker<'_>,
     entry: &Located<HardwareEntry>,
-    twin: bool,
-    places: &mut Vec<(String, NodeId)>,
+    duplicate: bool,
+    named_at: &mut Vec<(String, NodeId)>,
 ) -> (Vec<String>, bool) {
     if !checker.has(entry.at, "joints") || checker.lost.contains(entry.joints.at) {
         return (Vec::new(), false);
@@ -208,13 +207,13 @@ fn joints(
         checker.error(entry.joints.at, diag.hint("for example `joints: {prefix: arm, count: 6}`"));
         known = false;
     }
-    // An arm given twice has all its joints twice; once is enough to say so.
-    if !twin {
+    // All joints of a duplicate arm are duplicates: reporting the arm is enough.
+    if !duplicate {
         let mut collisions = Vec::new();
         for name in &names {
-            match places.iter().find(|(other, _)| *other == name.value) {
+            match named_at.iter().find(|(other, _)| *other == name.value) {
                 Some((_, first)) => collisions.push((name.clone(), *first)),
-                None => places.push((name.value.clone(), name.at)),
+                None => named_at.push((name.value.clone(), name.at)),
             }
         }
         report_collisions(checker, &collisions);
@@ -222,7 +221,7 @@ fn joints(
     (names.into_iter().map(|name| name.value).collect(), known)
 }
 
-/// Reports joints that were named before; those of one pattern once.
+/// Reports duplicate joint names, with one report per pattern.
 fn report_collisions(checker: &mut Checker<'_>, collisions: &[(Located<String>, NodeId)]) {
     let mut reported: Vec<NodeId> = Vec::new();
     for (name, first) in collisions {
@@ -268,7 +267,7 @@ fn counted_at(entry: &HardwareEntry) -> NodeId {
     }
 }
 
-/// Whether the adapter takes that many joints.
+/// Returns whether the adapter supports this number of joints; reports it if not.
 fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, count: usize) -> bool {
     let (fewest, most) = row.dof;
     if (fewest..=most).contains(&count) {
@@ -281,7 +280,7 @@ fn dof(checker: &mut Checker<'_>, entry: &HardwareEntry, row: &AdapterSpec, coun
     false
 }
 
-/// Checks the address and gives it; empty where there is none.
+/// Checks and returns the address; empty if there is none.
 fn address(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: &AdapterSpec) -> String {
     let given = entry.address.as_ref();
     if !checker.has(entry.at, "address") {
@@ -306,8 +305,8 @@ fn address(checker: &mut Checker<'_>, entry: &Located<HardwareEntry>, row: &Adap
                 let diag = Diag::warning(format!("{} needs no address; this one is ignored", quote(row.name)));
                 checker.error(address.at, diag.hint("remove it"));
             } else if let Err(reason) = (row.address.check)(address) {
-                let diag = Diag::error(format!("{} is no address of {}: {reason}", quote(address), quote(row.name)));
-                checker.error(address.at, diag.hint(format!("write it as {form}{or_sim}")));
+                let what = format!("{} is not an address of {}: {reason}", quote(address), quote(row.name));
+                checker.error(address.at, Diag::error(what).hint(format!("write it as {form}{or_sim}")));
             }
         }
     }

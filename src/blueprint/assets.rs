@@ -1,9 +1,9 @@
-//! The section `assets`, and the paths that lead into them: `asset:NAME/path`.
+//! The section `assets`, and paths of files in assets: `asset:NAME/path`.
 
 use std::path::{Path, PathBuf};
 
 use crate::assets::{Asset, Cache, split};
-use crate::blueprint::planner::{PlannerConfig, ShapeEntry};
+use crate::blueprint::planner::{PlannerEntry, ShapeEntry};
 use crate::blueprint::resolve::{Checker, UsedAsset};
 use crate::blueprint::schema::{AssetEntry, TaskEntry};
 use crate::robot::Source;
@@ -16,7 +16,7 @@ pub(super) struct Assets {
 }
 
 impl Assets {
-    /// Those of a blueprint, in the user's cache.
+    /// Uses the user's cache.
     pub fn of(entries: Keyed<AssetEntry>) -> Self {
         Self { entries, cache: Cache::standard() }
     }
@@ -25,27 +25,27 @@ impl Assets {
         self.entries.0.iter().find(|(ours, _)| ours.value == name).map(|(_, entry)| entry)
     }
 
-    /// Where a path into an asset leads; `None` for any other path, and for one into an asset that there is not.
+    /// Returns the file that `asset:NAME/path` refers to; `None` for other paths and unknown assets.
     pub fn path(&self, path: &str) -> Option<PathBuf> {
         let (name, inside) = split(path)?;
         let folder = self.cache.folder(&self.entry(name)?.sha256);
         Some(if inside.is_empty() { folder } else { folder.join(inside) })
     }
 
-    /// Whether a file lies in an asset that has not been fetched yet.
+    /// Returns whether a file is in an asset that is not fetched yet.
     pub fn awaited(&self, path: &Path) -> bool {
         self.cache.awaits(path)
     }
 
-    /// Whether anything of a description does.
+    /// Returns whether any file of a description is in an asset that is not fetched yet.
     pub fn source_awaited(&self, source: &Source) -> bool {
         let files = [Some(&source.path), source.srdf.as_ref(), source.joint_limits.as_ref()];
         files.into_iter().flatten().chain(source.packages.values()).any(|path| self.awaited(path))
     }
 }
 
-/// Reports entries that cannot be fetched, and paths into assets that there are not.
-pub(super) fn check(checker: &mut Checker<'_>, tasks: &[Located<TaskEntry>], planner: Option<&Located<PlannerConfig>>) {
+/// Reports entries that cannot be fetched, and paths into unknown assets.
+pub(super) fn check(checker: &mut Checker<'_>, tasks: &[Located<TaskEntry>], planner: Option<&Located<PlannerEntry>>) {
     for (name, entry) in checker.assets.entries.0.clone() {
         checker.check_name(&name, "asset's name");
         address(checker, &entry.url);
@@ -63,7 +63,7 @@ pub(super) fn check(checker: &mut Checker<'_>, tasks: &[Located<TaskEntry>], pla
 fn reference(checker: &mut Checker<'_>, at: NodeId, path: &str) {
     let Some((name, inside)) = split(path) else { return };
     if inside.split('/').any(|part| part == "..") || inside.starts_with('/') {
-        let diag = Diag::error(format!("{} leads out of its asset", quote(path)));
+        let diag = Diag::error(format!("{} points outside its asset", quote(path)));
         checker.error(at, diag.hint("write asset:NAME/path, without `..`"));
     } else if checker.assets.entry(name).is_none() {
         let names = checker.assets.entries.0.iter().map(|(name, _)| name.as_str());
@@ -73,11 +73,11 @@ fn reference(checker: &mut Checker<'_>, at: NodeId, path: &str) {
     }
 }
 
-/// The assets with the places of their entries, and whether any path leads into them.
+/// Returns the assets with the positions of their entries, and whether any path refers to them.
 pub(super) fn resolved(
     checker: &Checker<'_>,
     tasks: &[Located<TaskEntry>],
-    planner: Option<&Located<PlannerConfig>>,
+    planner: Option<&Located<PlannerEntry>>,
 ) -> Vec<UsedAsset> {
     let paths = paths(checker, tasks, planner);
     let used = |name: &str| paths.iter().any(|(_, path)| split(path).is_some_and(|(ours, _)| ours == name));
@@ -96,15 +96,15 @@ pub(super) fn resolved(
     checker.assets.entries.0.iter().map(asset).collect()
 }
 
-/// All paths of descriptions and shapes, with their places.
+/// Returns all paths of descriptions and shapes, with their positions.
 fn paths(
     checker: &Checker<'_>,
     tasks: &[Located<TaskEntry>],
-    planner: Option<&Located<PlannerConfig>>,
+    planner: Option<&Located<PlannerEntry>>,
 ) -> Vec<(NodeId, String)> {
     let tree = &checker.tree;
     let mut all = Vec::new();
-    // Tasks and robots give them by the same keys.
+    // Tasks and planning robots use the same keys.
     let tasks = tasks.iter().filter_map(|task| task.params.as_ref()).map(|params| params.at);
     let robots = planner.iter().flat_map(|planner| planner.robots.iter()).map(|robot| robot.at);
     for owner in tasks.chain(robots) {
@@ -127,12 +127,12 @@ fn address(checker: &mut Checker<'_>, url: &Located<String>) {
     match rest {
         _ if url.is_empty() => {}
         None => {
-            let diag = Diag::error(format!("{} is no address of a file", quote(url)));
+            let diag = Diag::error(format!("{} is not the URL of a file", quote(url)));
             checker.error(url.at, diag.hint("it starts with https://, http:// or file://"));
         }
         Some(rest) if url.starts_with("file://") && !rest.starts_with('/') => {
-            let diag = Diag::error(format!("{} has no full path", quote(url)));
-            checker.error(url.at, diag.hint("write file:// and the path from the root: file:///home/you/robot.zip"));
+            let diag = Diag::error(format!("{} has no absolute path", quote(url)));
+            checker.error(url.at, diag.hint("write file:// and the absolute path: file:///home/you/robot.zip"));
         }
         Some(rest) if rest.starts_with('/') && !url.starts_with("file://") || rest.is_empty() => {
             checker.error(url.at, Diag::error(format!("{} names no server", quote(url))));

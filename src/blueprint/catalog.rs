@@ -1,4 +1,4 @@
-//! What a blueprint can name: adapters and task types.
+//! The adapters and task types that a blueprint may use.
 
 use crate::control::task_spec::TaskTable;
 use crate::hardware::registry::Registry;

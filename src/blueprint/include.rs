@@ -1,28 +1,28 @@
-//! Reads a blueprint's file and what it includes into one tree.
+//! Reads a blueprint's file and its includes into one tree.
 
 use crate::blueprint::registry::{Found, SearchPath, Source};
 use crate::yaml::{Diag, Kind, Label, Located, MergeRules, Missing, NodeId, Tree, merge, quote, read};
 
-/// How blueprints are merged.
+/// Merge rules of blueprints.
 pub(super) const RULES: MergeRules = MergeRules {
     by_id: &[("hardware", "hardware_id"), ("tasks", "name"), ("planner.robots", "name")],
     whole: &["joints", "joint_names", "base_pose"],
 };
 
-/// More files than these are not read for one blueprint: includes of includes multiply.
+/// Maximum number of files per blueprint: nested includes multiply.
 const MAX_FILES: usize = 50;
 
-/// A file's identity, to notice that it includes itself.
+/// Identity of a file, to detect include cycles.
 type Identity = (String, Source);
 
 /// Reads files into a tree.
 pub(super) struct Includer<'t> {
     pub(super) tree: &'t mut Tree,
     pub(super) search: &'t SearchPath,
-    /// The files that are being read, outermost first.
+    /// Stack of the files being read, the outermost first.
     open: Vec<Identity>,
     files: usize,
-    /// A file could not be read, so that names may be missing.
+    /// Whether a file could not be read, so that names may be missing.
     pub(super) incomplete: bool,
 }
 
@@ -31,7 +31,7 @@ impl<'t> Includer<'t> {
         Self { tree, search, open: Vec::new(), files: 0, incomplete: false }
     }
 
-    /// Reads a file and merges it over what it includes. `None`: nothing usable; why has been reported.
+    /// Reads a file and merges it over its includes. Returns `None` if nothing is usable; the reason has been reported.
     pub(super) fn read(&mut self, found: &Found) -> Option<NodeId> {
         self.files += 1;
         let source = self.tree.add_bytes(found.file(), &found.bytes)?;
@@ -39,14 +39,14 @@ impl<'t> Includer<'t> {
         let Some(root) = self.tree.parse(source) else {
             if self.tree.diags().len() == before {
                 let diag = Diag::error("the blueprint is empty").at(Label::start_of(source));
-                self.tree.report(diag.hint("`dimos list-blueprints` shows some that can be copied"));
+                self.tree.report(diag.hint("`dimos list-blueprints` shows examples to copy"));
             }
             return None;
         };
         if !matches!(self.tree.node(root).map(|n| &n.kind), Some(Kind::Map(_))) {
             let diag = Diag::error("a blueprint is a group of keys: `hardware: …`, `tasks: …`");
             let diag = diag.at(self.tree.label(root));
-            self.tree.report(diag.hint("`dimos list-blueprints` shows some that can be copied"));
+            self.tree.report(diag.hint("`dimos list-blueprints` shows examples to copy"));
             return None;
         }
         self.open.push(identity(found));

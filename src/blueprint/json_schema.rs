@@ -11,17 +11,17 @@ use crate::blueprint::catalog::Catalog;
 use crate::blueprint::schema::BlueprintFile;
 use crate::hardware::registry::Registry;
 
-/// The JSON Schema (draft 2020-12) of a blueprint whose arms and task types are those of the catalog.
+/// Returns the JSON Schema (draft 2020-12) of blueprints with the adapters and task types of the catalog.
 pub fn json_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
     let mut schema = full_schema(catalog.into());
     allow_partial_entries(&mut schema);
     schema
 }
 
-/// The schema of a blueprint that includes no other: every key that is needed is required.
+/// Returns the schema of a blueprint without includes: every necessary key is required.
 pub(super) fn full_schema(Catalog { adapters, tasks }: Catalog<'_>) -> Value {
     let mut generator = SchemaSettings::draft2020_12().into_generator();
-    // One generator for all: it keeps types of equal name apart.
+    // One generator for all: it distinguishes types of the same name.
     let options: Vec<(&str, Value)> =
         adapters.rows().iter().map(|row| (row.name, (row.options.schema)(&mut generator).to_value())).collect();
     let params: Vec<(&str, Value)> =
@@ -40,15 +40,15 @@ pub(super) fn full_schema(Catalog { adapters, tasks }: Catalog<'_>) -> Value {
         join(task, "type", "params", params);
         if let Some(kind) = task.pointer_mut("/properties/type").and_then(Value::as_object_mut) {
             let about: Vec<String> = tasks.rows().map(|row| format!("`{}` {}", row.name, row.about)).collect();
-            kind.insert("description".to_owned(), json!(format!("What the task does: {}.", about.join(", "))));
+            kind.insert("description".to_owned(), json!(format!("Type of the task: {}.", about.join(", "))));
             kind.insert("enum".to_owned(), json!(tasks.names()));
         }
     }
     schema
 }
 
-/// The group in which a key belongs: `coordinator` for `tick_rate`, an empty name for the top of the file. For keys of
-/// one group only.
+/// Returns the group that a key belongs to: `coordinator` for `tick_rate`, an empty name for the top level. Returns
+/// `None` if no group has it, or several.
 pub(super) fn home_of(key: &str) -> Option<String> {
     static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
     let homes = HOMES.get_or_init(|| {
@@ -68,7 +68,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
     }
 }
 
-/// Groups of the schema, and how they are called.
+/// Groups of the schema, and their paths in a blueprint.
 const GROUPS: [(&str, &str); 10] = [
     ("", ""),
     ("/$defs/CoordinatorConfig", "coordinator"),
@@ -76,20 +76,20 @@ const GROUPS: [(&str, &str); 10] = [
     ("/$defs/LimitsEntry", "limits"),
     ("/$defs/TaskEntry", "tasks"),
     ("/$defs/TrajectoryParams", "params"),
-    ("/$defs/PlannerConfig", "planner"),
-    ("/$defs/RobotConfig", "planner.robots"),
+    ("/$defs/PlannerEntry", "planner"),
+    ("/$defs/RobotEntry", "planner.robots"),
     ("/$defs/RecordingConfig", "recording"),
     ("/$defs/ViewConfig", "view"),
 ];
 
-/// A blueprint that includes others may give a part of an entry: only the id is required then. What else is required
-/// moves to the top, under the condition that nothing is included.
+/// Makes all keys of a list entry optional except its id: a blueprint with includes may contain parts of entries. A
+/// rule at the top level requires the other keys if there is no `include`.
 fn allow_partial_entries(schema: &mut Value) {
     let mut without_include = json!({});
     for (definition, id, pointer) in [
         ("HardwareEntry", "hardware_id", &["hardware"][..]),
         ("TaskEntry", "name", &["tasks"]),
-        ("RobotConfig", "name", &["planner", "robots"]),
+        ("RobotEntry", "name", &["planner", "robots"]),
     ] {
         let Some(group) = schema.pointer_mut(&format!("/$defs/{definition}")).and_then(Value::as_object_mut) else {
             continue;
@@ -111,8 +111,8 @@ fn allow_partial_entries(schema: &mut Value) {
     }
 }
 
-/// Adds "if the key `by` is this word, then the key `what` is of that type" for each word. `required` keeps the
-/// condition from holding where `by` is absent.
+/// Adds a rule for each word: if the key `by` is this word, the key `what` has that type. `required` disables the rule
+/// if `by` is absent.
 fn join<'w>(group: &mut Value, by: &str, what: &str, types: impl IntoIterator<Item = (&'w str, Value)>) {
     let rules: Vec<Value> = types
         .into_iter()

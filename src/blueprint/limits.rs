@@ -1,4 +1,4 @@
-//! `hardware[].limits`: narrower limits than the arm's own, as typed and resolved per joint.
+//! `hardware[].limits`: limits narrower than the arm's own, as written and resolved per joint.
 
 use std::fmt;
 
@@ -150,7 +150,7 @@ impl JsonSchema for PerJoint {
     }
 }
 
-/// What the blueprint says of one joint's limits; `None` leaves the arm's own.
+/// Limits of one joint in the blueprint; `None`: the arm's own limit applies.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct JointOverride {
     /// Lowest position [rad].
@@ -165,7 +165,7 @@ pub struct JointOverride {
     pub jerk: Option<f64>,
 }
 
-/// Checks the limits of an arm against its own, and gives them per joint.
+/// Checks the limits of an arm against its own, and returns them per joint.
 pub(super) fn resolve(
     checker: &mut Checker<'_>,
     entry: &LimitsEntry,
@@ -188,14 +188,14 @@ pub(super) fn resolve(
                 let name = joints.get(joint).map_or("", String::as_str);
                 let diag = Diag::error(format!("`{name}`: [{lower}, {upper}] is wider than the arm's own range"));
                 let diag = diag.note(format!("the arm's own range is {low} to {high} rad"));
-                checker.error(at, diag.hint("limits narrow the arm's own; leave them out to use the full range"));
+                checker.error(at, diag.hint("limits can only narrow the arm's own; omit them to use the full range"));
             }
             if let Some(slot) = out.get_mut(joint) {
                 (slot.position_lower, slot.position_upper) = (Some(lower), Some(upper));
             }
         }
     }
-    /// What it is, its unit, what the blueprint gives, the arm's own, and where the result goes.
+    /// Name, unit, limit in the blueprint, the arm's own limits, and the field to set.
     type Top<'e> =
         (&'e str, &'e str, &'e Option<Located<PerJoint>>, &'e [f64], fn(&mut JointOverride) -> &mut Option<f64>);
     let none: &[f64] = &[];
@@ -211,13 +211,13 @@ pub(super) fn resolve(
         for (joint, value, at) in spread(checker, given, joints) {
             let top = own.get(joint).copied();
             if value <= 0.0 {
-                let diag = Diag::error(format!("a highest {what} must be more than 0, is {value}"));
-                checker.error(at, diag.hint(format!("give it in {unit}, or leave it out for the arm's own")));
+                let diag = Diag::error(format!("the {what} limit must be above 0, not {value}"));
+                checker.error(at, diag.hint(format!("give it in {unit}, or omit it to use the arm's own limit")));
             } else if let Some(top) = top.filter(|top| value > *top) {
                 let name = joints.get(joint).map_or("", String::as_str);
-                let diag = Diag::error(format!("`{name}`: {value} {unit} is more than the arm's own {what}"));
-                let diag = diag.note(format!("the arm's own is {top} {unit}"));
-                checker.error(at, diag.hint("limits narrow the arm's own; leave this one out to use it"));
+                let diag = Diag::error(format!("`{name}`: {value} {unit} is above the arm's own {what} limit"));
+                let diag = diag.note(format!("the arm's own limit is {top} {unit}"));
+                checker.error(at, diag.hint("limits can only narrow the arm's own; omit this one to use that"));
             }
             if let Some(joint) = out.get_mut(joint) {
                 *slot(joint) = Some(value);
@@ -227,7 +227,7 @@ pub(super) fn resolve(
     out
 }
 
-/// The position limits by joint number, each with its place.
+/// Returns the position limits by joint index, each with its node.
 fn spread_positions(
     checker: &mut Checker<'_>,
     given: &Located<Positions>,
@@ -242,7 +242,7 @@ fn spread_positions(
     }
 }
 
-/// The values by joint number, each with its place.
+/// Returns the values by joint index, each with its node.
 fn spread(checker: &mut Checker<'_>, given: &Located<PerJoint>, joints: &[String]) -> Vec<(usize, f64, NodeId)> {
     match &given.value {
         PerJoint::All(value) => (0..joints.len()).map(|i| (i, *value, given.at)).collect(),
@@ -262,7 +262,7 @@ fn spread(checker: &mut Checker<'_>, given: &Located<PerJoint>, joints: &[String
 
 fn joint_index(checker: &mut Checker<'_>, name: &Located<String>, joints: &[String]) -> Option<usize> {
     let found = joints.iter().position(|joint| *joint == name.value);
-    // Without joints there is a mistake in them already.
+    // A mistake in the joints has been reported.
     if found.is_none() && !joints.is_empty() {
         let diag = Diag::error(format!("this arm has no joint {}", quote(name)));
         let hint = did_you_mean(name, joints.iter().map(String::as_str), "its joints");

@@ -1,4 +1,4 @@
-//! From a file to a checked blueprint, with every mistake in it.
+//! Reads and checks a blueprint, and collects every mistake in it.
 
 use serde::Serialize;
 
@@ -12,41 +12,42 @@ use crate::blueprint::schema::BlueprintFile;
 use crate::hardware::registry::{Registry, SIM};
 use crate::yaml::{self, Diag, Keyed, Label, Missing, NodeId, Report, Severity, Tree, quote, read};
 
-/// What the command line changes in a blueprint.
+/// Changes of a blueprint by command-line options.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Overrides {
     /// `--set path=value`, in the order given.
     pub set: Vec<String>,
-    /// `--sim`: every arm's address becomes `sim`. Fails where an adapter has no emulator and is none itself.
+    /// `--sim`: replaces every arm by its emulator. An error if the adapter of a real arm has none.
     pub sim: bool,
 }
 
-/// A blueprint that was read, and what is wrong with it.
+/// A loaded blueprint and its diagnostics.
 #[derive(Debug, Clone)]
 pub struct Loaded {
-    /// The blueprint; `None` when there is any error.
+    /// The blueprint; `None` if there are errors.
     pub blueprint: Option<Blueprint>,
     tree: Tree,
     diags: Vec<Diag>,
 }
 
 impl Loaded {
-    /// Everything that is wrong, file by file from top to bottom.
+    /// Returns all diagnostics, file by file from top to bottom.
     pub fn diagnostics(&self) -> &[Diag] {
         &self.diags
     }
 
-    /// Number of errors.
+    /// Returns the number of errors.
     pub fn errors(&self) -> usize {
         self.diags.iter().filter(|d| d.severity == Severity::Error).count() + self.tree.unlisted()
     }
 
-    /// Number of warnings.
+    /// Returns the number of warnings.
     pub fn warnings(&self) -> usize {
         self.diags.iter().filter(|d| d.severity == Severity::Warning).count()
     }
 
-    /// Everything that is wrong, for people; ends with a line that counts it. Empty when nothing is.
+    /// Returns all diagnostics as text, with the numbers of errors and warnings in the last line; empty if there are
+    /// none.
     pub fn render(&self, colour: bool) -> String {
         let mut out = String::new();
         for diag in &self.diags {
@@ -54,7 +55,7 @@ impl Loaded {
             out.push_str("\n\n");
         }
         if self.tree.unlisted() > 0 {
-            out.push_str("There are more mistakes than are listed; put these right first.\n");
+            out.push_str("Not all mistakes are listed; fix these first.\n");
         }
         let count = |n: usize, what: &str| match n {
             0 => None,
@@ -69,12 +70,12 @@ impl Loaded {
         out
     }
 
-    /// Everything that is wrong, as data.
+    /// Returns all diagnostics as data.
     pub fn reports(&self) -> Vec<Report> {
         self.diags.iter().map(|diag| diag.located(&self.tree)).collect()
     }
 
-    /// Everything that is wrong, as JSON: `{"ok", "errors", "warnings", "diagnostics": […]}`.
+    /// Returns all diagnostics as JSON: `{"ok", "errors", "warnings", "diagnostics": […]}`.
     pub fn to_json(&self) -> serde_json::Value {
         #[derive(Serialize)]
         struct Document {
@@ -92,7 +93,7 @@ impl Loaded {
         serde_json::to_value(document).unwrap_or_default()
     }
 
-    /// The first error in one line, with its place.
+    /// Returns the first error in one line, with its position.
     pub(super) fn first_problem(&self) -> Option<String> {
         let report = self.reports().into_iter().find(|r| r.severity == Severity::Error)?;
         Some(match (report.line, report.column) {
@@ -102,12 +103,12 @@ impl Loaded {
     }
 }
 
-/// Reads and checks a blueprint; includes are looked for in the folders of the environment.
+/// Reads and checks a blueprint; searches includes in the folders of [`SearchPath::from_env`].
 pub fn load<'a>(found: &Found, overrides: &Overrides, catalog: impl Into<Catalog<'a>>) -> Loaded {
     load_from(&SearchPath::from_env(), found, overrides, catalog)
 }
 
-/// Reads and checks a blueprint; includes are looked for in `search`.
+/// Reads and checks a blueprint; searches includes in `search`.
 pub fn load_from<'a>(
     search: &SearchPath,
     found: &Found,
@@ -117,7 +118,7 @@ pub fn load_from<'a>(
     let mut tree = Tree::new();
     let blueprint = read_blueprint(&mut tree, search, found, overrides, catalog.into());
     let mut diags = tree.diags().to_vec();
-    // The main file is the first source, the arguments are the last; what has no place comes first of all.
+    // The main file is the first source, arguments are the last; diagnostics without a position come first.
     diags.sort_by_key(|d| d.at.as_ref().map(|at| (at.source, at.range.start)));
     Loaded { blueprint, tree, diags }
 }
@@ -151,11 +152,11 @@ fn read_blueprint(
     if tree.has_errors() {
         return None;
     }
-    blueprint.source_yaml = write(tree, root, &blueprint.name);
+    blueprint.source_yaml = merged_yaml(tree, root, &blueprint.name);
     Some(blueprint)
 }
 
-/// `--sim`: gives every arm the address of its emulator. An arm that would stay real is an error.
+/// `--sim`: sets the address of every arm to its emulator. A real arm without an emulator is an error.
 fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
     let source = tree.add_source("--sim", "--sim");
     let hardware = tree.get(root, "hardware").map(|list| tree.items(list).to_vec()).unwrap_or_default();
@@ -175,8 +176,8 @@ fn simulate(tree: &mut Tree, root: NodeId, adapters: &Registry) {
     }
 }
 
-/// The merged blueprint as YAML.
-fn write(tree: &mut Tree, root: NodeId, name: &str) -> String {
+/// Returns the merged blueprint as YAML.
+fn merged_yaml(tree: &mut Tree, root: NodeId, name: &str) -> String {
     let (value, _) = read::<serde_yaml::Value>(tree, root, Missing::Ignore);
     let Some(serde_yaml::Value::Mapping(merged)) = value else { return String::new() };
     let mut whole = serde_yaml::Mapping::new();

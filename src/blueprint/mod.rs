@@ -1,8 +1,8 @@
-//! Blueprints: the YAML files that say which arms there are and what is done with them.
+//! Blueprints: YAML files that define the arms, tasks, planner and log of a run.
 //!
 //! ```text
-//! name ─▶ registry (which file) ─▶ load (includes, --set, --sim) ─▶ schema (as typed) ─▶ resolve (checked, indices)
-//!                                     └────────── every mistake, each at its place: Loaded::render ──────────┘
+//! name ─▶ registry (which file) ─▶ load (includes, --set, --sim) ─▶ schema (as written) ─▶ resolve (checked, indices)
+//!                                     └────────── every mistake with its position: Loaded::render ───────────┘
 //! ```
 
 mod arms;

@@ -1,4 +1,4 @@
-//! The sections `planner` and `view` as they are typed.
+//! The sections `planner` and `view` as written.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -12,32 +12,31 @@ use crate::collision::body::MeshMode;
 use crate::yaml::range::{maybe_positive, non_negative, positive};
 use crate::yaml::{Keyed, Located, Text};
 
-/// Distance that plans keep when the blueprint does not say [m].
+/// Default distance that plans keep from obstacles and other arms [m].
 const PADDING: f64 = 0.003;
 
 /// Motion planning.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct PlannerConfig {
-    /// The longest time one planning request may take [s].
+pub struct PlannerEntry {
+    /// Maximum duration of a planning request [s].
     #[serde(deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub planning_timeout: f64,
-    /// Distance that plans keep from obstacles and other arms [m]; 0: they only do not touch. Reduced near a start or
-    /// goal that is closer itself; every such plan reports it.
+    /// Distance that plans keep from obstacles and other arms [m]; 0: plans only avoid contact. Reduced near a start or
+    /// goal that is closer; every such plan reports it.
     #[serde(deserialize_with = "non_negative")]
     #[schemars(range(min = 0.0))]
     pub padding: f64,
-    /// The robots that are planned for.
-    pub robots: Vec<Located<RobotConfig>>,
-    /// Obstacles that are there from the start, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0,
-    /// 0]}}`.
+    /// Planning robots: the arms as the planner models them.
+    pub robots: Vec<Located<RobotEntry>>,
+    /// Initial obstacles, by name: `table: {shape: {box: [1, 1, 0.02]}, pose: {xyz: [0.5, 0, 0]}}`.
     pub world: Keyed<Located<ObjectEntry>>,
-    /// The same as the section `view`; only one of the two may be given.
+    /// Same as the section `view`; give only one of the two.
     pub visualization: Option<Located<ViewConfig>>,
 }
 
-impl Default for PlannerConfig {
+impl Default for PlannerEntry {
     fn default() -> Self {
         Self {
             planning_timeout: 10.0,
@@ -49,13 +48,13 @@ impl Default for PlannerConfig {
     }
 }
 
-/// A robot that is planned for.
+/// A planning robot: an arm as the planner models it.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct RobotConfig {
+pub struct RobotEntry {
     /// Unique name of the robot: letters, digits, `_` and `-`.
     pub name: Located<String>,
-    /// The robot's `.urdf` or `.xacro` file, as seen from this file; `builtin:NAME`, a built-in description; or
+    /// The robot's `.urdf` or `.xacro` file, relative to this file; `builtin:NAME`, a built-in description; or
     /// `asset:NAME/path`, a file of an asset.
     pub model_path: Located<String>,
     /// Folders of `package://NAME`, by name; `asset:NAME` or `asset:NAME/path` for those of an asset.
@@ -64,21 +63,22 @@ pub struct RobotConfig {
     /// Arguments of the xacro file.
     #[serde(default)]
     pub xacro_args: BTreeMap<String, Text>,
-    /// The robot's SRDF, as seen from this file: groups of joints, named poses, pairs of links that may touch.
+    /// The robot's SRDF, relative to this file: groups of joints, named poses, allowed collision pairs.
     #[serde(default)]
     pub srdf_path: Option<Located<String>>,
-    /// The robot's `joint_limits.yaml` as MoveIt has it, as seen from this file: accelerations, jerks, narrower limits.
+    /// The robot's `joint_limits.yaml` in MoveIt's format, relative to this file: accelerations, jerks, narrower
+    /// limits.
     #[serde(default)]
     pub joint_limits_path: Option<Located<String>>,
-    /// Where the robot's base is, in the frame `map`.
+    /// Pose of the base link in the frame `map`.
     #[serde(default)]
     pub base_pose: Located<PoseEntry>,
-    /// Root link of the robot.
+    /// The link that `base_pose` places.
     #[serde(default = "base_link")]
     pub base_link: String,
-    /// The link that pose goals are for.
+    /// The link that pose goals refer to.
     pub end_effector_link: Located<String>,
-    /// The joints that are planned for, as the model names them, base first; or `{group: NAME}`: a `group` of the SRDF.
+    /// The planned joints by their names in the model, from the base; or `{group: NAME}`, a group of the SRDF.
     pub joint_names: Located<RobotJoints>,
     /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
     #[serde(default)]
@@ -86,55 +86,55 @@ pub struct RobotConfig {
     /// The coordinator's joint names and the model's: `{arm_joint1: joint1}`. Default: they are the same.
     #[serde(default)]
     pub joint_name_mapping: Keyed<Located<String>>,
-    /// The joint of the model that the arm's gripper moves: `{joint: finger, closed: 0, open: 0.04}`. Without it a
-    /// gripper is planned for at its widest opening.
+    /// The joint of the model that the arm's gripper drives: `{joint: finger, closed: 0, open: 0.04}`. Without it,
+    /// plans assume a fully open gripper.
     #[serde(default)]
     pub gripper_joint: Option<Located<GripperJointEntry>>,
     /// The trajectory task that executes the robot's motions.
     #[serde(default)]
     pub coordinator_task_name: Option<Located<String>>,
-    /// Pairs of links that may touch: `[[finger_left, finger_right]]`.
+    /// Allowed collision pairs of links: `[[finger_left, finger_right]]`.
     #[serde(default)]
     pub collision_exclusion_pairs: Vec<(String, String)>,
-    /// How the collision meshes of links are checked, by the link's name: `{left_finger: decomposition}`. `hull`
-    /// (default) fills what is hollow, `decomposition` takes several convex parts, `triangles` the mesh as it is,
-    /// slowly.
+    /// Collision geometry of links with meshes, by link name: `{left_finger: decomposition}`. `hull` (default) is one
+    /// convex hull, which fills cavities; `decomposition` is several convex parts; `triangles` is the exact mesh, which
+    /// is slow.
     #[serde(default)]
     pub collision_shapes: Keyed<Located<MeshMode>>,
-    /// Whether collision meshes may be Collada files, which are converted to triangles. STL and OBJ are read as they
-    /// are.
+    /// Whether Collada collision meshes are accepted; they are converted to triangles when read. STL and OBJ are always
+    /// accepted.
     #[serde(default = "yes")]
     pub auto_convert_meshes: bool,
-    /// Highest joint speed, on top of the model's own limits [rad/s].
+    /// Cap on joint speed, besides the model's limits [rad/s].
     #[serde(default = "max_velocity", deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_velocity: f64,
-    /// Highest joint acceleration, on top of the model's own limits [rad/s²].
+    /// Cap on joint acceleration, besides the model's limits [rad/s²].
     #[serde(default = "max_acceleration", deserialize_with = "positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_acceleration: f64,
-    /// Highest joint jerk, on top of the model's and the arm's own limits [rad/s³].
+    /// Cap on joint jerk, besides the limits of the model and the arm [rad/s³].
     #[serde(default, deserialize_with = "maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0.0))]
     pub max_jerk: Option<f64>,
-    /// Poses with a name: one position for each of `joint_names` [rad].
+    /// Named poses: one position for each of `joint_names` [rad].
     #[serde(default)]
     pub named_poses: Keyed<Located<Vec<f64>>>,
 }
 
-/// The joint of a model that a gripper moves. Joints that follow it by `mimic` move with it.
+/// The joint of a model that a gripper drives; other joints may follow by `mimic`.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct GripperJointEntry {
-    /// Its name in the model.
+    /// Name in the model.
     pub joint: Located<String>,
-    /// Its position when the gripper is closed [rad or m].
+    /// Position when the gripper is closed [rad or m].
     pub closed: f64,
-    /// Its position when the gripper is open [rad or m]; between the two it follows the opening in proportion.
+    /// Position when the gripper is open [rad or m]; in between, it is proportional to the opening.
     pub open: f64,
 }
 
-/// The joints of a robot that are planned for.
+/// The planned joints of a robot.
 #[derive(Debug, Clone)]
 pub enum RobotJoints {
     /// Their names.
@@ -214,18 +214,18 @@ fn max_acceleration() -> f64 {
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectEntry {
-    /// What it is: `box: [x, y, z]`, `sphere: radius`, `cylinder: [radius, length]` [m], `mesh: FILE`, `cloud: FILE`.
+    /// Geometry: `box: [x, y, z]`, `sphere: radius`, `cylinder: [radius, length]` [m], `mesh: FILE`, `cloud: FILE`.
     pub shape: Located<ShapeEntry>,
-    /// Where its middle is, in the frame `map`.
+    /// Pose in the frame `map`.
     #[serde(default)]
     pub pose: Located<PoseEntry>,
-    /// How much it is thickened all around [m].
+    /// Padding added on all sides [m].
     #[serde(default, deserialize_with = "non_negative")]
     #[schemars(range(min = 0.0))]
     pub padding: f64,
 }
 
-/// Shape of an obstacle: one of these. The axis of a cylinder is z.
+/// Geometry of an obstacle, centred on its frame; a cylinder's axis is z.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ShapeEntry {
@@ -235,9 +235,9 @@ pub enum ShapeEntry {
     Sphere(f64),
     /// Radius and length [m].
     Cylinder([f64; 2]),
-    /// A mesh file (STL, OBJ, DAE), as seen from this file.
+    /// A mesh file (STL, OBJ, DAE), relative to this file.
     Mesh(String),
-    /// A point cloud file (PLY), as seen from this file.
+    /// A point cloud file (PLY), relative to this file.
     Cloud(String),
 }
 
@@ -253,13 +253,13 @@ pub struct PoseEntry {
     pub quat: Option<[f64; 4]>,
 }
 
-/// The live view in the browser. Not in this version: `check` and `run` warn of it.
+/// The live view in the browser. Not in this version: `check` and `run` warn about it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ViewConfig {
-    /// Which view.
+    /// Backend of the view.
     pub backend: ViewBackend,
-    /// Port of its page on this machine; 0 = any free one.
+    /// Port of its page on this machine; 0 = any free port.
     pub port: u16,
 }
 
@@ -269,7 +269,7 @@ impl Default for ViewConfig {
     }
 }
 
-/// Which view.
+/// Backend of the view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ViewBackend {

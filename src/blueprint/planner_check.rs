@@ -1,7 +1,7 @@
-//! Checks what `planner` and `view` refer to.
+//! Checks the names and values of `planner` and `view`.
 
-use crate::blueprint::arms::Found;
-use crate::blueprint::planner::{ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ShapeEntry, ViewConfig};
+use crate::blueprint::arms::Hardware;
+use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry, ViewConfig};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::blueprint::schema::{JointNames, TaskEntry};
@@ -10,11 +10,11 @@ use crate::yaml::{Diag, Located, did_you_mean, quote};
 
 pub(super) fn check(
     checker: &mut Checker<'_>,
-    planner: &Located<PlannerConfig>,
+    planner: &Located<PlannerEntry>,
     described: &[Described],
     view: Option<&Located<ViewConfig>>,
     tasks: &[Located<TaskEntry>],
-    found: &Found,
+    hardware: &Hardware,
 ) {
     if let (Some(view), Some(visualization)) = (view, &planner.visualization) {
         let also = checker.tree.label(view.at).with_text("the same thing");
@@ -25,16 +25,16 @@ pub(super) fn check(
     for (number, (robot, described)) in planner.robots.iter().zip(described).enumerate() {
         if checker.has(robot.at, "name") {
             checker.check_name(&robot.name, "robot's name");
-            let twin = planner.robots.iter().take(number).find(|r| r.name.value == robot.name.value);
-            if let Some(twin) = twin {
-                let also = checker.tree.label(twin.name.at).with_text("first used here");
+            let duplicate = planner.robots.iter().take(number).find(|r| r.name.value == robot.name.value);
+            if let Some(duplicate) = duplicate {
+                let also = checker.tree.label(duplicate.name.at).with_text("first used here");
                 let diag = Diag::error(format!("two robots are named {}", quote(&robot.name))).also(also);
-                checker.error(robot.name.at, diag.hint("give each robot a name of its own"));
+                checker.error(robot.name.at, diag.hint("give each robot its own name"));
             }
         }
         pose(checker, &robot.base_pose);
         let task = task(checker, robot, tasks);
-        joints(checker, robot, described, found, task);
+        joints(checker, robot, described, hardware, task);
         named_poses(checker, robot, described);
     }
     for (name, entry) in &planner.world.0 {
@@ -42,7 +42,7 @@ pub(super) fn check(
     }
 }
 
-/// Objects of the world: names, poses, sizes.
+/// Checks an object of the world: name, pose, sizes.
 fn object(checker: &mut Checker<'_>, name: &Located<String>, object: &Located<ObjectEntry>) {
     checker.check_name(name, "object's name");
     pose(checker, &object.pose);
@@ -72,15 +72,15 @@ fn pose(checker: &mut Checker<'_>, pose: &Located<PoseEntry>) {
     }
 }
 
-/// Whether a task is of a type that executes trajectories.
+/// Returns whether a task is of a type that executes trajectories.
 fn executes(checker: &Checker<'_>, task: &TaskEntry) -> bool {
     checker.catalog.tasks.get(&task.kind).is_some_and(|row| row.takes(TargetKind::Trajectory))
 }
 
-/// The task that executes the robot's motions, when it exists and can.
+/// Returns the task that executes the robot's motions; reports one that does not exist or cannot execute them.
 fn task<'t>(
     checker: &mut Checker<'_>,
-    robot: &RobotConfig,
+    robot: &RobotEntry,
     tasks: &'t [Located<TaskEntry>],
 ) -> Option<&'t Located<TaskEntry>> {
     let name = robot.coordinator_task_name.as_ref()?;
@@ -103,19 +103,19 @@ fn task<'t>(
     }
 }
 
-/// Whether the robot's joints are joints of the coordinator, and of the task.
+/// Checks that the robot's joints are joints of the coordinator and of the task.
 fn joints(
     checker: &mut Checker<'_>,
-    robot: &Located<RobotConfig>,
+    robot: &Located<RobotEntry>,
     described: &Described,
-    found: &Found,
+    hardware: &Hardware,
     task: Option<&Located<TaskEntry>>,
 ) {
     let mapping = &robot.joint_name_mapping;
     let (model, good) = (described.joints.as_deref().unwrap_or_default(), described.joints.is_some());
     if good && model.is_empty() {
         let diag = Diag::error("the robot has no joints");
-        checker.error(robot.joint_names.at, diag.hint("name those of the model that are planned for, base first"));
+        checker.error(robot.joint_names.at, diag.hint("list the planned joints by their names in the model"));
     }
     if let (Some(prefix), Some((first, _))) = (&robot.joint_prefix, mapping.0.first()) {
         let also = checker.tree.label(first.at).with_text("given here too");
@@ -123,7 +123,7 @@ fn joints(
         checker.error(prefix.at, diag.hint("remove one of the two"));
         return;
     }
-    // Names of the coordinator's joints, with the place that says so.
+    // Names of the coordinator's joints, each with its node.
     let mut wanted: Vec<Located<String>> = Vec::new();
     for (ours, theirs) in &mapping.0 {
         wanted.push(ours.clone());
@@ -143,24 +143,24 @@ fn joints(
             wanted.push(Located { at: prefix.map_or(joint.at, |p| p.at), value: name });
         }
     }
-    if !found.joints_known {
+    if !hardware.joints_known {
         return;
     }
-    let ours: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
+    let ours: Vec<&str> = hardware.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
     let known = |t: &&Located<TaskEntry>| checker.has(t.at, "joint_names") && !checker.lost.contains(t.joint_names.at);
     let of_task = task.filter(known).map(|t| match &t.joint_names.value {
         JointNames::Names(names) => names.iter().map(|n| n.value.clone()).collect::<Vec<_>>(),
         JointNames::Hardware(arm) => {
-            found.entries.iter().filter(|e| e.id == arm.hardware.value).flat_map(|e| e.joints.clone()).collect()
+            hardware.entries.iter().filter(|e| e.id == arm.hardware.value).flat_map(|e| e.joints.clone()).collect()
         }
     });
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for name in &wanted {
-        if told.contains(&name.at) {
+        if reported.contains(&name.at) {
             continue;
         }
         if !ours.contains(&name.as_str()) {
-            told.push(name.at);
+            reported.push(name.at);
             let diag = Diag::error(format!("no arm has a joint {}", quote(name)));
             let (hint, given) = (did_you_mean(name, ours.iter().copied(), "joints"), robot.joint_prefix.is_some());
             let diag = match given {
@@ -172,7 +172,7 @@ fn joints(
             && !joints.is_empty()
             && !joints.contains(&name.value)
         {
-            told.push(name.at);
+            reported.push(name.at);
             let also = checker.tree.label(task.joint_names.at).with_text("the task's joints");
             let diag = Diag::error(format!("the task {} does not command {}", quote(&task.name), quote(name)));
             checker.error(name.at, diag.also(also).hint("add the joint to the task, or name another task"));
@@ -180,7 +180,7 @@ fn joints(
     }
 }
 
-fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotConfig>, described: &Described) {
+fn named_poses(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, described: &Described) {
     let Some(count) = described.joints.as_ref().map(Vec::len) else { return };
     for (_, pose) in &robot.named_poses.0 {
         if pose.len() != count && !checker.lost.contains(pose.at) {

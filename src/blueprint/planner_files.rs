@@ -1,4 +1,4 @@
-//! The section `planner` as a planner takes it: paths in full, every joint with both its names.
+//! Resolves the section `planner`: full paths, and both names of every joint.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,17 +6,15 @@ use std::time::Duration;
 
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 
-use crate::blueprint::planner::{
-    ObjectEntry, PlannerConfig as Typed, PoseEntry, RobotConfig as TypedRobot, ShapeEntry,
-};
+use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
-/// What a planner is made from. Only of use when nothing was reported.
-pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Described]) -> PlannerConfig {
+/// Returns the configuration of the planner; only valid if nothing was reported.
+pub(super) fn resolve(checker: &Checker<'_>, typed: &PlannerEntry, described: &[Described]) -> PlannerConfig {
     let robots = typed.robots.iter().zip(described);
     PlannerConfig {
         timeout: Duration::from_secs_f64(typed.planning_timeout.clamp(0.0, 86_400.0)),
@@ -26,8 +24,8 @@ pub(super) fn resolve(checker: &Checker<'_>, typed: &Typed, described: &[Describ
     }
 }
 
-/// The files of a robot's description.
-pub(super) fn source(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> Source {
+/// Returns the files of a robot's description.
+pub(super) fn source(checker: &Checker<'_>, typed: &Located<RobotEntry>) -> Source {
     let path = |path: &Located<String>| file(checker, path.at, path);
     Source {
         path: path(&typed.model_path),
@@ -39,7 +37,7 @@ pub(super) fn source(checker: &Checker<'_>, typed: &Located<TypedRobot>) -> Sour
     }
 }
 
-fn robot(checker: &Checker<'_>, typed: &Located<TypedRobot>, described: &Described) -> RobotConfig {
+fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Described) -> RobotConfig {
     let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
     let source = source(checker, typed);
     let ours = |model: &String| {

@@ -1,10 +1,10 @@
-//! Checks the planner's robots against their descriptions, so that `dimos check` finds what a run would fail at: files
-//! that are not there, joints, groups and links that the model does not have, poses outside its limits. What lies in an
-//! asset that has not been fetched yet is checked once it has been.
+//! Checks planning robots against their descriptions, so that `dimos check` finds what would fail in a run: missing
+//! files; joints, groups and links that the model lacks; poses outside its limits. Files of assets that are not fetched
+//! yet are not checked.
 
 use std::path::Path;
 
-use crate::blueprint::planner::{PlannerConfig as Typed, RobotConfig as TypedRobot, RobotJoints, ShapeEntry};
+use crate::blueprint::planner::{PlannerEntry, RobotEntry, RobotJoints, ShapeEntry};
 use crate::blueprint::planner_files;
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{ObjectShape, PlannerConfig};
@@ -13,19 +13,19 @@ use crate::robot::srdf::Semantics;
 use crate::robot::{Source, load};
 use crate::yaml::{Diag, Located, NodeId, Report, Severity, did_you_mean, quote};
 
-/// Warnings about one description that are shown; `dimos model check` shows all.
+/// Maximum number of warnings shown per description; `dimos model check` shows all.
 const WARNINGS: usize = 5;
 
-/// A robot's description, as far as it could be read.
+/// The readable part of a robot's description.
 pub(super) struct Described {
     model: Option<RobotModel>,
     semantics: Semantics,
-    /// The joints that are planned for, each with the place that names it; `None` where they are not known.
+    /// The planned joints, each with its node; `None` if they are not known.
     pub(super) joints: Option<Vec<Located<String>>>,
 }
 
-/// Reads the descriptions of all robots, and finds the joints of groups.
-pub(super) fn read(checker: &mut Checker<'_>, typed: &Typed) -> Vec<Described> {
+/// Reads the descriptions of all robots, and resolves groups of joints.
+pub(super) fn read(checker: &mut Checker<'_>, typed: &PlannerEntry) -> Vec<Described> {
     let read = |robot| {
         let (model, semantics) = description(checker, robot);
         let joints = joints(checker, robot, model.as_ref(), &semantics);
@@ -34,8 +34,8 @@ pub(super) fn read(checker: &mut Checker<'_>, typed: &Typed) -> Vec<Described> {
     typed.robots.iter().map(read).collect()
 }
 
-/// Checks robots and objects against the files that they name.
-pub(super) fn check(checker: &mut Checker<'_>, typed: &Typed, described: &[Described], config: &PlannerConfig) {
+/// Checks robots and objects against their files.
+pub(super) fn check(checker: &mut Checker<'_>, typed: &PlannerEntry, described: &[Described], config: &PlannerConfig) {
     for (robot, described) in typed.robots.iter().zip(described) {
         if let Some(model) = &described.model {
             names(checker, robot, described, model);
@@ -63,8 +63,8 @@ fn file(checker: &mut Checker<'_>, at: NodeId, path: &Path) {
     }
 }
 
-/// The robot's description, where it has no mistakes. Its warnings are passed on.
-fn description(checker: &mut Checker<'_>, robot: &Located<TypedRobot>) -> (Option<RobotModel>, Semantics) {
+/// Returns the robot's description if it has no mistakes. Reports its mistakes and warnings.
+fn description(checker: &mut Checker<'_>, robot: &Located<RobotEntry>) -> (Option<RobotModel>, Semantics) {
     let lost = |path: &Located<String>| checker.lost.contains(path.at);
     let optional = [&robot.srdf_path, &robot.joint_limits_path];
     let known = checker.has(robot.at, "model_path") && !lost(&robot.model_path);
@@ -80,13 +80,13 @@ fn description(checker: &mut Checker<'_>, robot: &Located<TypedRobot>) -> (Optio
     let check = command(&source);
     let (errors, warnings): (Vec<_>, Vec<_>) = reports.iter().partition(|report| report.severity == Severity::Error);
     if let Some(first) = errors.first() {
-        let (at, what) = place(robot, &source, first);
+        let (at, what) = report_position(robot, &source, first);
         let diag = Diag::error(format!("the robot's description cannot be used: {what}"));
-        let more = format!("`{check}` shows all that is wrong with it");
+        let more = format!("`{check}` shows all mistakes in it");
         checker.error(at, diag.hint(first.hint.clone().unwrap_or(more)));
     }
     for report in warnings.iter().take(WARNINGS) {
-        let (at, what) = place(robot, &source, report);
+        let (at, what) = report_position(robot, &source, report);
         checker.error(at, Diag::warning(what).maybe_hint(report.hint.clone()));
     }
     if let Some(more) = warnings.len().checked_sub(WARNINGS).filter(|more| *more > 0) {
@@ -96,7 +96,7 @@ fn description(checker: &mut Checker<'_>, robot: &Located<TypedRobot>) -> (Optio
     (loaded.model, loaded.semantics)
 }
 
-/// The command that checks a description alone.
+/// Returns the command that checks a description alone.
 fn command(source: &Source) -> String {
     let mut command = format!("dimos model check {}", source.path.display());
     for (option, path) in [("--srdf", &source.srdf), ("--joint-limits", &source.joint_limits)] {
@@ -111,8 +111,8 @@ fn command(source: &Source) -> String {
     command
 }
 
-/// The key that names the file of a mistake, and the mistake with its own place in that file.
-fn place(robot: &TypedRobot, source: &Source, report: &Report) -> (NodeId, String) {
+/// Returns the key of the file with a mistake, and the mistake with its position in that file.
+fn report_position(robot: &RobotEntry, source: &Source, report: &Report) -> (NodeId, String) {
     let what = match (&report.file, report.line, report.column) {
         (Some(file), Some(line), Some(column)) => format!("{file}:{line}:{column}: {}", report.message),
         _ => report.message.clone(),
@@ -123,10 +123,10 @@ fn place(robot: &TypedRobot, source: &Source, report: &Report) -> (NodeId, Strin
     (found.and_then(|(key, _)| key.as_ref()).map_or(robot.model_path.at, |key| key.at), what)
 }
 
-/// The joints that are planned for; those of a group where one is named.
+/// Returns the planned joints, or those of the named group; `None` if they are not known.
 fn joints(
     checker: &mut Checker<'_>,
-    robot: &Located<TypedRobot>,
+    robot: &Located<RobotEntry>,
     model: Option<&RobotModel>,
     semantics: &Semantics,
 ) -> Option<Vec<Located<String>>> {
@@ -139,7 +139,7 @@ fn joints(
     };
     if robot.srdf_path.is_none() {
         let diag = Diag::error(format!("the group {} is not known: the robot has no SRDF", quote(group)));
-        checker.error(group.at, diag.hint("name its file by `srdf_path`, or list the joints"));
+        checker.error(group.at, diag.hint("set `srdf_path`, or list the joints"));
         return None;
     }
     let model = model?;
@@ -150,7 +150,7 @@ fn joints(
         return None;
     };
     if found.is_empty() {
-        let diag = Diag::error(format!("the group {} has no joints that move on their own", quote(group)));
+        let diag = Diag::error(format!("the group {} has no independent joints", quote(group)));
         checker.error(group.at, diag.hint("`dimos model info` with `--srdf` shows the groups and their joints"));
         return None;
     }
@@ -158,8 +158,8 @@ fn joints(
     Some(names.map(|value| Located { at: group.at, value }).collect())
 }
 
-/// Joints and links.
-fn names(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, described: &Described, model: &RobotModel) {
+/// Checks joint and link names.
+fn names(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, described: &Described, model: &RobotModel) {
     let joints: Vec<&str> = model.joints.iter().map(|joint| joint.name.as_str()).collect();
     for (number, name) in described.joints.iter().flatten().enumerate() {
         let diag = match model.joint_index(name).and_then(|index| model.joints.get(index)) {
@@ -169,9 +169,9 @@ fn names(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, described: &Des
                 "its joints",
             )),
             Some(joint) if !joint.is_independent() => {
-                let why = if joint.is_movable() { "follows another joint" } else { "is fixed" };
-                Diag::error(format!("the joint {} {why}: it cannot be planned for", quote(name)))
-                    .hint("remove it; what follows moves with the joint that it follows")
+                let why = if joint.is_movable() { "mimics another joint" } else { "is fixed" };
+                Diag::error(format!("the joint {} {why}: it cannot be planned", quote(name)))
+                    .hint("remove it; a mimic joint moves with its leader")
             }
             Some(_) if described.joints.iter().flatten().take(number).any(|other| other.value == name.value) => {
                 Diag::error(format!("the joint {} is named twice", quote(name)))
@@ -183,7 +183,7 @@ fn names(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, described: &Des
     if checker.has(robot.at, "end_effector_link") && !checker.lost.contains(robot.end_effector_link.at) {
         link(checker, robot.end_effector_link.at, &robot.end_effector_link, model);
     }
-    // Where it is not written the default is meant, and the robot itself is the place.
+    // If it is not written, the default applies, and a mistake is reported at the robot.
     let base = checker.tree.get(robot.at, "base_link");
     if base.is_none_or(|at| !checker.lost.contains(at)) {
         link(checker, base.unwrap_or(robot.at), &robot.base_link, model);
@@ -198,8 +198,8 @@ fn link(checker: &mut Checker<'_>, at: NodeId, name: &str, model: &RobotModel) {
     }
 }
 
-/// The joint that the gripper moves: one that is not planned and has a position of its own, within its limits.
-fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Described, model: &RobotModel) {
+/// Checks the gripper's joint: independent, not planned, and its positions within the limits.
+fn gripper_joint(checker: &mut Checker<'_>, robot: &RobotEntry, described: &Described, model: &RobotModel) {
     let Some(gripper) = &robot.gripper_joint else { return };
     let name = &gripper.joint;
     let planned = described.joints.iter().flatten().any(|joint| joint.value == name.value);
@@ -212,11 +212,11 @@ fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Desc
                 "its joints",
             ))
         }
-        Some(_) if planned => Diag::error(format!("the joint {} is planned for", quote(name)))
-            .hint("name the joint that the gripper moves, which is none of `joint_names`"),
+        Some(_) if planned => Diag::error(format!("the joint {} is a planned joint", quote(name)))
+            .hint("name the joint that the gripper drives; it is not one of `joint_names`"),
         Some(joint) if !joint.is_independent() => {
-            let why = if joint.is_movable() { "follows another joint" } else { "is fixed" };
-            Diag::error(format!("the joint {} {why}", quote(name))).hint("name the joint that the others follow")
+            let why = if joint.is_movable() { "mimics another joint" } else { "is fixed" };
+            Diag::error(format!("the joint {} {why}", quote(name))).hint("name the joint that the others mimic")
         }
         Some(joint) => {
             let limits = joint.limits;
@@ -224,13 +224,13 @@ fn gripper_joint(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Desc
             let Some(at) = [gripper.closed, gripper.open].into_iter().find(outside) else { return };
             let (lower, upper, unit) = (limits.lower, limits.upper, joint.kind.unit());
             Diag::error(format!("{} at {at} {unit} is outside the model's limits", quote(name)))
-                .hint(format!("it goes from {lower:.4} to {upper:.4} {unit}"))
+                .hint(format!("its range is {lower:.4} to {upper:.4} {unit}"))
         }
     };
     checker.error(name.at, diag);
 }
 
-fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {
+fn exclusions(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotModel) {
     let Some(at) = checker.tree.get(robot.at, "collision_exclusion_pairs") else { return };
     for (a, b) in &robot.collision_exclusion_pairs {
         link(checker, at, a, model);
@@ -238,29 +238,30 @@ fn exclusions(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &Ro
     }
 }
 
-fn shapes(checker: &mut Checker<'_>, robot: &TypedRobot, model: &RobotModel) {
+fn shapes(checker: &mut Checker<'_>, robot: &RobotEntry, model: &RobotModel) {
     for (name, _) in &robot.collision_shapes.0 {
         link(checker, name.at, &name.value, model);
     }
 }
 
-fn meshes(checker: &mut Checker<'_>, robot: &Located<TypedRobot>, model: &RobotModel) {
+fn meshes(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotModel) {
     let Some(at) = checker.tree.get(robot.at, "auto_convert_meshes") else { return };
     if let Some((link, mesh)) = model.collada_collision().filter(|_| !robot.auto_convert_meshes) {
-        let diag = Diag::error(format!("the link {} collides by a Collada file: {}", quote(&link.name), mesh.uri));
-        checker.error(at, diag.hint("set auto_convert_meshes to true, or give the link an STL or OBJ file"));
+        let (name, uri) = (quote(&link.name), &mesh.uri);
+        let what = format!("the collision mesh of the link {name} is a Collada file: {uri}");
+        checker.error(at, Diag::error(what).hint("set auto_convert_meshes to true, or give the link an STL or OBJ file"));
     }
 }
 
-/// Poses with a name, of the blueprint and of the SRDF, must be within the limits.
-fn named_poses(checker: &mut Checker<'_>, robot: &TypedRobot, described: &Described, model: &RobotModel) {
+/// Checks that the named poses of blueprint and SRDF are within the limits.
+fn named_poses(checker: &mut Checker<'_>, robot: &RobotEntry, described: &Described, model: &RobotModel) {
     let joints: Vec<String> = described.joints.iter().flatten().map(|name| name.value.clone()).collect();
     let outside = |pose: &[f64]| {
         let joint = |name: &String| model.joint_index(name).and_then(|index| model.joints.get(index));
         let mut limits = pose.iter().zip(&joints).filter_map(|(q, name)| Some((*q, name, joint(name)?)));
         limits.find(|(q, _, joint)| !(joint.limits.lower..=joint.limits.upper).contains(q)).map(|(q, name, joint)| {
             let (unit, limits) = (joint.kind.unit(), joint.limits);
-            let hint = format!("it goes from {:.4} to {:.4} {unit}", limits.lower, limits.upper);
+            let hint = format!("its range is {:.4} to {:.4} {unit}", limits.lower, limits.upper);
             (format!("{} at {q} {unit} is outside the model's limits", quote(name)), hint)
         })
     };

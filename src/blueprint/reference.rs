@@ -7,7 +7,7 @@ use serde_json::Value;
 use crate::blueprint::catalog::Catalog;
 use crate::blueprint::json_schema::full_schema;
 use crate::blueprint::limits::LimitsEntry;
-use crate::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerConfig, PoseEntry, RobotConfig, ViewConfig};
+use crate::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
 use crate::blueprint::schema::{
     AssetEntry, BlueprintFile, CoordinatorConfig, CountedJoints, HardwareEntry, RecordingConfig, RpcConfig, TaskEntry,
 };
@@ -17,16 +17,16 @@ use crate::yaml::keys;
 const INTRODUCTION: &str = "\
 # Blueprint reference
 
-A blueprint is a YAML file that says which arms there are and what is done with them. `dimos run NAME|PATH` runs one,
-`dimos check NAME|PATH` finds every mistake in it, `dimos list-blueprints` shows those that can be run by name:
-from `./blueprints`, the folders in `$DIMOS_BLUEPRINT_PATH`, `~/.config/dimos/blueprints`, and the binary itself, in this
-order. Units are SI: rad, rad/s, m, s, Hz.
+A blueprint is a YAML file that defines the arms, tasks, planner and log of a run. `dimos run NAME|PATH` runs one,
+`dimos check NAME|PATH` reports every mistake in it, `dimos list-blueprints` lists those that can be run by name: from
+`./blueprints`, the folders of `$DIMOS_BLUEPRINT_PATH`, `~/.config/dimos/blueprints` and the binary, in this order.
+Units are SI: rad, rad/s, m, s, Hz.
 
 `--set path=value` changes one value for one run; entries of lists are addressed by their id:
-`--set hardware.arm.address=192.168.1.100`, `--set coordinator.tick_rate=250`. `--sim` gives every arm its emulator.
+`--set hardware.arm.address=192.168.1.100`, `--set coordinator.tick_rate=250`. `--sim` uses every arm's emulator.
 
-YAML is read by version 1.2: booleans are `true` and `false` (`yes` is a text), keys are given once, numbers are finite.
-A file has at most 1 MiB.
+Blueprints are YAML 1.2: booleans are `true` and `false` (`yes` is a text). Keys must be unique, numbers finite, and a
+file has at most 1 MiB.
 
 This page is generated. Regenerate it with `DIMOS_REGENERATE=1 cargo test --lib blueprint`.
 
@@ -60,8 +60,8 @@ const SECTIONS: [Section; 6] = [
 ];
 /// Those behind the parameters of the task types.
 const SECTIONS_AFTER_TASKS: [Section; 9] = [
-    section("`planner`", "", "/$defs/PlannerConfig", keys::<PlannerConfig>),
-    section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotConfig", keys::<RobotConfig>),
+    section("`planner`", "", "/$defs/PlannerEntry", keys::<PlannerEntry>),
+    section("`planner.robots[]`", "A list of robots, merged by `name`.", "/$defs/RobotEntry", keys::<RobotEntry>),
     section("`planner.robots[].gripper_joint`", "", "/$defs/GripperJointEntry", keys::<GripperJointEntry>),
     section("`planner.robots[].base_pose`", "", "/$defs/PoseEntry", keys::<PoseEntry>),
     section("`planner.world`", "A group of obstacles by name.", "/$defs/ObjectEntry", keys::<ObjectEntry>),

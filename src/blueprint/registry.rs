@@ -12,23 +12,23 @@ use crate::blueprint::catalog::Catalog;
 use crate::blueprint::load::{Overrides, load_from};
 use crate::yaml::{MAX_BYTES, did_you_mean, quote};
 
-/// Names and texts of the blueprints in the binary, made by `build.rs` from `blueprints/`.
+/// Names and texts of the blueprints in the binary, embedded by `build.rs` from `blueprints/`.
 const EMBEDDED: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/blueprints.rs"));
 
-/// Those that the program which embeds this crate brings along.
+/// Blueprints added by a program that embeds this crate.
 static MORE: OnceLock<Vec<(&str, &str)>> = OnceLock::new();
 
-/// Adds blueprints to the built-in ones; they win over those of the same name. For `main`, once, before anything else.
+/// Adds named blueprints, which win over the built-in ones. Call it once, first thing in `main`.
 pub fn embed(more: Vec<(&'static str, &'static str)>) {
     let _ = MORE.set(more);
 }
 
-/// All blueprints in the program, by name.
+/// Returns all blueprints in the program, by name.
 fn embedded() -> BTreeMap<&'static str, &'static str> {
     EMBEDDED.iter().chain(MORE.get().into_iter().flatten()).copied().collect()
 }
 
-/// Where a blueprint comes from.
+/// Origin of a blueprint.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Source {
@@ -47,19 +47,19 @@ impl std::fmt::Display for Source {
     }
 }
 
-/// A blueprint's file, not read yet as YAML.
+/// A blueprint's file, not parsed yet.
 #[derive(Debug, Clone)]
 pub struct Found {
-    /// The name of the blueprint, unless the file gives another: the file's name.
+    /// The file's name: the name of the blueprint unless the file sets another.
     pub name: String,
-    /// Where it comes from.
+    /// Origin.
     pub source: Source,
-    /// What is in it; at most one byte more than is accepted.
+    /// Contents, at most one byte more than the size limit.
     pub bytes: Vec<u8>,
 }
 
 impl Found {
-    /// The file as shown in messages.
+    /// Returns the file's name for messages.
     pub fn file(&self) -> String {
         match &self.source {
             Source::Path(path) => path.display().to_string(),
@@ -67,7 +67,7 @@ impl Found {
         }
     }
 
-    /// The folder that paths in it are relative to.
+    /// Returns the folder that its paths are relative to.
     pub(super) fn folder(&self) -> Option<&Path> {
         match &self.source {
             Source::Path(path) => path.parent(),
@@ -88,17 +88,17 @@ impl Found {
     }
 }
 
-/// There is no such blueprint, or it cannot be opened.
+/// The blueprint does not exist, or cannot be opened.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}\nhint: {hint}")]
 pub struct FindError {
     /// What is wrong.
     pub message: String,
-    /// What to do about it.
+    /// How to fix it.
     pub hint: String,
 }
 
-/// The folders in which blueprints are looked for by name, in this order; the embedded ones come last.
+/// Folders that are searched for a blueprint's name, in this order; embedded blueprints come last.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct SearchPath {
     /// The folders.
@@ -106,7 +106,7 @@ pub struct SearchPath {
 }
 
 impl SearchPath {
-    /// `./blueprints`, the folders of `$DIMOS_BLUEPRINT_PATH`, and the user's configuration folder.
+    /// Returns `./blueprints`, the folders of `$DIMOS_BLUEPRINT_PATH`, and the user's configuration folder.
     pub fn from_env() -> Self {
         let mut folders = vec![PathBuf::from("blueprints")];
         if let Some(path) = env::var_os("DIMOS_BLUEPRINT_PATH") {
@@ -118,7 +118,7 @@ impl SearchPath {
         Self { folders }
     }
 
-    /// The file of a name or path.
+    /// Returns the file of a name or path.
     pub fn find(&self, name_or_path: &str) -> Result<Found, FindError> {
         let path = Path::new(name_or_path);
         if looks_like_path(name_or_path) || path.is_file() {
@@ -142,7 +142,7 @@ impl SearchPath {
         let path = Path::new(name);
         if path.is_absolute() || path.components().any(|c| c == std::path::Component::ParentDir) {
             return Err(FindError {
-                message: format!("an include stays in the blueprint's own folder, {} does not", quote(name)),
+                message: format!("an include must be in the blueprint's own folder; {} is not", quote(name)),
                 hint: "include by name, and put the file's folder into $DIMOS_BLUEPRINT_PATH".to_owned(),
             });
         }
@@ -165,7 +165,7 @@ impl SearchPath {
         })
     }
 
-    /// All names, each with the place where it is found.
+    /// Returns all names, each with its origin.
     fn names(&self) -> Vec<(String, Source)> {
         let mut seen = BTreeSet::new();
         let mut out = Vec::new();
@@ -196,7 +196,7 @@ impl SearchPath {
     fn cannot_open(&self, path: &Path, error: &io::Error) -> FindError {
         let reason = match error.kind() {
             io::ErrorKind::NotFound => "there is no such file".to_owned(),
-            io::ErrorKind::PermissionDenied => "you may not read it".to_owned(),
+            io::ErrorKind::PermissionDenied => "permission denied".to_owned(),
             io::ErrorKind::IsADirectory => "it is a folder".to_owned(),
             _ => error.to_string(),
         };
@@ -209,13 +209,13 @@ impl SearchPath {
         FindError { message: format!("cannot open {}: {reason}", quote(&path.display().to_string())), hint }
     }
 
-    /// All blueprints that can be run by name.
+    /// Returns all blueprints that can be run by name.
     pub fn list<'a>(&self, catalog: impl Into<Catalog<'a>>) -> Vec<Listing> {
         let catalog = catalog.into();
         let found = self.names().into_iter().map(|(name, source)| {
             let found = match &source {
                 Source::Path(path) => Found::file_at(path).map_err(|error| self.cannot_open(path, &error).message),
-                Source::Embedded => Found::embedded(&name).ok_or_else(|| "it is gone".to_owned()),
+                Source::Embedded => Found::embedded(&name).ok_or_else(|| "it no longer exists".to_owned()),
             };
             let mut listing = Listing { name, source, arms: Vec::new(), description: String::new(), problem: None };
             match found.map(|found| load_from(self, &found, &Overrides::default(), catalog)) {
@@ -244,27 +244,27 @@ fn looks_like_path(text: &str) -> bool {
     text.contains(['/', '\\']) || EXTENSIONS.iter().any(|ext| Path::new(text).extension().is_some_and(|e| e == *ext))
 }
 
-/// A line of `dimos list-blueprints`.
+/// A row of `dimos list-blueprints`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Listing {
-    /// What to give to `dimos run`.
+    /// Name for `dimos run`.
     pub name: String,
-    /// Where it comes from.
+    /// Origin.
     pub source: Source,
     /// Its arms: name, adapter, number of joints.
     pub arms: Vec<String>,
     /// Its description.
     pub description: String,
-    /// Its first mistake, when it has one.
+    /// Its first mistake, if any.
     pub problem: Option<String>,
 }
 
-/// The file of a name or path, looked for in the folders of the environment.
+/// Returns the file of a name or path; searches the folders of [`SearchPath::from_env`].
 pub fn find(name_or_path: &str) -> Result<Found, FindError> {
     SearchPath::from_env().find(name_or_path)
 }
 
-/// All blueprints that can be run by name, from the folders of the environment.
+/// Returns all blueprints that can be run by name, from the folders of [`SearchPath::from_env`].
 pub fn list<'a>(catalog: impl Into<Catalog<'a>>) -> Vec<Listing> {
     SearchPath::from_env().list(catalog)
 }

@@ -1,4 +1,4 @@
-//! A blueprint as it is meant: checked, indices instead of names, SI units.
+//! The resolved blueprint: checked, with indices instead of names.
 
 use serde_json::Value;
 
@@ -41,20 +41,20 @@ pub struct Blueprint {
     pub rpc: RpcConfig,
     /// Files that are fetched on first use.
     pub assets: Vec<UsedAsset>,
-    /// The whole blueprint as one YAML text, includes and arguments merged in: what the log keeps.
+    /// The complete blueprint as YAML, with includes and arguments merged; recorded in the log.
     pub source_yaml: String,
     /// The files it was read from: name and text, the main one first.
     pub sources: Vec<(String, String)>,
 }
 
 impl Blueprint {
-    /// The assets that it uses and that have not been fetched yet.
+    /// Returns the used assets that are not fetched yet.
     pub fn awaited_assets(&self) -> Vec<&Asset> {
         let cache = Cache::standard();
         self.assets.iter().filter(|a| a.used && !cache.has(&a.asset.sha256)).map(|a| &a.asset).collect()
     }
 
-    /// The names of all joints, arm by arm: what [`Task::joints`] counts.
+    /// Returns the names of all joints, arm by arm; [`Task::joints`] are indices in this list.
     pub fn joint_names(&self) -> Vec<&str> {
         self.arms.iter().flat_map(|arm| arm.joints.iter().map(String::as_str)).collect()
     }
@@ -63,9 +63,9 @@ impl Blueprint {
 /// An asset of a blueprint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UsedAsset {
-    /// What it is.
+    /// The asset.
     pub asset: Asset,
-    /// Whether any path of the blueprint leads into it.
+    /// Whether any path of the blueprint refers to it.
     pub used: bool,
 }
 
@@ -74,15 +74,15 @@ pub struct UsedAsset {
 pub struct Arm {
     /// Its name.
     pub hardware_id: String,
-    /// What kind of hardware it is.
+    /// Kind of hardware.
     pub hardware_type: HardwareType,
-    /// Its joints' names, base first.
+    /// Names of its joints, from the base.
     pub joints: Vec<String>,
     /// The adapter's row.
     pub adapter: AdapterSpec,
     /// The adapter's name.
     pub adapter_type: String,
-    /// Where the arm is; `sim` for the emulator; empty where no address is needed.
+    /// Address; `sim` for the emulator, empty if none is needed.
     pub address: String,
     /// Whether the adapter's emulator replaces the arm.
     pub simulated: bool,
@@ -90,13 +90,13 @@ pub struct Arm {
     pub auto_enable: bool,
     /// What happens to the motors when the run ends.
     pub on_exit: OnExit,
-    /// Whether the blueprint says so, or the default was taken.
+    /// Whether the blueprint sets `on_exit`; otherwise it is the default.
     pub on_exit_given: bool,
-    /// Figures with which its measurements and its motion are checked.
+    /// Figures that its measurements and motion are checked against.
     pub supervision: Supervision,
     /// The adapter's own options: an object.
     pub options: Value,
-    /// The arm's own nominal limits, by its number of joints and its options.
+    /// The arm's own limits, from its adapter.
     pub own_limits: JointLimits,
     /// Limits narrower than the arm's own, one entry for each joint.
     pub limits: Vec<JointOverride>,
@@ -111,15 +111,15 @@ pub struct Task {
     pub spec: TaskSpec,
     /// Its parameters, defaults filled in.
     pub params: Value,
-    /// The joints it commands, counted over all arms' joints in the blueprint's order.
+    /// Its joints, as indices in [`Blueprint::joint_names`].
     pub joints: Vec<usize>,
-    /// The arms those joints belong to.
+    /// Indices of the arms of these joints.
     pub arms: Vec<usize>,
-    /// Who wins a joint: the higher number.
+    /// Priority: the higher number wins a joint.
     pub priority: i32,
     /// Whether it is started with the run.
     pub auto_start: bool,
-    /// The robot whose end effector it moves, where its type needs one.
+    /// The robot whose end effector it moves, if its type needs one.
     pub robot: Option<TaskRobot>,
 }
 
@@ -130,22 +130,22 @@ pub struct TaskRobot {
     pub source: Source,
     /// The model's names of the task's joints, in the task's order.
     pub joints: Vec<String>,
-    /// The link that is moved.
+    /// The link that the task moves.
     pub link: String,
     /// Its base pose if it is a robot of the planner; otherwise everything is in the frame of the model's root.
     pub base: Option<Base>,
 }
 
-/// What every check needs: the tree to point into, and what reading had to leave out.
+/// Context of all checks: the tree, the nodes that could not be read, and the catalog.
 pub(super) struct Checker<'t> {
     pub(super) tree: &'t mut Tree,
-    /// The blueprint's own group.
+    /// The root node of the blueprint.
     pub(super) root: NodeId,
     pub(super) lost: Lost,
     pub(super) catalog: Catalog<'t>,
-    /// Files that paths may lead into.
+    /// The assets that paths may refer to.
     pub(super) assets: Assets,
-    /// A file could not be read: names may be missing for that reason.
+    /// Whether a file could not be read, so that names may be missing.
     pub(super) incomplete: bool,
 }
 
@@ -161,13 +161,13 @@ impl Checker<'_> {
         !self.lost.key(group, key)
     }
 
-    /// Whether an entry of a list at the top, or all of it, was left out.
+    /// Returns whether a list at the top level could not be read completely.
     pub(super) fn list_lost(&self, key: &str) -> bool {
         let damaged = |list| self.tree.is_damaged(list) || self.tree.items(list).iter().any(|i| self.lost.dropped(*i));
         self.incomplete || !self.has(self.root, key) || self.tree.get(self.root, key).is_some_and(damaged)
     }
 
-    /// Reports a name that cannot be one.
+    /// Returns whether a name is valid; reports it if not.
     pub(super) fn check_name(&mut self, name: &Located<String>, what: &str) -> bool {
         let good = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
         let problem = match name.value.chars().find(|c| !good(*c)) {
@@ -189,7 +189,7 @@ impl Checker<'_> {
     }
 }
 
-/// Checks the meaning of a blueprint as typed. What it gives is only of use when nothing was reported.
+/// Checks the meaning of a blueprint. The result is only valid if nothing was reported.
 pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_name: &str) -> Blueprint {
     let root = checker.root;
     let name = file.name.unwrap_or_else(|| default_name.to_owned().into());
@@ -197,31 +197,31 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
         let at = if name.at == NOWHERE { root } else { name.at };
         checker.check_name(&Located { at, value: name.value.clone() }, "blueprint's name");
     }
-    let found = arms::resolve(&mut checker, &file.hardware);
-    let mut tasks = tasks::resolve(&mut checker, &file.tasks, &found);
+    let hardware = arms::resolve(&mut checker, &file.hardware);
+    let mut tasks = tasks::resolve(&mut checker, &file.tasks, &hardware);
     checker.assets = Assets::of(file.assets);
     assets::check(&mut checker, &file.tasks, file.planner.as_ref());
     let planner = file.planner.as_ref().map(|planner| {
         let described = planner_models::read(&mut checker, planner);
-        planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &found);
+        planner_check::check(&mut checker, planner, &described, file.view.as_ref(), &file.tasks, &hardware);
         let config = planner_files::resolve(&checker, planner, &described);
         planner_models::check(&mut checker, planner, &described, &config);
         config
     });
-    task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &found);
+    task_robots::resolve(&mut checker, &file.tasks, &mut tasks, planner.as_ref(), &hardware);
     let assets = assets::resolved(&checker, &file.tasks, file.planner.as_ref());
     let view = file.view.or_else(|| file.planner.and_then(|p| p.value.visualization));
-    // What is wrong comes first: a mistake in the section may be the reason for its backend.
+    // Only without errors: a mistake in the section may have changed its backend.
     let sound = checker.tree.diags().iter().all(|diag| diag.severity != Severity::Error);
     if let Some(view) = view.as_ref().filter(|view| sound && view.backend != ViewBackend::None) {
         let diag = Diag::warning("the live view is not in this version: no page will be served");
-        checker.error(view.at, diag.hint("leave the section out, or say `backend: none`"));
+        checker.error(view.at, diag.hint("remove the section, or set `backend: none`"));
     }
     Blueprint {
         name: name.value,
         description: file.description,
         coordinator: file.coordinator,
-        arms: found.arms,
+        arms: hardware.arms,
         tasks,
         planner,
         view: view.map(|v| v.value),

@@ -1,4 +1,4 @@
-//! A blueprint as it is typed. The doc comments here become `docs/blueprint-reference.md` and the JSON Schema.
+//! A blueprint as written. These doc comments become `docs/blueprint-reference.md` and the JSON Schema.
 
 use std::fmt;
 
@@ -8,12 +8,12 @@ use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::blueprint::limits::LimitsEntry;
-use crate::blueprint::planner::{PlannerConfig, ViewConfig};
+use crate::blueprint::planner::{PlannerEntry, ViewConfig};
 use crate::blueprint::size::Size;
 use crate::yaml::range::{self, tick_rate};
 use crate::yaml::{Keyed, Located, Raw};
 
-/// A blueprint: which arms there are, and what is done with them.
+/// A blueprint: the arms, tasks, planner and log of a run.
 #[derive(Debug, Clone, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 #[schemars(title = "dimos blueprint")]
@@ -29,18 +29,18 @@ pub struct BlueprintFile {
     pub coordinator: CoordinatorConfig,
     /// The arms.
     pub hardware: Vec<Located<HardwareEntry>>,
-    /// What may command the arms' joints.
+    /// The tasks: they command the arms' joints.
     pub tasks: Vec<Located<TaskEntry>>,
     /// Motion planning.
-    pub planner: Option<Located<PlannerConfig>>,
+    pub planner: Option<Located<PlannerEntry>>,
     /// The live view in the browser; not in this version.
     pub view: Option<Located<ViewConfig>>,
     /// The log of the run.
     pub recording: RecordingConfig,
-    /// The socket by which other programs talk to the run.
+    /// The socket for client programs.
     pub rpc: RpcConfig,
-    /// Files that are fetched on first use, by name: archives of robot descriptions, meshes, point clouds. Wherever a
-    /// robot or an obstacle names a file or a folder, `asset:NAME/path` is one in there; see `docs/models.md`.
+    /// Files that are fetched on first use, by name: archives of robot descriptions, meshes, point clouds. Robots and
+    /// obstacles refer to files and folders in them by `asset:NAME/path`; see `docs/models.md`.
     pub assets: Keyed<AssetEntry>,
 }
 
@@ -48,13 +48,13 @@ pub struct BlueprintFile {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct CoordinatorConfig {
-    /// How often the arms are read and commanded [Hz].
+    /// Rate of the control loop [Hz].
     #[serde(deserialize_with = "tick_rate")]
     #[schemars(range(min = 1.0, max = 2000.0))]
     pub tick_rate: f64,
-    /// Whether the joint state is published to other programs.
+    /// Whether the joint state is published to clients.
     pub publish_joint_state: bool,
-    /// The frame named in published joint states.
+    /// `frame_id` of published joint states.
     pub joint_state_frame_id: String,
 }
 
@@ -70,24 +70,24 @@ impl Default for CoordinatorConfig {
 pub struct HardwareEntry {
     /// Unique name of the arm: letters, digits, `_` and `-`.
     pub hardware_id: Located<String>,
-    /// What kind of hardware it is.
+    /// Kind of hardware.
     #[serde(default)]
     pub hardware_type: HardwareType,
-    /// The arm's joints, base first: a list of names, or `{prefix: arm, count: 6}` for `arm_joint1` … `arm_joint6`.
+    /// The arm's joints, from the base: a list of names, or `{prefix: arm, count: 6}` for `arm_joint1` … `arm_joint6`.
     pub joints: Located<Joints>,
-    /// The adapter that talks to the arm; see `dimos list-adapters`.
+    /// The arm's adapter; see `dimos list-adapters`.
     pub adapter_type: Located<String>,
-    /// Where the arm is, in the form that `dimos list-adapters` shows; `sim` starts the adapter's emulator.
+    /// Address of the arm, in the form that `dimos list-adapters` shows; `sim` starts the adapter's emulator.
     #[serde(default)]
     pub address: Option<Located<String>>,
     /// Whether the motors are enabled when the run starts.
     #[serde(default = "yes")]
     pub auto_enable: bool,
-    /// What happens to the motors when the run ends. Default: `hold` where the arm falls when its motors are
-    /// disabled, `disable` where it has brakes.
+    /// What happens to the motors when the run ends. Default: `hold` if the arm drops when its motors are disabled,
+    /// `disable` if it has brakes.
     #[serde(default)]
     pub on_exit: Option<OnExit>,
-    /// Largest distance of a joint at rest from its setpoint under load [rad]. Default: the adapter's.
+    /// Maximum position error of a joint at rest under load [rad]. Default: the adapter's.
     #[serde(default, deserialize_with = "range::maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub accuracy: Option<f64>,
@@ -96,17 +96,17 @@ pub struct HardwareEntry {
     #[serde(default, deserialize_with = "range::maybe_lag")]
     #[schemars(extend("minimum" = 0, "maximum" = 1))]
     pub lag: Option<f64>,
-    /// Age limit of a state [s]: an arm without a newer one is held. At least three of the device's periods are
-    /// granted. Default: the adapter's.
+    /// Max age of a state [s]: an arm without a newer state is held. The limit is never shorter than three device
+    /// periods. Default: the adapter's.
     #[serde(default, deserialize_with = "range::maybe_age")]
     #[schemars(extend("minimum" = 0.02, "maximum" = 2))]
     pub stale_after: Option<f64>,
-    /// Largest distance of a joint from its setpoints of the last `lag` seconds [rad]: beyond it for 100 ms, the arm is
-    /// held. Default: 0.15.
+    /// Maximum tracking error of a joint, compared with its setpoints of the last `lag` seconds [rad]: an arm that
+    /// exceeds it for 100 ms is held. Default: 0.15.
     #[serde(default, deserialize_with = "range::maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0))]
     pub tracking_tolerance: Option<f64>,
-    /// Whether a pose with every joint at exactly zero is believed although the device does not confirm it.
+    /// Whether a state with every joint at exactly zero is accepted even if the device does not confirm it.
     #[serde(default)]
     pub accept_zero_pose: bool,
     /// The adapter's own options.
@@ -122,7 +122,7 @@ fn yes() -> bool {
     true
 }
 
-/// What kind of hardware it is.
+/// Kind of hardware.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum HardwareType {
@@ -135,9 +135,9 @@ pub enum HardwareType {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum OnExit {
-    /// They stay enabled and hold the pose.
+    /// The motors stay enabled and hold the pose.
     Hold,
-    /// They are disabled, and the arm's brakes hold it.
+    /// The motors are disabled; the arm's brakes hold it.
     Disable,
 }
 
@@ -164,9 +164,9 @@ pub enum Joints {
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CountedJoints {
-    /// What the names start with: `arm` for `arm_joint1`.
+    /// Prefix of the names: `arm` for `arm_joint1`.
     pub prefix: Located<String>,
-    /// How many there are.
+    /// Number of joints.
     #[schemars(range(min = 1, max = 16))]
     pub count: Located<u64>,
 }
@@ -217,18 +217,18 @@ impl JsonSchema for Joints {
     }
 }
 
-/// A task: something that may command joints.
+/// A task: commands joints.
 #[derive(Debug, Clone, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TaskEntry {
     /// Unique name of the task: letters, digits, `_` and `-`.
     pub name: Located<String>,
-    /// What the task does: a row of the table of task types, from which the schema has their names.
+    /// Type of the task. The schema replaces this description by the table of task types.
     #[serde(rename = "type")]
     pub kind: Located<String>,
     /// The joints it commands: a list of names, or `{hardware: arm}` for all joints of an arm.
     pub joint_names: Located<JointNames>,
-    /// Who wins when two tasks want the same joint: the higher number.
+    /// Priority: if two tasks command the same joint, the higher number wins.
     #[serde(default = "default_priority")]
     pub priority: i32,
     /// Whether the task is started with the run.
@@ -312,10 +312,10 @@ pub struct RecordingConfig {
     pub enabled: bool,
     /// Folder of the logs. Default: `$XDG_STATE_HOME/dimos`.
     pub directory: Option<String>,
-    /// How many logs are kept there, the newest ones; 0 = all.
+    /// Number of logs to keep there, the newest ones; 0 = all.
     pub keep: u32,
-    /// Room that the disk of the log must have, such as `200 MB`, or in bytes; 0 = any. A run does not start with less,
-    /// and ends when the room falls below: its log is closed and stays whole.
+    /// Minimum free space on the disk of the log, such as `200 MB`, or in bytes; 0 = no minimum. With less, a run does
+    /// not start, and a live run ends with its log closed and complete.
     pub min_free: Size,
 }
 
@@ -325,7 +325,7 @@ impl Default for RecordingConfig {
     }
 }
 
-/// The socket by which other programs talk to the run.
+/// The socket for client programs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RpcConfig {
@@ -343,7 +343,7 @@ impl Default for RpcConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AssetEntry {
-    /// Where it is: `https://`, `http://` or `file://` with a full path.
+    /// URL: `https://`, `http://`, or `file://` with an absolute path.
     pub url: Located<String>,
     /// SHA-256 of the file, 64 hexadecimal digits.
     pub sha256: Located<String>,

@@ -1,4 +1,4 @@
-//! An amount of memory as it is typed: `200 MB`, `1.5 GiB`, or plain bytes.
+//! Amounts of data as written: `200 MB`, `1.5 GiB`, or plain bytes.
 
 use std::fmt;
 
@@ -19,7 +19,7 @@ const UNITS: &[(&str, u64)] = &[
     ("B", 1),
 ];
 
-/// An amount of memory.
+/// An amount of data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Size(
     /// [bytes]
@@ -40,7 +40,7 @@ impl std::str::FromStr for Size {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let wrong = || format!("{text:?} is no amount of memory\nhint: write 200 MB, 1.5 GB, 512 MiB, or plain bytes");
+        let wrong = || format!("{text:?} is not an amount of data\nhint: write 200 MB, 1.5 GB, 512 MiB, or bytes");
         let text = text.trim();
         let end = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
         let (number, unit) = (text[..end].trim(), text[end..].trim());
@@ -72,7 +72,7 @@ impl Visitor<'_> for SizeVisitor {
     type Value = Size;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("an amount of memory such as 200 MB, or bytes")
+        f.write_str("an amount of data such as 200 MB, or bytes")
     }
 
     fn visit_u64<E: Error>(self, bytes: u64) -> Result<Size, E> {

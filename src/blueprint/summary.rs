@@ -1,4 +1,4 @@
-//! What `dimos check` shows of a blueprint: arms, their joints' limits and where each comes from, tasks.
+//! Summary of a blueprint for `dimos check`: arms, joint limits with their origins, tasks.
 
 use serde::Serialize;
 use serde_json::Value;
@@ -9,34 +9,34 @@ use crate::joint::{DEFAULT_ACCELERATION, DEFAULT_JERK};
 use crate::named::named;
 
 named! {
-    /// Where a value comes from.
+    /// Origin of a value.
     #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
     #[serde(rename_all = "lowercase")]
     pub enum Origin {
         /// The adapter states it.
         Adapter = "adapter",
-        /// The blueprint says so.
+        /// The blueprint sets it.
         Blueprint = "blueprint",
-        /// Neither of them states it.
+        /// Neither of them sets it.
         Default = "default",
     }
 }
 
-/// A limit and where it comes from.
+/// A limit and its origin.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Limit {
     /// The limit; its unit is that of the field.
     pub value: f64,
-    /// Where it comes from.
+    /// Origin.
     pub from: Origin,
 }
 
-/// A joint with the limits it is held to.
+/// A joint and its effective limits.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JointSummary {
     /// Its name.
     pub name: String,
-    /// Lowest position [rad]; absent where the adapter states none and the blueprint gives none.
+    /// Lowest position [rad]; absent if neither adapter nor blueprint states one.
     pub position_lower: Option<Limit>,
     /// Highest position [rad].
     pub position_upper: Option<Limit>,
@@ -55,17 +55,17 @@ pub struct ArmSummary {
     pub hardware_id: String,
     /// The adapter's name.
     pub adapter: String,
-    /// How far that has been proven.
+    /// Level to which the adapter has been proven.
     pub level: String,
-    /// Where the arm is; empty where no address is needed.
+    /// Address; empty if none is needed.
     pub address: String,
-    /// Whether the emulator replaces it.
+    /// Whether it is an emulator.
     pub simulated: bool,
     /// Whether the motors are enabled at the start.
     pub auto_enable: bool,
     /// What happens to the motors at the end.
     pub on_exit: OnExit,
-    /// Where that comes from.
+    /// Origin of `on_exit`.
     pub on_exit_from: Origin,
     /// Whether the arm keeps its pose when its motors are disabled.
     pub holds_when_disabled: bool,
@@ -85,15 +85,15 @@ pub struct TaskSummary {
     pub params: Value,
     /// The joints it commands.
     pub joints: Vec<String>,
-    /// The arms those belong to.
+    /// The arms of these joints.
     pub arms: Vec<String>,
-    /// Who wins a joint: the higher number.
+    /// Priority: the higher number wins a joint.
     pub priority: i32,
     /// Whether it is started with the run.
     pub auto_start: bool,
 }
 
-/// A blueprint as it will be run.
+/// Summary of a blueprint.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Summary {
     /// Its name.
@@ -108,12 +108,12 @@ pub struct Summary {
     pub arms: Vec<ArmSummary>,
     /// The tasks.
     pub tasks: Vec<TaskSummary>,
-    /// Robots that are planned for.
+    /// Names of the planning robots.
     pub planner_robots: Vec<String>,
 }
 
 impl Summary {
-    /// Sums a blueprint up.
+    /// Creates the summary of a blueprint.
     pub fn of(blueprint: &Blueprint) -> Self {
         let joints = blueprint.joint_names();
         let tasks = blueprint.tasks.iter().map(|task| TaskSummary {

@@ -4,51 +4,50 @@
 use std::collections::HashMap;
 use std::path::PathBuf;
 
-use glamx::DQuat;
 use nalgebra::Isometry3;
 use serde::Deserialize;
 
-use crate::blueprint::arms::Found;
+use crate::blueprint::arms::Hardware;
 use crate::blueprint::planner_files::file;
 use crate::blueprint::resolve::{Checker, Task, TaskRobot};
 use crate::blueprint::schema::TaskEntry;
 use crate::control::task_robot::{FramePose, RobotParams, TaskKinematics};
 use crate::planning::config::{PlannerConfig, RobotConfig};
-use crate::robot::kinematics::{Kinematics, frame};
+use crate::robot::kinematics::Kinematics;
 use crate::robot::model::{JointKind, RobotModel};
 use crate::robot::{Source, load};
 use crate::yaml::{Diag, Located, NodeId, Severity, did_you_mean, quote};
 
-/// Gives those of `tasks` their robots whose types move an end effector.
+/// Sets the robot of every task whose type moves an end effector.
 pub(super) fn resolve(
     checker: &mut Checker<'_>,
     entries: &[Located<TaskEntry>],
     tasks: &mut [Task],
     planner: Option<&PlannerConfig>,
-    found: &Found,
+    hardware: &Hardware,
 ) {
-    let names: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
+    let names: Vec<&str> = hardware.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
     for task in tasks.iter_mut().filter(|task| task.spec.robot) {
         let Ok(params) = RobotParams::deserialize(&task.params) else { continue };
         let Some(entry) = entries.iter().find(|e| e.name.value == task.name) else { continue };
-        let known = found.joints_known && !task.joints.is_empty() && checker.has(entry.at, "joint_names");
+        let known = hardware.joints_known && !task.joints.is_empty() && checker.has(entry.at, "joint_names");
         let whole = checker.has(entry.at, "params") && !checker.lost.contains(entry.joint_names.at);
         let joints: Vec<String> = task.joints.iter().filter_map(|j| names.get(*j)).map(|j| (*j).to_owned()).collect();
         if known && whole {
-            let place = Place { entry, params: entry.params.as_ref().map(|p| p.at) };
-            task.robot = robot(checker, &place, &params, &joints, planner, task.spec.name);
+            let pos = TaskPos { entry, params: entry.params.as_ref().map(|p| p.at) };
+            task.robot = robot(checker, &pos, &params, &joints, planner, task.spec.name);
         }
     }
 }
 
 /// Position of a task in its file.
-struct Place<'e> {
+struct TaskPos<'e> {
     entry: &'e Located<TaskEntry>,
     params: Option<NodeId>,
 }
 
-impl Place<'_> {
-    /// A key of the parameters, or the task's type where it is not written.
+impl TaskPos<'_> {
+    /// Returns the node of a parameter, or of the task's type if the parameter is not written.
     fn of(&self, checker: &Checker<'_>, key: &str) -> NodeId {
         self.params.and_then(|params| checker.tree.get(params, key)).unwrap_or(self.entry.kind.at)
     }
@@ -56,7 +55,7 @@ impl Place<'_> {
 
 fn robot(
     checker: &mut Checker<'_>,
-    place: &Place<'_>,
+    pos: &TaskPos<'_>,
     params: &RobotParams,
     joints: &[String],
     planner: Option<&PlannerConfig>,
@@ -64,12 +63,12 @@ fn robot(
 ) -> Option<TaskRobot> {
     let covers = |robot: &&RobotConfig| joints.iter().all(|j| robot.coordinator_joints.contains(j));
     let planned = planner.and_then(|planner| planner.robots.iter().find(covers));
-    let mapped = mapping(checker, place, params, joints)?;
+    let mapped = mapping(checker, pos, params, joints)?;
     let mut robot = match (&params.model_path, planned) {
         (Some(path), _) => TaskRobot {
             source: Source {
-                path: file(checker, place.of(checker, "model_path"), path),
-                packages: packages(checker, place, params),
+                path: file(checker, pos.of(checker, "model_path"), path),
+                packages: packages(checker, pos, params),
                 xacro_args: params.xacro_args.iter().map(|(name, value)| (name.clone(), value.0.clone())).collect(),
                 ..Source::default()
             },
@@ -79,10 +78,10 @@ fn robot(
         },
         (None, Some(planned)) => of_planner(planned, joints, mapped),
         (None, None) => {
-            let diag = Diag::error(format!("the description of the robot is missing, which a `{kind}` task needs"));
-            let hint = "name it: `params: {model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: arm_}`, \
+            let diag = Diag::error(format!("a `{kind}` task needs a robot description"));
+            let hint = "set it: `params: {model_path: builtin:yourarm, end_effector_link: flange, joint_prefix: arm_}`, \
                         or add a robot with these joints to `planner`";
-            checker.error(place.entry.kind.at, diag.hint(hint));
+            checker.error(pos.entry.kind.at, diag.hint(hint));
             return None;
         }
     };
@@ -91,16 +90,16 @@ fn robot(
         None if params.model_path.is_some() => {
             let diag = Diag::error("the end effector is missing");
             let hint = "name the link to move: `end_effector_link: flange`";
-            checker.error(place.of(checker, "model_path"), diag.hint(hint));
+            checker.error(pos.of(checker, "model_path"), diag.hint(hint));
             return None;
         }
         None => {}
     }
-    check(checker, place, &robot, joints);
+    check(checker, pos, &robot, joints);
     Some(robot)
 }
 
-/// The planner's robot as that of a task.
+/// Returns a planning robot as the robot of a task.
 fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<String>>) -> TaskRobot {
     let model_name = |ours: &String| {
         let at = planned.coordinator_joints.iter().position(|j| j == ours);
@@ -121,24 +120,24 @@ fn of_planner(planned: &RobotConfig, joints: &[String], mapped: Option<Vec<Strin
 
 fn packages(
     checker: &Checker<'_>,
-    place: &Place<'_>,
+    pos: &TaskPos<'_>,
     params: &RobotParams,
 ) -> std::collections::BTreeMap<String, PathBuf> {
-    let at = place.of(checker, "package_paths");
+    let at = pos.of(checker, "package_paths");
     params.package_paths.iter().map(|(name, path)| (name.clone(), file(checker, at, path))).collect()
 }
 
-/// The model's names of the task's joints, where the parameters say how they are mapped; `None`: they cannot be.
+/// Returns the model's names of the task's joints if the parameters map them; the outer `None` follows an error.
 fn mapping(
     checker: &mut Checker<'_>,
-    place: &Place<'_>,
+    pos: &TaskPos<'_>,
     params: &RobotParams,
     joints: &[String],
 ) -> Option<Option<Vec<String>>> {
     let (prefix, mapping) = (&params.joint_prefix, &params.joint_name_mapping);
     match prefix {
         Some(_) if !mapping.is_empty() => {
-            let at = place.of(checker, "joint_prefix");
+            let at = pos.of(checker, "joint_prefix");
             let diag = Diag::error("`joint_prefix` and `joint_name_mapping` both map the joints' names");
             checker.error(at, diag.hint("remove one of the two"));
             None
@@ -147,7 +146,7 @@ fn mapping(
         Some(prefix) => {
             let odd = joints.iter().find(|joint| !joint.starts_with(prefix.as_str()));
             if let Some(odd) = odd {
-                let at = place.of(checker, "joint_prefix");
+                let at = pos.of(checker, "joint_prefix");
                 let diag = Diag::error(format!("the joint {} does not begin with {}", quote(odd), quote(prefix)));
                 checker.error(at, diag.hint("`joint_prefix` and the model's name make the coordinator's joint name"));
                 return None;
@@ -155,7 +154,7 @@ fn mapping(
             Some(Some(joints.iter().map(|j| j.strip_prefix(prefix.as_str()).unwrap_or(j).to_owned()).collect()))
         }
         None => {
-            let at = place.of(checker, "joint_name_mapping");
+            let at = pos.of(checker, "joint_name_mapping");
             if let Some(odd) = mapping.keys().find(|ours| !joints.contains(ours)) {
                 let diag = Diag::error(format!("the task has no joint {}", quote(odd)));
                 let hint = did_you_mean(odd, joints.iter().map(String::as_str), "its joints");
@@ -168,27 +167,27 @@ fn mapping(
 }
 
 /// Checks a task's robot against its description.
-fn check(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, ours: &[String]) {
+fn check(checker: &mut Checker<'_>, pos: &TaskPos<'_>, robot: &TaskRobot, ours: &[String]) {
     if checker.assets.source_awaited(&robot.source) {
         return;
     }
     let loaded = load(&robot.source);
     let first = loaded.reports().into_iter().find(|report| report.severity == Severity::Error);
-    // A mistake in a planner's robot is reported there.
+    // A mistake in a planning robot is reported in its section.
     if let Some(first) = first.filter(|_| robot.base.is_none()) {
         let diag = Diag::error(format!("the robot's description cannot be used: {}", first.message));
-        let more = format!("`dimos model check {}` shows all that is wrong with it", robot.source.path.display());
-        checker.error(place.of(checker, "model_path"), diag.hint(first.hint.unwrap_or(more)));
+        let more = format!("`dimos model check {}` shows all mistakes in it", robot.source.path.display());
+        checker.error(pos.of(checker, "model_path"), diag.hint(first.hint.unwrap_or(more)));
     }
     let Some(model) = loaded.model else { return };
     let at = ["joint_name_mapping", "joint_prefix", "model_path"].into_iter();
-    let at = at.map(|key| place.of(checker, key)).find(|at| *at != place.entry.kind.at).unwrap_or(place.entry.kind.at);
+    let at = at.map(|key| pos.of(checker, key)).find(|at| *at != pos.entry.kind.at).unwrap_or(pos.entry.kind.at);
     let mut good = true;
     for (name, ours) in robot.joints.iter().zip(ours) {
         let joint = model.joint_index(name).and_then(|j| model.joints.get(j));
         let diag = match joint {
             Some(joint) if joint.is_independent() => continue,
-            Some(_) => Diag::error(format!("the model's joint {} does not move on its own", quote(name))),
+            Some(_) => Diag::error(format!("the model's joint {} is not independent", quote(name))),
             None => {
                 let names = model.joints.iter().filter(|j| j.kind != JointKind::Fixed).map(|j| j.name.as_str());
                 let diag = Diag::error(format!("the model has no joint {}, for {}", quote(name), quote(ours)));
@@ -203,31 +202,31 @@ fn check(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, ours: 
         let diag = Diag::error(format!("the model has no link {}", quote(&robot.link)));
         let links = model.links.iter().map(|link| link.name.as_str());
         let hint = did_you_mean(&robot.link, links, "its links");
-        return checker.error(place.of(checker, "end_effector_link"), diag.maybe_hint(hint));
+        return checker.error(pos.of(checker, "end_effector_link"), diag.maybe_hint(hint));
     };
     if good {
-        check_chain(checker, place, robot, &model, link);
+        check_chain(checker, pos, robot, &model, link);
     }
 }
 
-/// Whether the task's joints are what moves the end effector.
-fn check_chain(checker: &mut Checker<'_>, place: &Place<'_>, robot: &TaskRobot, model: &RobotModel, link: usize) {
+/// Checks that the task's joints move the end effector.
+fn check_chain(checker: &mut Checker<'_>, pos: &TaskPos<'_>, robot: &TaskRobot, model: &RobotModel, link: usize) {
     let chain = model.chain(0, link).unwrap_or_default();
     let names: Vec<&str> = chain.iter().filter_map(|j| model.joints.get(*j)).map(|j| j.name.as_str()).collect();
     if !robot.joints.iter().any(|j| names.contains(&j.as_str())) {
         let diag = Diag::error(format!("no joint of the task moves the link {}", quote(&robot.link)));
-        let at = place.of(checker, "end_effector_link");
-        return checker.error(at, diag.hint("name a link that hangs on the task's joints"));
+        let at = pos.of(checker, "end_effector_link");
+        return checker.error(at, diag.hint("name a link below the task's joints"));
     }
     let independent = chain.iter().filter_map(|j| model.joints.get(*j)).filter(|j| j.is_independent());
     if let Some(other) = { independent }.find(|j| !robot.joints.contains(&j.name)) {
-        let what = format!("the joint {} carries the end effector and is not of the task", quote(&other.name));
+        let what = format!("the joint {} moves the end effector but is not a joint of the task", quote(&other.name));
         let diag = Diag::warning(what).note("the task assumes that it is fixed at 0");
-        checker.error(place.entry.joint_names.at, diag.hint("add it to the task's joints, if the coordinator has it"));
+        checker.error(pos.entry.joint_names.at, diag.hint("add it to the task's joints, if the coordinator has it"));
     }
 }
 
-/// Base of a planner's robot: its base link, and that link's pose in the frame `map`.
+/// Base of a planning robot: its base link, and that link's pose in the frame `map`.
 pub type Base = (String, Isometry3<f64>);
 
 impl TaskRobot {
@@ -242,10 +241,10 @@ impl TaskRobot {
         if let Some((base_link, base_pose)) = &self.base {
             let rest = model.positions(&HashMap::new());
             let base = model.link_poses(&rest).get(link(base_link)?).copied().unwrap_or_default();
-            let root = frame(&(base_pose * base.inverse()));
-            let turn = DQuat::from_mat3(&root.matrix3).to_array();
-            robot.root = FramePose { position: root.translation.to_array(), orientation: turn };
-            robot.base = DQuat::from_mat3(&frame(&base).matrix3).to_array();
+            let root = base_pose * base.inverse();
+            robot.root =
+                FramePose { position: root.translation.vector.into(), orientation: root.rotation.coords.into() };
+            robot.base = base.rotation.coords.into();
         }
         Ok(robot)
     }

@@ -1,8 +1,8 @@
-//! Checks `tasks`: names, types, joints, modes, parameters, and who shares a joint with whom.
+//! Checks `tasks`: names, types, joints, modes, parameters, and shared joints.
 
 use serde_json::Value;
 
-use crate::blueprint::arms::Found;
+use crate::blueprint::arms::Hardware;
 use crate::blueprint::resolve::{Checker, Task};
 use crate::blueprint::schema::{JointNames, TaskEntry};
 use crate::control::task_body::TargetKind;
@@ -10,13 +10,13 @@ use crate::control::task_spec::{TaskSetup, TaskSpec};
 use crate::joint::{ControlMode, MAX_DOF};
 use crate::yaml::{Diag, Located, NodeId, did_you_mean, quote};
 
-/// A task as far as it is understood, with its places.
+/// The readable part of a task.
 struct Checked<'e> {
     entry: &'e Located<TaskEntry>,
     joints: Vec<usize>,
 }
 
-pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>], found: &Found) -> Vec<Task> {
+pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>], hardware: &Hardware) -> Vec<Task> {
     let root = checker.root;
     if entries.is_empty() && !checker.list_lost("tasks") {
         let at = checker.tree.entry(root, "tasks").map_or(root, |(key, _)| key);
@@ -33,13 +33,13 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>],
             if let Some(first) = checked.iter().find(named).map(|c| c.entry.name.at) {
                 let also = checker.tree.label(first).with_text("first used here");
                 let diag = Diag::error(format!("two tasks are named {}", quote(&entry.name))).also(also);
-                checker.error(entry.name.at, diag.hint("give each task a name of its own"));
+                checker.error(entry.name.at, diag.hint("give each task its own name"));
             }
         }
-        let (joints, arms) = joints(checker, entry, found);
+        let (joints, arms) = joints(checker, entry, hardware);
         if let Some(spec) = spec(checker, entry) {
-            let params = params(checker, entry, &spec, &joints, found);
-            modes(checker, entry, &spec, &arms, found);
+            let params = params(checker, entry, &spec, &joints, hardware);
+            modes(checker, entry, &spec, &arms, hardware);
             tasks.push(Task {
                 name: entry.name.value.clone(),
                 spec,
@@ -53,17 +53,17 @@ pub(super) fn resolve(checker: &mut Checker<'_>, entries: &[Located<TaskEntry>],
         }
         checked.push(Checked { entry, joints });
     }
-    report_sharing(checker, &checked, found);
+    report_sharing(checker, &checked, hardware);
     tasks
 }
 
-/// The joints of a task, counted over all arms, and those arms.
-fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) -> (Vec<usize>, Vec<usize>) {
+/// Returns the joints of a task (indices over all arms), and their arms.
+fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, hardware: &Hardware) -> (Vec<usize>, Vec<usize>) {
     let mut joints: Vec<usize> = Vec::new();
     if !checker.has(entry.at, "joint_names") {
         return (joints, Vec::new());
     }
-    let all: Vec<(usize, &str)> = found
+    let all: Vec<(usize, &str)> = hardware
         .entries
         .iter()
         .enumerate()
@@ -73,12 +73,12 @@ fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) 
         JointNames::Hardware(_) if checker.lost.contains(entry.joint_names.at) => {}
         JointNames::Hardware(by_arm) => {
             let id = &by_arm.hardware;
-            match found.entries.iter().position(|e| e.id == id.value) {
+            match hardware.entries.iter().position(|e| e.id == id.value) {
                 Some(arm) => joints = (0..all.len()).filter(|i| all.get(*i).is_some_and(|(a, _)| *a == arm)).collect(),
-                None if !found.ids_known => {}
+                None if !hardware.ids_known => {}
                 None => {
                     let diag = Diag::error(format!("there is no arm {}", quote(id)));
-                    let ids = found.entries.iter().map(|e| e.id.as_str());
+                    let ids = hardware.entries.iter().map(|e| e.id.as_str());
                     let hint = did_you_mean(id, ids, "arms in `hardware`");
                     checker.error(id.at, diag.maybe_hint(hint));
                 }
@@ -98,7 +98,7 @@ fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) 
                 }
                 match all.iter().position(|(_, joint)| *joint == name.value) {
                     Some(joint) => joints.push(joint),
-                    None if found.joints_known => {
+                    None if hardware.joints_known => {
                         let diag = Diag::error(format!("no arm has a joint {}", quote(name)));
                         let hint = did_you_mean(name, all.iter().map(|(_, joint)| *joint), "joints");
                         checker.error(name.at, diag.maybe_hint(hint));
@@ -114,7 +114,7 @@ fn joints(checker: &mut Checker<'_>, entry: &Located<TaskEntry>, found: &Found) 
     (joints, arms)
 }
 
-/// The row of the task's type.
+/// Returns the row of the task's type.
 fn spec(checker: &mut Checker<'_>, entry: &Located<TaskEntry>) -> Option<TaskSpec> {
     if !checker.has(entry.at, "type") {
         return None;
@@ -128,13 +128,13 @@ fn spec(checker: &mut Checker<'_>, entry: &Located<TaskEntry>) -> Option<TaskSpe
     found
 }
 
-/// The task's parameters, with what the type itself has to say to them.
+/// Returns the task's parameters, checked by its type.
 fn params(
     checker: &mut Checker<'_>,
     entry: &Located<TaskEntry>,
     spec: &TaskSpec,
     joints: &[usize],
-    found: &Found,
+    hardware: &Hardware,
 ) -> Value {
     check_width(checker, entry, spec, joints);
     let node = entry.params.as_ref().filter(|p| !p.value.is_null()).map(|p| p.at);
@@ -144,14 +144,14 @@ fn params(
     checker.lost.extend(lost);
     let params = params.unwrap_or_else(spec.params.default);
     let named = checker.has(entry.at, "joint_names") && !checker.lost.contains(entry.joint_names.at);
-    if named && found.joints_known && !joints.is_empty() && !spec.robot {
+    if named && hardware.joints_known && !joints.is_empty() && !spec.robot {
         try_build(checker, node, spec, joints, &params);
     }
     params
 }
 
-/// Builds the task's body as a run does, only to learn whether that works. Where the type moves an end effector, its
-/// robot is checked elsewhere.
+/// Builds the task's body as a run does, to report the mistakes that its type finds. Types that move an end effector
+/// are checked in `task_robots`.
 fn try_build(checker: &mut Checker<'_>, node: NodeId, spec: &TaskSpec, joints: &[usize], params: &Value) {
     let joints: Vec<u16> = joints.iter().map(|&j| j as u16).collect();
     let Err(error) = (spec.build)(&TaskSetup { joints: &joints, params, robot: None }) else { return };
@@ -161,7 +161,7 @@ fn try_build(checker: &mut Checker<'_>, node: NodeId, spec: &TaskSpec, joints: &
     }
 }
 
-/// A stream's target crosses to the tick as one fixed array.
+/// Checks the number of joints of a task with streamed targets, which have a fixed size.
 fn check_width(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, joints: &[usize]) {
     if spec.takes.iter().any(|kind| *kind != TargetKind::Trajectory) && joints.len() > MAX_DOF {
         let kind = spec.name;
@@ -171,10 +171,10 @@ fn check_width(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, jo
     }
 }
 
-/// Whether every arm of the task can be commanded the way the task does.
-fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, arms: &[usize], found: &Found) {
+/// Checks that every arm of the task has a control mode that the task needs.
+fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, arms: &[usize], hardware: &Hardware) {
     let wanted = spec.modes();
-    for (id, row) in arms.iter().filter_map(|i| found.entries.get(*i)).filter_map(|e| Some((&e.id, e.adapter?))) {
+    for (id, row) in arms.iter().filter_map(|i| hardware.entries.get(*i)).filter_map(|e| Some((&e.id, e.adapter?))) {
         if wanted.is_empty() || row.modes.iter().any(|mode| wanted.contains(mode)) {
             continue;
         }
@@ -194,9 +194,10 @@ fn modes(checker: &mut Checker<'_>, entry: &TaskEntry, spec: &TaskSpec, arms: &[
     }
 }
 
-/// Two tasks of equal priority on one joint: the blueprint's order decides, which is rarely meant.
-fn report_sharing(checker: &mut Checker<'_>, tasks: &[Checked<'_>], found: &Found) {
-    let names: Vec<&str> = found.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
+/// Reports tasks of the same priority with a common joint: their order in the blueprint would decide, which is rarely
+/// intended.
+fn report_sharing(checker: &mut Checker<'_>, tasks: &[Checked<'_>], hardware: &Hardware) {
+    let names: Vec<&str> = hardware.entries.iter().flat_map(|e| e.joints.iter().map(String::as_str)).collect();
     for (number, second) in tasks.iter().enumerate() {
         for first in tasks.iter().take(number) {
             let (a, b) = (&first.entry, &second.entry);

@@ -91,7 +91,7 @@ fn reached(
     }
     ik.solve(&in_root, near, settings, |_| true, stop).map_err(|failure| {
         if stop.is_cancelled() {
-            return PlanFailure { cancelled: true, ..PlanFailure::new("cancelled") };
+            return PlanFailure::cancelled();
         }
         PlanFailure::new(format!("{}: {failure}", robot.config.name))
             .hint("poses are those of `end_effector_link` in the frame `map` [m, rad]")

@@ -97,6 +97,11 @@ impl PlanFailure {
         Self { what: what.into(), hint: None, cancelled: false }
     }
 
+    /// Creates the failure of a cancelled request.
+    pub(super) fn cancelled() -> Self {
+        Self { cancelled: true, ..Self::new("cancelled") }
+    }
+
     pub(super) fn hint(self, hint: impl Into<String>) -> Self {
         Self { hint: Some(hint.into()), ..self }
     }
@@ -224,7 +229,7 @@ fn failure_for(stage: &Stage<'_>, error: &PlanError) -> PlanFailure {
             PlanFailure::new(error.to_string()).hint("choose another goal, or correct the world")
         }
         PlanError::Timeout(_) => PlanFailure::new(error.to_string()).hint("increase --timeout, or try another --seed"),
-        PlanError::Cancelled => PlanFailure { cancelled: true, ..PlanFailure::new("cancelled") },
+        PlanError::Cancelled => PlanFailure::cancelled(),
         _ => PlanFailure::new(error.to_string()),
     }
 }
@@ -273,7 +278,7 @@ fn timed(
 /// Returns the failure if the request was cancelled or its timeout was reached.
 pub(super) fn late(stop: &Stop) -> Option<PlanFailure> {
     match (stop.is_cancelled(), stop.is_over()) {
-        (true, _) => Some(PlanFailure { cancelled: true, ..PlanFailure::new("cancelled") }),
+        (true, _) => Some(PlanFailure::cancelled()),
         (_, true) => Some(PlanFailure::new("no motion found before the timeout").hint("increase --timeout")),
         _ => None,
     }

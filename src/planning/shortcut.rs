@@ -11,14 +11,14 @@ pub struct ShortcutSettings {
     /// Number of random cuts.
     pub tries: usize,
     /// Maximum consecutive cuts without a gain.
-    pub patience: usize,
+    pub max_idle_tries: usize,
     /// Minimum part of the path that a cut must save.
     pub gain: f64,
 }
 
 impl Default for ShortcutSettings {
     fn default() -> Self {
-        Self { tries: 100, patience: 25, gain: 1e-3 }
+        Self { tries: 100, max_idle_tries: 25, gain: 1e-3 }
     }
 }
 
@@ -36,7 +36,7 @@ pub fn shorten<C: CollisionChecker>(
     let mut random = Random::new(seed);
     let mut idle = 0;
     for _ in 0..settings.tries {
-        if path.len() < 3 || idle >= settings.patience || stop.is_over() {
+        if path.len() < 3 || idle >= settings.max_idle_tries || stop.is_over() {
             break;
         }
         let whole = length(&path);

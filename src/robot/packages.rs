@@ -73,7 +73,7 @@ impl Packages {
             let root = self.find(package, beside)?;
             let path = plain(&root.join(decoded(inside)));
             if !path.starts_with(&root) {
-                return Err(format!("`{uri}` leads out of its package"));
+                return Err(format!("`{uri}` points outside its package"));
             }
             path
         } else if let Some(rest) = uri.strip_prefix("file://") {
@@ -192,8 +192,8 @@ mod tests {
         let packages = packages(folder.path());
         for (uri, what) in [
             ("package://zz/a.stl", "--package zz=FOLDER"),
-            ("package://g/../ros/p/b.stl", "leads out of its package"),
-            ("package://g/%2e%2e/ros/p/b.stl", "leads out of its package"),
+            ("package://g/../ros/p/b.stl", "points outside its package"),
+            ("package://g/%2e%2e/ros/p/b.stl", "points outside its package"),
             ("package://../given/a.stl", "is not a package name"),
             ("package://g/none.stl", "file not found"),
             ("https://x/a.stl", "`https://` is not supported"),

@@ -327,7 +327,7 @@ tasks:
     }
     let mapped = "end_effector_link: flange, joint_name_mapping: {arm_joint1: joint2, arm_joint2: joint1}";
     for (entry, said, place) in [
-        (task("params: {}"), "the description of the robot is missing", "4:21"),
+        (task("params: {}"), "task needs a robot description", "4:21"),
         (own(""), "the end effector is missing", "builtin:yourarm"),
         (own("end_effector_link: flnge, joint_prefix: arm_"), "no link `flnge`", "flnge"),
         (own("end_effector_link: base_link, joint_prefix: arm_"), "no joint of the task moves", "base_link"),
@@ -357,5 +357,5 @@ tasks:
     let part = "{name: c, type: eef_twist, joint_names: [arm_joint1, arm_joint2],
      params: {model_path: 'builtin:yourarm', end_effector_link: flange, joint_prefix: arm_}}";
     let text = load_text(part, false).render(false);
-    assert!(text.contains("`joint3` carries the end effector and is not of the task"), "{text}");
+    assert!(text.contains("`joint3` moves the end effector but is not a joint of the task"), "{text}");
 }

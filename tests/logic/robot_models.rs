@@ -232,10 +232,10 @@ fn mistakes_around_a_description_stand_at_the_keys_that_name_it() {
         ),
         ("rig.srdf", "rg.srdf", "rg.srdf: No such file", "lab.yaml:13:18"),
         ("joint_limits.yaml", "limits.yaml", "limits.yaml: No such file", "lab.yaml:14:26"),
-        ("{group: all}", "[rail, turn, wrist, right]", "the joint `right` follows another joint", "lab.yaml:18:40"),
+        ("{group: all}", "[rail, turn, wrist, right]", "the joint `right` mimics another joint", "lab.yaml:18:40"),
         ("{group: all}", "[rail, turn, wrist, end]", "the joint `end` is fixed", "lab.yaml:18:40"),
         ("{group: all}", "[rail, turn, wrist, rail]", "the joint `rail` is named twice", "lab.yaml:18:40"),
-        ("meshes: true", "meshes: false", "the link `hand` collides by a Collada file", "lab.yaml:22:28"),
+        ("meshes: true", "meshes: false", "the collision mesh of the link `hand` is a Collada file", "lab.yaml:22:28"),
         ("rig_description: robots", "rig_description: robot", "does not exist: robot", "lab.yaml:10:19"),
         ("home: [0,", "home: [0.9,", "`rail` at 0.9 m is outside the model's limits", "lab.yaml:25:27"),
     ];

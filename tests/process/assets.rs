@@ -109,9 +109,9 @@ fn mistakes_of_assets_are_found_at_their_places() {
     for (assets, path, place, says) in [
         (&*good, "asset:yuorarm/a.urdf", "a.yaml:3:", "did you mean `yourarm`?"),
         ("{}", "asset:yourarm/a.urdf", "a.yaml:3:", "there is no asset `yourarm`"),
-        (&good, "asset:yourarm/../a.urdf", "a.yaml:3:", "leads out of its asset"),
-        (&good.replace("https", "ftp"), "asset:yourarm/a.urdf", "a.yaml:2:", "is no address of a file"),
-        (&good.replace("https://x.invalid", "file://x"), "asset:yourarm/a.urdf", "a.yaml:2:", "has no full path"),
+        (&good, "asset:yourarm/../a.urdf", "a.yaml:3:", "points outside its asset"),
+        (&good.replace("https", "ftp"), "asset:yourarm/a.urdf", "a.yaml:2:", "is not the URL of a file"),
+        (&good.replace("https://x.invalid", "file://x"), "asset:yourarm/a.urdf", "a.yaml:2:", "has no absolute path"),
         (&good.replace("x.invalid", ""), "asset:yourarm/a.urdf", "a.yaml:2:", "names no server"),
         (&good.replace(&sum, "0123"), "asset:yourarm/a.urdf", "a.yaml:2:", "64 hexadecimal digits"),
     ] {

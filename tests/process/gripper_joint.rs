@@ -77,8 +77,8 @@ fn a_gripper_that_nothing_is_known_of_is_planned_for_wide_open_and_check_says_so
 fn a_gripper_joint_that_cannot_be_one_is_refused() {
     for (gripper, words) in [
         ("{joint: left_fingr, closed: 0, open: 1}", ["the model has no joint `left_fingr`", "left_finger"]),
-        ("{joint: right_finger, closed: 0, open: -1}", ["right_finger` follows another joint", "hint: "]),
-        ("{joint: turn, closed: 0, open: 1}", ["the joint `turn` is planned for", "hint: "]),
+        ("{joint: right_finger, closed: 0, open: -1}", ["right_finger` mimics another joint", "hint: "]),
+        ("{joint: turn, closed: 0, open: 1}", ["the joint `turn` is a planned joint", "hint: "]),
         ("{joint: left_finger, closed: 0, open: 2}", ["left_finger` at 2 rad is outside the model's limits", "1.2"]),
     ] {
         home(&format!("gripper_joint: {gripper}")).dimos("check tongs.yaml").with(2).says(&words);

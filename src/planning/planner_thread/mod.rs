@@ -126,10 +126,11 @@ impl PlannerThread {
 
     /// Cancels the request that is being planned. Returns whether there was one.
     pub fn cancel(&self) -> bool {
+        // Before the cancel flag, as in `begin`: the flag and the job must belong to the same request.
+        let mut jobs = lock(&self.shared.jobs);
         if let Some(cancel) = &*lock(&self.shared.cancel) {
             cancel.store(true, Ordering::Relaxed);
         }
-        let mut jobs = lock(&self.shared.jobs);
         let mut planning = false;
         for job in jobs.iter_mut().filter(|job| job.is_planning()) {
             job.deadline = job.deadline.min(Instant::now());

@@ -184,6 +184,10 @@ fn resolved(text: &str) -> Value {
 
 fn whole(digits: &str) -> Option<i64> {
     let first = digits.bytes().next().filter(u8::is_ascii_digit)?;
+    // Rust's parsers accept a sign, which YAML does not allow here: `0-7` is a text.
+    if !digits.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'_' | b':')) {
+        return None;
+    }
     let plain = digits.replace('_', "");
     if let Some(bits) = plain.strip_prefix("0b") {
         return i64::from_str_radix(bits, 2).ok();
@@ -251,6 +255,9 @@ mod tests {
             ("a b", "'a b'"),
             ("1.2.3", "'1.2.3'"),
             ("0o7", "'0o7'"),
+            ("0-7", "'0-7'"),
+            ("1:+5", "'1:+5'"),
+            ("-0x-8000000000000000", "'-0x-8000000000000000'"),
             ("!!str 5", "'5'"),
             ("!!float 5", "5.0"),
             ("!degrees 180", "3.141592653589793"),
