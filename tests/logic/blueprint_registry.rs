@@ -144,7 +144,7 @@ fn the_reference_has_the_adapters_options() {
 }
 
 #[test]
-fn an_adapter_of_another_build_is_told_with_the_way_to_get_it() {
+fn an_adapter_of_another_build_is_refused_with_a_hint() {
     let absent = Absent { name: "servobot", about: "a serial arm", remedy: "build with --features servobot" };
     let text = "hardware: [{hardware_id: arm, adapter_type: servobot, joints: {prefix: arm, count: 6}}]\n\
                 tasks: [{name: t, type: trajectory, joint_names: {hardware: arm}}]\n";

@@ -50,7 +50,7 @@ fn shipped_blueprints_have_no_mistakes() {
 /// Mistakes in options that only the built-in arms can find, each located like any other.
 #[test]
 #[cfg(feature = "can")]
-fn options_that_do_not_fit_are_told_where_they_stand() {
+fn options_that_do_not_fit_are_located() {
     let file = fixtures().join("misfits.yaml");
     let found = SearchPath { folders: vec![fixtures()] }.find(file.to_str().unwrap()).unwrap();
     let loaded = load_from(&SearchPath::default(), &found, &Overrides::default(), &Registry::builtin());

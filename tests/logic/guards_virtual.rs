@@ -333,13 +333,12 @@ fn a_delay_of_the_device_thread_is_not_the_arms_silence() {
         let mut rig = ready(figured(0.05, 0.005), one(servo()));
         rig.arms[0].silent = true;
         for k in 1..=6u64 {
-            rig.arms[0].state.own_delay_ns = if k < 6 { 0 } else { delay };
-            if k < 3 || k == 6 {
-                rig.tick();
-            } else {
-                rig.arms[0].state.own_delay_ns = 10_000_000 * (k - 2);
-                rig.tick();
-            }
+            rig.arms[0].state.own_delay_ns = match k {
+                3..=5 => 10_000_000 * (k - 2),
+                6 => delay,
+                _ => 0,
+            };
+            rig.tick();
         }
         assert_eq!(rig.phase(0), phase, "{delay}: {:?}", rig.samples[0].cause);
     }

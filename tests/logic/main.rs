@@ -21,7 +21,7 @@ mod conformance_pushed;
 mod coordinator;
 mod device_stops;
 mod english;
-mod faults_virtual;
+mod faults;
 mod guards_virtual;
 mod kinematics;
 mod layering;

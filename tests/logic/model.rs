@@ -15,7 +15,7 @@ fn robot(source: &Source) -> RobotModel {
     load(source).into_model().unwrap_or_else(|e| panic!("{e}"))
 }
 
-fn in_the_box(name: &str) -> RobotModel {
+fn built_in(name: &str) -> RobotModel {
     robot(&Source::new(format!("builtin:{name}")))
 }
 
@@ -165,29 +165,29 @@ fn agree(ours: &RobotModel, theirs: &RobotModel, base: &str, least: usize) {
 }
 
 #[test]
-fn robots_in_the_box_move_as_the_vendors_do() {
+fn robots_built_in_move_as_the_vendors_do() {
     let Some(models) = shared::shared("models") else { return };
     for (own, vendor, base, least) in [
         ("xarm6_gripper", "xarm6", "link_base", 16),
         ("xarm7_gripper", "xarm7", "link_base", 17),
         ("xarm6", "xarm6", "link_base", 8),
     ] {
-        agree(&in_the_box(own), &robot(&Source::new(models.join(vendor).join(format!("{vendor}.urdf")))), base, least);
+        agree(&built_in(own), &robot(&Source::new(models.join(vendor).join(format!("{vendor}.urdf")))), base, least);
     }
-    let mut ours = in_the_box("piper_gripper");
+    let mut ours = built_in("piper_gripper");
     // The vendor's second finger moves on its own; ours follows the first.
     ours.joints.iter_mut().for_each(|j| j.mimic = None);
     agree(&ours, &robot(&Source::new(models.join("piper/piper.urdf"))), "base_link", 9);
     for (own, vendor) in [("xarm5", "xarm5"), ("lite6", "lite6"), ("xarm850", "uf850")] {
         let source =
             Source { meshes: Meshes::Ignore, ..Source::new(models.join(format!("../xacro/out/{vendor}.urdf"))) };
-        agree(&in_the_box(own), &robot(&source), "link_base", 7);
+        agree(&built_in(own), &robot(&source), "link_base", 7);
     }
 }
 
 #[test]
 fn yourarm_stands_as_its_sheet_says() {
-    let robot = in_the_box("yourarm");
+    let robot = built_in("yourarm");
     let at = |joints: &[(&str, f64)]| {
         let joints = joints.iter().map(|(n, q)| ((*n).to_owned(), *q)).collect();
         poses(&robot, "base_link", &joints)["flange"]
@@ -219,10 +219,10 @@ fn outside(link: &Link, point: &Point3<f64>) -> f64 {
 }
 
 #[test]
-fn shapes_in_the_box_cover_the_vendors_meshes() {
+fn shapes_built_in_cover_the_vendors_meshes() {
     let Some(models) = shared::shared("models") else { return };
     for (own, vendor) in [("xarm6_gripper", "xarm6"), ("xarm7_gripper", "xarm7"), ("piper_gripper", "piper")] {
-        let (ours, theirs) = (in_the_box(own), robot(&Source::new(models.join(vendor).join(format!("{vendor}.urdf")))));
+        let (ours, theirs) = (built_in(own), robot(&Source::new(models.join(vendor).join(format!("{vendor}.urdf")))));
         let mut vertices = 0;
         for link in &theirs.links {
             let Some(own) = ours.link_index(&link.name).map(|i| &ours.links[i]) else { continue };
@@ -240,7 +240,7 @@ fn shapes_in_the_box_cover_the_vendors_meshes() {
 }
 
 #[test]
-fn every_robot_in_the_box_is_sound() {
+fn every_robot_built_in_is_sound() {
     for name in builtin::NAMES {
         let loaded = load(&Source::new(format!("builtin:{name}")));
         assert_eq!(loaded.render(false), "", "{name}");

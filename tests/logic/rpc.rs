@@ -14,7 +14,8 @@ use dimos::rpc::server::Server;
 use dimos::rpc::streams::{EventReport, JointState, Stream, Subscribe, Unsubscribe};
 use serde_json::{Value, json};
 
-use crate::support::fake_run::{FakeBackend, eventually, start};
+use crate::support::fake_run::{FakeBackend, start};
+use crate::support::program::eventually;
 
 /// A client that can say anything.
 struct Raw(BufReader<UnixStream>);

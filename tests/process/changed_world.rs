@@ -1,8 +1,6 @@
 //! A planned motion under way and a world that changes: the arm stops before the obstacle, in whole runs.
 //! Judged from the positions of the emulated joints and a collision checker of its own.
 
-use std::time::{Duration, Instant};
-
 use dimos::collision::{CollisionChecker, ExactChecker, Resolution};
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
@@ -13,18 +11,10 @@ use dimos::rpc::api::{
 use dimos::rpc::place::RunFolder;
 use dimos::runtime::{Builder, Record, Run};
 
-/// Far more than anything here takes, on a machine that is busy with other things too.
-const TIMEOUT: Duration = Duration::from_secs(60);
+use crate::support::program::eventually;
+
 const PADDING: f64 = 0.003;
 const HOME: [f64; 6] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
-
-fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
-    let began = Instant::now();
-    while !holds() {
-        assert!(began.elapsed() < TIMEOUT, "never: {what}");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
 
 /// A run with an emulated arm that shows where its joints truly are, and the planner's robots for the judge.
 struct Cell {

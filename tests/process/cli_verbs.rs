@@ -7,7 +7,8 @@ use dimos::rpc::Request;
 use dimos::rpc::api::{Cancel, Gripper};
 use serde_json::Value;
 
-use crate::support::fake_run::{FakeBackend, eventually, start};
+use crate::support::fake_run::{FakeBackend, start};
+use crate::support::program::eventually;
 
 /// A folder for `XDG_RUNTIME_DIR`; the runs in it are the only ones that the binary sees.
 struct Home(tempfile::TempDir);
@@ -114,7 +115,7 @@ pose     xyz 0.1000 0.2000 0.3000 m, rpy 0.0000 0.0000 0.0000 rad
 }
 
 #[test]
-fn move_takes_negative_numbers_waits_and_tells_how_far_off_it_ended() {
+fn move_takes_negative_numbers_waits_and_prints_the_deviation() {
     let home = Home::new();
     let (_server, run) = start(&home.runs(), "test", FakeBackend::default());
     let ended = home.run("move arm 0.3 -0.2 --speed 0.25").with(0);
@@ -195,7 +196,7 @@ fn stop_says_whether_it_was_confirmed() {
 }
 
 #[test]
-fn arm_verbs_and_cancel_tell_what_became_of_them() {
+fn arm_verbs_and_cancel_print_their_result() {
     let home = Home::new();
     let (_server, run) = start(&home.runs(), "test", FakeBackend::default());
     let reset = home.run("arm reset arm").with(0);
@@ -272,7 +273,7 @@ fn a_trajectory_too_long_for_a_request_is_refused_here() {
 }
 
 #[test]
-fn nobody_reading_the_output_is_no_crash() {
+fn a_closed_stdout_is_no_crash() {
     let home = Home::new();
     let _run = start(&home.runs(), "test", FakeBackend::default());
     let mut child = home.command("status").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();

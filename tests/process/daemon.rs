@@ -62,7 +62,7 @@ fn text(path: &Path) -> String {
 }
 
 #[test]
-fn it_returns_when_the_arms_are_up_and_tells_run_pid_and_logs() {
+fn it_returns_when_the_arms_are_up_and_prints_run_pid_and_logs() {
     let home = Home::new();
     let daemon = Daemon::start(&home, RUN);
     let status = home.status();
@@ -99,7 +99,7 @@ fn it_survives_its_terminal() {
 }
 
 #[test]
-fn what_keeps_it_from_coming_up_is_told_with_its_exit_code() {
+fn a_failed_start_is_reported_with_its_exit_code() {
     let home = Home::new();
     home.dimos("run -d no-such-blueprint").with(2).says(&["error: ", "hint: "]);
     home.dimos(&format!("run -d {RUN} --set coordinator.tick_rate=-1")).with(2).says(&["tick_rate"]);
@@ -117,7 +117,7 @@ fn what_keeps_it_from_coming_up_is_told_with_its_exit_code() {
 }
 
 #[test]
-fn that_it_crashed_while_it_started_is_told() {
+fn a_crash_during_startup_is_reported() {
     let home = Home::new();
     // A controller that takes the connection and says nothing: the start waits for it.
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -130,7 +130,7 @@ fn that_it_crashed_while_it_started_is_told() {
 }
 
 #[test]
-fn it_ends_when_nobody_waits_for_it_any_more() {
+fn it_ends_when_its_starter_has_exited() {
     let home = Home::new();
     // What `run -d` starts, after that has been killed.
     let (ours, theirs) = UnixStream::pair().unwrap();
@@ -262,7 +262,7 @@ fn the_service_manager_hears_that_it_is_up_that_it_beats_and_that_it_ends() {
 }
 
 #[test]
-fn the_service_manager_hears_nothing_from_a_run_that_stands_still() {
+fn a_stopped_process_sends_no_watchdog_pings() {
     let home = Home::new();
     let manager = Manager::new(&home);
     let run = manager.run(&home, RUN);

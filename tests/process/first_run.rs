@@ -233,14 +233,12 @@ fn an_arm_that_cannot_be_reached_ends_the_start_within_3_s() {
     let home = Home::new();
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-    let mut best = Duration::MAX;
     for address in [closed, silent.local_addr().unwrap()] {
         home.write("two.yaml", &TWO_ARMS.replace("ADDRESS", &address.to_string()));
         let ended = home.dimos("run two.yaml").with(3);
         assert!(ended.err.contains("error: second: ") && ended.err.contains("hint: "), "{}", ended.err);
         assert!(!ended.err.contains("first"), "{}", ended.err);
         assert!(home.logs().is_empty() && home.runs().runs().unwrap().is_empty());
-        best = best.min(ended.took);
         println!("{address}: {:.2} s", ended.took.as_secs_f64());
         assert!(ended.took < Duration::from_secs(3), "{:?}", ended.took);
     }

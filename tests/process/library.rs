@@ -31,7 +31,7 @@ fn a_run_that_is_dropped_is_stopped() {
 }
 
 #[test]
-fn what_is_wrong_is_told_before_anything_is_connected() {
+fn errors_are_reported_before_anything_is_connected() {
     let Err(error) = Run::from_name("coordinator-mokc") else { panic!("there is none") };
     assert!(error.hint.contains("coordinator-mock"), "{error}");
     let folder = tempfile::tempdir().unwrap();

@@ -189,7 +189,7 @@ fn a_run_that_goes_away_is_waited_for() {
 }
 
 #[test]
-fn f23_a_planner_process_that_hangs_or_dies_holds_up_nobody() {
+fn f23_a_planner_process_that_hangs_or_dies_delays_no_client() {
     let (home, _run, planner) = up();
     home.dimos("move arm 1.5 -0.3 0.6 0 0.8 0 --direct --speed 0.1 --no-wait").with(0);
     planner.signal(Signal::STOP);
@@ -234,7 +234,7 @@ fn f23_a_planner_process_that_hangs_or_dies_holds_up_nobody() {
 }
 
 #[test]
-fn who_fits_is_attached_to_and_who_does_not_is_told_why() {
+fn a_run_that_fits_is_attached_to_and_others_are_refused_with_a_reason() {
     let home = home();
     home.dimos("run lab.yaml --attach cell").with(2).says(&["no live run is named `cell`"]);
     home.dimos("run cell.yaml --attach cell").with(2).says(&["has no planner to attach"]);

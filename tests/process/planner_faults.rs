@@ -123,7 +123,7 @@ fn f23_a_search_without_end_in_the_real_program_disturbs_no_motion() {
 }
 
 #[test]
-fn a_motion_that_leaves_its_plan_ends_and_is_told() {
+fn a_motion_that_leaves_its_plan_is_aborted_and_reported() {
     let home = Home::new();
     // An arm that lags far behind its commands, and a task that minds.
     let lagging = BLUEPRINT

@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
 
 use dimos::rpc::api::*;
 use dimos::rpc::place::RunFolder;
@@ -131,18 +130,6 @@ pub fn start(folder: &Path, run: &str, backend: FakeBackend) -> (Server, Arc<Fak
     let backend = Arc::new(backend);
     let claim = RunFolder::at(folder).claim(run).expect("the name is free");
     (Server::start(claim, backend.clone()).expect("the socket opens"), backend)
-}
-
-/// Waits until `what` holds, for 30 s at most.
-pub fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
-    let began = Instant::now();
-    while began.elapsed() < Duration::from_secs(30) {
-        if holds() {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    panic!("not within 30 s: {what}");
 }
 
 pub fn status() -> StatusReport {

@@ -39,11 +39,11 @@ pub struct SimArm {
     pub reports_velocity: bool,
     /// Ticks until a commanded mode is in effect.
     pub mode_delay: u32,
-    /// Whether its stop makes the place where it is its setpoint.
+    /// Whether a stop makes its current position its setpoint.
     pub stop_takes_hold: bool,
     /// The joints do not move, whatever is commanded.
     pub blocked: bool,
-    /// No new states come.
+    /// It reports no new states.
     pub silent: bool,
     /// Commands do not reach it.
     pub deaf: bool,
@@ -118,7 +118,7 @@ impl SimArm {
     }
 
     /// Executes a command for one period.
-    fn obey(&mut self, command: &ArmCommand, dt: f64) {
+    fn execute_command(&mut self, command: &ArmCommand, dt: f64) {
         if command.stop_seq != self.last.stop_seq {
             self.stops += 1;
             if self.stop_takes_hold {
@@ -185,7 +185,7 @@ pub struct Rig {
     next_id: u64,
 }
 
-/// What was last on an arm's wire.
+/// The last command to an arm.
 #[derive(Debug, Clone)]
 struct Wire {
     mode: Option<ControlMode>,
@@ -241,7 +241,7 @@ pub fn motion(id: u64, joints: &[u16], points: &[(f64, &[f64])]) -> Box<Motion> 
     Box::new(Motion { id, joints: joints.to_vec(), spline: Spline::new(&given).unwrap() })
 }
 
-/// All of an arm's joints from one place to another.
+/// Moves all joints from one position to another [rad].
 pub fn sweep(id: u64, joints: std::ops::Range<u16>, from: f64, to: f64, seconds: f64) -> Box<Motion> {
     let joints: Vec<u16> = joints.collect();
     let n = joints.len();
@@ -306,7 +306,7 @@ impl Rig {
         id
     }
 
-    /// Sends a request, makes one tick, and answers what came of it.
+    /// Sends a request, makes one tick, and returns its outcome.
     pub fn ask(&mut self, request: Request) -> Outcome {
         let id = self.send(request);
         self.tick();
@@ -360,7 +360,7 @@ impl Rig {
         self.tick_with(&states, skipped);
         let dt = self.dt();
         for (arm, command) in self.arms.iter_mut().zip(&self.commands) {
-            arm.obey(command, dt);
+            arm.execute_command(command, dt);
         }
     }
 
@@ -425,7 +425,7 @@ impl Rig {
         self.wire[arm].velocity.iter().fold(0.0, |s: f64, v| s.max(v.abs()))
     }
 
-    /// What no command may ever do.
+    /// Checks the rules that every command must keep.
     fn check_wire(&mut self) {
         let dt = self.dt();
         for (i, (wire, command)) in self.wire.iter_mut().zip(&self.commands).enumerate() {

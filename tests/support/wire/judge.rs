@@ -206,19 +206,4 @@ impl Bounds {
         }
         worst.verdict("the way of the arm itself", "rad", since)
     }
-
-    /// Setpoints beside the pose at which the arm truly was when they reached it.
-    pub fn beside_the_truth(&self, delivered: &[WireCommand], most: f64) -> Result<(), String> {
-        let (mut worst, first) = (Worst::default(), delivered.first().map_or(Mono::ZERO, |t| t.at));
-        for one in delivered {
-            if let (Some(commands), Some(truth)) = (position(&one.what), &one.truth) {
-                commands
-                    .iter()
-                    .zip(truth)
-                    .enumerate()
-                    .for_each(|(j, (a, b))| worst.look(j, one.at, (a - b).abs(), most));
-            }
-        }
-        worst.verdict("a setpoint beside the true pose", "rad", first)
-    }
 }

@@ -181,7 +181,7 @@ fn a_piper_has_no_velocity_mode_and_check_says_so() {
 
 #[test]
 #[cfg(feature = "can")]
-fn a_piper_that_falls_is_told_of_wherever_its_motors_go_off() {
+fn a_piper_that_falls_is_reported_by_list_adapters_and_check() {
     let home = Home::new();
     assert!(home.dimos("list-adapters").with(0).out.lines().any(|l| l.contains("piper") && l.contains("no, falls")));
     let checked = home.dimos("check coordinator-piper --set hardware.arm.on_exit=disable --sim");

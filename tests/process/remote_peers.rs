@@ -1,0 +1,65 @@
+//! `adapter_type: remote` with peers that do not speak its protocol correctly: each ends the start with one error.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::time::Duration;
+
+use super::remote_shim::BLUEPRINT;
+use crate::support::program::Home;
+
+const DESCRIPTION: &str = r#"{"id":1,"version":1,"dof":6,"native_rate":100,"info":{"vendor":"V","model":"M"},
+ "limits":{"position_lower":[-1,-1,-1,-1,-1,-1],"position_upper":[1,1,1,1,1,1],"velocity_max":[1,1,1,1,1,1]}}"#;
+
+/// A peer that answers the first request with the first of `replies`, and so on, and then nothing more; it remembers
+/// what it was asked.
+fn peer(replies: Vec<String>) -> (String, std::thread::JoinHandle<Vec<String>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    let thread = std::thread::spawn(move || {
+        let (mut stream, _): (TcpStream, _) = listener.accept().unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        let mut asked = Vec::new();
+        let mut lines = BufReader::new(stream.try_clone().unwrap()).lines();
+        for reply in replies {
+            asked.extend(lines.next().and_then(Result::ok));
+            let _ = stream.write_all(format!("{}\n", reply.replace('\n', "")).as_bytes());
+        }
+        asked.extend(lines.map_while(Result::ok));
+        let _ = stream.read(&mut [0]);
+        asked
+    });
+    (address, thread)
+}
+
+#[test]
+fn peers_that_are_something_else_end_the_start_with_one_clear_line() {
+    let reading = r#"{"id":2,"state":{"time":1,"read_joint_positions":[0,0,0,0,0]}}"#;
+    let cases: &[(&[&str], &str)] = &[
+        (&["HTTP/1.1 400 Bad Request"], "does not speak this protocol"),
+        (&[r#"{"id":1,"version":2,"dof":6}"#], "speaks version 2 of the protocol, this program version 1"),
+        (&[&DESCRIPTION.replace("\"dof\":6", "\"dof\":7").replace("1]", "1,1]")], "expected 6 joints, the arm says 7"),
+        (&[&DESCRIPTION.replace("\"V\"", "null")], "its description"),
+        (&[&DESCRIPTION.replace("[-1,-1,-1,-1,-1,-1]", "[]")], "limits must have 6 values each"),
+        (&[r#"{"id":1,"error":"io","text":"no arm there"}"#], "no arm there"),
+        (&[], "accepts the connection, but does not say what it is"),
+        (&[DESCRIPTION], "did not answer within"),
+        (&[DESCRIPTION, reading], "position has 5 values for 6 joints"),
+        (&[DESCRIPTION, &reading.replace("0,0]", "0,NaN,0]")], "does not speak this protocol"),
+        (&[DESCRIPTION, r#"{"id":2,"error":"io","text":"its bus is down"}"#], "its bus is down"),
+    ];
+    for (replies, part) in cases {
+        let home = Home::new();
+        let (address, thread) = peer(replies.iter().map(|r| (*r).to_owned()).collect());
+        home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", &address));
+        let ended = home.dimos("run remote.yaml").with(3).says(&["error: arm: ", part, "hint: "]);
+        assert_eq!(ended.err.lines().filter(|l| l.starts_with("error: ")).count(), 1, "{}", ended.err);
+        assert!(ended.took < Duration::from_secs(5), "{:?}", ended.took);
+        let asked = thread.join().unwrap();
+        assert!(asked.iter().all(|a| a.contains(r#""do":"hello""#) || a.ends_with(r#""do":"cycle"}"#)), "{asked:?}");
+    }
+    let home = Home::new();
+    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", "unix:/nowhere/arm.sock"));
+    home.dimos("run remote.yaml").with(3).says(&["there is no such socket", "hint: start the process that serves"]);
+    home.write("remote.yaml", &BLUEPRINT.replace("ADDRESS", "10.0.0.1:7450"));
+    home.dimos("run remote.yaml").with(2).says(&["no authentication", "ssh -L 7450:127.0.0.1:7450 10.0.0.1"]);
+}
