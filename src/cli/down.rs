@@ -8,7 +8,7 @@ use super::output;
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Shutdown;
 use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::place::{LiveRun, RunFolder};
+use crate::rpc::run_dir::{LiveRun, RunDir};
 
 /// Maximum wait for a controlled stop, with some margin.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(6);
@@ -27,7 +27,7 @@ pub struct Args {
 
 /// Runs the verb: sends the request, waits until the run has ended, and prints the result.
 pub fn run(args: &Args) -> Result {
-    let folder = RunFolder::standard();
+    let folder = RunDir::standard();
     let name = args.name.as_deref().or(args.run.as_deref());
     let found = match find(&folder, name) {
         Ok(found) => found,
@@ -63,7 +63,7 @@ pub fn run(args: &Args) -> Result {
 }
 
 /// Returns the selected run; for one that has ended, its failure.
-fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun> {
+fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun> {
     client::find(folder, name).map_err(|error| {
         let dead = name.and_then(RunRecord::of).and_then(|record| record.failure());
         dead.unwrap_or_else(|| error.into())

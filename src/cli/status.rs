@@ -10,7 +10,7 @@ use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::place::LiveRun;
+use crate::rpc::run_dir::LiveRun;
 use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
 
 /// Arguments of `status`.
