@@ -31,22 +31,25 @@ pub fn run(args: &Args) -> Result {
     let name = args.name.as_deref().or(args.run.as_deref());
     let found = match find(&folder, name) {
         Ok(found) => found,
-        // A planner in its own process is not a run, but has a name as well.
-        Err(failure) => return attach::find(name).map_or(Err(failure), |planner| attach::end(&planner)),
+        // A planner in its own process is not a run. Without a name it is ended only if no run is live.
+        Err(failure) => {
+            let planner = attach::find(name).filter(|_| name.is_some() || failure.exit != Exit::Usage);
+            return planner.map_or(Err(failure), |planner| attach::end(&planner));
+        }
     };
     Client::connect(&found.name, &found.socket)?.call(Shutdown {})?;
-    let asked = Instant::now();
+    let requested = Instant::now();
     // The name is free before the process has written its last lines.
-    let noted = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
-    let lives = || noted().is_some_and(|record| record.state() == RunState::Live);
-    while folder.runs().map_err(ClientError::from)?.contains(&found) || lives() {
-        if asked.elapsed() > SHUTDOWN_TIMEOUT {
+    let recorded = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
+    let is_live = || recorded().is_some_and(|record| record.state() == RunState::Live);
+    while folder.runs().map_err(ClientError::from)?.contains(&found) || is_live() {
+        if requested.elapsed() > SHUTDOWN_TIMEOUT {
             let what = format!("{} is still shutting down: pid {} has not exited", found.name, found.pid);
             return Err(Failure::new(Exit::Failed, what).hint("its terminal or `dimos logs` shows the reason"));
         }
         std::thread::sleep(POLL_PERIOD);
     }
-    match noted() {
+    match recorded() {
         Some(record) if record.ended_abnormally() => {
             let exit = if let RunState::Ended(end) = record.state() { Exit::of(end.exit) } else { Exit::Failed };
             Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it ended abnormally")) })

@@ -40,8 +40,8 @@ pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
 
 /// Answers the requests that the server receives: the run.
 pub trait Backend: Send + Sync + 'static {
-    /// Answers one request. Called concurrently from the server's threads. Must not block its thread: a stop may wait for
-    /// it. Dropped after [`server::CALL_TIMEOUT`](super::server::CALL_TIMEOUT).
+    /// Answers one request. Called concurrently from the server's threads. Must not block its thread: a stop may wait
+    /// for it. Dropped after [`server::CALL_TIMEOUT`](super::server::CALL_TIMEOUT).
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
     /// Returns the arms of `subject` by `hardware_id`, for leases; empty if it names something unknown.
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String>;
@@ -153,8 +153,8 @@ methods! {
     "status" Status -> StatusReport;
     /// The latest joint states and commands.
     "state" State -> StateReport;
-    /// Moves an arm to a joint target, directly: not collision-checked. Replies when the motion begins; `motion` reports
-    /// its progress.
+    /// Moves an arm to a joint target, directly: not collision-checked. Replies when the motion begins; `motion`
+    /// reports its progress.
     "move" Move -> MoveReply, check Move::valid;
     /// Follows a trajectory. Replies when the motion begins.
     "execute" Execute -> ExecuteReply, check Execute::valid;

@@ -82,8 +82,8 @@ pub struct PlannerRequest {
 pub struct Moment {
     /// Number for a plan that this request begins.
     pub plan: u64,
-    /// Joint positions [rad]: commanded, or measured if the joint is not commanded in positions. Joints without a state for
-    /// 1 s are missing.
+    /// Joint positions [rad]: commanded, or measured if the joint is not commanded in positions. Joints without a state
+    /// for 1 s are missing.
     pub positions: BTreeMap<String, f64>,
     /// Opening of the gripper (0–1), listed for each joint of its arm.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]

@@ -1,5 +1,5 @@
-//! The connection of one client: answers its requests in order, while its subscriptions send their messages. Every queue
-//! is bounded; the requests of a client that does not read its replies are not read either.
+//! The connection of one client: answers its requests in order, while its subscriptions send their messages. Every
+//! queue is bounded; the requests of a client that does not read its replies are not read either.
 //!
 //! Each request completes before the next one begins, except targets of a stream: several may be pending until the tick
 //! answers them.

@@ -1,7 +1,7 @@
 //! Limits the connections of a run, and closes idle ones to make room.
 //!
-//! [`MAX_CONNECTIONS`] are for all requests, [`RESERVED_CONNECTIONS`] more only for the requests that always get through.
-//! If all are in use, a new connection replaces the one that has been idle for the longest time.
+//! [`MAX_CONNECTIONS`] are for all requests, [`RESERVED_CONNECTIONS`] more only for the requests that always get
+//! through. If all are in use, a new connection replaces the one that has been idle for the longest time.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,8 +1,8 @@
 //! Leases: only one connection at a time can command an arm.
 //!
 //! A connection takes the lease of an arm with its first accepted motion request, or with `lease`, and holds it until
-//! `release` or its end. Leases exist in the rpc server only: when a connection ends, its stream of targets times out, and
-//! a trajectory that has begun continues.
+//! `release` or its end. Leases exist in the rpc server only: when a connection ends, its stream of targets times out,
+//! and a trajectory that has begun continues.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -133,8 +133,8 @@ impl Lessee {
         &self.leases
     }
 
-    /// Takes the leases that a request requires; fails if another connection holds one. A request for the newest plan gets
-    /// its number, so that the plan whose arms are leased is the one that is executed.
+    /// Takes the leases that a request requires; fails if another connection holds one. A request for the newest plan
+    /// gets its number, so that the plan whose arms are leased is the one that is executed.
     ///
     /// Returns the request and the leased arms; afterwards call [`settle`](Self::settle) with them.
     pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<(Request, Vec<String>), RpcError> {
@@ -158,8 +158,8 @@ impl Lessee {
         Ok((request, Vec::new()))
     }
 
-    /// Ends a request that required the leases of these arms: keeps them if it was accepted, otherwise releases those that
-    /// it took.
+    /// Ends a request that required the leases of these arms: keeps them if it was accepted, otherwise releases those
+    /// that it took.
     pub fn settle(&self, arms: &[String], accepted: bool) {
         if arms.is_empty() {
             return;

@@ -10,8 +10,8 @@
 //!
 //! Requests that move an arm need its lease, which one connection at a time can hold: `lease.rs`.
 //!
-//! [`api`] has the methods and their parameters, [`report`] the status reports, [`error`] the errors. [`run_dir`] finds the
-//! sockets of live runs; [`server`] and [`client`] are the two sides of a connection.
+//! [`api`] has the methods and their parameters, [`report`] the status reports, [`error`] the errors. [`run_dir`] finds
+//! the sockets of live runs; [`server`] and [`client`] are the two sides of a connection.
 
 pub mod api;
 mod arm_api;

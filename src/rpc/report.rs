@@ -1,4 +1,5 @@
-//! Reports of a run: the replies to `status`, `state` and `motion`. SI units; a field in another unit has it in its name.
+//! Reports of a run: the replies to `status`, `state` and `motion`. SI units; a field in another unit has it in its
+//! name.
 
 use std::collections::BTreeMap;
 

@@ -1,7 +1,7 @@
 //! The run directory: sockets and locks of the live runs.
 //!
-//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`. The kernel releases the lock
-//! when the process ends, so files without a lock are stale; any process that finds them removes them.
+//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`. The kernel releases the
+//! lock when the process ends, so files without a lock are stale; any process that finds them removes them.
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Read, Write};
@@ -88,8 +88,8 @@ pub struct Claim {
 }
 
 impl RunDir {
-    /// Returns the default directory: `$XDG_RUNTIME_DIR/dimos`, or `<tmp>/dimos-<uid>` if that variable is unset or names
-    /// no directory.
+    /// Returns the default directory: `$XDG_RUNTIME_DIR/dimos`, or `<tmp>/dimos-<uid>` if that variable is unset or
+    /// names no directory.
     pub fn standard() -> Self {
         let runtime = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|dir| dir.is_dir());
         Self(match runtime {

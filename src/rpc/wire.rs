@@ -66,8 +66,8 @@ pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> St
     }
 }
 
-/// Encodes a message of a subscription as a line. `data` is JSON; `lost` counts the messages that this client missed just
-/// before.
+/// Encodes a message of a subscription as a line. `data` is JSON; `lost` counts the messages that this client missed
+/// just before.
 pub(super) fn message(stream: &str, subscription: u64, lost: u64, data: &str) -> String {
     let lost = if lost == 0 { String::new() } else { format!(r#","lost":{lost}"#) };
     format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription}{lost},\"data\":{data}}}\n")
