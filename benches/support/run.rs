@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use dimos::rpc::api::{Execute, Point, Shutdown, State, Trajectory};
 use dimos::rpc::client::Client;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 
 /// Maximum time for a run to be up.
 const UP_LIMIT: Duration = Duration::from_secs(10);
@@ -53,7 +53,7 @@ impl LiveRun {
 
     /// Connects to it as soon as it is up.
     pub fn client(&mut self) -> Result<Client, String> {
-        let folder = RunFolder::at(self.home.path().join("dimos"));
+        let folder = RunDir::at(self.home.path().join("dimos"));
         loop {
             if let Some(status) = self.child.try_wait().map_err(|e| e.to_string())? {
                 return Err(format!("the run ended during startup: {status}"));

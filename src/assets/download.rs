@@ -48,7 +48,7 @@ pub fn download(url: &str, part: &Path, progress: &mut dyn Progress) -> Result<(
         return copy(&PathBuf::from(percent_decoded(path)), part, progress);
     }
     let agent = agent(url.starts_with("https://"))?;
-    let (mut fruitless, mut connections) = (0, 0);
+    let (mut stalled, mut connections) = (0, 0);
     loop {
         let before = length(part);
         let error = match connection(&agent, url, part, before, progress) {
@@ -57,8 +57,8 @@ pub fn download(url: &str, part: &Path, progress: &mut dyn Progress) -> Result<(
             Err(Interruption::Temporary(error)) => error,
         };
         connections += 1;
-        fruitless = if length(part) > before { 0 } else { fruitless + 1 };
-        if fruitless >= MAX_STALLED_TRIES || connections >= MAX_CONNECTIONS {
+        stalled = if length(part) > before { 0 } else { stalled + 1 };
+        if stalled >= MAX_STALLED_TRIES || connections >= MAX_CONNECTIONS {
             let kept = length(part);
             let kept = if kept > 0 {
                 format!("; {kept} bytes are kept and the next attempt resumes there")
@@ -68,7 +68,7 @@ pub fn download(url: &str, part: &Path, progress: &mut dyn Progress) -> Result<(
             return Err(AssetError { what: format!("{}{kept}", error.what), hint: error.hint });
         }
         progress.note(&format!("{error}: retrying"));
-        std::thread::sleep(BACK_OFF * (1 << fruitless.min(4)));
+        std::thread::sleep(BACK_OFF * (1 << stalled.min(4)));
     }
 }
 
@@ -78,11 +78,11 @@ fn length(part: &Path) -> u64 {
 
 /// Copies a local file.
 fn copy(from: &Path, part: &Path, progress: &mut dyn Progress) -> Result<(), AssetError> {
-    let there = |e: io::Error| {
+    let unreadable = |e: io::Error| {
         AssetError::new(format!("{}: {e}", from.display())).hint("write the full path of a local file after file://")
     };
-    let mut source = File::open(from).map_err(there)?;
-    let found = source.metadata().map_err(there)?;
+    let mut source = File::open(from).map_err(unreadable)?;
+    let found = source.metadata().map_err(unreadable)?;
     if !found.is_file() {
         return Err(AssetError::new(format!("{} is not a file", from.display())));
     }

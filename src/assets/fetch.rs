@@ -22,18 +22,17 @@ impl Cache {
         let part = self.file(&asset.sha256, ".part");
         let resumed = part.exists();
         download::download(&asset.url, &part, progress)?;
-        let found = sum_of(&part)?;
-        if found != sum {
+        let mut found = sum_of(&part)?;
+        if found != sum && resumed {
+            // The address may now return another file than when the download began.
             fs::remove_file(&part).map_err(|e| AssetError::io(&part, &e))?;
-            if resumed {
-                // The address may now return another file than when the download began.
-                progress.note("an earlier partial download does not match: downloading from scratch");
-                download::download(&asset.url, &part, progress)?;
-            }
-            if !resumed || sum_of(&part)? != sum {
-                let _ = fs::remove_file(&part);
-                return Err(AssetError::other_file(&asset.url, &sum, &found));
-            }
+            progress.note("an earlier partial download does not match: downloading from scratch");
+            download::download(&asset.url, &part, progress)?;
+            found = sum_of(&part)?;
+        }
+        if found != sum {
+            let _ = fs::remove_file(&part);
+            return Err(AssetError::other_file(&asset.url, &sum, &found));
         }
         let fresh = self.file(&asset.sha256, ".new");
         let _ = fs::remove_dir_all(&fresh);
@@ -74,7 +73,7 @@ fn file_name(url: &str) -> String {
     }
 }
 
-/// Decodes `%20` in an address's path.
+/// Decodes percent-encoded characters, such as `%20`, in a path.
 pub(super) fn percent_decoded(text: &str) -> String {
     percent_decode_str(text).decode_utf8().map_or_else(|_| text.to_owned(), Into::into)
 }

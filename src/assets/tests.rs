@@ -187,6 +187,18 @@ fn a_file_with_another_checksum_is_rejected_and_discarded() {
 }
 
 #[test]
+fn after_a_resumed_download_the_error_names_the_checksum_of_the_whole_file() {
+    let (_folder, cache) = cache();
+    let served = noise(10_000);
+    let server = FileServer::new(served.clone(), &[]);
+    let asset = asset(&server.url("arm.bin"), b"another");
+    fs::create_dir_all(&cache.0).unwrap();
+    fs::write(cache.file(&asset.sha256, ".part"), [7; 4_000]).unwrap();
+    let error = cache.fetch(&asset, &mut NoProgress).unwrap_err();
+    assert!(error.what.contains(&sum(&served)), "{error}");
+}
+
+#[test]
 fn an_unreachable_server_or_a_missing_file_is_reported() {
     let (folder, cache) = cache();
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();

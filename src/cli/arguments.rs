@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::exit::Result;
 use crate::rpc::client::{self, Client};
-use crate::rpc::place::{LiveRun, RunFolder};
+use crate::rpc::run_dir::{LiveRun, RunDir};
 
 /// Arguments that select a run and the output format.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Args)]
@@ -22,12 +22,12 @@ pub struct Target {
 impl Target {
     /// Connects to the run.
     pub fn connect(&self) -> Result<Client> {
-        Ok(Client::find(&RunFolder::standard(), self.run.as_deref())?)
+        Ok(Client::find(&RunDir::standard(), self.run.as_deref())?)
     }
 
     /// Returns the named run, or all live runs.
     pub fn named_or_all(&self) -> Result<Vec<LiveRun>> {
-        let folder = RunFolder::standard();
+        let folder = RunDir::standard();
         Ok(match &self.run {
             Some(name) => vec![client::find(&folder, Some(name))?],
             None => folder.runs().map_err(client::ClientError::from)?,

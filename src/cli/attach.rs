@@ -15,7 +15,7 @@ use crate::blueprint::Blueprint;
 use crate::planning::config::RobotConfig;
 use crate::rpc::api::Status;
 use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::place::{Claim, LiveRun, RunFolder};
+use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::rpc::report::StatusReport;
 use crate::runtime::{AttachedPlanner, Ending, Turn};
 
@@ -32,7 +32,7 @@ pub struct Attached {
 
 /// Returns the run that a blueprint's planner attaches to; `None` if it starts its own.
 pub fn chosen(args: &Args, blueprint: &Blueprint) -> Result<Option<LiveRun>> {
-    let folder = RunFolder::standard();
+    let folder = RunDir::standard();
     let run = match (&args.attach, &blueprint.planner) {
         (Some(_), None) => {
             return Err(Failure::usage(format!("{} has no planner to attach", blueprint.name))
@@ -134,7 +134,7 @@ impl Attached {
     /// Attaches a blueprint's planner to a run.
     pub fn start(args: &Args, blueprint: &Blueprint, run: LiveRun, terminal: &Terminal) -> Result<Self> {
         let name = args.name.clone().unwrap_or_else(|| blueprint.name.clone());
-        let claim = RunFolder::standard().planners().claim(&name);
+        let claim = RunDir::standard().planners().claim(&name);
         let claim = claim.map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
         let config = blueprint.planner.clone().unwrap_or_default();
         let (terminal, json) = (terminal.clone(), args.json);
@@ -238,7 +238,7 @@ pub fn find(name: Option<&str>) -> Option<LiveRun> {
 
 /// Returns the live planners in their own processes.
 pub fn live() -> Vec<LiveRun> {
-    RunFolder::standard().planners().runs().unwrap_or_default()
+    RunDir::standard().planners().runs().unwrap_or_default()
 }
 
 /// Ends a planner, like a signal from its terminal.

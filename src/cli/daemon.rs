@@ -25,7 +25,7 @@ use super::run_record::last_lines;
 use super::{check, output};
 use crate::blueprint::Catalog;
 use crate::recording::files::{self, KEPT_LOGS};
-use crate::rpc::place;
+use crate::rpc::run_dir;
 use crate::rpc::report::StatusReport;
 
 /// Last line of the banner of a run without a terminal.
@@ -68,7 +68,7 @@ pub fn start(args: &Args, catalog: Catalog<'_>) -> Result {
     let Some(blueprint) = &loaded.blueprint else { return Err(check::refuse(&loaded)) };
     check::print_warnings(&loaded);
     let run = args.name.as_ref().unwrap_or(&blueprint.name);
-    place::check_name(run).map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
+    run_dir::check_name(run).map_err(|e| Failure::new(Exit::Failed, e.to_string()).hint(e.hint()))?;
     let text_log = new_text_log(run)?;
     let (mut child, ours) = spawn(&text_log).context("cannot start the run's process")?;
     let mut line = String::new();

@@ -8,7 +8,7 @@ use super::output;
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Shutdown;
 use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::place::{LiveRun, RunFolder};
+use crate::rpc::run_dir::{LiveRun, RunDir};
 
 /// Maximum wait for a controlled stop, with some margin.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(6);
@@ -27,26 +27,29 @@ pub struct Args {
 
 /// Runs the verb: sends the request, waits until the run has ended, and prints the result.
 pub fn run(args: &Args) -> Result {
-    let folder = RunFolder::standard();
+    let folder = RunDir::standard();
     let name = args.name.as_deref().or(args.run.as_deref());
     let found = match find(&folder, name) {
         Ok(found) => found,
-        // A planner in its own process is not a run, but has a name as well.
-        Err(failure) => return attach::find(name).map_or(Err(failure), |planner| attach::end(&planner)),
+        // A planner in its own process is not a run. Without a name it is ended only if no run is live.
+        Err(failure) => {
+            let planner = attach::find(name).filter(|_| name.is_some() || failure.exit != Exit::Usage);
+            return planner.map_or(Err(failure), |planner| attach::end(&planner));
+        }
     };
     Client::connect(&found.name, &found.socket)?.call(Shutdown {})?;
-    let asked = Instant::now();
+    let requested = Instant::now();
     // The name is free before the process has written its last lines.
-    let noted = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
-    let lives = || noted().is_some_and(|record| record.state() == RunState::Live);
-    while folder.runs().map_err(ClientError::from)?.contains(&found) || lives() {
-        if asked.elapsed() > SHUTDOWN_TIMEOUT {
+    let recorded = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
+    let is_live = || recorded().is_some_and(|record| record.state() == RunState::Live);
+    while folder.runs().map_err(ClientError::from)?.contains(&found) || is_live() {
+        if requested.elapsed() > SHUTDOWN_TIMEOUT {
             let what = format!("{} is still shutting down: pid {} has not exited", found.name, found.pid);
             return Err(Failure::new(Exit::Failed, what).hint("its terminal or `dimos logs` shows the reason"));
         }
         std::thread::sleep(POLL_PERIOD);
     }
-    match noted() {
+    match recorded() {
         Some(record) if record.ended_abnormally() => {
             let exit = if let RunState::Ended(end) = record.state() { Exit::of(end.exit) } else { Exit::Failed };
             Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it ended abnormally")) })
@@ -63,7 +66,7 @@ pub fn run(args: &Args) -> Result {
 }
 
 /// Returns the selected run; for one that has ended, its failure.
-fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun> {
+fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun> {
     client::find(folder, name).map_err(|error| {
         let dead = name.and_then(RunRecord::of).and_then(|record| record.failure());
         dead.unwrap_or_else(|| error.into())

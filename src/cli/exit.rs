@@ -1,12 +1,13 @@
-//! How a verb ends: an exit code for scripts; what went wrong and what to do about it for people.
+//! Result of a verb: an exit code for scripts, an error with a hint for people.
 
 use std::fmt::Display;
 
 use crate::message::Message;
 use crate::rpc::client::ClientError;
 use crate::rpc::{Code, RpcError};
+use crate::runtime::StartError;
 
-/// The exit codes: a contract. `dimos --help` lists them from here.
+/// The exit codes; scripts depend on them. `dimos --help` lists them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Exit {
@@ -16,11 +17,11 @@ pub enum Exit {
     Failed = 1,
     /// The command line, the blueprint or a file is wrong.
     Usage = 2,
-    /// Hardware cannot be reached; for readers of logs: data lost or cut.
+    /// Hardware unreachable; for log readers: the log is cut or has lost data.
     Hardware = 3,
     /// A run ended by a fault.
     Fault = 4,
-    /// A run ended because its log did: no room on the disk, or the log was removed.
+    /// A run ended because its log could not be written: the disk is full, or the log was removed.
     Log = 5,
     /// Ended by SIGINT, after the controlled stop.
     Interrupted = 130,
@@ -44,12 +45,12 @@ impl Exit {
         (Self::Terminated, "ended by SIGTERM, after the controlled stop"),
     ];
 
-    /// The exit code of a number; one that is not in the contract (a crash) counts as failed.
+    /// Returns the exit code of a number; an unknown one (a crash) counts as failed.
     pub fn of(code: u8) -> Self {
         Self::ALL.iter().map(|(exit, _)| *exit).find(|exit| *exit as u8 == code).unwrap_or(Self::Failed)
     }
 
-    /// The code of a run or a wait that a signal ended.
+    /// Returns the exit code after a signal.
     pub fn by_signal(signal: i32) -> Self {
         if signal == libc::SIGTERM { Self::Terminated } else { Self::Interrupted }
     }
@@ -61,7 +62,7 @@ impl Exit {
 pub struct Failure {
     /// The exit code.
     pub exit: Exit,
-    /// What went wrong and where, in a sentence without full stop; further lines may show details.
+    /// What went wrong, without full stop; further lines may show details.
     pub what: String,
     /// What to do about it.
     pub hint: Option<String>,
@@ -71,7 +72,7 @@ pub struct Failure {
 pub type Result<T = Exit> = std::result::Result<T, Failure>;
 
 impl Failure {
-    /// A failure without a hint.
+    /// Creates a failure without a hint.
     pub fn new(exit: Exit, what: impl Into<String>) -> Self {
         Self { exit, what: what.into(), hint: None }
     }
@@ -82,22 +83,29 @@ impl Failure {
         Self { exit, what, hint }
     }
 
-    /// Something is wrong with what was typed.
+    /// Creates a failure for wrong arguments or a wrong file.
     pub fn usage(what: impl Into<String>) -> Self {
         Self::new(Exit::Usage, what)
     }
 
-    /// The same with a hint.
+    /// Adds a hint.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
     }
 }
 
-/// At the program's edge an error of the system is shown with its context: `FILE: permission denied`.
+/// Shows an error with its context: `FILE: permission denied`.
 impl From<anyhow::Error> for Failure {
     fn from(error: anyhow::Error) -> Self {
         error.downcast().unwrap_or_else(|error| Self::of(Exit::Failed, format_args!("{error:#}")))
+    }
+}
+
+impl From<StartError> for Failure {
+    fn from(error: StartError) -> Self {
+        let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
+        Self::new(exit, error.to_string()).hint(error.hint())
     }
 }
 
@@ -116,7 +124,7 @@ impl From<ClientError> for Failure {
     }
 }
 
-/// What was typed wrong is a usage error, wherever it was noticed.
+/// Returns the exit code of a refusal; a mistake in the arguments is a usage error.
 fn exit_of(code: Code) -> Exit {
     match code {
         Code::UnknownArm | Code::UnknownTask | Code::InvalidParams | Code::InvalidTrajectory => Exit::Usage,

@@ -11,7 +11,7 @@ use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::client::{self, ClientError};
-use crate::rpc::place::RunFolder;
+use crate::rpc::run_dir::RunDir;
 
 /// Poll period of --follow.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
@@ -49,7 +49,7 @@ pub fn run(args: &Args) -> Result {
 
 /// Returns the record of the named run, or of the default one.
 fn find(name: Option<&str>) -> Result<RunRecord> {
-    let mut live = RunFolder::standard().runs().map_err(ClientError::from)?;
+    let mut live = RunDir::standard().runs().map_err(ClientError::from)?;
     let unknown = |name: &str| {
         let what = format!("no record of a run named {name}");
         Failure::usage(what).hint("`dimos status` shows the live runs")

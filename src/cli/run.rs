@@ -20,7 +20,7 @@ use super::text_log::Terminal;
 use super::{banner, check, daemon};
 use crate::blueprint::{Catalog, Overrides};
 use crate::rpc::report::StatusReport;
-use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager, StartError};
+use crate::runtime::{Ended, Ending, Options, Record, Run, ServiceManager};
 
 /// Arguments of `run`.
 #[derive(Debug, Clone, PartialEq, clap::Args)]
@@ -156,8 +156,7 @@ fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)
         if let Some(manager) = ServiceManager::from_env() {
             manager.status(&error.to_string());
         }
-        let exit = if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed };
-        Failure::new(exit, error.to_string()).hint(error.hint())
+        Failure::from(error)
     })?;
     Ok((Up::Run(Box::new(run)), signals, terminal))
 }

@@ -100,7 +100,7 @@ impl RunRecord {
 
     /// Returns the record of a name.
     pub fn of(run: &str) -> Option<Self> {
-        crate::rpc::place::check_name(run).ok()?;
+        crate::rpc::run_dir::check_name(run).ok()?;
         read(&path_in(&files::log_folder()?, run))
     }
 

@@ -10,7 +10,7 @@ use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::place::LiveRun;
+use crate::rpc::run_dir::LiveRun;
 use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
 
 /// Arguments of `status`.
@@ -26,7 +26,7 @@ pub struct Args {
 #[serde(untagged)]
 enum RunEntry {
     Answered(Box<StatusReport>),
-    Silent {
+    NoReply {
         run: String,
         pid: u32,
         error: String,
@@ -39,13 +39,13 @@ enum RunEntry {
     },
 }
 
-/// A run that crashed or ended by a fault, and has not been started again.
+/// A run that crashed, or that a fault or the end of its log ended, and that has not been started again.
 #[derive(Serialize)]
 struct FailedRun {
     /// The run and its end.
     #[serde(flatten)]
     record: RunRecord,
-    /// Whether it crashed without recording its end.
+    /// Whether it crashed without recording its end; otherwise a fault or the end of its log ended it.
     crashed: bool,
     /// The last lines of its text log.
     last_words: Vec<String>,
@@ -60,7 +60,7 @@ pub fn run(args: &Args) -> Result {
     })?;
     if args.target_run.run.is_some() || (runs.len() == 1 && !args.target_run.json) {
         let Some(run) = runs.pop() else { return Ok(Exit::Ok) };
-        let report = ask(&run)?;
+        let report = request_status(&run)?;
         if args.target_run.json {
             output::json(&report);
             return Ok(Exit::Ok);
@@ -86,21 +86,21 @@ fn failed_runs(live: &[LiveRun]) -> Vec<FailedRun> {
     .collect()
 }
 
-fn print_failed(failed_runs: &FailedRun) {
+fn print_failed(failed: &FailedRun) {
     output::line("");
-    output::line(failed_runs.record.describe_end().unwrap_or_default());
-    failed_runs.last_words.iter().for_each(|words| output::line(format_args!("  {words}")));
+    output::line(failed.record.describe_end().unwrap_or_default());
+    failed.last_words.iter().for_each(|text| output::line(format_args!("  {text}")));
 }
 
-fn ask(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
+fn request_status(run: &LiveRun) -> std::result::Result<StatusReport, ClientError> {
     Client::connect(&run.name, &run.socket)?.call(Status {})
 }
 
 fn overview(runs: Vec<LiveRun>, json: bool) {
     let failed_runs = failed_runs(&runs);
-    let answers = runs.into_iter().map(|run| match ask(&run) {
+    let answers = runs.into_iter().map(|run| match request_status(&run) {
         Ok(report) => RunEntry::Answered(Box::new(report)),
-        Err(error) => RunEntry::Silent { run: run.name, pid: run.pid, error: error.to_string() },
+        Err(error) => RunEntry::NoReply { run: run.name, pid: run.pid, error: error.to_string() },
     });
     let mut found: Vec<RunEntry> = answers.chain(failed_runs.into_iter().map(RunEntry::FailedRun)).collect();
     let waiting =
@@ -122,12 +122,18 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
                 let arms = arms.join(", ") + simulated;
                 table.row([r.run.clone(), r.pid.to_string(), span(r.uptime), r.blueprint.clone(), arms, log]);
             }
-            RunEntry::Silent { run, pid, error } => {
+            RunEntry::NoReply { run, pid, error } => {
                 let [pid, error] = [pid.to_string(), error.clone()];
                 table.row([run.as_str(), &pid, "-", "-", &error, "-"]);
             }
             RunEntry::FailedRun(FailedRun { record, crashed, .. }) => {
-                let how = toned(if *crashed { "CRASHED" } else { "FAULT" }, Tone::Bad);
+                let end = record.end.as_ref().map(|end| Exit::of(end.exit));
+                let how = match end {
+                    _ if *crashed => "CRASHED",
+                    Some(Exit::Log) => "LOG ENDED",
+                    _ => "FAULT",
+                };
+                let how = toned(how, Tone::Bad);
                 let log = record.log.as_ref().map_or_else(|| "-".into(), |log| log.display().to_string());
                 let [run, pid, blueprint] = [record.run.clone(), record.pid.to_string(), record.blueprint.clone()];
                 table.row([run.into(), pid.into(), "-".into(), blueprint.into(), how, log.into()]);
@@ -146,8 +152,8 @@ fn overview(runs: Vec<LiveRun>, json: bool) {
         print_planners(planners.into_iter());
     }
     for found in &found {
-        if let RunEntry::FailedRun(failed_runs) = found {
-            print_failed(failed_runs);
+        if let RunEntry::FailedRun(failed) = found {
+            print_failed(failed);
         }
     }
 }
@@ -238,10 +244,8 @@ fn print_arms(arms: &[ArmReport]) {
             output::line(format_args!("  {name}: a stop is pending; it is sent after the reconnect"));
         }
         if let Some(codes) = &arm.device_state {
-            output::line(format_args!(
-                "  {name}: the device is in state {}, mode {} of its own",
-                codes.state, codes.mode
-            ));
+            let (state, mode) = (codes.state, codes.mode);
+            output::line(format_args!("  {name}: device state {state}, mode {mode} (the vendor's numbers)"));
         }
         if let Some(error) = &arm.error {
             output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));
@@ -254,7 +258,7 @@ fn print_arms(arms: &[ArmReport]) {
         if let Some(c) = &arm.commander {
             let process = c.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
             let held = span(c.held_for);
-            output::line(format_args!("  {name} is commanded by {}{process}, since {held}", c.program));
+            output::line(format_args!("  {name} is commanded by {}{process} for {held}", c.program));
         }
         let counted: Vec<String> = arm
             .counters

@@ -9,7 +9,7 @@ use super::output::{self, Table, Tone, toned};
 use crate::rpc::Code;
 use crate::rpc::api::{Confirmation, Stop, StopReply};
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::place::LiveRun;
+use crate::rpc::run_dir::LiveRun;
 
 /// Arguments of `stop`.
 #[derive(Debug, clap::Args)]

@@ -42,11 +42,11 @@ pub struct Source {
 }
 
 impl Source {
-    /// Opens a file. Reads all of it first, so that a mistake in its last line moves nothing.
+    /// Reads a whole file, so that a mistake in its last line moves nothing. Opens it once: it may be a pipe.
     pub fn file(path: &Path, width: Width) -> Result<Self> {
-        let open = || File::open(path).map_err(|e| Failure::usage(format!("{}: {e}", path.display())));
-        Lines::new(open()?, path.display().to_string(), width).try_for_each(|target| target.map(|_| ()))?;
-        Ok(Self::read(Lines::new(open()?, path.display().to_string(), width)))
+        let file = File::open(path).map_err(|e| Failure::usage(format!("{}: {e}", path.display())))?;
+        let targets = Lines::new(file, path.display().to_string(), width).collect::<Result<Vec<_>>>()?;
+        Ok(Self::read(targets.into_iter().map(Ok)))
     }
 
     /// Opens stdin, read line by line.
@@ -117,7 +117,7 @@ impl<R: Read> Iterator for Lines<R> {
                 Ok(_) => {}
                 Err(e) => return Some(Err(self.mistake(e))),
             }
-            let Ok(text) = std::str::from_utf8(&text) else { return Some(Err(self.mistake("not a text"))) };
+            let Ok(text) = std::str::from_utf8(&text) else { return Some(Err(self.mistake("not UTF-8"))) };
             let text = text.trim();
             if text.is_empty() || text.starts_with('#') {
                 continue;
@@ -144,6 +144,20 @@ fn numbers(text: &str) -> std::result::Result<Vec<f64>, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_pipe_is_read_like_a_file() {
+        use std::io::Write;
+        use std::os::fd::AsRawFd;
+        let (reader, mut writer) = io::pipe().unwrap();
+        writer.write_all(b"1 2\n3 4\n").unwrap();
+        drop(writer);
+        let path = format!("/proc/self/fd/{}", reader.as_raw_fd());
+        let mut source = Source::file(Path::new(&path), Width::Joints(2)).unwrap();
+        let mut next = || source.next(Duration::from_secs(5)).unwrap();
+        assert_eq!((next(), next(), next()), (Some(vec![1.0, 2.0]), Some(vec![3.0, 4.0]), None));
+        assert!(source.is_over());
+    }
 
     fn all(text: &str, width: usize) -> Vec<std::result::Result<Vec<f64>, String>> {
         let lines = Lines::new(text.as_bytes(), "t".into(), Width::Joints(width));

@@ -1,6 +1,6 @@
-//! What a run can be asked: the table of methods, their parameters and replies, and [`Backend`], which answers.
+//! The methods of a run: a table with their parameters and replies, and [`Backend`], which answers requests.
 //!
-//! Everything is in SI units (rad, rad/s, Nm, m, N, s); a field in another unit says so in its name (`age_ms`).
+//! Units are SI (rad, rad/s, Nm, m, N, s); a field in another unit has it in its name (`age_ms`).
 
 use std::future::Future;
 use std::pin::Pin;
@@ -18,94 +18,92 @@ use super::error::{Code, RpcError};
 use super::lease::Subject;
 pub use super::motion_api::*;
 pub use super::planner_api::*;
-use super::planner_line::PlannerLine;
+use super::planner_proxy::PlannerProxy;
 use super::report::{MotionReport, StateReport, StatusReport};
 use super::schema::MethodSchema;
 use super::streams::Streams;
 pub use super::world_api::*;
 
-/// Longest request line, newline included [bytes].
+/// Maximum length of a request line, including its newline [bytes].
 pub const MAX_LINE: usize = 256 * 1024;
-/// Most connections to one run.
+/// Maximum number of connections to a run.
 pub const MAX_CONNECTIONS: usize = 128;
-/// Connections beside those that may `stop`, `cancel`, ask for `status` and `shutdown`.
+/// Further connections, reserved for `stop`, `cancel`, `status` and `shutdown`.
 pub const RESERVED_CONNECTIONS: usize = 8;
-/// Most subscriptions of one connection.
+/// Maximum number of subscriptions of a connection.
 pub const MAX_SUBSCRIPTIONS: usize = 16;
-/// Lowest `speed` of a move, as a fraction of the arm's limits.
+/// Minimum `speed` of a motion, as a fraction of the limits.
 pub const MIN_SPEED: f64 = 0.1;
 
-/// A boxed future, as trait objects need it.
+/// A boxed future, for trait objects.
 pub type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + Send + 'a>>;
 
-/// What the server serves: the run itself.
+/// Answers the requests that the server receives: the run.
 pub trait Backend: Send + Sync + 'static {
-    /// Answers one request. Called from the server's threads, several at once; it may wait but must not block, or a
-    /// stop would wait for it. When it takes longer than [`server::CALL_LIMIT`](super::server::CALL_LIMIT) it is
-    /// dropped.
+    /// Answers one request. Called concurrently from the server's threads. Must not block its thread: a stop may wait
+    /// for it. Dropped after [`server::CALL_TIMEOUT`](super::server::CALL_TIMEOUT).
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>>;
-    /// The arms that `subject` is about, by `hardware_id`; none where it names something that is not there. Who
-    /// moves an arm needs its lease.
+    /// Returns the arms of `subject` by `hardware_id`, for leases; empty if it names something unknown.
     fn arms_of(&self, subject: Subject<'_>) -> Vec<String>;
-    /// The number of a plan, the newest without one, and the coordinator's joints that it moves.
+    /// Returns the number of a plan (`None`: the newest one), and the coordinator's joints that it moves.
     fn plan_of(&self, plan: Option<u64>) -> BoxFuture<'_, Result<(u64, Vec<String>), RpcError>> {
         let _ = plan;
         Box::pin(async { Err(RpcError::new(Code::NoPlanner, "this run has no planner")) })
     }
-    /// Lets the process at the other end of `line` be the run's planner.
-    fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
-        let _ = (planner, line);
-        Err(RpcError::new(Code::Unsupported, "this run takes no planner"))
+    /// Attaches a planner in another process to the run; `proxy` sends it requests.
+    fn register_planner(&self, planner: RegisterPlanner, proxy: Arc<PlannerProxy>) -> Result<Registered, RpcError> {
+        let _ = (planner, proxy);
+        Err(RpcError::new(Code::Unsupported, "this run cannot have a planner"))
     }
-    /// Called once on the thread that answers `stop`, `cancel`, `status` and `shutdown`, before it does.
+    /// Called once on the thread that answers `stop`, `cancel`, `status` and `shutdown`, before the first request.
     fn prepare_urgent_thread(&self) {}
-    /// What the run publishes.
+    /// Returns the streams that the run publishes.
     fn streams(&self) -> &Streams;
 }
 
-/// The parameters of a method, which know the method's name and reply.
+/// Parameters of a method, with the method's name and the type of its reply.
 pub trait Method: Serialize + DeserializeOwned + JsonSchema {
     /// The method's name.
     const NAME: &'static str;
-    /// What comes back.
+    /// The reply.
     type Reply: Serialize + DeserializeOwned + JsonSchema;
-    /// Says what is wrong with the values, in a sentence without full stop.
+    /// Checks the values; the error says what is wrong, without full stop.
     fn check(&self) -> Result<(), String> {
         Ok(())
     }
-    /// The request to the run; `None`: the connection itself answers it.
+    /// Returns the request to the run; `None` if the connection itself answers the method.
     fn to_request(&self) -> Option<Request> {
         None
     }
-    /// Takes the reply to such a request; `None`: it is the reply to another one.
+    /// Returns the reply to such a request; `None` if it belongs to another method.
     fn from_reply(_reply: Reply) -> Option<Self::Reply> {
         None
     }
 }
 
-/// One row per method: name, parameters, reply. Makes [`Request`], [`Reply`], [`METHODS`].
+/// One row per method: name, parameters, reply. Generates [`Request`], [`Reply`] and [`METHODS`].
 macro_rules! methods {
     ($($(#[$doc:meta])* $name:literal $variant:ident -> $reply:ty $(, check $check:path)?;)*) => {
-        /// A request that a run answers.
+        /// A request to the run.
         #[derive(Debug, Clone, PartialEq)]
         pub enum Request { $($(#[$doc])* $variant($variant),)* }
 
-        /// What comes back: the variant of the same name.
+        /// A reply of the run: the variant of the same name.
         #[derive(Debug, Clone, PartialEq, Serialize)]
         #[serde(untagged)]
         pub enum Reply { $($(#[$doc])* $variant($reply),)* }
 
-        /// Names of all methods, those that the connection itself answers at the end.
+        /// Names of all methods; the last ones are answered by the connection itself.
         pub const METHODS: &[&str] = &[$($name,)* "subscribe", "unsubscribe", "lease", "release",
             "register_planner", "planner_answer"];
 
-        /// Name, parameters and reply of each method in the table.
+        /// Returns the schemas of each method in the table.
         pub(super) fn method_schemas(generator: &mut SchemaGenerator) -> Vec<MethodSchema> {
             vec![$(MethodSchema::of::<$variant>(generator),)*]
         }
 
         impl Reply {
-            /// Reads what came back from a method.
+            /// Parses the reply to a method.
             pub fn read(method: &str, reply: Value) -> Result<Self, RpcError> {
                 let unlike = |e: serde_json::Error| RpcError::new(Code::Internal, format!("reply to {method:?}: {e}"));
                 match method {
@@ -131,7 +129,7 @@ macro_rules! methods {
         })*
 
         impl Request {
-            /// The method's name and its parameters, as they travel.
+            /// Returns the method's name and its parameters as JSON.
             pub fn written(&self) -> (&'static str, Value) {
                 // Plain structs with string keys always encode.
                 match self {
@@ -139,7 +137,7 @@ macro_rules! methods {
                 }
             }
 
-            /// Reads the parameters of a method; refuses unknown methods, unknown or ill-formed parameters.
+            /// Parses the parameters of a method; fails on unknown methods and on unknown or invalid parameters.
             pub fn read(method: &str, params: Value) -> Result<Self, RpcError> {
                 match method {
                     $($name => read_params::<$variant>(params).map(Self::$variant),)*
@@ -155,22 +153,22 @@ methods! {
     "status" Status -> StatusReport;
     /// The latest joint states and commands.
     "state" State -> StateReport;
-    /// Moves an arm from where it is to a joint target, directly: not collision-checked. Answers when the motion
-    /// begins; `motion` reports its progress.
+    /// Moves an arm to a joint target, directly: not collision-checked. Replies when the motion begins; `motion`
+    /// reports its progress.
     "move" Move -> MoveReply, check Move::valid;
-    /// Follows a trajectory. Answers when the motion begins.
+    /// Follows a trajectory. Replies when the motion begins.
     "execute" Execute -> ExecuteReply, check Execute::valid;
-    /// How a motion goes, or how it ended.
+    /// Progress or result of a motion.
     "motion" Motion -> MotionReport;
     /// Ends motions by decelerating within limits: those of a task, of an arm, or all.
     "cancel" Cancel -> CancelReply;
-    /// Latched hold at once, of one arm or of all: tasks cancelled, arms held until `arm_reset`. An operational stop.
+    /// Holds one arm or all at once: tasks end, arms are held until `arm_reset`. An operational stop.
     "stop" Stop -> StopReply;
     /// Clears a latched hold or a fault. Moves nothing, enables nothing.
     "arm_reset" ArmReset -> ArmReply;
-    /// Enables the motors and makes the arm ready for motion, where it is.
+    /// Enables the motors at the current position and makes the arm ready for motion.
     "arm_enable" ArmEnable -> ArmReply;
-    /// Disables the motors. An arm without brakes falls.
+    /// Decelerates the arm to rest and disables the motors. An arm without brakes falls.
     "arm_disable" ArmDisable -> ArmReply;
     /// Commands a gripper.
     "gripper" Gripper -> Done, check Gripper::valid;
@@ -182,33 +180,33 @@ methods! {
     "twist" Twist -> Done, check Twist::valid;
     /// Next target of a `cartesian_ik` task; repeat it within the task's timeout.
     "pose" Pose -> Done, check Pose::valid;
-    /// Plans a collision-free motion. Answers when planning begins; `planning` reports its progress. Moves nothing.
+    /// Plans a collision-free motion. Replies when planning begins; `planning` reports its progress. Moves nothing.
     "plan" Plan -> PlanReply, check Plan::valid;
-    /// How planning goes, or what came of it.
+    /// Progress or result of planning.
     "planning" Planning -> PlanningReport;
-    /// A plan in full: the trajectory, and the way of the end effectors.
+    /// A plan in full: the trajectory, and the paths of the end effectors.
     "preview" Preview -> PreviewReply;
-    /// Carries out a plan. Answers when the motion begins.
+    /// Executes a plan. Replies when the motion begins.
     "execute_plan" ExecutePlan -> ExecuteReply;
-    /// What the planner is and does.
+    /// The planner's state and robots.
     "planner" Planner -> PlannerReport;
     /// The objects of the planner's world.
     "world" World -> WorldReport;
-    /// Puts an object into the world, or another one in its place.
+    /// Adds an object to the world, or replaces the one of the same name.
     "world_add" WorldAdd -> Done, check WorldAdd::valid;
     /// Moves an object of the world.
     "world_move" WorldMove -> Done, check WorldMove::valid;
     /// Removes an object of the world, or all.
     "world_remove" WorldRemove -> Done;
-    /// Lets a robot hold an object, where it is now.
+    /// Attaches an object to a robot at its current pose.
     "attach" Attach -> Done;
-    /// Lets go of an object: it stays where it is.
+    /// Detaches an object; it stays at its current pose.
     "detach" Detach -> Done;
-    /// Ends the run exactly like SIGTERM: controlled. Answers before it begins.
+    /// Shuts the run down like SIGTERM. Replies before it begins.
     "shutdown" Shutdown -> Done;
 }
 
-/// Reads and checks the parameters of one method; absent ones stand for `{}`.
+/// Parses and checks the parameters of a method; null means `{}`.
 pub(super) fn read_params<M: Method>(params: Value) -> Result<M, RpcError> {
     let params = if params.is_null() { Value::Object(Default::default()) } else { params };
     let invalid = |what: String| RpcError::new(Code::InvalidParams, format!("params of {:?}: {what}", M::NAME));
@@ -232,11 +230,11 @@ pub struct State {}
 #[serde(deny_unknown_fields)]
 pub struct Shutdown {}
 
-/// Done; nothing to tell.
+/// Reply without data.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Done {}
 
-/// JSON has no infinities, but callers in this process do.
+/// Checks that all values are finite. JSON has only finite numbers, but callers in this process may pass others.
 pub(super) fn finite(field: &str, values: &[f64]) -> Result<(), String> {
     match values.iter().find(|v| !v.is_finite()) {
         Some(v) => Err(format!("{field} has the value {v}, which is not finite")),

@@ -1,4 +1,4 @@
-//! Parameters and replies of the methods that change what an arm is ready for.
+//! Parameters and replies of the methods for arms: stop, reset, enable, disable, leases, gripper.
 
 use std::collections::BTreeMap;
 
@@ -11,32 +11,32 @@ use super::api::{Method, finite};
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Stop {
-    /// Stops this arm only; without it, all.
+    /// The arm to stop; default: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub arm: Option<String>,
 }
 
-/// What `stop` achieved, per arm.
+/// Reply to `stop`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct StopReply {
     /// Confirmation per arm.
     pub arms: BTreeMap<String, Confirmation>,
 }
 
-/// How far a stop is known to have reached the arm.
+/// Whether an arm has received a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Confirmation {
-    /// The device answered that it stops.
+    /// The device confirmed the stop.
     Confirmed,
-    /// It was sent, but the device has not confirmed it (or has no way to).
+    /// It was sent, but the device did not confirm it in time, or cannot.
     SentNotConfirmed,
     /// The device could not be reached.
     NotSent,
 }
 
 impl Confirmation {
-    /// The words used in tables.
+    /// Returns the text for tables and messages.
     pub fn text(self) -> &'static str {
         match self {
             Self::Confirmed => "confirmed",
@@ -68,37 +68,37 @@ pub struct ArmEnable {
 pub struct ArmDisable {
     /// The arm's `hardware_id`.
     pub arm: String,
-    /// Switches the motors off at once, also while the arm moves. Without it the arm is brought to rest first.
+    /// Disables the motors at once, even while the arm moves; default: the arm decelerates to rest first.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub now: bool,
 }
 
-/// An arm after `arm_reset`, `arm_enable` or `arm_disable`.
+/// Reply to `arm_reset`, `arm_enable` and `arm_disable`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ArmReply {
     /// The arm's `hardware_id`.
     pub arm: String,
     /// Its phase now.
     pub phase: String,
-    /// What else there is to say about it.
+    /// Further information for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
 }
 
-/// Parameters of `lease`: takes the right to move one arm, or all, for this connection.
+/// Parameters of `lease`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Lease {
-    /// This arm only; without it, all.
+    /// The arm; default: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub arm: Option<String>,
 }
 
-/// Parameters of `release`: gives back what this connection took.
+/// Parameters of `release`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Release {
-    /// This arm only; without it, all.
+    /// The arm; default: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub arm: Option<String>,
 }
@@ -106,7 +106,7 @@ pub struct Release {
 /// Reply to `lease` and `release`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct LeaseReply {
-    /// The arms that were taken, or given back.
+    /// The arms that this connection now holds, or has released.
     pub arms: Vec<String>,
 }
 
@@ -133,6 +133,6 @@ pub struct Gripper {
 impl Gripper {
     pub(super) fn valid(&self) -> Result<(), String> {
         finite("position", &[self.position])?;
-        if self.position < 0.0 { Err(format!("position is {}, and cannot be negative", self.position)) } else { Ok(()) }
+        if self.position < 0.0 { Err(format!("position is {}, must not be negative", self.position)) } else { Ok(()) }
     }
 }

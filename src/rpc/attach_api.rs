@@ -1,5 +1,5 @@
-//! How a planner in another process and its run talk: the process connects like any client and registers; the run then
-//! sends it what planning is asked of it, as messages of the stream `planner_requests`, and it answers each with
+//! Protocol between a run and a planner in another process: the planner connects like any client and registers. The run
+//! then forwards planner requests as messages of the stream `planner_requests`; the planner answers each with
 //! `planner_answer`.
 
 use std::collections::BTreeMap;
@@ -12,28 +12,28 @@ use super::api::{Done, Method};
 use super::error::RpcError;
 use super::motion_api::Trajectory;
 
-/// Name of the stream of what a run asks its planner.
+/// Name of the stream of requests to an attached planner.
 pub const PLANNER_REQUESTS: &str = "planner_requests";
-/// Longest line of a connection that registered a planner, newline included [bytes]: plans are long.
+/// Maximum length of a line from an attached planner, including its newline [bytes]: plans are long.
 pub const MAX_ANSWER: usize = 16 << 20;
 
 /// Parameters of `register_planner`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RegisterPlanner {
-    /// What the planner is called, in `status`.
+    /// The planner's name in `status`.
     pub name: String,
     /// The robots that it plans for.
     pub robots: Vec<RegisteredRobot>,
 }
 
-/// A robot of a planner that registers.
+/// A robot of an attached planner.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RegisteredRobot {
     /// Its name in the planner.
     pub name: String,
-    /// The coordinator's joints that it has.
+    /// Its joints, by their names in the coordinator, in the order of joint goals.
     pub joints: Vec<String>,
     /// The trajectory task that executes its motions.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -43,13 +43,13 @@ pub struct RegisteredRobot {
 /// Reply to `register_planner`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Registered {
-    /// The run.
+    /// Name of the run.
     pub run: String,
-    /// How far and how fast each of the joints may be commanded.
+    /// Command limits of each joint.
     pub limits: BTreeMap<String, CommandLimits>,
 }
 
-/// How far and how fast a joint may be commanded.
+/// Limits of the commands to a joint.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CommandLimits {
     /// Lowest and highest position [rad]: the arm's own limits, narrowed by the blueprint, 0.01 rad inside.
@@ -62,30 +62,30 @@ pub struct CommandLimits {
     pub jerk: f64,
 }
 
-/// What a run asks its planner: `data` of a message of the stream `planner_requests`.
+/// A request to an attached planner: `data` of a message of the stream `planner_requests`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PlannerRequest {
-    /// Its number, for the answer.
+    /// Number of the request, for the answer.
     pub request: u64,
-    /// The method that was asked: `plan`, `world_add`, `cancel`, …
+    /// The method: `plan`, `world_add`, `cancel`, …
     pub method: String,
     /// Its parameters.
     #[serde(default)]
     pub params: Value,
-    /// What the run knows and the planner needs.
+    /// State of the run at the time of the request.
     #[serde(default)]
     pub moment: Moment,
 }
 
-/// What a planner needs to know of the run at the moment of a request.
+/// State of the run that a planner needs to answer a request.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Moment {
-    /// The number of the plan that begins now.
+    /// Number for a plan that this request begins.
     pub plan: u64,
-    /// Where joints are [rad]: where they are commanded to be, where positions are commanded. Without those whose arm
-    /// has not been heard of for 1 s.
+    /// Joint positions [rad]: commanded, or measured if the joint is not commanded in positions. Joints without a state
+    /// for 1 s are missing.
     pub positions: BTreeMap<String, f64>,
-    /// How far the grippers of arms are open, 0–1, by each of their arm's joints.
+    /// Opening of the gripper (0–1), listed for each joint of its arm.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub grippers: BTreeMap<String, f64>,
 }
@@ -96,52 +96,52 @@ pub struct Moment {
 pub struct PlannerAnswer {
     /// Number of the request.
     pub request: u64,
-    /// What the method replies; to `execute_plan`, a [`ReleasedPlan`].
+    /// Reply of the method; for `execute_plan`, a [`ReleasedPlan`].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub result: Option<Value>,
-    /// Why it is refused.
+    /// The error.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<RpcError>,
 }
 
-/// Name of what a run asks its planner after every change of the world, for each planned motion under way.
+/// Method that a run sends to its planner after every change of the world, for each planned motion in progress.
 pub const RECHECK: &str = "recheck";
 
 /// Parameters of `recheck`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Recheck {
-    /// The plan that is being carried out.
+    /// The plan that is being executed.
     pub plan: u64,
-    /// How far its motion is [s].
+    /// Elapsed time of its motion [s].
     pub elapsed: f64,
 }
 
 /// Reply to `recheck`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RecheckReply {
-    /// What is in the way of the rest of the motion.
+    /// What blocks the rest of the motion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub blocked: Option<BlockedReport>,
 }
 
-/// What is in the way of a motion.
+/// An obstacle to a motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BlockedReport {
-    /// Up to here the motion keeps its distance [s since its start].
+    /// Time up to which the motion keeps its clearance [s since its start].
     pub free_until: f64,
-    /// What is in the way, with names and distances.
+    /// Link, obstacle and distance, as text.
     pub what: String,
 }
 
-/// A plan that is still free, for the coordinator to execute.
+/// A plan that is still collision-free, for the coordinator to execute.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ReleasedPlan {
     /// The plan's number.
     pub plan: u64,
     /// Its motion.
     pub trajectory: Trajectory,
-    /// The task that executes it; without one, that whose joints cover it.
+    /// The task that executes it; default: the one whose joints cover it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
 }
@@ -149,10 +149,10 @@ pub struct ReleasedPlan {
 impl RegisterPlanner {
     fn valid(&self) -> Result<(), String> {
         if self.name.is_empty() || self.name.len() > 64 || self.name.chars().any(char::is_control) {
-            return Err("name must have 1 to 64 characters, and no control characters".into());
+            return Err("name must have 1 to 64 characters without control characters".into());
         }
         if self.robots.is_empty() || self.robots.iter().any(|robot| robot.joints.is_empty()) {
-            return Err("a planner has robots, and a robot has joints".into());
+            return Err("a planner needs robots, and each robot needs joints".into());
         }
         Ok(())
     }
@@ -174,7 +174,7 @@ impl Method for PlannerAnswer {
     fn check(&self) -> Result<(), String> {
         match (&self.result, &self.error) {
             (Some(_), None) | (None, Some(_)) => Ok(()),
-            _ => Err("an answer has a result or an error".into()),
+            _ => Err("an answer must have either a result or an error".into()),
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Parameters of the methods that stream targets of an end effector.
+//! Parameters of the methods that stream end-effector targets.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -12,23 +12,23 @@ use super::planner_api::PoseSpec;
 pub struct Twist {
     /// The `eef_twist` task's name.
     pub task: String,
-    /// Velocity of the end effector's origin: x, y, z [m/s].
+    /// Linear velocity of the end effector's origin along x, y, z [m/s].
     pub linear: [f64; 3],
-    /// Angular velocity of the end effector: about x, y, z [rad/s].
+    /// Angular velocity of the end effector about x, y, z [rad/s].
     pub angular: [f64; 3],
-    /// Whose axes those are.
+    /// Frame whose axes x, y, z are.
     #[serde(default)]
     pub frame: TwistFrame,
 }
 
-/// Whose axes the parts of a twist are along.
+/// Frame of a twist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum TwistFrame {
-    /// Those of the robot's base.
+    /// The robot's base.
     #[default]
     Base,
-    /// Those of the end effector itself.
+    /// The end effector.
     Tool,
 }
 
@@ -50,13 +50,13 @@ pub struct Pose {
     /// Its roll, pitch, yaw about fixed axes [rad].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rpy: Option<[f64; 3]>,
-    /// A quaternion x, y, z, w, in place of `rpy`.
+    /// Its orientation as a quaternion x, y, z, w, instead of `rpy`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quat: Option<[f64; 4]>,
 }
 
 impl Pose {
-    /// The target without the task.
+    /// Returns the target pose.
     pub fn spec(&self) -> PoseSpec {
         PoseSpec { xyz: self.xyz, rpy: self.rpy, quat: self.quat }
     }
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn targets_that_cannot_be_meant_are_refused() {
+    fn invalid_targets_are_refused() {
         let refused = |method: &str, params: serde_json::Value| Request::read(method, params).unwrap_err().message;
         let pose = |more: serde_json::Value| {
             let mut params = json!({"task": "t", "xyz": [0.3, 0, 0.4]});

@@ -1,4 +1,4 @@
-//! The other end of the socket: a blocking client, for the command line and for programs.
+//! A blocking client of a run's socket, for the command line and for programs.
 
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Write};
@@ -10,71 +10,71 @@ use serde_json::{Value, json};
 
 use super::api::{MAX_LINE, Method};
 use super::error::{Code, RpcError};
-use super::place::{LiveRun, PlaceError, RunFolder};
-use super::server::CALL_LIMIT;
+use super::run_dir::{LiveRun, RunDir, RunDirError};
+use super::server::CALL_TIMEOUT;
 use super::wire::Incoming;
 use crate::yaml::{did_you_mean, quote};
 
-/// How long to wait for a reply: a little longer than the run takes to give up.
-const PATIENCE: Duration = CALL_LIMIT.saturating_add(Duration::from_secs(2));
-/// Stream messages kept while a reply is awaited; older ones are lost and counted.
-const KEPT: usize = 1024;
+/// Timeout for a reply: a little longer than the run's own.
+const REPLY_TIMEOUT: Duration = CALL_TIMEOUT.saturating_add(Duration::from_secs(2));
+/// Stream messages buffered while waiting for a reply; older ones are dropped and counted.
+const MAX_BUFFERED: usize = 1024;
 
-/// Why a client got no reply.
+/// Why a request has no result.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
     /// No run is live.
     #[error("no run is live")]
     NoRun,
-    /// Several runs live, and none was named.
+    /// Several runs are live, and none was selected.
     #[error("several runs are live: {}", names(.0))]
     SeveralRuns(Vec<LiveRun>),
-    /// No live run has the name.
+    /// No live run has this name.
     #[error("no live run is named {}", quote(name))]
     UnknownRun {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The runs that live.
+        /// The live runs.
         live: Vec<LiveRun>,
     },
-    /// The folder of the sockets cannot be read.
+    /// The run directory cannot be read.
     #[error(transparent)]
-    Place(#[from] PlaceError),
+    RunDir(#[from] RunDirError),
     /// The connection failed or broke.
     #[error("run {run:?}: {error}")]
     Io {
         /// The run's name.
         run: String,
-        /// What the system said.
+        /// The system's error.
         error: io::Error,
     },
-    /// The run answered what it should not.
-    #[error("run {run:?} answered what cannot be read: {what}")]
+    /// The reply is not valid.
+    #[error("run {run:?}: invalid reply: {what}")]
     Protocol {
         /// The run's name.
         run: String,
-        /// What was wrong.
+        /// What is wrong.
         what: String,
     },
-    /// The run refused.
+    /// The run refused the request.
     #[error(transparent)]
     Refused(#[from] RpcError),
 }
 
 impl ClientError {
-    /// What to do about it.
+    /// Returns what the user can do about it.
     pub fn hint(&self) -> Option<String> {
         match self {
             Self::NoRun => Some("start one: dimos run coordinator-yourarm".into()),
-            Self::SeveralRuns(_) => Some("say which with --run NAME".into()),
+            Self::SeveralRuns(_) => Some("select one with --run NAME".into()),
             Self::UnknownRun { live, .. } if live.is_empty() => Self::NoRun.hint(),
             Self::UnknownRun { name, live } => did_you_mean(name, live.iter().map(|r| r.name.as_str()), "live"),
-            Self::Place(error) => Some(error.hint().into()),
+            Self::RunDir(error) => Some(error.hint().into()),
             Self::Io { error, .. } if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
                 Some("the process is live but does not answer; its log may say why".into())
             }
             Self::Io { .. } => Some("the run is starting or has just ended; see `dimos status`".into()),
-            Self::Protocol { .. } => Some("is it another version of dimos?".into()),
+            Self::Protocol { .. } => Some("the run may be another version of dimos: `dimos status` shows it".into()),
             Self::Refused(error) => error.hint.clone(),
         }
     }
@@ -87,13 +87,13 @@ fn names(runs: &[LiveRun]) -> String {
 /// A message of a subscription.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
-    /// The stream's name.
+    /// Name of the stream.
     pub stream: String,
-    /// The subscription's number.
+    /// Number of the subscription.
     pub subscription: u64,
-    /// How many messages this reader missed before this one.
+    /// Messages that this client missed just before this one.
     pub lost: u64,
-    /// What was published.
+    /// The published value.
     pub data: Value,
 }
 
@@ -103,11 +103,11 @@ pub struct Client {
     run: String,
     from: BufReader<UnixStream>,
     next: u64,
-    kept: VecDeque<Message>,
+    buffered: VecDeque<Message>,
 }
 
-/// The live run of a name or, without one, the only live run.
-pub fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun, ClientError> {
+/// Returns the live run of this name; without a name, the only live run.
+pub fn find(folder: &RunDir, name: Option<&str>) -> Result<LiveRun, ClientError> {
     let mut live = folder.runs()?;
     match name {
         Some(name) => match live.iter().position(|run| run.name == name) {
@@ -120,41 +120,41 @@ pub fn find(folder: &RunFolder, name: Option<&str>) -> Result<LiveRun, ClientErr
 }
 
 impl Client {
-    /// Connects to the run of a name or, without one, to the only live run.
-    pub fn find(folder: &RunFolder, name: Option<&str>) -> Result<Self, ClientError> {
+    /// Connects to the run of this name; without a name, to the only live run.
+    pub fn find(folder: &RunDir, name: Option<&str>) -> Result<Self, ClientError> {
         let run = find(folder, name)?;
         Self::connect(&run.name, &run.socket)
     }
 
-    /// Connects to a socket; `run` is for messages.
+    /// Connects to a socket; `run` is the name used in errors.
     pub fn connect(run: &str, socket: &Path) -> Result<Self, ClientError> {
         let connect = || {
             let stream = UnixStream::connect(socket)?;
-            stream.set_read_timeout(Some(PATIENCE))?;
-            stream.set_write_timeout(Some(PATIENCE))?;
+            stream.set_read_timeout(Some(REPLY_TIMEOUT))?;
+            stream.set_write_timeout(Some(REPLY_TIMEOUT))?;
             Ok(stream)
         };
         let stream = connect().map_err(|error| ClientError::Io { run: run.to_owned(), error })?;
-        Ok(Self { run: run.to_owned(), from: BufReader::new(stream), next: 1, kept: VecDeque::new() })
+        Ok(Self { run: run.to_owned(), from: BufReader::new(stream), next: 1, buffered: VecDeque::new() })
     }
 
-    /// The run's name.
+    /// Returns the run's name.
     pub fn run(&self) -> &str {
         &self.run
     }
 
-    /// Asks, and waits for the answer. Stream messages that come meanwhile are kept for
+    /// Sends a request and waits for its reply. Buffers stream messages that arrive meanwhile for
     /// [`next_message`](Self::next_message).
     pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
         let id = self.next;
         self.next += 1;
         let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
         if line.len() > MAX_LINE {
-            let text = format!("the request is {} bytes long, and may be {MAX_LINE}", line.len());
-            return Err(RpcError::new(Code::TooLarge, text).hint("send less at once: fewer points").into());
+            let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
+            return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());
         }
         if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
-            // A run that refuses the connection says so before it closes.
+            // A run that refuses the connection sends the reason before it closes it.
             return Err(match self.read() {
                 Ok(Incoming { error: Some(refusal), .. }) => refusal.into(),
                 _ => self.io(error),
@@ -163,13 +163,13 @@ impl Client {
         loop {
             let incoming = self.read()?;
             if incoming.stream.is_some() {
-                if self.kept.len() == KEPT
-                    && let Some(lost) = self.kept.pop_front()
-                    && let Some(next) = self.kept.front_mut()
+                if self.buffered.len() == MAX_BUFFERED
+                    && let Some(lost) = self.buffered.pop_front()
+                    && let Some(next) = self.buffered.front_mut()
                 {
                     next.lost += lost.lost + 1;
                 }
-                self.kept.push_back(message(incoming));
+                self.buffered.push_back(message(incoming));
             } else if let Some(refusal) = incoming.error {
                 return Err(refusal.into());
             } else if incoming.id == Some(id) {
@@ -180,7 +180,7 @@ impl Client {
 
     /// Waits for the next message of any subscription.
     pub fn next_message(&mut self) -> Result<Message, ClientError> {
-        if let Some(message) = self.kept.pop_front() {
+        if let Some(message) = self.buffered.pop_front() {
             return Ok(message);
         }
         loop {
@@ -191,9 +191,9 @@ impl Client {
         }
     }
 
-    /// The next message that came while a reply was awaited, if there is one: waits for nothing.
-    pub fn kept_message(&mut self) -> Option<Message> {
-        self.kept.pop_front()
+    /// Returns the next buffered message, if any. Never blocks.
+    pub fn buffered_message(&mut self) -> Option<Message> {
+        self.buffered.pop_front()
     }
 
     fn read(&mut self) -> Result<Incoming, ClientError> {

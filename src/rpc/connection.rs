@@ -1,8 +1,8 @@
-//! One client's conversation: requests are answered in their order, subscriptions run beside them, and a writer sends
-//! what both have to say. Every queue is bounded: who does not read is not read from either.
+//! The connection of one client: answers its requests in order, while its subscriptions send their messages. Every
+//! queue is bounded; the requests of a client that does not read its replies are not read either.
 //!
-//! A request is done before the next one begins, except that targets of a stream are handed on as they come: each is
-//! answered by the tick that takes it, and the next ones may be on their way before that.
+//! Each request completes before the next one begins, except targets of a stream: several may be pending until the tick
+//! answers them.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::future::{Future, poll_fn, ready};
@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 use serde_json::Value;
-use tokio::io::{AsyncBufRead, AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::io::{AsyncBufRead, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::net::unix::OwnedWriteHalf;
 use tokio::sync::mpsc;
@@ -24,31 +24,32 @@ use super::api::{
     Backend, Done, Lease, LeaseReply, MAX_ANSWER, MAX_LINE, MAX_SUBSCRIPTIONS, Method, PlannerAnswer, RegisterPlanner,
     Registered, Release, Reply, Request, read_params,
 };
+use super::connection_limit::Permit;
 use super::error::{Code, RpcError};
 use super::lease::{Leases, Lessee, Subject};
-use super::planner_line::PlannerLine;
-use super::seats::Seat;
-use super::server::CALL_LIMIT;
+use super::line_reader::{Line, read_line, skip_line};
+use super::planner_proxy::PlannerProxy;
+use super::server::CALL_TIMEOUT;
 use super::streams::{Subscribe, SubscribeReply, Unsubscribe};
-use super::subscription::{Pace, Subscription};
-use super::urgent::Arrival;
+use super::subscription::{RateLimit, Subscription};
+use super::urgent::Transfer;
 use super::wire;
 
-/// Lines that wait for a client to read them.
+/// Maximum number of lines queued for the client.
 const QUEUE: usize = 64;
-/// Targets of one client that may wait for the tick at once.
-const IN_FLIGHT: usize = 32;
-/// A connection that is silent for this long is given back.
-const SILENT_FOR: Duration = Duration::from_millis(250);
-/// Time for the client to take the last replies, and for the rest of an oversize line to pass.
-const FAREWELL: Duration = Duration::from_secs(1);
+/// Maximum number of pending targets of one client.
+const MAX_PENDING: usize = 32;
+/// Silence after which a connection returns to the thread that accepts connections.
+const RETURN_AFTER: Duration = Duration::from_millis(250);
+/// Maximum time for the client to take the last replies, and for discarding the rest of a line that is too long.
+const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Serves one client until it closes its end, sends a line that is too long, or must make room. Gives back a connection
-/// that says nothing for a while: its next request may be one of those that always get through.
-pub(super) async fn serve(arrival: Arrival, backend: Arc<dyn Backend>) -> Option<Arrival> {
-    let Arrival { stream, read, lessee, seat } = arrival;
+/// Serves one client until it closes its end, sends a line that is too long, or must make room for another connection.
+/// Returns a connection that is silent for a while: its next request may be one of those that always get through.
+pub(super) async fn serve(transfer: Transfer, backend: Arc<dyn Backend>) -> Option<Transfer> {
+    let Transfer { stream, read, lessee, permit } = transfer;
     let stream =
-        UnixStream::from_std(stream).inspect_err(|e| tracing::warn!("rpc: a connection was not taken: {e}")).ok()?;
+        UnixStream::from_std(stream).inspect_err(|e| tracing::warn!("rpc: cannot serve a connection: {e}")).ok()?;
     let (from_client, to_client) = stream.into_split();
     let (queue, waiting) = mpsc::channel(QUEUE);
     let mut writer = tokio::spawn(write(to_client, waiting));
@@ -56,37 +57,37 @@ pub(super) async fn serve(arrival: Arrival, backend: Arc<dyn Backend>) -> Option
     let connection = Connection {
         backend,
         lessee,
-        seat,
+        permit,
         queue,
-        in_flight: VecDeque::new(),
+        pending: VecDeque::new(),
         running: JoinSet::new(),
         subscriptions: BTreeMap::new(),
         next: 1,
         planner: None,
     };
-    let Some((lessee, seat)) = connection.converse(&mut from_client).await else {
-        if timeout(FAREWELL, &mut writer).await.is_err() {
+    let Some((lessee, permit)) = connection.answer_requests(&mut from_client).await else {
+        if timeout(CLOSE_TIMEOUT, &mut writer).await.is_err() {
             writer.abort();
         }
         return None;
     };
     let written = tokio::select! {
-        // A client that does not read its last replies is not read from either.
+        // The client may be slow to read its last replies.
         written = &mut writer => written.ok().flatten()?,
-        _ = seat.must_leave() => {
+        _ = permit.evicted() => {
             writer.abort();
             return None;
         }
     };
     let (_, from_client) = from_client.into_inner().into_inner();
     let stream = from_client.reunite(written).ok()?.into_std().ok()?;
-    Some(Arrival { stream, read: Vec::new(), lessee, seat })
+    Some(Transfer { stream, read: Vec::new(), lessee, permit })
 }
 
-/// Gives its half back when nothing more is to be written.
+/// Writes the queued lines; returns its half of the socket when the queue is closed and empty.
 async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) -> Option<OwnedWriteHalf> {
     while let Some(line) = waiting.recv().await {
-        // The client is gone; dropping the queue ends the rest of the conversation.
+        // If the client has disconnected, dropping the queue ends the connection.
         to.write_all(line.as_bytes()).await.ok()?;
     }
     Some(to)
@@ -94,84 +95,86 @@ async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) -> O
 
 struct Connection {
     backend: Arc<dyn Backend>,
-    /// What it holds of the leases; they end with the conversation.
+    /// Its leases; released with the connection.
     lessee: Lessee,
-    /// Its place among the connections.
-    seat: Seat,
+    permit: Permit,
     queue: mpsc::Sender<String>,
     /// Targets that the tick has not answered yet, the oldest first.
-    in_flight: VecDeque<InFlight>,
+    pending: VecDeque<PendingTarget>,
     /// The subscriptions' tasks; dropping the set ends them.
     running: JoinSet<()>,
     subscriptions: BTreeMap<u64, AbortHandle>,
+    /// Number of the next subscription.
     next: u64,
-    /// The line to the planner that registered here.
-    planner: Option<PlannerHere>,
+    /// The planner that registered on this connection.
+    planner: Option<RegisteredPlanner>,
 }
 
-/// A planner's line, closed with its connection.
-struct PlannerHere(Arc<PlannerLine>);
+/// A registered planner; closed when dropped.
+struct RegisteredPlanner(Arc<PlannerProxy>);
 
-impl Drop for PlannerHere {
+impl Drop for RegisteredPlanner {
     fn drop(&mut self) {
         self.0.close();
     }
 }
 
-/// The answer to a request, when it comes.
+/// Future result of a request.
 type Answer = Pin<Box<dyn Future<Output = Result<Reply, RpcError>> + Send>>;
 
 /// A target that the tick has not answered yet.
-struct InFlight {
+struct PendingTarget {
     id: Value,
-    /// The arms whose leases it needs.
+    /// Arms whose leases it needs.
     arms: Vec<String>,
     answer: Answer,
 }
 
-/// The client is gone.
-struct Gone;
+/// The client has disconnected.
+struct Disconnected;
 
 impl Connection {
-    /// Answers requests until the connection ends (`None`), or says nothing for a while.
-    async fn converse(mut self, from: &mut (impl AsyncBufRead + Unpin)) -> Option<(Lessee, Seat)> {
+    /// Answers requests until the connection ends (`None`) or is silent for [`RETURN_AFTER`].
+    async fn answer_requests(mut self, from: &mut (impl AsyncBufRead + Unpin)) -> Option<(Lessee, Permit)> {
         let mut line = Vec::new();
         loop {
-            let longest = self.longest();
-            if self.in_flight.is_empty() {
-                self.seat.pin(!self.subscriptions.is_empty() || self.planner.is_some());
-                self.seat.rest();
+            let max_line = self.max_line();
+            if self.pending.is_empty() {
+                self.permit.set_pinned(!self.subscriptions.is_empty() || self.planner.is_some());
+                self.permit.set_idle();
             }
             let read = tokio::select! {
                 biased;
-                reason = self.seat.must_leave() => {
-                    let _ = timeout(FAREWELL, self.reply::<Done>(&Value::Null, Err(reason))).await;
+                reason = self.permit.evicted() => {
+                    let _ = timeout(CLOSE_TIMEOUT, self.reply::<Done>(&Value::Null, Err(reason))).await;
                     return None;
                 }
-                done = oldest(&mut self.in_flight), if !self.in_flight.is_empty() => {
+                done = oldest(&mut self.pending), if !self.pending.is_empty() => {
                     if self.send_oldest(done).await.is_err() {
                         return None;
                     }
                     continue;
                 }
-                // Before the line, so that nothing is read that would be lost; a partial line belongs here.
-                () = sleep(SILENT_FOR), if line.is_empty() && self.is_plain() => Line::Nothing,
-                // Begins again where it was when an answer came first: what it read so far is in `line`.
-                read = read_line(from, &mut line, longest), if self.in_flight.len() < IN_FLIGHT => read,
+                // Polled before the line, so that no bytes are read that would be lost with the transfer.
+                () = sleep(RETURN_AFTER), if line.is_empty() && self.is_plain() => {
+                    if line.is_empty() {
+                        return Some((self.lessee, self.permit));
+                    }
+                    continue;
+                }
+                read = read_line(from, &mut line, max_line), if self.pending.len() < MAX_PENDING => read,
             };
             match read {
-                Line::Whole => self.seat.begin(),
-                Line::Nothing if line.is_empty() => return Some((self.lessee, self.seat)),
-                Line::Nothing => continue,
+                Line::Complete => self.permit.set_busy(),
                 Line::End => {
-                    let _ = self.settle().await;
+                    let _ = self.finish_pending().await;
                     return None;
                 }
                 Line::TooLong => {
-                    let error = RpcError::new(Code::TooLarge, format!("the line is longer than {longest} bytes"));
+                    let error = RpcError::new(Code::TooLarge, format!("the line is longer than {max_line} bytes"));
                     let error = error.hint("send less at once; the connection is closed now");
                     let _ = self.reply::<Done>(&Value::Null, Err(error)).await;
-                    let _ = timeout(FAREWELL, skip_line(from)).await;
+                    let _ = timeout(CLOSE_TIMEOUT, skip_line(from)).await;
                     return None;
                 }
             }
@@ -184,10 +187,10 @@ impl Connection {
 
     /// Returns whether the connection only sends requests and receives replies.
     fn is_plain(&self) -> bool {
-        self.in_flight.is_empty() && self.next == 1 && self.planner.is_none()
+        self.pending.is_empty() && self.next == 1 && self.planner.is_none()
     }
 
-    async fn answer(&mut self, line: &[u8]) -> Result<(), Gone> {
+    async fn answer(&mut self, line: &[u8]) -> Result<(), Disconnected> {
         let wire::Envelope { id, method, params } = match wire::read(line) {
             Ok(envelope) => envelope,
             Err((id, error)) => return self.reply::<Done>(&id, Err(error)).await,
@@ -211,7 +214,7 @@ impl Connection {
                 self.reply(&id, result).await
             }
             Release::NAME => {
-                self.settle().await?; // targets that are on their way were sent under the lease
+                self.finish_pending().await?; // the pending targets were sent under the lease
                 let result = self.release(params);
                 self.reply(&id, result).await
             }
@@ -230,7 +233,7 @@ impl Connection {
         }
     }
 
-    async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Gone> {
+    async fn request(&mut self, id: Value, method: String, request: Request) -> Result<(), Disconnected> {
         let (request, arms) = match self.lessee.admit(request, &*self.backend).await {
             Ok(admitted) => admitted,
             Err(refusal) => return self.reply::<Done>(&id, Err(refusal)).await,
@@ -239,16 +242,16 @@ impl Connection {
             matches!(request, Request::Servo(_) | Request::Velocity(_) | Request::Twist(_) | Request::Pose(_));
         let mut answer = self.call(method, request);
         if !is_target {
-            self.settle().await?;
+            self.finish_pending().await?;
             let result = answer.await;
-            self.lessee.settle(&arms, is_taken_on(&result));
+            self.lessee.settle(&arms, may_take_effect(&result));
             return self.reply(&id, result).await;
         }
-        // Polled once, it is on its way to the tick, whatever is read next.
+        // The first poll sends it to the tick.
         if let Poll::Ready(result) = poll_fn(|cx| Poll::Ready(answer.as_mut().poll(cx))).await {
             answer = Box::pin(ready(result));
         }
-        self.in_flight.push_back(InFlight { id, arms, answer });
+        self.pending.push_back(PendingTarget { id, arms, answer });
         Ok(())
     }
 
@@ -257,22 +260,22 @@ impl Connection {
         Box::pin(async move { answer(&method, backend.call(request), &leases).await })
     }
 
-    /// Waits for the answers to all targets that are on their way.
-    async fn settle(&mut self) -> Result<(), Gone> {
-        while !self.in_flight.is_empty() {
-            let done = oldest(&mut self.in_flight).await;
+    /// Waits for the answers to all pending targets and sends them.
+    async fn finish_pending(&mut self) -> Result<(), Disconnected> {
+        while !self.pending.is_empty() {
+            let done = oldest(&mut self.pending).await;
             self.send_oldest(done).await?;
         }
         Ok(())
     }
 
-    async fn send_oldest(&mut self, result: Result<Reply, RpcError>) -> Result<(), Gone> {
-        match self.in_flight.pop_front() {
-            Some(InFlight { id, arms, .. }) => {
-                let taken_on = is_taken_on(&result);
-                // While more targets are on their way, the last of them decides.
-                if taken_on || self.in_flight.is_empty() {
-                    self.lessee.settle(&arms, taken_on);
+    async fn send_oldest(&mut self, result: Result<Reply, RpcError>) -> Result<(), Disconnected> {
+        match self.pending.pop_front() {
+            Some(PendingTarget { id, arms, .. }) => {
+                let keeps_lease = may_take_effect(&result);
+                // If more targets are pending, the last of them decides.
+                if keeps_lease || self.pending.is_empty() {
+                    self.lessee.settle(&arms, keeps_lease);
                 }
                 self.send(wire::reply(&id, result)).await
             }
@@ -280,28 +283,28 @@ impl Connection {
         }
     }
 
-    /// Sends a reply, after those to all requests before.
-    async fn reply<T: Serialize>(&mut self, id: &Value, result: Result<T, RpcError>) -> Result<(), Gone> {
-        self.settle().await?;
+    /// Sends a reply, after the replies to all previous requests.
+    async fn reply<T: Serialize>(&mut self, id: &Value, result: Result<T, RpcError>) -> Result<(), Disconnected> {
+        self.finish_pending().await?;
         self.send(wire::reply(id, result)).await
     }
 
-    /// Longest line that is taken.
-    fn longest(&self) -> usize {
+    /// Returns the maximum length of a request line [bytes].
+    fn max_line(&self) -> usize {
         if self.planner.is_some() { MAX_ANSWER } else { MAX_LINE }
     }
 
     fn register_planner(&mut self, params: Value) -> Result<Registered, RpcError> {
         let planner: RegisterPlanner = read_params(params)?;
-        let line = Arc::new(PlannerLine::new(self.queue.clone(), self.lessee.pid()));
-        let registered = self.backend.register_planner(planner, line.clone())?;
-        self.planner = Some(PlannerHere(line));
+        let proxy = Arc::new(PlannerProxy::new(self.queue.clone(), self.lessee.pid()));
+        let registered = self.backend.register_planner(planner, proxy.clone())?;
+        self.planner = Some(RegisteredPlanner(proxy));
         Ok(registered)
     }
 
     fn planner_answer(&self, params: Value) -> Result<Done, RpcError> {
         match &self.planner {
-            Some(PlannerHere(planner)) => planner.answered(read_params(params)?),
+            Some(RegisteredPlanner(planner)) => planner.deliver(read_params(params)?),
             None => return Err(RpcError::new(Code::InvalidParams, "this connection registered no planner")),
         }
         Ok(Done {})
@@ -336,7 +339,8 @@ impl Connection {
         let number = self.next;
         self.next += 1;
         let from = self.backend.streams().reader(wanted.stream);
-        let subscription = Subscription { number, stream: wanted.stream.name(), from, pace: Pace::of(wanted.rate) };
+        let subscription =
+            Subscription { number, stream: wanted.stream.name(), from, limit: RateLimit::new(wanted.rate) };
         Ok((SubscribeReply { subscription: number }, subscription))
     }
 
@@ -354,81 +358,35 @@ impl Connection {
         }
     }
 
-    /// Waits for room in the queue, so a client that does not read is not read from.
-    async fn send(&mut self, line: String) -> Result<(), Gone> {
-        self.queue.send(line).await.map_err(|_| Gone)
+    /// Queues a line; waits while the queue is full.
+    async fn send(&mut self, line: String) -> Result<(), Disconnected> {
+        self.queue.send(line).await.map_err(|_| Disconnected)
     }
 }
 
-/// Whether a request takes effect, or may: what is not answered in time was not refused.
-fn is_taken_on(result: &Result<Reply, RpcError>) -> bool {
+/// Returns whether a request may take effect: it was accepted, or not answered in time.
+fn may_take_effect(result: &Result<Reply, RpcError>) -> bool {
     result.as_ref().map_or_else(|error| error.code == Code::NoAnswer, |_| true)
 }
 
-/// Waits for what the run answers, not for ever.
+/// Waits for the run's answer, at most [`CALL_TIMEOUT`].
 pub(super) async fn answer(
     method: &str,
     call: impl Future<Output = Result<Reply, RpcError>>,
     leases: &Leases,
 ) -> Result<Reply, RpcError> {
-    let Ok(result) = timeout(CALL_LIMIT, call).await else {
-        let waited = CALL_LIMIT.as_secs();
+    let Ok(result) = timeout(CALL_TIMEOUT, call).await else {
+        let waited = CALL_TIMEOUT.as_secs();
         let error = RpcError::new(Code::NoAnswer, format!("{method:?} was not answered within {waited} s"));
         return Err(error.hint("it may still take effect; ask for `status`"));
     };
     result.map(|reply| leases.complete(reply))
 }
 
-/// The answer to the oldest target that is on its way. Once it has come, the target must be taken out.
-async fn oldest(in_flight: &mut VecDeque<InFlight>) -> Result<Reply, RpcError> {
-    match in_flight.front_mut() {
-        Some(InFlight { answer, .. }) => answer.await,
+/// Waits for the answer to the oldest pending target, which must then be removed.
+async fn oldest(pending: &mut VecDeque<PendingTarget>) -> Result<Reply, RpcError> {
+    match pending.front_mut() {
+        Some(PendingTarget { answer, .. }) => answer.await,
         None => std::future::pending().await,
-    }
-}
-
-enum Line {
-    Whole,
-    /// Not even a part of one, for a while.
-    Nothing,
-    End,
-    TooLong,
-}
-
-/// Reads a line of at most `longest` bytes. What comes after the last newline is no line.
-async fn read_line(from: &mut (impl AsyncBufRead + Unpin), line: &mut Vec<u8>, longest: usize) -> Line {
-    loop {
-        let chunk = match from.fill_buf().await {
-            Ok([]) | Err(_) => return Line::End,
-            Ok(chunk) => chunk,
-        };
-        let (take, whole) = match chunk.iter().position(|b| *b == b'\n') {
-            Some(at) => (at + 1, true),
-            None => (chunk.len(), false),
-        };
-        if line.len() + take > longest {
-            return Line::TooLong;
-        }
-        line.extend(chunk.iter().take(take));
-        from.consume(take);
-        if whole {
-            return Line::Whole;
-        }
-    }
-}
-
-/// Lets the rest of a line pass, so that its sender gets to read why it was refused.
-async fn skip_line(from: &mut (impl AsyncBufRead + Unpin)) {
-    loop {
-        let chunk = match from.fill_buf().await {
-            Ok([]) | Err(_) => return,
-            Ok(chunk) => chunk,
-        };
-        let end = chunk.iter().position(|b| *b == b'\n');
-        let take = end.map_or(chunk.len(), |at| at + 1);
-        from.consume(take);
-        if end.is_some() {
-            return;
-        }
     }
 }

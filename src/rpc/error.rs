@@ -1,4 +1,4 @@
-//! How a request is refused: a code for programs, a sentence and a hint for people.
+//! Errors of requests: a code for programs, a message and a hint for people.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -7,7 +7,7 @@ use serde_json::Value;
 use crate::telemetry::Outcome;
 use crate::yaml::{did_you_mean, quote};
 
-/// What went wrong, for programs. In JSON: `START_STATE_MISMATCH`.
+/// Error code for programs; in JSON: `START_STATE_MISMATCH`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum Code {
@@ -15,9 +15,9 @@ pub enum Code {
     Malformed,
     /// The line is longer than [`MAX_LINE`](super::api::MAX_LINE); the connection ends.
     TooLarge,
-    /// The run has as many connections as it takes; the connection ends.
+    /// The run has the maximum number of connections, or closed this idle one; the connection ends.
     TooManyConnections,
-    /// The connection has as many subscriptions as it may.
+    /// The connection has the maximum number of subscriptions.
     TooManySubscriptions,
     /// The socket belongs to another user; the connection ends.
     Forbidden,
@@ -29,21 +29,21 @@ pub enum Code {
     UnknownArm,
     /// No such task in the run.
     UnknownTask,
-    /// No such motion, or one too long ago.
+    /// No such motion, or it is too old.
     UnknownMotion,
     /// No such subscription on this connection.
     UnknownSubscription,
-    /// Another connection commands the arm; the refusal names it.
+    /// Another connection holds the arm's lease; the message names its process.
     LeaseHeld,
     /// The run has no planner.
     NoPlanner,
-    /// The run has a planner, and takes no second one.
+    /// The run already has a planner.
     HasPlanner,
     /// No such robot in the planner.
     UnknownRobot,
-    /// No such plan, or one too long ago.
+    /// No such plan, or it is too old.
     UnknownPlan,
-    /// The world has changed since the plan was made, and something is in its way now.
+    /// The world has changed since the plan was made, and now blocks it.
     PlanOutdated,
     /// No such object in the world.
     UnknownObject,
@@ -51,11 +51,11 @@ pub enum Code {
     Planning,
     /// No trajectory task covers these joints.
     NoTrajectoryTask,
-    /// The trajectory is not well-formed: empty, not increasing in time, wrong widths.
+    /// The trajectory is invalid: empty, times that do not increase, wrong number of values.
     InvalidTrajectory,
     /// The task is executing already.
     AlreadyExecuting,
-    /// The trajectory does not start where the arm is.
+    /// The trajectory does not start at the arm's position.
     StartStateMismatch,
     /// No fresh state of the arm.
     StartStateUnavailable,
@@ -65,7 +65,7 @@ pub enum Code {
     ArmLatched,
     /// The fault that latched the arm is still present.
     StillFaulted,
-    /// The task cannot do that.
+    /// The task does not support the request.
     WrongTask,
     /// A number is not finite.
     NonFinite,
@@ -75,9 +75,9 @@ pub enum Code {
     NoGripper,
     /// The arm or the run lacks this feature.
     Unsupported,
-    /// The arm's device did not do it; the message has its words.
+    /// The arm's controller refused; the message has its text.
     DeviceRefused,
-    /// The run is ending.
+    /// The run is shutting down.
     ShuttingDown,
     /// The run did not answer in time; the request may still take effect.
     NoAnswer,
@@ -89,12 +89,12 @@ pub enum Code {
 }
 
 impl Code {
-    /// The word used in JSON and messages.
+    /// Returns the code as in JSON and messages.
     pub fn name(self) -> String {
         serde_json::to_value(self).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
     }
 
-    /// The code of a refusal by the tick; `None` where the request was taken on.
+    /// Returns the code of a refusal by the tick; `None` if the request was accepted.
     pub fn of(outcome: &Outcome) -> Option<Self> {
         match outcome {
             Outcome::Accepted | Outcome::Cancelled | Outcome::AlreadyStopped => None,
@@ -118,37 +118,37 @@ impl Code {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, thiserror::Error)]
 #[error("{message}")]
 pub struct RpcError {
-    /// What went wrong, for programs.
+    /// Error code for programs.
     pub code: Code,
-    /// What went wrong and where, in a sentence without full stop.
+    /// What went wrong, without full stop.
     pub message: String,
     /// What to do about it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub hint: Option<String>,
-    /// Figures that belong to it: the joint, the amount.
+    /// Details for programs: the joint, the amount.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub data: Option<Value>,
 }
 
 impl RpcError {
-    /// A refusal without hint or data.
+    /// Creates an error without hint and data.
     pub fn new(code: Code, message: impl Into<String>) -> Self {
         Self { code, message: message.into(), hint: None, data: None }
     }
 
-    /// The same with a hint.
+    /// Adds a hint.
     pub fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hint = Some(hint.into());
         self
     }
 
-    /// The same with figures for programs.
+    /// Adds details for programs.
     pub fn data(mut self, data: Value) -> Self {
         self.data = Some(data);
         self
     }
 
-    /// `what` has no entry called `name`; the hint suggests the nearest of `known`, or lists them.
+    /// Creates the error for an unknown name; the hint suggests the most similar of `known`, or lists them.
     pub fn unknown<S: AsRef<str>>(code: Code, what: &str, name: &str, known: &[S]) -> Self {
         let error = Self::new(code, format!("no {what} named {}", quote(name)));
         let hint = did_you_mean(name, known.iter().map(AsRef::as_ref), "there is");

@@ -1,8 +1,8 @@
-//! One commander at a time: who may move an arm just now.
+//! Leases: only one connection at a time can command an arm.
 //!
-//! A connection takes the lease of an arm with its first request that is taken on and moves it, or with `lease`, and
-//! has it until `release` or its own end. The rest of the program knows nothing of it: a stream of targets that ends
-//! with its commander goes stale like any other, and a trajectory that has begun continues.
+//! A connection takes the lease of an arm with its first accepted motion request, or with `lease`, and holds it until
+//! `release` or its end. Leases exist in the rpc server only: when a connection ends, its stream of targets times out,
+//! and a trajectory that has begun continues.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -15,33 +15,33 @@ use super::error::{Code, RpcError};
 use super::report::CommanderReport;
 use crate::sync::lock;
 
-/// What a request is about, for [`Backend::arms_of`].
+/// The arms that a request concerns, for [`Backend::arms_of`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Subject<'a> {
     /// All arms of the run.
     All,
-    /// The arm of this `hardware_id`.
+    /// The arm with this `hardware_id`.
     Arm(&'a str),
-    /// The arms whose joints a task may claim.
+    /// The arms whose joints this task may claim.
     Task(&'a str),
     /// The arms of these joints.
     Joints(&'a [String]),
 }
 
-/// What a request needs.
+/// Lease that a request requires.
 #[derive(Debug, PartialEq)]
 pub(super) enum Need<'a> {
-    /// Nothing: it reads, or it ends motion. Both are for everyone, always.
+    /// None: it reads, plans, or ends motion.
     Nothing,
-    /// The lease, which it takes where it is free: it moves an arm.
+    /// The lease, taken if it is free: the request moves an arm.
     Lease(Subject<'a>),
-    /// The leases of the arms that a plan moves; without a number, the newest plan.
+    /// The leases of the arms that a plan moves; without a number, the newest plan's.
     Plan(Option<u64>),
-    /// No other client may command the arm: the request changes what the arm is ready for.
-    Peace(Subject<'a>),
+    /// No lease, but no other connection may hold it: the request changes whether the arm accepts motion.
+    NoOtherHolder(Subject<'a>),
 }
 
-/// What a request needs of the leases.
+/// Returns the lease that a request requires.
 pub(super) fn need(request: &Request) -> Need<'_> {
     match request {
         Request::Move(m) => Need::Lease(Subject::Arm(&m.arm)),
@@ -51,9 +51,9 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::Velocity(v) => Need::Lease(Subject::Task(&v.task)),
         Request::Twist(t) => Need::Lease(Subject::Task(&t.task)),
         Request::Pose(p) => Need::Lease(Subject::Task(&p.task)),
-        Request::ArmReset(a) => Need::Peace(Subject::Arm(&a.arm)),
-        Request::ArmEnable(a) => Need::Peace(Subject::Arm(&a.arm)),
-        Request::ArmDisable(a) => Need::Peace(Subject::Arm(&a.arm)),
+        Request::ArmReset(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
+        Request::ArmEnable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
+        Request::ArmDisable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::Status(_) | Request::State(_) | Request::Motion(_) => Need::Nothing,
         Request::ExecutePlan(e) => Need::Plan(e.plan),
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
@@ -63,14 +63,14 @@ pub(super) fn need(request: &Request) -> Need<'_> {
     }
 }
 
-/// Who holds the lease of an arm.
+/// Holder of an arm's lease.
 #[derive(Debug, Clone)]
 struct Holder {
     connection: u64,
     pid: Option<i32>,
     program: String,
     since: Instant,
-    /// A request under it was taken on, or it was asked for as such: it stays until it is released.
+    /// A request was accepted under it, or `lease` took it: it remains until it is released.
     kept: bool,
 }
 
@@ -90,12 +90,12 @@ impl Leases {
         lock(&self.0)
     }
 
-    /// Whether a connection holds the lease of any arm.
+    /// Returns whether a connection holds the lease of any arm.
     pub fn holds(&self, connection: u64) -> bool {
         self.lock().values().any(|holder| holder.connection == connection)
     }
 
-    /// Adds to a reply what only the connections know: `status` reports who commands the arms.
+    /// Adds the lease holders to a `status` reply.
     pub fn complete(&self, mut reply: Reply) -> Reply {
         if let Reply::Status(status) = &mut reply {
             let held = self.lock();
@@ -107,7 +107,7 @@ impl Leases {
     }
 }
 
-/// A connection's part in the leases. Dropping it gives back all that it holds.
+/// The leases of one connection. Dropping it releases them.
 #[derive(Debug)]
 pub(super) struct Lessee {
     leases: Arc<Leases>,
@@ -118,25 +118,25 @@ pub(super) struct Lessee {
 }
 
 impl Lessee {
-    /// `connection` is a number given once; `pid` is the process at its other end.
+    /// Creates a lessee without leases. `connection` is unique within the run; `pid` is the client's process.
     pub fn new(leases: Arc<Leases>, connection: u64, pid: Option<i32>) -> Self {
         Self { leases, connection, pid, alive: Arc::default() }
     }
 
-    /// Returns the process at the other end of the connection, if the system knows it.
+    /// Returns the client's process, if the system reports it.
     pub fn pid(&self) -> Option<i32> {
         self.pid
     }
 
-    /// The leases of the run.
+    /// Returns the leases of the run.
     pub fn leases(&self) -> &Arc<Leases> {
         &self.leases
     }
 
-    /// Lets a request through, or says who is in its way. The newest plan is named by its number from here on, so that
-    /// the plan whose arms are leased is the one that is carried out.
+    /// Takes the leases that a request requires; fails if another connection holds one. A request for the newest plan
+    /// gets its number, so that the plan whose arms are leased is the one that is executed.
     ///
-    /// Answers the arms whose leases it needs and has now; pass the result to [`settle`](Self::settle).
+    /// Returns the request and the leased arms; afterwards call [`settle`](Self::settle) with them.
     pub async fn admit(&self, request: Request, backend: &dyn Backend) -> Result<(Request, Vec<String>), RpcError> {
         match need(&request) {
             Need::Nothing => {}
@@ -145,7 +145,7 @@ impl Lessee {
                 self.claim(&arms, false)?;
                 return Ok((request, arms));
             }
-            Need::Peace(subject) => self.check(&backend.arms_of(subject), &self.leases.lock())?,
+            Need::NoOtherHolder(subject) => self.check(&backend.arms_of(subject), &self.leases.lock())?,
             Need::Plan(plan) => {
                 let (plan, joints) = backend.plan_of(plan).await?;
                 let arms = backend.arms_of(Subject::Joints(&joints));
@@ -158,15 +158,16 @@ impl Lessee {
         Ok((request, Vec::new()))
     }
 
-    /// A request that needed the leases of these arms was taken on, or refused: then those that it took end.
-    pub fn settle(&self, arms: &[String], taken_on: bool) {
+    /// Ends a request that required the leases of these arms: keeps them if it was accepted, otherwise releases those
+    /// that it took.
+    pub fn settle(&self, arms: &[String], accepted: bool) {
         if arms.is_empty() {
             return;
         }
         let mut held = self.leases.lock();
         for arm in arms {
             match held.get_mut(arm).filter(|holder| holder.connection == self.connection) {
-                Some(holder) if taken_on => holder.kept = true,
+                Some(holder) if accepted => holder.kept = true,
                 Some(Holder { kept: false, .. }) => drop(held.remove(arm)),
                 _ => {}
             }
@@ -193,7 +194,7 @@ impl Lessee {
         Ok(())
     }
 
-    /// Gives back the leases of arms, as far as this connection holds them, and answers those.
+    /// Releases the leases of arms, as far as this connection holds them; returns the released arms.
     pub fn release(&self, arms: &[String]) -> Vec<String> {
         let mut held = self.leases.lock();
         let mine = |arm: &&String| held.get(*arm).is_some_and(|h| h.connection == self.connection);
@@ -211,7 +212,7 @@ impl Lessee {
         };
         let CommanderReport { pid, program, held_for } = holder.report();
         let process = pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
-        let text = format!("{arm} is commanded by {program}{process}, since {held_for:.1} s");
+        let text = format!("{arm} is commanded by {program}{process} for {held_for:.1} s");
         Err(RpcError::new(Code::LeaseHeld, text)
             .hint("wait until it ends or releases the arm, or end it; `dimos stop` and `dimos cancel` always work")
             .data(json!({"arm": arm, "pid": pid, "program": program, "held_for": held_for})))
@@ -224,7 +225,7 @@ impl Drop for Lessee {
     }
 }
 
-/// What a process calls itself: `dimos move`, `python3 policy.py`. Asked of the system once per lease.
+/// Returns the name of a process from its command line: `dimos move`, `python3 policy.py`.
 fn program(pid: Option<i32>) -> String {
     let read = |pid: i32| std::fs::read(format!("/proc/{pid}/cmdline")).ok();
     let line = pid.and_then(read).unwrap_or_default();
@@ -234,7 +235,7 @@ fn program(pid: Option<i32>) -> String {
         let word: String = word.rsplit('/').next().unwrap_or_default().chars().take(40).collect();
         name = if name.is_empty() { word } else { format!("{name} {word}") };
     }
-    // Control characters in a name would reach the terminals of others.
+    // Other users' terminals show the name.
     name.retain(|c| !c.is_control());
     if name.is_empty() { "another program".to_owned() } else { name }
 }
@@ -248,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn all_arms_or_none_are_taken_and_the_end_of_a_connection_gives_them_back() {
+    fn leases_are_taken_all_or_none_and_released_with_the_connection() {
         let leases = Arc::new(Leases::default());
         let lessee = |connection| Lessee::new(leases.clone(), connection, Some(std::process::id() as i32));
         let (one, two) = (lessee(1), lessee(2));
@@ -266,22 +267,22 @@ mod tests {
     }
 
     #[test]
-    fn a_refused_request_leaves_no_lease_behind() {
+    fn a_refused_request_keeps_no_lease() {
         let leases = Arc::new(Leases::default());
         let (one, arms) = (Lessee::new(leases.clone(), 1, None), names(&["left"]));
         one.claim(&arms, false).unwrap();
-        assert!(leases.holds(1), "while it is asked");
+        assert!(leases.holds(1), "during the request");
         one.settle(&arms, false);
         assert!(!leases.holds(1));
         one.claim(&arms, false).unwrap();
         one.settle(&arms, true);
         one.claim(&arms, false).unwrap();
         one.settle(&arms, false);
-        assert!(leases.holds(1), "what it moves already it keeps");
+        assert!(leases.holds(1), "a later refusal does not release it");
     }
 
     #[test]
-    fn programs_are_named() {
+    fn a_program_is_named_by_its_command_line() {
         let mine = program(Some(std::process::id() as i32));
         assert!(mine.starts_with("dimos"), "{mine}");
         assert_eq!(program(None), "another program");

@@ -1,4 +1,4 @@
-//! Talking to a run: one Unix socket per run, one JSON object per line each way.
+//! The protocol of a run: one Unix socket per run, one JSON object per line in each direction.
 //!
 //! ```text
 //! → {"id":1,"method":"move","params":{"arm":"arm","target":[0.3,-0.2,0.5,0,0.4,0]}}
@@ -8,10 +8,10 @@
 //! ← {"stream":"coordinator_joint_state","subscription":1,"data":{…}}
 //! ```
 //!
-//! Requests that move an arm need its lease, which one connection has at a time: `lease.rs`.
+//! Requests that move an arm need its lease, which one connection at a time can hold: `lease.rs`.
 //!
-//! [`api`] says what may be asked, [`report`] what comes back, [`error`] how it is refused. [`place`] says where the
-//! sockets are and which runs are live, [`server`] and [`client`] are the two ends.
+//! [`api`] has the methods and their parameters, [`report`] the status reports, [`error`] the errors. [`run_dir`] finds
+//! the sockets of live runs; [`server`] and [`client`] are the two sides of a connection.
 
 pub mod api;
 mod arm_api;
@@ -19,16 +19,17 @@ mod attach_api;
 mod cartesian_api;
 pub mod client;
 mod connection;
+mod connection_limit;
 pub mod error;
 mod lease;
+mod line_reader;
 mod motion_api;
-pub mod place;
 mod planner_api;
-pub mod planner_end;
-pub mod planner_line;
+pub mod planner_proxy;
+pub mod planner_stub;
 pub mod report;
+pub mod run_dir;
 pub mod schema;
-mod seats;
 pub mod server;
 pub mod streams;
 mod subscription;

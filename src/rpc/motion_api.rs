@@ -22,37 +22,44 @@ pub struct Move {
     pub speed: f64,
 }
 
-/// Fraction of the limits that a move uses when none is given.
+/// Default fraction of the limits for a motion.
 pub const DEFAULT_SPEED: f64 = 0.5;
 
-fn default_speed() -> f64 {
+pub(super) fn default_speed() -> f64 {
     DEFAULT_SPEED
+}
+
+/// Checks a fraction of the limits.
+pub(super) fn valid_speed(speed: f64) -> Result<(), String> {
+    let valid = (MIN_SPEED..=1.0).contains(&speed);
+    if valid { Ok(()) } else { Err(format!("speed is {speed}, must be within {MIN_SPEED}–1")) }
 }
 
 impl Move {
     pub(super) fn valid(&self) -> Result<(), String> {
-        values("target", &self.target)?;
-        if !(MIN_SPEED..=1.0).contains(&self.speed) {
-            return Err(format!("speed is {}, and must be within {MIN_SPEED}–1", self.speed));
+        let count = self.target.len();
+        if !(1..=MAX_DOF).contains(&count) {
+            return Err(format!("target has {count} values, must have 1 to {MAX_DOF}"));
         }
-        Ok(())
+        finite("target", &self.target)?;
+        valid_speed(self.speed)
     }
 }
 
-/// A motion that began with `move`.
+/// Reply to `move`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MoveReply {
     /// The motion's number, for `motion`.
     pub motion: u64,
-    /// The task that carries it out.
+    /// The task that executes it.
     pub task: String,
-    /// How long it is planned to take [s].
+    /// Planned duration [s].
     pub duration: f64,
     /// Names of the joints, in the order of the values.
     pub joints: Vec<String>,
-    /// Where it starts [rad].
+    /// Start positions [rad].
     pub start: Vec<f64>,
-    /// Where it goes [rad].
+    /// Target positions [rad].
     pub target: Vec<f64>,
 }
 
@@ -60,14 +67,14 @@ pub struct MoveReply {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Execute {
-    /// What to follow.
+    /// The trajectory.
     pub trajectory: Trajectory,
-    /// The trajectory task to use; without it the one whose joints cover the trajectory's.
+    /// The trajectory task to use; default: the one whose joints cover the trajectory's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
 }
 
-/// A trajectory as it travels: ROS names and meaning.
+/// A trajectory with the field names and meaning of ROS (`trajectory_msgs/JointTrajectory`).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Trajectory {
@@ -85,7 +92,7 @@ pub struct Point {
     pub time_from_start: f64,
     /// Joint positions [rad].
     pub positions: Vec<f64>,
-    /// Joint velocities [rad/s]; without them the path between points is the task's choice.
+    /// Joint velocities [rad/s]; if missing, the task chooses the path between the points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub velocities: Option<Vec<f64>>,
     /// Joint accelerations [rad/s²].
@@ -104,7 +111,7 @@ impl Execute {
             finite(&at("time_from_start"), &[point.time_from_start])?;
             if point.time_from_start > MAX_DURATION {
                 let (given, hours) = (point.time_from_start, MAX_DURATION / 3600.0);
-                return Err(format!("{} is {given} s, and may be {hours} h at most", at("time_from_start")));
+                return Err(format!("{} is {given} s, must be at most {hours} h", at("time_from_start")));
             }
             let given = [
                 ("positions", Some(&point.positions)),
@@ -122,14 +129,14 @@ impl Execute {
     }
 }
 
-/// A motion that began with `execute`.
+/// Reply to `execute` and `execute_plan`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ExecuteReply {
     /// The motion's number, for `motion`.
     pub motion: u64,
-    /// The task that carries it out.
+    /// The task that executes it.
     pub task: String,
-    /// How long the trajectory takes [s].
+    /// Duration of the trajectory [s].
     pub duration: f64,
 }
 
@@ -141,7 +148,7 @@ pub struct Motion {
     pub motion: u64,
 }
 
-/// Parameters of `cancel`: without any, every motion ends.
+/// Parameters of `cancel`; without any, all motions end.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Cancel {
@@ -153,12 +160,12 @@ pub struct Cancel {
     pub task: Option<String>,
 }
 
-/// What `cancel` did, per task.
+/// Reply to `cancel`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CancelReply {
-    /// The status word of each task asked: `CANCELLED` or `ALREADY_STOPPED`.
+    /// Result for each task: `CANCELLED` or `ALREADY_STOPPED`.
     pub tasks: BTreeMap<String, String>,
-    /// Whether planning was ended.
+    /// Whether planning was cancelled.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub planning: bool,
 }
@@ -193,12 +200,4 @@ impl Velocity {
     pub(super) fn valid(&self) -> Result<(), String> {
         finite("velocities", &self.velocities)
     }
-}
-
-/// One value per joint of an arm, each finite.
-fn values(field: &str, values: &[f64]) -> Result<(), String> {
-    if values.is_empty() || values.len() > MAX_DOF {
-        return Err(format!("{field} has {} values, and must have 1 to {MAX_DOF}", values.len()));
-    }
-    finite(field, values)
 }

@@ -7,8 +7,8 @@ use std::sync::{Arc, Weak};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::api::{MIN_SPEED, finite};
-use super::motion_api::{DEFAULT_SPEED, Trajectory};
+use super::api::finite;
+use super::motion_api::{Trajectory, default_speed, valid_speed};
 
 /// A pose in the frame `map`.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -19,7 +19,7 @@ pub struct PoseSpec {
     /// Roll, pitch, yaw about fixed axes [rad].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rpy: Option<[f64; 3]>,
-    /// A quaternion x, y, z, w, in place of `rpy`.
+    /// The orientation as a quaternion x, y, z, w, instead of `rpy`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub quat: Option<[f64; 4]>,
 }
@@ -34,7 +34,7 @@ impl PoseSpec {
         match (self.rpy, self.quat) {
             (Some(_), Some(_)) => Err(format!("{field} has both rpy and quat")),
             (_, Some(_)) if !(0.99..=1.01).contains(&length) => {
-                Err(format!("{field}.quat has the length {length}, and must have 1"))
+                Err(format!("{field}.quat has length {length}, must be 1"))
             }
             _ => Ok(()),
         }
@@ -50,13 +50,13 @@ pub struct PlanGoal {
     /// Joint positions [rad], in the order of the robot's `joint_names`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub joints: Option<Vec<f64>>,
-    /// Target pose of its end effector; without `rpy` and `quat` only the position counts.
+    /// Target pose of its end effector; without `rpy` and `quat` the orientation is free.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pose: Option<PoseSpec>,
     /// One of its named poses.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub named: Option<String>,
-    /// Whether the end effector goes to `pose` on a straight line.
+    /// Whether the end effector moves to `pose` on a straight line.
     #[serde(default)]
     pub linear: bool,
 }
@@ -65,7 +65,7 @@ pub struct PlanGoal {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Plan {
-    /// Goals of the robots, one entry each. The others stay where they are.
+    /// Goals of the robots, at most one each. Robots without a goal do not move.
     pub goals: Vec<PlanGoal>,
     /// Fraction of the velocity and acceleration limits to use, 0.1–1.
     #[serde(default = "default_speed")]
@@ -73,13 +73,9 @@ pub struct Plan {
     /// Seed of the search; the same request from the same state with the same seed gives the same plan.
     #[serde(default)]
     pub seed: u64,
-    /// The longest time to search [s]; default: the blueprint's `planning_timeout`.
+    /// Maximum planning time [s]; default: the blueprint's `planning_timeout`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub timeout: Option<f64>,
-}
-
-fn default_speed() -> f64 {
-    DEFAULT_SPEED
 }
 
 impl Plan {
@@ -102,19 +98,17 @@ impl Plan {
             finite(&format!("{field}.joints"), goal.joints.as_deref().unwrap_or_default())?;
             goal.pose.map_or(Ok(()), |pose| pose.valid(&format!("{field}.pose")))?;
         }
-        if !(MIN_SPEED..=1.0).contains(&self.speed) {
-            return Err(format!("speed is {}, and must be within {MIN_SPEED}–1", self.speed));
-        }
+        valid_speed(self.speed)?;
         match self.timeout {
             Some(timeout) if !(timeout > 0.0 && timeout <= 3600.0) => {
-                Err(format!("timeout is {timeout}, and must be above 0 and at most 3600 s"))
+                Err(format!("timeout is {timeout}, must be above 0 and at most 3600 s"))
             }
             _ => Ok(()),
         }
     }
 }
 
-/// Planning that began.
+/// Reply to `plan`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct PlanReply {
     /// The plan's number, for `planning`, `preview` and `execute_plan`.
@@ -129,72 +123,72 @@ pub struct Planning {
     pub plan: u64,
 }
 
-/// How planning goes, or what came of it.
+/// Reply to `planning`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PlanningReport {
     /// The plan's number.
     pub plan: u64,
     /// `PLANNING`, `PLANNED`, `FAILED`, `CANCELLED`.
     pub state: String,
-    /// How long it has taken so far, or took [s].
+    /// Planning time so far, or in total [s].
     pub elapsed: f64,
-    /// Why there is no plan, in a sentence.
+    /// Why there is no plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<String>,
-    /// What to do about that.
+    /// What to do about it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub hint: Option<String>,
-    /// The plan.
+    /// Figures of the plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub summary: Option<PlanSummary>,
 }
 
-/// A plan in figures.
+/// Figures of a plan.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PlanSummary {
     /// The coordinator's joints that it moves.
     pub joints: Vec<String>,
-    /// Where it starts [rad].
+    /// Start positions [rad].
     pub start: Vec<f64>,
-    /// Where it ends [rad].
+    /// Goal positions [rad].
     pub goal: Vec<f64>,
-    /// Corners of the path, its ends included.
+    /// Number of waypoints of the path, including its ends.
     pub waypoints: usize,
     /// Length of the path in joint space [rad].
     pub length: f64,
-    /// How long the motion takes [s].
+    /// Duration of the motion [s].
     pub duration: f64,
-    /// Smallest distance to an obstacle or between links that are checked [m], where there is anything to be near to.
+    /// Minimum distance to an obstacle or between checked links [m]; missing if nothing is near.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clearance: Option<f64>,
-    /// The two that come closest.
+    /// The two bodies with this distance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closest: Option<[String; 2]>,
-    /// Distance that it keeps from obstacles and other arms [m].
+    /// Required distance to obstacles and other arms [m].
     #[serde(default)]
     pub padding: f64,
-    /// Pairs that do not keep it, and where.
+    /// Pairs that do not keep the padding, and where.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub padding_given_up: Vec<PaddingGivenUp>,
-    /// Of a straight line, the part that can be done (0–1].
+    /// Feasible fraction of a straight line (0–1].
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fraction: Option<f64>,
     /// Seed of the search.
     pub seed: u64,
-    /// Time for inverse kinematics, search, shortcuts, timing, checking [s].
+    /// Time per planning step [s]: inverse kinematics, search, shortcutting, time parameterization, checking.
     pub times: BTreeMap<String, f64>,
 }
 
-/// A pair that does not keep the padding, near the start or the goal, where it is closer itself.
+/// A pair that does not keep the padding, because it is closer at the start or the goal.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PaddingGivenUp {
-    /// `start`, `goal`, or `everywhere`: the two are closer in every configuration.
+    /// `start`, `goal`, or `everywhere` (closer in every configuration).
     pub near: String,
     /// The link.
     pub link: String,
     /// The obstacle, or the link of another arm.
     pub other: String,
-    /// Their distance there [m]; negative: they touch.
+    /// Their distance there [m]; negative if they touch.
     pub distance: f64,
 }
 
@@ -202,7 +196,7 @@ pub struct PaddingGivenUp {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Preview {
-    /// The plan's number; without it the newest plan.
+    /// The plan's number; default: the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
 }
@@ -212,11 +206,11 @@ pub struct Preview {
 pub struct PreviewReply {
     /// The plan's number.
     pub plan: u64,
-    /// The plan in figures.
+    /// Figures of the plan.
     pub summary: PlanSummary,
     /// The motion, with the coordinator's joint names.
     pub trajectory: Trajectory,
-    /// For each robot, where its end effector is at each point of the trajectory: x, y, z [m] in the frame `map`.
+    /// For each robot, the position of its end effector at each point of the trajectory: x, y, z [m] in `map`.
     pub end_effectors: BTreeMap<String, Vec<[f64; 3]>>,
 }
 
@@ -224,28 +218,28 @@ pub struct PreviewReply {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ExecutePlan {
-    /// The plan's number; without it the newest plan.
+    /// The plan's number; default: the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<u64>,
-    /// Whether a motion that must end before something that gets in its way is planned again from there and continues.
+    /// Whether a motion that an obstacle blocks is planned again from where it stopped, and continues.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub replan: bool,
-    /// The connection that asks for it, where there is one: with its end nothing is planned again.
+    /// The requesting connection, if any; after its end nothing is planned again.
     #[serde(skip)]
     pub presence: Option<Presence>,
 }
 
-/// Whether a connection is still open.
+/// Observes whether a connection is open.
 #[derive(Debug, Clone)]
 pub struct Presence(Weak<()>);
 
 impl Presence {
-    /// That of a connection which keeps `alive` to its end.
+    /// Observes a connection that keeps `alive` until its end.
     pub fn of(alive: &Arc<()>) -> Self {
         Self(Arc::downgrade(alive))
     }
 
-    /// Whether the connection has ended.
+    /// Returns whether the connection has ended.
     pub fn is_over(&self) -> bool {
         self.0.strong_count() == 0
     }
@@ -264,7 +258,7 @@ impl Eq for Presence {}
 #[serde(deny_unknown_fields)]
 pub struct Planner {}
 
-/// What the planner is and does.
+/// Reply to `planner`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct PlannerReport {
     /// `IDLE`, `PLANNING`, `EXECUTING`, `COMPLETED`, `FAULT`.
@@ -272,7 +266,7 @@ pub struct PlannerReport {
     /// Why it is in `FAULT`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub error: Option<String>,
-    /// The robots that are planned for.
+    /// The planning robots.
     pub robots: Vec<RobotReport>,
     /// Number of the newest plan.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -281,16 +275,16 @@ pub struct PlannerReport {
     pub always_touching: BTreeMap<String, Vec<[String; 2]>>,
 }
 
-/// A robot that is planned for.
+/// A planning robot.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RobotReport {
     /// Its name.
     pub name: String,
-    /// The link that pose goals are for.
+    /// The link of pose goals.
     pub end_effector_link: String,
     /// The coordinator's joints, in the order of joint goals.
     pub joints: Vec<String>,
-    /// Lowest and highest positions [rad]; `null` where a joint turns without end.
+    /// Lower and upper position limits [rad]; `null` for a joint without limits.
     pub limits: Vec<[Option<f64>; 2]>,
     /// The task that executes its motions.
     #[serde(default, skip_serializing_if = "Option::is_none")]

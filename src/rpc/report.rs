@@ -1,5 +1,5 @@
-//! Reports of a run: the replies to `status`, `state` and `motion`. SI units; a field in another unit
-//! says so in its name.
+//! Reports of a run: the replies to `status`, `state` and `motion`. SI units; a field in another unit has it in its
+//! name.
 
 use std::collections::BTreeMap;
 
@@ -11,33 +11,33 @@ use serde::{Deserialize, Serialize};
 pub struct StatusReport {
     /// Name of the run.
     pub run: String,
-    /// Its process.
+    /// Its process id.
     pub pid: u32,
     /// Version of the program.
     pub version: String,
     /// Name of the blueprint.
     pub blueprint: String,
-    /// When it started, RFC 3339 in UTC.
+    /// Start time, RFC 3339 in UTC.
     pub started: String,
-    /// How long it runs [s].
+    /// Time since the start [s].
     pub uptime: f64,
     /// Ticks per second [Hz].
     pub tick_rate: f64,
     /// Whether an emulator replaces any of the arms.
     pub simulated: bool,
-    /// The log that is being written; absent when there is none.
+    /// Path of the log; absent without one.
     pub log: Option<String>,
-    /// What real-time measures were asked of the system, and what came of it.
+    /// Requested real-time measures, and whether the system granted them.
     pub realtime: Vec<RealtimeReport>,
     /// Timing of the tick.
     pub ticks: TickReport,
-    /// The recorder; absent when nothing is recorded.
+    /// The recorder; absent without a log.
     pub recorder: Option<RecorderReport>,
     /// The arms, in the blueprint's order.
     pub arms: Vec<ArmReport>,
     /// The tasks, in the blueprint's order.
     pub tasks: Vec<TaskReport>,
-    /// The planner; absent where there is none.
+    /// The planner; absent without one.
     #[serde(default)]
     pub planner: Option<PlannerStatus>,
 }
@@ -51,55 +51,55 @@ pub struct PlannerStatus {
     pub error: Option<String>,
     /// The robots that it plans for.
     pub robots: Vec<String>,
-    /// The process that it attached from; absent where it is part of the run.
+    /// Its process; absent if it is part of the run.
     pub attached: Option<AttachedReport>,
 }
 
 /// A planner in its own process.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct AttachedReport {
-    /// What it is called.
+    /// Its name.
     pub name: String,
-    /// Its process; absent where the system does not tell.
+    /// Process id; absent if the system does not report it.
     pub pid: Option<i32>,
 }
 
 /// One real-time measure.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct RealtimeReport {
-    /// What was asked: `SCHED_FIFO 80 for the tick`.
+    /// The measure: `real-time scheduling: SCHED_FIFO 80–82`.
     pub what: String,
     /// Whether the system granted it.
     pub granted: bool,
-    /// How to get it, where it was not granted.
+    /// How to get it, if it was not granted.
     pub remedy: Option<String>,
 }
 
 /// Timing of the tick since the run's start.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct TickReport {
-    /// Ticks done.
+    /// Number of ticks.
     pub count: u64,
-    /// Ticks that began a period or more too late.
+    /// Ticks that began at least one period late.
     pub overruns: u64,
-    /// Periods skipped by them.
+    /// Periods skipped after overruns.
     pub skipped: u64,
-    /// Wake-up after the deadline [µs].
+    /// Delay of the wake-up after the deadline [µs].
     pub lateness_us: Percentiles,
     /// Time from wake-up to the last command passed on [µs].
     pub compute_us: Percentiles,
 }
 
-/// A distribution.
+/// Percentiles of a distribution.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Percentiles {
-    /// Half of all values are below.
+    /// Median.
     pub p50: f64,
-    /// 99 % are below.
+    /// 99th percentile.
     pub p99: f64,
-    /// 99.9 % are below.
+    /// 99.9th percentile.
     pub p99_9: f64,
-    /// The highest of all.
+    /// Maximum.
     pub max: f64,
 }
 
@@ -110,72 +110,72 @@ pub struct RecorderReport {
     pub messages: u64,
     /// Samples lost because the ring was full.
     pub dropped: u64,
-    /// Why it ended, where it did.
+    /// Why it ended, if it did.
     pub error: Option<String>,
 }
 
 /// One arm in `status`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct ArmReport {
-    /// Its name in the blueprint.
+    /// Its `hardware_id` in the blueprint.
     pub hardware_id: String,
     /// Its adapter's name.
     pub adapter: String,
-    /// Where its device is.
+    /// Address of its device.
     pub address: String,
     /// Whether an emulator replaces it.
     pub simulated: bool,
     /// State of the connection: `down`, `up`, `stale`, `faulted`.
     pub link: String,
-    /// What it is ready for: `unknown`, `disabled`, `activating`, `ready`, `held`, `standby`.
+    /// Its phase: `unknown`, `disabled`, `activating`, `ready`, `held`, `standby`.
     pub phase: String,
-    /// Why it is held; absent when it is not.
+    /// Why it is held; absent if it is not.
     pub cause: Option<CauseReport>,
-    /// A stop was asked for while the arm could not be reached, and is delivered when it can.
+    /// A stop that could not be sent; it is delivered after the reconnect.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub stop_pending: bool,
     /// Whether its motors are enabled.
     pub enabled: bool,
-    /// The control mode it is in.
+    /// Its control mode.
     pub mode: String,
-    /// The device's own state and mode codes, as its manual has them; absent where it has none.
+    /// State and mode codes of the device, as in its manual; absent if it has none.
     #[serde(default)]
     pub device_state: Option<DeviceState>,
-    /// The device's error; absent when there is none.
+    /// Error of the device; absent without one.
     pub error: Option<DeviceError>,
     /// Age of its latest state [ms]; absent before the first.
     pub state_age_ms: Option<f64>,
-    /// How often its states come [Hz].
+    /// Measured rate of new states [Hz].
     pub measured_rate_hz: Option<f64>,
-    /// How often they should [Hz].
+    /// Nominal rate of new states [Hz].
     pub native_rate_hz: f64,
-    /// Recent episodes of trouble, the newest last.
+    /// Recent faults, the newest last.
     pub faults: Vec<FaultReport>,
-    /// Lease holder, which may move it; absent without one.
+    /// Holder of its lease; absent without one.
     #[serde(default)]
     pub commander: Option<CommanderReport>,
-    /// How far its gripper closes and opens [m]; absent without a gripper, or where its adapter does not say.
+    /// Closed and open position of its gripper [m]; absent without a gripper, or if the adapter does not report it.
     #[serde(default)]
     pub gripper_range: Option<[f64; 2]>,
-    /// How far its joints go: lowest and highest position [rad], in their order.
+    /// Lower and upper position limits of its joints [rad], in their order.
     #[serde(default)]
     pub position_limits: Vec<[f64; 2]>,
-    /// What happens to it when the run ends: `hold` or `disable`.
+    /// Behaviour at the end of the run: `hold` or `disable`.
     pub on_exit: String,
-    /// Whether it keeps its pose when its motors are disabled, or falls.
+    /// Whether it keeps its pose when its motors are disabled; otherwise it falls.
     pub holds_when_disabled: bool,
-    /// What the device thread counted: `reads`, `read_errors`, `writes`, …
+    /// Counters of the device thread: `reads`, `read_errors`, `writes`, …
     pub counters: BTreeMap<String, u64>,
 }
 
-/// Who commands an arm.
+/// The lease holder of an arm.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct CommanderReport {
-    /// Its process; absent where the system does not tell.
+    /// Process id; absent if the system does not report it.
     pub pid: Option<i32>,
-    /// What the process calls itself: `python3 policy.py`.
+    /// Name of the program: `python3 policy.py`.
     pub program: String,
-    /// For how long it holds the lease [s].
+    /// Time since it took the lease [s].
     pub held_for: f64,
 }
 
@@ -188,34 +188,34 @@ pub struct CauseReport {
     pub text: String,
 }
 
-/// A device's own codes.
+/// State and mode codes of a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct DeviceState {
-    /// Its state.
+    /// State code.
     pub state: i32,
-    /// Its mode.
+    /// Mode code.
     pub mode: i32,
 }
 
-/// A device's own error.
+/// Error of a device.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct DeviceError {
-    /// The device's code.
+    /// Error code of the device.
     pub code: i32,
     /// What it means.
     pub text: String,
 }
 
-/// An episode of trouble with an arm.
+/// A fault of an arm; repeated occurrences count as one.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct FaultReport {
-    /// How long ago it began [s].
+    /// Time since it began [s].
     pub since: f64,
     /// Whether it is over.
     pub over: bool,
-    /// How often it was seen.
+    /// Number of occurrences.
     pub count: u64,
-    /// What it is.
+    /// Description.
     pub text: String,
 }
 
@@ -230,25 +230,25 @@ pub struct TaskReport {
     /// The methods that send it targets: `execute`, `servo`, `velocity`, `pose`, `twist`.
     #[serde(default)]
     pub takes: Vec<String>,
-    /// The joints that it may claim.
+    /// Joints that it may claim.
     pub joints: Vec<String>,
-    /// Its priority; the higher wins.
+    /// Its priority; the highest wins.
     pub priority: i32,
     /// Its state: `IDLE`, `EXECUTING`, …
     pub state: String,
-    /// How far it is, 0–1, where it has an end.
+    /// Progress 0–1, if the task has an end.
     pub progress: Option<f64>,
-    /// Why it is in its state, where there is a reason.
+    /// Reason for its state, if any.
     pub reason: Option<String>,
-    /// The motion it carries out, or carried out last.
+    /// Number of its current or latest motion.
     pub motion: Option<u64>,
-    /// What holds its end effector back just now.
+    /// What currently limits its end effector.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bound: Option<String>,
 }
 
 impl TaskReport {
-    /// Whether this method sends it targets.
+    /// Returns whether this method sends it targets.
     pub fn takes(&self, method: &str) -> bool {
         self.takes.iter().any(|taken| taken == method)
     }
@@ -259,7 +259,7 @@ impl TaskReport {
 pub struct StateReport {
     /// Index of the tick.
     pub tick: u64,
-    /// When it was, by the wall clock [s since the Unix epoch].
+    /// Wall-clock time of the tick [s since the Unix epoch].
     pub stamp: f64,
     /// The arms, in the blueprint's order.
     pub arms: Vec<ArmStateReport>,
@@ -268,7 +268,7 @@ pub struct StateReport {
 /// One arm in `state`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct ArmStateReport {
-    /// Its name in the blueprint.
+    /// Its `hardware_id` in the blueprint.
     pub hardware_id: String,
     /// Whether an emulator replaces it.
     pub simulated: bool,
@@ -293,11 +293,11 @@ pub struct JointReport {
     pub position: Option<f64>,
     /// Velocity [rad/s].
     pub velocity: Option<f64>,
-    /// Where the velocity comes from: `measured`, `estimated`, `absent`.
+    /// Source of the velocity: `measured`, `estimated`, `absent`.
     pub velocity_source: String,
-    /// Torque [Nm], where the arm reports it.
+    /// Torque [Nm]; absent if the arm does not report it.
     pub effort: Option<f64>,
-    /// What is commanded [rad or rad/s, by the arm's mode].
+    /// Commanded value [rad or rad/s, by the arm's mode].
     pub command: Option<f64>,
 }
 
@@ -315,43 +315,43 @@ pub struct PoseReport {
 pub struct MotionReport {
     /// The motion's number.
     pub motion: u64,
-    /// The task that carries it out.
+    /// The task that executes it.
     pub task: String,
     /// The task's state in this motion: `EXECUTING`, `COMPLETED`, `ABORTED`, …
     pub state: String,
-    /// Whether it is over: the arm is where it ended.
+    /// Whether it has ended and the arm is at rest.
     pub done: bool,
-    /// How far it is, 0–1.
+    /// Progress 0–1.
     pub progress: f64,
     /// Time since its start [s].
     pub elapsed: f64,
-    /// Time to its planned end [s].
+    /// Time until its planned end [s].
     pub remaining: f64,
-    /// Why it ended elsewhere than it should, in a sentence.
+    /// Why it did not reach its goal.
     pub error: Option<String>,
-    /// Whether it had to end before something in its way, and is being planned again; until then it is not done.
+    /// Whether an obstacle blocked it and it is being replanned; meanwhile it is not done.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub replanning: bool,
-    /// The motion that continues in its place, around the obstacle.
+    /// Number of the motion that continues it around the obstacle.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<u64>,
-    /// When done: how far off each joint ended.
+    /// When done: final error of each joint.
     pub deviation: Option<Vec<Deviation>>,
 }
 
-/// How far off a joint ended.
+/// Final error of a joint.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Deviation {
     /// The joint.
     pub joint: String,
-    /// Where it should be [rad].
+    /// Target position [rad].
     pub target: f64,
-    /// Where it is [rad].
+    /// Measured position [rad].
     pub actual: f64,
 }
 
 impl Deviation {
-    /// By how much it missed [rad].
+    /// Returns measured minus target position [rad].
     pub fn error(&self) -> f64 {
         self.actual - self.target
     }

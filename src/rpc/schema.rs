@@ -1,4 +1,4 @@
-//! The JSON Schema of the protocol: parameters and reply of every method, data of every stream, refusals.
+//! The JSON Schema of the protocol: parameters and reply of every method, data of every stream, errors.
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, generate::SchemaSettings};
 use serde_json::{Map, Value, json};
@@ -18,7 +18,7 @@ pub(super) struct MethodSchema {
 }
 
 impl MethodSchema {
-    /// The schemas of the method with parameters `M`.
+    /// Returns the schemas of the method with parameters `M`.
     pub fn of<M: Method>(generator: &mut SchemaGenerator) -> Self {
         Self::named::<M, M::Reply>(M::NAME, generator)
     }
@@ -28,14 +28,14 @@ impl MethodSchema {
     }
 }
 
-/// The JSON Schema (draft 2020-12) of the protocol: `methods` with `params` and `result` of each, `streams` with their
-/// `data`, `planner_requests` with what a run asks of an attached planner besides these methods, `error`, and the types
-/// that they refer to in `$defs`.
+/// Returns the JSON Schema (draft 2020-12) of the protocol: `methods` with their `params` and `result`, `streams` with
+/// their `data`, `planner_requests` (methods that only a run sends to an attached planner), `error`, and the types that
+/// they refer to in `$defs`.
 pub fn json_schema() -> Value {
     let mut generator = SchemaSettings::draft2020_12().into_generator();
     let g = &mut generator;
     let mut methods = method_schemas(g);
-    // Those that the connection itself answers.
+    // The methods that the connection itself answers.
     methods.extend([
         MethodSchema::of::<Subscribe>(g),
         MethodSchema::of::<Unsubscribe>(g),

@@ -1,7 +1,7 @@
-//! What a run publishes while it runs, and how clients ask for it.
+//! The streams that a run publishes, and the requests to subscribe to them.
 //!
 //! Each message is encoded once, by the publisher, and kept in a ring of fixed length. Every subscriber reads the ring
-//! at its own pace: a slow subscriber loses its own oldest messages, learns how many, and delays no other.
+//! at its own pace: a slow subscriber loses its oldest messages, receives their number, and delays no other.
 
 use std::sync::Arc;
 
@@ -12,9 +12,9 @@ use tokio::sync::broadcast;
 use super::api::Method;
 use crate::named::named;
 
-/// Joint states kept for slow readers.
+/// Joint states buffered for slow readers.
 const STATES_KEPT: usize = 256;
-/// Events kept for slow readers.
+/// Events buffered for slow readers.
 const EVENTS_KEPT: usize = 1024;
 
 named! {
@@ -33,7 +33,7 @@ named! {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Subscribe {
-    /// Which stream.
+    /// The stream.
     pub stream: Stream,
     /// Maximum rate of messages [Hz]; without it, all of them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -62,7 +62,7 @@ impl Method for Subscribe {
     fn check(&self) -> Result<(), String> {
         match self.rate {
             Some(rate) if !(rate.is_finite() && (0.01..=10_000.0).contains(&rate)) => {
-                Err(format!("rate is {rate}, and must be within 0.01–10000 Hz"))
+                Err(format!("rate is {rate}, must be within 0.01–10000 Hz"))
             }
             _ => Ok(()),
         }
@@ -74,12 +74,12 @@ impl Method for Unsubscribe {
     type Reply = super::api::Done;
 }
 
-/// The joints of all arms after a tick: the guide's `coordinator_joint_state`.
+/// The joints of all arms after a tick: `coordinator_joint_state` of the Python dimos.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct JointState {
     /// Index of the tick.
     pub tick: u64,
-    /// When it was, by the wall clock [s since the Unix epoch].
+    /// Wall-clock time of the tick [s since the Unix epoch].
     pub stamp: f64,
     /// The blueprint's `joint_state_frame_id`.
     pub frame_id: String,
@@ -93,45 +93,45 @@ pub struct JointState {
     pub effort: Vec<Option<f64>>,
 }
 
-/// Something that happened.
+/// An event of the run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct EventReport {
     /// Index of the tick in which it happened.
     pub tick: u64,
-    /// When it was, by the wall clock [s since the Unix epoch].
+    /// Wall-clock time of the tick [s since the Unix epoch].
     pub stamp: f64,
-    /// How much it matters.
+    /// Its severity.
     pub level: Level,
-    /// What kind it is, for programs: `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`,
+    /// Its kind, for programs: `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`,
     /// `degraded`.
     pub kind: String,
-    /// The arm it is about.
+    /// The arm that it concerns.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub arm: Option<String>,
-    /// The task it is about.
+    /// The task that it concerns.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
-    /// The joint it is about.
+    /// The joint that it concerns.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub joint: Option<String>,
-    /// What happened, for people, in a sentence without full stop.
+    /// Description for people, without full stop.
     pub text: String,
 }
 
-/// How much an event matters.
+/// Severity of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Level {
-    /// The ordinary course of things.
+    /// Normal operation.
     #[default]
     Info,
-    /// Worth a look.
+    /// Unexpected, but nothing ended.
     Warning,
-    /// Something ended that should not have.
+    /// Something ended unexpectedly.
     Error,
 }
 
-/// The publishing end, owned by the run. Cheap to clone; never waits for a reader.
+/// Publishes the streams of a run. Cheap to clone; never waits for a reader.
 #[derive(Debug, Clone)]
 pub struct Streams {
     joint_state: broadcast::Sender<Arc<str>>,
@@ -145,22 +145,22 @@ impl Default for Streams {
 }
 
 impl Streams {
-    /// Publishes the state of a tick. `build` is only called when somebody listens. Allocates: not for the tick.
+    /// Publishes the state of a tick. Calls `build` only if there are subscribers. Allocates: not for the tick thread.
     pub fn publish_joint_state(&self, build: impl FnOnce() -> JointState) {
         publish(&self.joint_state, build);
     }
 
-    /// Whether anybody listens to the joint state.
+    /// Returns whether the joint state has subscribers.
     pub fn has_joint_state_readers(&self) -> bool {
         self.joint_state.receiver_count() > 0
     }
 
-    /// Publishes an event. `build` is only called when somebody listens. Allocates: not for the tick.
+    /// Publishes an event. Calls `build` only if there are subscribers. Allocates: not for the tick thread.
     pub fn publish_event(&self, build: impl FnOnce() -> EventReport) {
         publish(&self.events, build);
     }
 
-    /// A reader of a stream, from now on.
+    /// Subscribes to a stream.
     pub(super) fn reader(&self, stream: Stream) -> broadcast::Receiver<Arc<str>> {
         match stream {
             Stream::CoordinatorJointState => self.joint_state.subscribe(),
@@ -173,7 +173,7 @@ fn publish<T: Serialize>(to: &broadcast::Sender<Arc<str>>, build: impl FnOnce() 
     if to.receiver_count() == 0 {
         return;
     }
-    // These types have string keys only, so encoding cannot fail; that the last reader just left is no error.
+    // These types have string keys only, so encoding cannot fail. Sending fails if the last subscriber has just left.
     if let Ok(text) = serde_json::to_string(&build()) {
         let _ = to.send(text.into());
     }

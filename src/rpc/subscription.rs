@@ -1,4 +1,5 @@
-//! A client's subscription: from the ring of a stream to the queue of its connection, at the client's pace.
+//! A client's subscription: passes messages from the ring of a stream to the queue of the connection, at the requested
+//! rate.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,25 +9,25 @@ use tokio::time::Instant;
 
 use super::wire;
 
-/// A client's reading of a stream.
+/// A client's subscription to a stream.
 pub(super) struct Subscription {
     /// Its number on the connection.
     pub number: u64,
     /// The stream's name.
     pub stream: &'static str,
-    /// Where its messages come from.
+    /// Receives the published messages.
     pub from: broadcast::Receiver<Arc<str>>,
-    /// Which of them are sent.
-    pub pace: Pace,
+    /// Limits the rate.
+    pub limit: RateLimit,
 }
 
 impl Subscription {
-    /// Sends what is published until the client is gone.
+    /// Sends published messages until the client has disconnected.
     pub async fn forward(mut self, queue: mpsc::Sender<String>) {
         let mut lost = 0;
         loop {
             match self.from.recv().await {
-                Ok(data) if self.pace.is_due(Instant::now()) => {
+                Ok(data) if self.limit.is_due(Instant::now()) => {
                     let line = wire::message(self.stream, self.number, lost, &data);
                     if queue.send(line).await.is_err() {
                         return;
@@ -41,20 +42,20 @@ impl Subscription {
     }
 }
 
-/// Thins a stream out to a rate.
-pub(super) struct Pace {
+/// Reduces a stream to a maximum rate.
+pub(super) struct RateLimit {
     period: Option<Duration>,
     next: Option<Instant>,
 }
 
-impl Pace {
-    /// At most `rate` messages per second [Hz]; without it, all.
-    pub fn of(rate: Option<f64>) -> Self {
+impl RateLimit {
+    /// Creates a limit of `rate` messages per second [Hz]; without it, all pass.
+    pub fn new(rate: Option<f64>) -> Self {
         Self { period: rate.map(|hz| Duration::from_secs_f64(1.0 / hz)), next: None }
     }
 
-    /// Whether a message that came now is to be sent. A quarter of a period early counts as on time, so that asking
-    /// for a stream at its own rate loses nothing to jitter.
+    /// Returns whether to send a message published now. Up to a quarter of a period early counts as on time, so that a
+    /// stream requested at its own rate loses nothing to jitter.
     fn is_due(&mut self, now: Instant) -> bool {
         let Some(period) = self.period else { return true };
         let next = self.next.unwrap_or(now);

@@ -1,18 +1,18 @@
-//! The lines themselves: what a request line says, and how replies and stream messages are written.
+//! Encoding of lines: requests, replies, stream messages.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::error::{Code, RpcError};
 
-/// Longest `id` that is a string [bytes]: it is sent back as it came.
+/// Maximum length of a string `id` [bytes]; it is repeated in the reply.
 const MAX_ID: usize = 128;
 
-/// A request line, its parameters not yet read.
+/// A request line; its parameters are not parsed yet.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Envelope {
-    /// Chosen by the client, sent back with the reply: a number, a string, or nothing.
+    /// Chosen by the client, repeated in the reply: a number, a string, or null.
     #[serde(default)]
     pub id: Value,
     pub method: String,
@@ -20,7 +20,7 @@ pub(super) struct Envelope {
     pub params: Value,
 }
 
-/// Reads a request line. A refusal comes with the id, where that much could be read.
+/// Parses a request line. An error has the id, or null if that could not be read.
 pub(super) fn read(line: &[u8]) -> Result<Envelope, (Value, RpcError)> {
     let malformed = |id: Value, what: String| {
         let hint = r#"one JSON object per line: {"id":1,"method":"state","params":{}}"#;
@@ -42,7 +42,7 @@ pub(super) fn read(line: &[u8]) -> Result<Envelope, (Value, RpcError)> {
     }
 }
 
-/// The reply to a request, as a line.
+/// Encodes the reply to a request as a line.
 pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> String {
     #[derive(Serialize)]
     #[serde(rename_all = "snake_case")]
@@ -62,18 +62,18 @@ pub(super) fn reply<T: Serialize>(id: &Value, result: Result<T, RpcError>) -> St
     };
     match serde_json::to_string(&Line { id, outcome }) {
         Ok(line) => line + "\n",
-        Err(e) => reply::<()>(id, Err(RpcError::new(Code::Internal, format!("a reply that is no JSON: {e}")))),
+        Err(e) => reply::<()>(id, Err(RpcError::new(Code::Internal, format!("the reply cannot be encoded: {e}")))),
     }
 }
 
-/// A message of a subscription, as a line. `data` is JSON already; `lost` counts messages that this reader missed
-/// before this one.
+/// Encodes a message of a subscription as a line. `data` is JSON; `lost` counts the messages that this client missed
+/// just before.
 pub(super) fn message(stream: &str, subscription: u64, lost: u64, data: &str) -> String {
     let lost = if lost == 0 { String::new() } else { format!(r#","lost":{lost}"#) };
     format!("{{\"stream\":\"{stream}\",\"subscription\":{subscription}{lost},\"data\":{data}}}\n")
 }
 
-/// What a client reads: a reply or a message of a subscription.
+/// A line received by a client: a reply or a message of a subscription.
 #[derive(Debug, Deserialize)]
 pub(super) struct Incoming {
     pub id: Option<u64>,

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::planner_api::PoseSpec;
 
-/// Shape of an obstacle. Every shape's frame is at its middle; the axis of a cylinder is z.
+/// Shape of an obstacle. Its frame is at its centre; the axis of a cylinder is z.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum ShapeSpec {
@@ -31,7 +31,7 @@ impl ShapeSpec {
             Self::Mesh(path) | Self::Cloud(path) => return Err(format!("{path:?} is not an absolute path")),
         };
         match sizes.iter().find(|size| !(**size > 0.0 && size.is_finite())) {
-            Some(size) => Err(format!("a size of the shape is {size}, and must be above 0")),
+            Some(size) => Err(format!("a size of the shape is {size}, must be above 0")),
             None => Ok(()),
         }
     }
@@ -43,12 +43,12 @@ impl ShapeSpec {
 pub struct WorldObject {
     /// Its name.
     pub name: String,
-    /// What it is.
+    /// Its shape.
     pub shape: ShapeSpec,
-    /// Where it is; of an attached object, in the frame of the link that holds it.
+    /// Its pose in `map`; for an attached object, in the frame of the link that holds it.
     #[serde(default)]
     pub pose: PoseSpec,
-    /// How much it is thickened all around [m].
+    /// Padding on all sides [m].
     #[serde(default)]
     pub padding: f64,
     /// The robot and the link that hold it.
@@ -65,10 +65,10 @@ impl WorldAdd {
     pub(super) fn valid(&self) -> Result<(), String> {
         let Self(object) = self;
         if object.name.is_empty() || object.held_by.is_some() {
-            return Err("an object needs a name, and is held by `attach` only".into());
+            return Err("an object needs a name, and `held_by` is set by `attach` only".into());
         }
         if !(0.0..=1.0).contains(&object.padding) {
-            return Err(format!("padding is {}, and must be within 0–1 m", object.padding));
+            return Err(format!("padding is {}, must be within 0–1 m", object.padding));
         }
         object.shape.valid()?;
         object.pose.valid("pose")
@@ -79,18 +79,18 @@ impl WorldAdd {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldEntry {
-    /// What it is.
+    /// Its shape.
     pub shape: ShapeSpec,
-    /// Where it is, in the frame `map`.
+    /// Its pose in `map`.
     #[serde(default)]
     pub pose: PoseSpec,
-    /// How much it is thickened all around [m].
+    /// Padding on all sides [m].
     #[serde(default)]
     pub padding: f64,
 }
 
 impl WorldEntry {
-    /// The object of that name.
+    /// Returns the object with this name.
     pub fn named(self, name: String) -> WorldObject {
         WorldObject { name, shape: self.shape, pose: self.pose, padding: self.padding, held_by: None }
     }
@@ -101,7 +101,7 @@ impl WorldEntry {
 #[serde(deny_unknown_fields)]
 pub struct World {}
 
-/// The world that is planned in.
+/// Reply to `world`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct WorldReport {
     /// Its objects, by name.
@@ -114,7 +114,7 @@ pub struct WorldReport {
 pub struct WorldMove {
     /// The object's name.
     pub name: String,
-    /// Where it is from now on.
+    /// Its new pose in `map`.
     pub pose: PoseSpec,
 }
 
@@ -128,12 +128,12 @@ impl WorldMove {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WorldRemove {
-    /// The object's name; without it, all objects go.
+    /// The object's name; default: all objects that are not attached.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
 }
 
-/// Parameters of `attach`: from now on the robot holds the object where it is.
+/// Parameters of `attach`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Attach {
@@ -141,15 +141,15 @@ pub struct Attach {
     pub name: String,
     /// The robot that holds it.
     pub robot: String,
-    /// The link that holds it; default: the end effector's.
+    /// The link that holds it; default: the end-effector link.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<String>,
-    /// Links that may touch it, beside that one.
+    /// Further links that may touch it.
     #[serde(default)]
     pub touch_links: Vec<String>,
 }
 
-/// Parameters of `detach`: the object stays where it is.
+/// Parameters of `detach`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Detach {

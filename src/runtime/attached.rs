@@ -16,7 +16,7 @@ use super::start::robots;
 use crate::planning::config::PlannerConfig;
 use crate::planning::planning_scene::PlanningScene;
 use crate::rpc::api::{RegisterPlanner, RegisteredRobot};
-use crate::rpc::planner_end::{NoLine, PlannerEnd};
+use crate::rpc::planner_stub::{PlannerStub, RegisterError};
 
 /// First pause before a reconnect; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_millis(200);
@@ -101,7 +101,7 @@ impl Process {
     /// Attaches, reports it, and answers requests until the connection ends.
     async fn live(self, setup: PlanningScene, ready: &Sender<Result<(), StartError>>, mut report: impl FnMut(Turn)) {
         let begun = async {
-            let end = PlannerEnd::register(&self.socket, &self.registration).await.map_err(refused)?;
+            let end = PlannerStub::register(&self.socket, &self.registration).await.map_err(refused)?;
             let limits = &end.registered.limits;
             let port = PlannerPort::start(&self.config, setup, limits, None).map_err(|what| {
                 let hint =
@@ -133,16 +133,16 @@ impl Process {
     }
 
     /// Retries until the run is back and accepts the planner. A refusal is reported once.
-    async fn again(&self, limits: &Limits, report: &mut impl FnMut(Turn)) -> PlannerEnd {
+    async fn again(&self, limits: &Limits, report: &mut impl FnMut(Turn)) -> PlannerStub {
         let (mut pause, mut last) = (FIRST_PAUSE, String::new());
         loop {
             tokio::time::sleep(pause).await;
             pause = (2 * pause).min(LONGEST_PAUSE);
-            let why = match PlannerEnd::register(&self.socket, &self.registration).await {
+            let why = match PlannerStub::register(&self.socket, &self.registration).await {
                 Ok(end) if end.registered.limits == *limits => return end,
                 Ok(_) => "the run has other limits now: start the planner again".to_owned(),
-                Err(NoLine::Io(_)) => continue,
-                Err(NoLine::Refused(refusal)) => refusal.message,
+                Err(RegisterError::Io(_)) => continue,
+                Err(RegisterError::Refused(refusal)) => refusal.message,
             };
             if why != last {
                 report(Turn::Fault(why.clone()));
@@ -154,12 +154,12 @@ impl Process {
 
 type Limits = std::collections::BTreeMap<String, crate::rpc::api::CommandLimits>;
 
-fn refused(why: NoLine) -> StartError {
+fn refused(why: RegisterError) -> StartError {
     match why {
-        NoLine::Io(error) => {
+        RegisterError::Io(error) => {
             StartError::other(format!("the run cannot be reached: {error}"), "`dimos status` shows it")
         }
-        NoLine::Refused(refusal) => {
+        RegisterError::Refused(refusal) => {
             let hint = refusal.hint.clone().unwrap_or_else(|| "`dimos status` shows what the run has".to_owned());
             StartError::other(format!("{} [{}]", refusal.message, refusal.code.name()), hint)
         }

@@ -6,7 +6,7 @@ use crate::blueprint::{self, Catalog, FindError, Found, Loaded, Overrides, Sourc
 use crate::control::task_spec::{TaskSpec, TaskTable};
 use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::planning::planner_thread::Solver;
-use crate::rpc::place::RunFolder;
+use crate::rpc::run_dir::RunDir;
 
 /// A run that is not up yet. What is not said is as the blueprint says.
 ///
@@ -111,8 +111,8 @@ impl Builder {
         self
     }
 
-    /// Where its socket and lock are; the command line looks in [`RunFolder::standard`] only.
-    pub fn folder(mut self, folder: RunFolder) -> Self {
+    /// Where its socket and lock are; the command line looks in [`RunDir::standard`] only.
+    pub fn folder(mut self, folder: RunDir) -> Self {
         self.options.folder = folder;
         self
     }

@@ -8,7 +8,7 @@ use tokio::runtime::{Builder, Handle, Runtime};
 
 use super::service::Service;
 use crate::rpc::api::{Backend, METHODS, Method, Reply, Request};
-use crate::rpc::server::CALL_LIMIT;
+use crate::rpc::server::CALL_TIMEOUT;
 use crate::rpc::{Code, RpcError};
 
 /// The runtime of all calls in this process. It has no threads: each call runs on the calling thread.
@@ -35,7 +35,7 @@ pub fn wait_for<T: Send>(something: impl Future<Output = T> + Send) -> Option<T>
 
 async fn ask(service: &Arc<Service>, requests: Vec<Result<Request, RpcError>>) -> Vec<Result<Reply, RpcError>> {
     let begin = |request: Result<Request, RpcError>| async move {
-        tokio::time::timeout(CALL_LIMIT, service.call(request?)).await.unwrap_or_else(late)
+        tokio::time::timeout(CALL_TIMEOUT, service.call(request?)).await.unwrap_or_else(late)
     };
     let mut begun: Vec<_> = requests.into_iter().map(|request| (Box::pin(begin(request)), None)).collect();
     poll_fn(|context| {
@@ -52,7 +52,7 @@ async fn ask(service: &Arc<Service>, requests: Vec<Result<Request, RpcError>>) -
 }
 
 fn late(_: tokio::time::error::Elapsed) -> Result<Reply, RpcError> {
-    let what = format!("the run did not answer within {} s", CALL_LIMIT.as_secs());
+    let what = format!("the run did not answer within {} s", CALL_TIMEOUT.as_secs());
     Err(RpcError::new(Code::NoAnswer, what).hint("the request may still take effect"))
 }
 

@@ -54,7 +54,7 @@ use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
 use crate::planning::planner_thread::Solver;
 use crate::recording::recorder::Recorder;
-use crate::rpc::place::RunFolder;
+use crate::rpc::run_dir::RunDir;
 use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
 use arms::Arms;
@@ -86,7 +86,7 @@ pub struct Options {
     /// Destination of the log.
     pub record: Record,
     /// Run directory, for the socket.
-    pub folder: RunFolder,
+    pub folder: RunDir,
     /// Called at the start of each tick, for tests and benchmarks.
     pub probe: Option<Probe>,
     /// Answers planning requests instead of the built-in planner.
@@ -102,7 +102,7 @@ impl Default for Options {
         Self {
             name: None,
             record: Record::AsBlueprint,
-            folder: RunFolder::standard(),
+            folder: RunDir::standard(),
             probe: None,
             solver: None,
             hold_latency: true,

@@ -17,7 +17,7 @@ use crate::rpc::api::{
     self, CommandLimits, Moment, PlannerReport, RECHECK, Recheck, RecheckReply, RegisterPlanner, Registered,
     ReleasedPlan, Reply, Request as Call,
 };
-use crate::rpc::planner_line::{PlannerLine, gone};
+use crate::rpc::planner_proxy::{PlannerProxy, gone};
 use crate::rpc::report::{AttachedReport, PlannerStatus};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
@@ -36,7 +36,7 @@ const GLANCE: Duration = Duration::from_millis(500);
 pub(super) struct Attached {
     name: String,
     robots: Vec<api::RegisteredRobot>,
-    line: Arc<PlannerLine>,
+    line: Arc<PlannerProxy>,
 }
 
 /// The planner of a run.
@@ -223,7 +223,7 @@ impl Service {
     }
 
     /// Registers the process at the other end of a connection as this run's planner.
-    pub(super) fn register(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
+    pub(super) fn register(&self, planner: RegisterPlanner, line: Arc<PlannerProxy>) -> Result<Registered, RpcError> {
         let has = |whose: String| {
             RpcError::new(Code::HasPlanner, format!("run {} has a planner already: {whose}", self.parts.run))
                 .hint("end that one first: a run has one planner")

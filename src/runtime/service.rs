@@ -25,9 +25,9 @@ use crate::hardware::device::{Connected, Device};
 use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
-use crate::rpc::place::Claim;
-use crate::rpc::planner_line::PlannerLine;
+use crate::rpc::planner_proxy::PlannerProxy;
 use crate::rpc::report::StatusReport;
+use crate::rpc::run_dir::Claim;
 use crate::rpc::streams::Streams;
 use crate::rpc::{Code, RpcError, Subject};
 use crate::rt::host::{self, Grant};
@@ -319,7 +319,7 @@ impl Backend for Service {
         Box::pin(self.plan_and_its_joints(plan))
     }
 
-    fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerLine>) -> Result<Registered, RpcError> {
+    fn register_planner(&self, planner: RegisterPlanner, line: Arc<PlannerProxy>) -> Result<Registered, RpcError> {
         self.register(planner, line)
     }
 

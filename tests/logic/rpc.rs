@@ -9,7 +9,7 @@ use std::time::Duration;
 use dimos::rpc::Code;
 use dimos::rpc::api::{MAX_CONNECTIONS, MAX_LINE, MAX_SUBSCRIPTIONS, Move, RESERVED_CONNECTIONS, State, Status};
 use dimos::rpc::client::{Client, ClientError};
-use dimos::rpc::place::{PlaceError, RunFolder};
+use dimos::rpc::run_dir::{RunDir, RunDirError};
 use dimos::rpc::server::Server;
 use dimos::rpc::streams::{EventReport, JointState, Stream, Subscribe, Unsubscribe};
 use serde_json::{Value, json};
@@ -309,20 +309,20 @@ fn a_folder_that_is_a_link_is_refused() {
     let (real, link) = (folder.path().join("real"), folder.path().join("link"));
     std::fs::create_dir(&real).unwrap();
     std::os::unix::fs::symlink(&real, &link).unwrap();
-    assert!(matches!(RunFolder::at(&link).claim("test"), Err(PlaceError::NotOurs(_))));
+    assert!(matches!(RunDir::at(&link).claim("test"), Err(RunDirError::NotOurs(_))));
 }
 
 #[test]
 fn a_name_is_taken_once_and_given_back_at_the_end() {
     let folder = tempfile::tempdir().unwrap();
-    let place = RunFolder::at(folder.path());
+    let place = RunDir::at(folder.path());
     let (server, _) = start(folder.path(), "test", FakeBackend::default());
     match place.claim("test") {
-        Err(PlaceError::Taken { run, pid }) => assert_eq!((run.as_str(), pid), ("test", std::process::id())),
+        Err(RunDirError::Taken { run, pid }) => assert_eq!((run.as_str(), pid), ("test", std::process::id())),
         other => panic!("{other:?}"),
     }
     let (other, _) = start(folder.path(), "other", FakeBackend::default());
-    let names = |place: &RunFolder| place.runs().unwrap().into_iter().map(|r| r.name).collect::<Vec<_>>();
+    let names = |place: &RunDir| place.runs().unwrap().into_iter().map(|r| r.name).collect::<Vec<_>>();
     assert_eq!(names(&place), ["other", "test"]);
     assert!(matches!(Client::find(&place, None), Err(ClientError::SeveralRuns(runs)) if runs.len() == 2));
     let error = Client::find(&place, Some("tset")).unwrap_err();
@@ -333,14 +333,14 @@ fn a_name_is_taken_once_and_given_back_at_the_end() {
     assert!(matches!(Client::find(&place, None), Err(ClientError::NoRun)));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left behind");
     for bad in ["", "a/b", "../x", ".hidden", "a b", &"x".repeat(65)] {
-        assert!(matches!(place.claim(bad), Err(PlaceError::BadName(_))), "{bad:?}");
+        assert!(matches!(place.claim(bad), Err(RunDirError::BadName(_))), "{bad:?}");
     }
 }
 
 #[test]
 fn what_dead_runs_left_is_removed() {
     let folder = tempfile::tempdir().unwrap();
-    let place = RunFolder::at(folder.path());
+    let place = RunDir::at(folder.path());
     // As after `kill -9`: the socket and the lock file stay, no process holds the lock.
     let leave = |name: &str, lock: bool| {
         drop(UnixListener::bind(folder.path().join(format!("{name}.sock"))).unwrap());
@@ -364,7 +364,7 @@ fn what_dead_runs_left_is_removed() {
 fn one_of_many_that_want_a_name_gets_it() {
     let folder = tempfile::tempdir().unwrap();
     for _ in 0..10 {
-        let place = &RunFolder::at(folder.path());
+        let place = &RunDir::at(folder.path());
         let won = std::thread::scope(|scope| {
             let claims: Vec<_> = (0..8).map(|_| scope.spawn(|| place.claim("test").ok())).collect();
             let listing = scope.spawn(|| place.runs().unwrap());

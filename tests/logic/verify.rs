@@ -19,7 +19,7 @@ use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
 use dimos::rpc::api;
 use dimos::rpc::client::Client;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Options, Record, Run};
 
 use crate::support::tampered::{rewrite, tamper, without_attachments};
@@ -319,7 +319,7 @@ fn blueprint(name: &str, set: &[&str]) -> Blueprint {
 fn start(folder: &Path, blueprint: &Blueprint, probe: Option<dimos::control::tick_loop::Probe>) -> (Run, Client) {
     let options = Options {
         record: Record::To(folder.join("real.mcap")),
-        folder: RunFolder::at(folder),
+        folder: RunDir::at(folder),
         probe,
         hold_latency: false,
         ..Options::default()

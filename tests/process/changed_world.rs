@@ -8,7 +8,7 @@ use dimos::planning::planning_scene::{PlanningScene, obstacle};
 use dimos::rpc::api::{
     ExecutePlan, Plan, PlanGoal, Planning, PoseSpec, Preview, ShapeSpec, WorldAdd, WorldObject, WorldRemove,
 };
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Builder, Record, Run};
 
 use crate::support::program::eventually;
@@ -31,7 +31,7 @@ fn up() -> Cell {
         Run::from_name("yourarm-planner").unwrap().set("hardware.arm.address", arm.address()).record(Record::Off)
     };
     let setup = PlanningScene::load(blueprint().check().blueprint.unwrap().planner.as_ref().unwrap()).unwrap();
-    let run = blueprint().folder(RunFolder::at(folder.path())).start().unwrap();
+    let run = blueprint().folder(RunDir::at(folder.path())).start().unwrap();
     let cell = Cell { run, arm, setup, _folder: folder };
     let begun = cell.run.move_arm("arm", &HOME, 1.0).unwrap();
     assert_eq!(cell.run.wait(begun.motion).unwrap().state, "COMPLETED");

@@ -79,7 +79,7 @@ fn several_runs_need_a_name() {
     let _one = start(&home.runs(), "left", FakeBackend::default());
     let (_server, right) = start(&home.runs(), "right", FakeBackend::default());
     let ended = home.run("state").with(2);
-    assert!(ended.err.contains("left, right") && ended.err.contains("hint: say which with --run"), "{}", ended.err);
+    assert!(ended.err.contains("left, right") && ended.err.contains("hint: select one with --run"), "{}", ended.err);
     assert!(home.run("state --run rihgt").with(2).err.contains("did you mean `right`?"));
     assert!(home.run("state --run right").with(0).out.contains("arm_joint1"));
     assert_eq!(right.asked().len(), 1);

@@ -54,7 +54,7 @@ fn one_commands_and_everyone_reads_cancels_and_stops() {
     assert_eq!(holder.pid, Some(std::process::id() as i32));
     assert!(holder.program.starts_with("process"), "{holder:?}");
 
-    let named = format!("arm is commanded by {} (pid {}), since ", holder.program, std::process::id());
+    let named = format!("arm is commanded by {} (pid {}) for ", holder.program, std::process::id());
     for verb in ["move arm 0 0 0 0 0 0", "arm gripper arm 0.02", "arm disable arm", "arm enable arm", "arm reset arm"] {
         let refused = home.dimos(verb).with(1).says(&[&named, "[LEASE_HELD]", "hint: "]);
         assert_eq!(refused.out, "", "{verb}");

@@ -5,12 +5,12 @@ use std::path::Path;
 use dimos::control::task_spec::TaskTable;
 use dimos::rpc::Code;
 use dimos::rpc::api::Move;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::rpc::streams::{Stream, Subscribe};
 use dimos::runtime::{Builder, Ending, Record, Run, StartError};
 
 fn mock(folder: &Path) -> Builder {
-    Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunFolder::at(folder))
+    Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::at(folder))
 }
 
 #[test]
@@ -21,7 +21,7 @@ fn a_run_that_is_dropped_is_stopped() {
     let handle = run.handle();
     let motion = handle.move_arm("arm", &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).unwrap().motion;
     drop(run);
-    assert!(RunFolder::at(folder.path()).runs().unwrap().is_empty());
+    assert!(RunDir::at(folder.path()).runs().unwrap().is_empty());
     // Who still has a handle is refused, and does not wait for ever.
     assert_eq!(handle.move_arm("arm", &[0.0; 7], 0.5).unwrap_err().code, Code::ShuttingDown);
     assert!(handle.wait(motion).map_or_else(|e| e.code == Code::ShuttingDown, |report| report.state == "ABORTED"));
@@ -100,7 +100,7 @@ hardware:
 tasks:
   - {name: stick, type: joystick, joint_names: {hardware: arm}, params: {timeout: 0.5}}
 ";
-    let of = |name: &str| Run::from_yaml(name, blueprint).folder(RunFolder::at(folder.path()));
+    let of = |name: &str| Run::from_yaml(name, blueprint).folder(RunDir::at(folder.path()));
     match of("without").record(Record::Off).start() {
         Err(StartError::Blueprint { what, .. }) => assert!(what.contains("no task type `joystick`"), "{what}"),
         other => panic!("{:?}", other.map(|_| ()).err()),

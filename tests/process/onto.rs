@@ -13,7 +13,7 @@ use dimos::joint::make_joints;
 use dimos::replay::motion::RecordedMotion;
 use dimos::replay::verify::{Finding, verify};
 use dimos::rpc::api::{Motion, Move};
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Options, Record, Run};
 use dimos::telemetry::TaskState;
 
@@ -92,7 +92,7 @@ impl Home {
         for again in 0..5 {
             let log = self.path(&format!("yourarm{again}.mcap"));
             let record = Record::To(log.clone());
-            let folder = RunFolder::at(self.path("runs"));
+            let folder = RunDir::at(self.path("runs"));
             let run = Run::start(&blueprint, Options { record, folder, hold_latency: false, ..Options::default() });
             let run = run.unwrap();
             let done = [GOAL, [0.1; 6], GOAL].iter().all(|target| moved(&run, target));

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::registry::AdapterSpec;
 use dimos::rpc::Code;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 
 use crate::support::program::eventually;
@@ -23,7 +23,7 @@ tasks: [{name: traj_arm, type: trajectory, joint_names: {hardware: arm}}]
 
 fn start(row: AdapterSpec, folder: &tempfile::TempDir) -> Run {
     let run = Run::from_yaml("orders", BLUEPRINT).adapters(&[row]).record(Record::Off);
-    run.folder(RunFolder::at(folder.path())).start().unwrap()
+    run.folder(RunDir::at(folder.path())).start().unwrap()
 }
 
 #[test]

@@ -13,8 +13,8 @@ use dimos::planning::pipeline::{self, solve};
 use dimos::planning::planning_scene::PlanningScene;
 use dimos::rpc::Code;
 use dimos::rpc::api::{ExecutePlan, Plan, PlanGoal, Planner, Planning};
-use dimos::rpc::place::RunFolder;
 use dimos::rpc::report::TickReport;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 
 use crate::support::program::{Home, eventually};
@@ -55,7 +55,7 @@ fn f23_a_planner_that_panics_or_never_ends_costs_that_request_only() {
             _ => solve(setup, world, request, stop),
         }
     };
-    let run = Run::from_yaml("f23", BLUEPRINT).record(Record::Off).folder(RunFolder::at(folder.path()));
+    let run = Run::from_yaml("f23", BLUEPRINT).record(Record::Off).folder(RunDir::at(folder.path()));
     let run = run.solver(Arc::new(solver)).start().unwrap();
     // A motion that takes as long as all of this does, and is not disturbed by any of it. Other programs may hold a
     // busy machine up: one undisturbed time of three shows that the planner does not.

@@ -7,7 +7,7 @@ use std::sync::{LazyLock, Mutex, MutexGuard, PoisonError};
 use dimos::hardware::adapter::AdapterError;
 use dimos::hardware::registry::AdapterSpec;
 use dimos::joint::JointLimits;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Builder, Options, Record, Run, StartError};
 
 use crate::support::program::eventually;
@@ -81,8 +81,8 @@ planner:
         run.folder(self.place())
     }
 
-    fn place(&self) -> RunFolder {
-        RunFolder::at(self.path("runs"))
+    fn place(&self) -> RunDir {
+        RunDir::at(self.path("runs"))
     }
 
     /// The start fails with these words, and nothing is left of it: the same run can be started at once.
@@ -150,7 +150,7 @@ fn a_device_that_another_run_has() {
     let other = other.replace("PID", &std::process::id().to_string());
     let other = Run::from_yaml("other", &other).adapters(&[SPEC]).record(Record::Off);
     let folder = tempfile::tempdir().unwrap();
-    let other = other.folder(RunFolder::at(folder.path())).start().unwrap();
+    let other = other.folder(RunDir::at(folder.path())).start().unwrap();
     let start = || {
         let failed = bench.run("log.mcap").start();
         other.stop();

@@ -18,7 +18,7 @@ use dimos::rpc::api::{
     ArmEnable, ArmReset, Confirmation, Execute, Point, Servo, State, Status, Stop, Trajectory, Velocity,
 };
 use dimos::rpc::client::{Client, ClientError};
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 use dimos::testing::{Call, MockAdapter};
 use serde_json::{Value, json};
@@ -429,7 +429,7 @@ fn an_arm_that_does_not_come_to_rest_keeps_its_motors_unless_now_is_said() {
     let mut row = *Registry::builtin().get("mock").unwrap();
     row.create = |_| Ok(Box::new(RUNAWAY.clone()));
     let folder = tempfile::tempdir().unwrap();
-    let run = Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunFolder::at(folder.path()));
+    let run = Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::at(folder.path()));
     let run = run.adapters(&[row]).start().unwrap();
     let _moving = RUNAWAY.clone().velocities(Some(&[0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0]));
     eventually("it moves", || run.state().arms[0].joints[1].velocity.is_some_and(|v| v > 0.2));

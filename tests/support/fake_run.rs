@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use dimos::rpc::api::*;
-use dimos::rpc::place::RunFolder;
 use dimos::rpc::report::*;
+use dimos::rpc::run_dir::RunDir;
 use dimos::rpc::server::Server;
 use dimos::rpc::streams::Streams;
 use dimos::rpc::{Backend, BoxFuture, Code, Reply, Request, RpcError, Subject};
@@ -128,7 +128,7 @@ impl Backend for FakeBackend {
 /// Starts a run of that name; it ends when the server is dropped.
 pub fn start(folder: &Path, run: &str, backend: FakeBackend) -> (Server, Arc<FakeBackend>) {
     let backend = Arc::new(backend);
-    let claim = RunFolder::at(folder).claim(run).expect("the name is free");
+    let claim = RunDir::at(folder).claim(run).expect("the name is free");
     (Server::start(claim, backend.clone()).expect("the socket opens"), backend)
 }
 

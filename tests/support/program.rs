@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use dimos::rpc::client::Client;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
@@ -75,8 +75,8 @@ impl Home {
         std::fs::write(self.path().join(name), text).unwrap();
     }
 
-    pub fn runs(&self) -> RunFolder {
-        RunFolder::at(self.path().join("run/dimos"))
+    pub fn runs(&self) -> RunDir {
+        RunDir::at(self.path().join("run/dimos"))
     }
 
     /// A connection to the only run.

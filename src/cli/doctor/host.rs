@@ -8,7 +8,7 @@ use rustix::process::{Resource, getrlimit};
 
 use super::Finding;
 use crate::recording::files::log_folder;
-use crate::rpc::place::RunFolder;
+use crate::rpc::run_dir::RunDir;
 use crate::rt::host::WATCHDOG_PRIORITY;
 
 /// Type of CAN links in `/sys/class/net/*/type` (ARPHRD_CAN).
@@ -202,7 +202,7 @@ fn log_room() -> Finding {
 /// Checks that other users can find runs: claims a name and releases it.
 fn sockets() -> Finding {
     let check = "sockets folder";
-    let folder = RunFolder::standard();
+    let folder = RunDir::standard();
     let shown = folder.path().display();
     match folder.claim(&format!("doctor-{}", std::process::id())) {
         Ok(claim) => {

@@ -73,7 +73,7 @@ impl Session {
         let mut message = None;
         if drives.get(setting.joint_mode).is_none() {
             setting.joint_mode = !setting.joint_mode;
-            message = Some((lacking(&setting.arm, !setting.joint_mode), false));
+            message = Some((missing_task(&setting.arm, !setting.joint_mode), false));
         }
         let (held, speed) = (ActiveMotions::default(), FIRST_SPEED);
         Self { client, watch, drives, setting, held, speed, joint: 0, stream: None, resting: None, message }
@@ -98,8 +98,8 @@ impl Session {
             }
             beat = (beat + PERIOD).max(Instant::now());
             loop {
-                let patience = beat.saturating_duration_since(Instant::now());
-                match terminal.event(patience).map_err(no_terminal)? {
+                let timeout = beat.saturating_duration_since(Instant::now());
+                match terminal.event(timeout).map_err(no_terminal)? {
                     Some((Event::Key(key), at)) => {
                         if let Some(exit) = self.key(&key, at)? {
                             return Ok(exit);
@@ -172,7 +172,7 @@ impl Session {
     fn change_mode(&mut self) -> Result<()> {
         let other = !self.setting.joint_mode;
         if self.drives.get(other).is_none() {
-            self.message = Some((lacking(&self.setting.arm, other), true));
+            self.message = Some((missing_task(&self.setting.arm, other), true));
             return Ok(());
         }
         self.rest()?;
@@ -200,7 +200,7 @@ impl Session {
         let arm = self.setting.arm.clone();
         let text = match self.client.call(Stop { arm: Some(arm.clone()) }) {
             Ok(reply) => {
-                let result = reply.arms.get(&arm).map_or_else(|| "unknown".to_owned(), word);
+                let result = reply.arms.get(&arm).map_or("unknown", |confirmation| confirmation.text());
                 format!("stop of {arm}: {result}; next: `dimos arm reset {arm}`, `dimos arm enable {arm}`")
             }
             Err(error) => refusal(Err(error))?.unwrap_or_default(),
@@ -323,14 +323,9 @@ fn no_terminal(error: std::io::Error) -> Failure {
 }
 
 /// Returns why a mode is unavailable.
-fn lacking(arm: &str, joint_mode: bool) -> String {
+fn missing_task(arm: &str, joint_mode: bool) -> String {
     let what = if joint_mode { "single joints" } else { "the end effector" };
     format!("no task of the run moves {what} of {arm}; add to `tasks`: {}", drive::line(arm, joint_mode))
-}
-
-fn word(how: &impl serde::Serialize) -> String {
-    let text = serde_json::to_value(how).ok();
-    text.and_then(|v| v.as_str().map(|s| s.replace('_', " "))).unwrap_or_else(|| "unknown".to_owned())
 }
 
 /// Returns a motion as text: `+x -yaw`.

@@ -11,7 +11,7 @@ use serde_json::Value;
 use crate::cli::exit::{Failure, Result};
 use crate::rpc::api::{State, Status};
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::place::RunFolder;
+use crate::rpc::run_dir::RunDir;
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
 use crate::rpc::streams::{Stream, Subscribe};
 use crate::sync::lock;
@@ -50,7 +50,7 @@ pub struct Watch {
 impl Watch {
     /// Starts reading an arm of a run.
     pub fn start(run: &str, arm: &str) -> Result<Self> {
-        let mut client = Client::find(&RunFolder::standard(), Some(run))?;
+        let mut client = Client::find(&RunDir::standard(), Some(run))?;
         let seen = Arc::new(Mutex::new(ArmSnapshot::default()));
         let ending = Arc::new(AtomicBool::new(false));
         let (arm, to, end) = (arm.to_owned(), seen.clone(), ending.clone());
@@ -107,7 +107,7 @@ fn read(
             seen.arm = status.arms.into_iter().find(|a| a.hardware_id == arm);
             seen.tasks = status.tasks;
         }
-        while let Some(message) = client.kept_message() {
+        while let Some(message) = client.buffered_message() {
             let mut seen = lock(to);
             if let Some(text) = bound(&message.data, &seen) {
                 seen.bound = Some((text, Instant::now()));

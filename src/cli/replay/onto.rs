@@ -22,7 +22,7 @@ use crate::replay::onto::{Approach, Plan, check as check_limits, is_real, plan};
 use crate::rpc::RpcError;
 use crate::rpc::api::{self, ArmEnable, Cancel, Execute, Move, Point, State, Trajectory};
 use crate::rpc::report::{Deviation, MotionReport, StateReport};
-use crate::runtime::{Ended, Ending, Options, Record, Run, StartError};
+use crate::runtime::{Ended, Ending, Options, Record, Run};
 use crate::trajectory::JointTrajectory;
 
 /// Fraction of the limits for the approach to the start of the motion.
@@ -51,11 +51,7 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Cata
     // The motors are enabled after the limits have been checked.
     let wanted: Vec<bool> = blueprint.arms.iter().map(|arm| arm.auto_enable).collect();
     blueprint.arms.iter_mut().for_each(|arm| arm.auto_enable = false);
-    let run = Run::start(&blueprint, options(args)).map_err(|error| Failure {
-        exit: if matches!(error, StartError::Hardware { .. }) { Exit::Hardware } else { Exit::Failed },
-        what: error.to_string(),
-        hint: Some(error.hint().to_owned()),
-    })?;
+    let run = Run::start(&blueprint, options(args))?;
     let show = Show { bars: !args.json && io::stderr().is_terminal(), quiet: args.json };
     let driver = Driver { run: &run, blueprint: &blueprint, plan: &plan, signals: &signals, show, rate: args.rate };
     let result = driver.drive(&wanted);
@@ -120,7 +116,7 @@ struct Show {
 }
 
 impl Show {
-    fn say(&self, text: std::fmt::Arguments<'_>) {
+    fn note(&self, text: std::fmt::Arguments<'_>) {
         if !self.quiet {
             output::note(text);
         }
@@ -150,7 +146,7 @@ impl Driver<'_> {
             let go = Move { arm: approach.arm.clone(), target, speed: APPROACH_SPEED };
             let begun = self.run.call(go)?;
             let (arm, duration) = (&approach.arm, begun.duration);
-            self.show.say(format_args!("approach: {arm} moves to the start of the motion, {duration:.1} s, directly"));
+            self.show.note(format_args!("approach: {arm} moves to the start of the motion, {duration:.1} s, directly"));
             self.follow(&[begun.motion], "approach")?;
         }
         let parts = self.plan.parts.iter();
@@ -170,7 +166,7 @@ impl Driver<'_> {
         }
         let duration = self.plan.parts.first().map_or(0.0, |p| p.trajectory.duration());
         let (joints, rate) = (self.plan.parts.iter().map(|p| p.trajectory.joint_names.len()).sum::<usize>(), self.rate);
-        self.show.say(format_args!("motion: {joints} joints, {duration:.1} s at rate {rate}, not collision-checked"));
+        self.show.note(format_args!("motion: {joints} joints, {duration:.1} s at rate {rate}, not collision-checked"));
         let reports = self.follow(&motions, "motion")?;
         Ok(reports.into_iter().flat_map(|report| report.deviation.unwrap_or_default()).collect())
     }
@@ -243,7 +239,7 @@ impl Driver<'_> {
         };
         bar.finish_and_clear();
         if let Err(End::Signal(_)) = &result {
-            self.show.say(format_args!("cancelling: the arms decelerate"));
+            self.show.note(format_args!("cancelling: the arms decelerate"));
         }
         if result.is_err() {
             self.cancel(motions)?;

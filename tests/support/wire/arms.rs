@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec, Emulator, EmulatorAddress, Registry};
 use dimos::hardware::sim::faults::Fault;
-use dimos::rpc::place::RunFolder;
+use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 use serde_json::{Value, json};
 
@@ -165,7 +165,7 @@ impl World {
         let arm = self.arm;
         let builder = Run::from_yaml("wire", &blueprint(&arm, &self.address))
             .record(Record::Off)
-            .folder(RunFolder::at(folder.path()))
+            .folder(RunDir::at(folder.path()))
             .adapters(arm.row.map(std::slice::from_ref).unwrap_or_default());
         let run = match builder.start() {
             Ok(run) => run,

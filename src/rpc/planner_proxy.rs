@@ -1,5 +1,5 @@
-//! The run's end of the line to a planner in another process: requests go out over its connection, answers come back by
-//! number. Nothing here waits longer than it says, however the process behaves: it may hang, send nonsense, or be gone.
+//! The run's side of the connection to a planner in another process: sends numbered requests and receives the answers.
+//! Every wait has a timeout: the process may hang, send invalid data, or exit.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard};
@@ -14,38 +14,38 @@ use super::error::{Code, RpcError};
 use super::wire;
 use crate::sync::lock;
 
-/// Requests that may wait for the planner at once.
-const WAITING: usize = 32;
+/// Maximum number of pending requests.
+const MAX_PENDING: usize = 32;
 
 type Answer = Result<Value, RpcError>;
 
-/// The line to a planner that registered.
+/// A registered planner in another process.
 #[derive(Debug)]
-pub struct PlannerLine {
-    /// The process at the other end, if the system knows it.
+pub struct PlannerProxy {
+    /// The planner's process, if the system reports it.
     pid: Option<i32>,
     state: Mutex<State>,
 }
 
 #[derive(Debug)]
 struct State {
-    /// To the connection's writer; bounded. `None`: the connection has ended.
+    /// Bounded queue of the connection's writer; `None` after the connection has ended.
     queue: Option<mpsc::Sender<String>>,
     next: u64,
-    waiting: HashMap<u64, oneshot::Sender<Answer>>,
+    pending: HashMap<u64, oneshot::Sender<Answer>>,
 }
 
-impl PlannerLine {
+impl PlannerProxy {
     pub(super) fn new(queue: mpsc::Sender<String>, pid: Option<i32>) -> Self {
-        Self { pid, state: Mutex::new(State { queue: Some(queue), next: 1, waiting: HashMap::new() }) }
+        Self { pid, state: Mutex::new(State { queue: Some(queue), next: 1, pending: HashMap::new() }) }
     }
 
-    /// Returns the process at the other end, if the system knows it.
+    /// Returns the planner's process, if the system reports it.
     pub fn pid(&self) -> Option<i32> {
         self.pid
     }
 
-    /// Whether the connection has ended.
+    /// Returns whether the connection has ended.
     pub fn is_closed(&self) -> bool {
         self.lock().queue.is_none()
     }
@@ -56,41 +56,41 @@ impl PlannerLine {
         let (queue, request) = {
             let mut state = self.lock();
             let Some(queue) = state.queue.clone() else { return Err(gone()) };
-            if state.waiting.len() >= WAITING {
-                return Err(self.silent(format!("{WAITING} requests wait for the planner already")));
+            if state.pending.len() >= MAX_PENDING {
+                return Err(self.no_answer(format!("the planner has {MAX_PENDING} pending requests already")));
             }
             let request = state.next;
             state.next += 1;
-            state.waiting.insert(request, sender);
+            state.pending.insert(request, sender);
             (queue, request)
         };
-        let _waiting = Waiting { line: self, request };
+        let _pending = Pending { proxy: self, request };
         let asked = PlannerRequest { request, method: method.to_owned(), params, moment };
-        // A number for a subscription, which this is not.
+        // Not a subscription: its number and the count of lost messages are 0.
         let line = wire::message(PLANNER_REQUESTS, 0, 0, &json!(asked).to_string());
         match queue.try_send(line) {
             Ok(()) => {}
             Err(mpsc::error::TrySendError::Full(_)) => {
-                return Err(self.silent("the planner does not read what it is sent".into()));
+                return Err(self.no_answer("the planner does not read its requests".into()));
             }
             Err(mpsc::error::TrySendError::Closed(_)) => return Err(gone()),
         }
         match timeout(limit, receiver).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) => Err(gone()),
-            Err(_) => Err(self.silent(format!("the planner did not answer within {:.1} s", limit.as_secs_f64()))),
+            Err(_) => Err(self.no_answer(format!("the planner did not answer within {:.1} s", limit.as_secs_f64()))),
         }
     }
 
-    fn silent(&self, what: String) -> RpcError {
+    fn no_answer(&self, what: String) -> RpcError {
         let process = self.pid.map(|pid| format!(" (pid {pid})")).unwrap_or_default();
         let error = RpcError::new(Code::NoAnswer, what);
         error.hint(format!("its process{process} is live but hangs: end it, and start the planner again"))
     }
 
-    /// Delivers the reply to the pending request; drops it if that request has timed out.
-    pub(super) fn answered(&self, answer: PlannerAnswer) {
-        let sender = self.lock().waiting.remove(&answer.request);
+    /// Delivers an answer to its pending request; drops it if that request has timed out.
+    pub(super) fn deliver(&self, answer: PlannerAnswer) {
+        let sender = self.lock().pending.remove(&answer.request);
         let result = match answer.error {
             Some(error) => Err(error),
             None => Ok(answer.result.unwrap_or_default()),
@@ -100,11 +100,11 @@ impl PlannerLine {
         }
     }
 
-    /// The connection has ended: so has all waiting.
+    /// Ends all pending requests: the connection has ended.
     pub(super) fn close(&self) {
         let mut state = self.lock();
         state.queue = None;
-        state.waiting.clear();
+        state.pending.clear();
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -112,20 +112,20 @@ impl PlannerLine {
     }
 }
 
-/// A place among those who wait; given back however the waiting ends.
-struct Waiting<'a> {
-    line: &'a PlannerLine,
+/// A pending request; removed when dropped, also if the caller stops waiting.
+struct Pending<'a> {
+    proxy: &'a PlannerProxy,
     request: u64,
 }
 
-impl Drop for Waiting<'_> {
+impl Drop for Pending<'_> {
     fn drop(&mut self) {
-        self.line.lock().waiting.remove(&self.request);
+        self.proxy.lock().pending.remove(&self.request);
     }
 }
 
-/// The planner's process has ended. A run that never had one refuses without `data`: who relied on a planner must not
-/// be moved without one because it crashed.
+/// Returns the error after the planner's process has ended. It has `data`, unlike that of a run without a planner: a
+/// client that relies on planning must not fall back to direct motion because the planner crashed.
 pub fn gone() -> RpcError {
     RpcError::new(Code::NoPlanner, "the planner that was attached to this run has gone")
         .hint("start it again: `dimos run` its blueprint beside this run; `dimos move … --direct` needs none")

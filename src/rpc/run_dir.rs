@@ -1,7 +1,7 @@
-//! Location of the sockets of runs, which runs are live, and that a run name is taken once.
+//! The run directory: sockets and locks of the live runs.
 //!
-//! A run holds a locked file `<run>.lock` with its pid in it, next to its socket `<run>.sock`. The lock dies with the
-//! process, however that ends, so what is not locked is stale and removed by the process that finds it.
+//! A run holds a lock on `<run>.lock`, which contains its pid, beside its socket `<run>.sock`. The kernel releases the
+//! lock when the process ends, so files without a lock are stale; any process that finds them removes them.
 
 use std::fs::{self, DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Read, Write};
@@ -9,76 +9,76 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsE
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Longest name of a run [bytes].
+/// Maximum length of a run name [bytes].
 const MAX_NAME: usize = 64;
-/// Longest path of a socket that Linux takes [bytes].
+/// Maximum length of a socket's path in Linux [bytes].
 const MAX_SOCKET_PATH: usize = 107;
-/// How often a name that looks taken is tried again: someone listing the runs holds each lock for a moment.
+/// Attempts to claim a name whose lock is held: a process that lists the runs holds each lock briefly.
 const ATTEMPTS: u32 = 20;
-/// The same while the lock's file does not say who has it: its holder will write it in a moment, or only lists.
+/// Attempts while the lock file has no pid: its holder is about to write it, or is listing the runs.
 const ATTEMPTS_UNNAMED: u32 = 400;
 /// Pause between attempts.
 const PAUSE: Duration = Duration::from_millis(5);
 
-/// Why a run's name or place cannot be used.
+/// Why a run name or the run directory cannot be used.
 #[derive(Debug, thiserror::Error)]
-pub enum PlaceError {
-    /// The name is no good for a file.
+pub enum RunDirError {
+    /// The name is not valid.
     #[error("{0:?} cannot be the name of a run")]
     BadName(String),
-    /// A live run has that name.
+    /// A live run has this name.
     #[error("a run named {run:?} is live already (pid {pid})")]
     Taken {
         /// The name.
         run: String,
-        /// The process that holds it; 0 when it has not said yet.
+        /// Process id of its holder; 0 while unknown.
         pid: u32,
     },
-    /// The folder belongs to someone else, or is none.
-    #[error("{} is not a folder of this user", .0.display())]
+    /// The directory belongs to another user, or is not a directory.
+    #[error("{} is not a directory of this user", .0.display())]
     NotOurs(PathBuf),
-    /// The path of the socket is too long for the system.
+    /// The path of the socket is too long for Linux.
     #[error("the path of the socket is too long: {}", .0.display())]
     PathTooLong(PathBuf),
-    /// The file system refused.
+    /// A file system operation failed.
     #[error("{}: {error}", path.display())]
     Io {
-        /// Which file or folder.
+        /// The file or directory.
         path: PathBuf,
-        /// What it said.
+        /// The system's error.
         error: io::Error,
     },
 }
 
-impl PlaceError {
-    /// What to do about it.
+impl RunDirError {
+    /// Returns what the user can do about it.
     pub fn hint(&self) -> &'static str {
         match self {
-            Self::BadName(_) => "up to 64 letters, digits, '-', '_' and '.', and no '.' at the start",
-            Self::Taken { .. } => "give this one another name with `--name`, or end that one with `dimos down`",
-            Self::NotOurs(_) => "remove it, or set XDG_RUNTIME_DIR to a folder of yours",
-            Self::PathTooLong(_) => "set XDG_RUNTIME_DIR to a folder with a shorter path, or take a shorter name",
-            Self::Io { .. } => "the folder must be writable; XDG_RUNTIME_DIR may name another",
+            Self::BadName(_) => "use 1 to 64 letters, digits, '-', '_' and '.', without a leading '.'",
+            Self::Taken { .. } => "choose another name with `--name`, or end that run with `dimos down`",
+            Self::NotOurs(_) => "remove it, or set XDG_RUNTIME_DIR to a directory of this user",
+            Self::PathTooLong(_) => "set XDG_RUNTIME_DIR to a directory with a shorter path, or use a shorter name",
+            Self::Io { .. } => "make the directory writable, or set XDG_RUNTIME_DIR to another one",
         }
     }
 }
 
-/// The folder with the sockets.
+/// The directory of sockets and locks.
 #[derive(Debug, Clone)]
-pub struct RunFolder(PathBuf);
+pub struct RunDir(PathBuf);
 
 /// A live run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LiveRun {
     /// Its name.
     pub name: String,
-    /// Its process; 0 when it has not said yet.
+    /// Process id; 0 while unknown.
     pub pid: u32,
-    /// Its socket; it may not exist yet while the run starts.
+    /// Its socket; missing while the run starts.
     pub socket: PathBuf,
 }
 
-/// A run's name, taken for as long as this value exists. Dropping it removes the socket and the lock.
+/// A claimed run name. Dropping it removes the socket and releases the name.
 #[derive(Debug)]
 pub struct Claim {
     run: String,
@@ -87,8 +87,9 @@ pub struct Claim {
     _lock: File,
 }
 
-impl RunFolder {
-    /// `$XDG_RUNTIME_DIR/dimos`, or `<tmp>/dimos-<uid>` where there is no such variable or folder.
+impl RunDir {
+    /// Returns the default directory: `$XDG_RUNTIME_DIR/dimos`, or `<tmp>/dimos-<uid>` if that variable is unset or
+    /// names no directory.
     pub fn standard() -> Self {
         let runtime = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|dir| dir.is_dir());
         Self(match runtime {
@@ -97,31 +98,31 @@ impl RunFolder {
         })
     }
 
-    /// A folder of one's own, for tests and embedders.
+    /// Returns a run directory at this path, for tests and programs that contain a run.
     pub fn at(path: impl Into<PathBuf>) -> Self {
         Self(path.into())
     }
 
-    /// The same for planners in processes of their own: they have names and live, but no socket.
+    /// Returns the directory for attached planners: they have a lock, but no socket.
     pub fn planners(&self) -> Self {
         Self(self.0.join("planners"))
     }
 
-    /// Where it is.
+    /// Returns its path.
     pub fn path(&self) -> &Path {
         &self.0
     }
 
-    /// Takes a run's name, or says who has it. Removes what a dead run of that name left.
-    pub fn claim(&self, run: &str) -> Result<Claim, PlaceError> {
+    /// Claims a run name, removing stale files of that name. Fails if a live run has it. May block for 2 s.
+    pub fn claim(&self, run: &str) -> Result<Claim, RunDirError> {
         check_name(run)?;
         let socket = self.0.join(format!("{run}.sock"));
         if socket.as_os_str().len() > MAX_SOCKET_PATH {
-            return Err(PlaceError::PathTooLong(socket));
+            return Err(RunDirError::PathTooLong(socket));
         }
         self.prepare()?;
         let lock_path = self.0.join(format!("{run}.lock"));
-        let in_lock = |error| PlaceError::Io { path: lock_path.clone(), error };
+        let in_lock = |error| RunDirError::Io { path: lock_path.clone(), error };
         let mut pid = 0;
         let mut attempts = 0;
         while attempts < if pid == 0 { ATTEMPTS_UNNAMED } else { ATTEMPTS } {
@@ -141,7 +142,7 @@ impl RunFolder {
                     remove(&socket)?;
                     return Ok(Claim { run: run.to_owned(), socket, lock_path, _lock: file });
                 }
-                Ok(()) => {} // Removed by its last holder between our opening and locking it.
+                Ok(()) => {} // Its previous holder removed the file after we opened it.
                 Err(TryLockError::WouldBlock) => {
                     pid = read_pid(&mut file);
                     std::thread::sleep(PAUSE);
@@ -149,12 +150,12 @@ impl RunFolder {
                 Err(TryLockError::Error(error)) => return Err(in_lock(error)),
             }
         }
-        Err(PlaceError::Taken { run: run.to_owned(), pid })
+        Err(RunDirError::Taken { run: run.to_owned(), pid })
     }
 
-    /// The runs that live, by name. Removes what dead ones left.
-    pub fn runs(&self) -> Result<Vec<LiveRun>, PlaceError> {
-        let in_folder = |error| PlaceError::Io { path: self.0.clone(), error };
+    /// Returns the live runs, sorted by name. Removes stale files.
+    pub fn runs(&self) -> Result<Vec<LiveRun>, RunDirError> {
+        let in_folder = |error| RunDirError::Io { path: self.0.clone(), error };
         let entries = match fs::read_dir(&self.0) {
             Ok(entries) => entries,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -187,14 +188,14 @@ impl RunFolder {
         Ok(runs)
     }
 
-    /// Makes the folder, for this user only.
-    fn prepare(&self) -> Result<(), PlaceError> {
-        let failed = |error| PlaceError::Io { path: self.0.clone(), error };
+    /// Creates the directory, accessible to this user only.
+    fn prepare(&self) -> Result<(), RunDirError> {
+        let failed = |error| RunDirError::Io { path: self.0.clone(), error };
         DirBuilder::new().recursive(true).mode(0o700).create(&self.0).map_err(failed)?;
-        // Anyone may make folders in the temporary folder: one that is not ours would let its owner take our socket.
+        // Any user can create directories in <tmp>. The owner of this one could replace our socket.
         let found = fs::symlink_metadata(&self.0).map_err(failed)?;
         if !found.is_dir() || found.uid() != rustix::process::geteuid().as_raw() {
-            return Err(PlaceError::NotOurs(self.0.clone()));
+            return Err(RunDirError::NotOurs(self.0.clone()));
         }
         if found.mode() & 0o777 != 0o700 {
             fs::set_permissions(&self.0, Permissions::from_mode(0o700)).map_err(failed)?;
@@ -204,12 +205,12 @@ impl RunFolder {
 }
 
 impl Claim {
-    /// The run's name.
+    /// Returns the run's name.
     pub fn run(&self) -> &str {
         &self.run
     }
 
-    /// Where its socket belongs.
+    /// Returns the path for its socket.
     pub fn socket(&self) -> &Path {
         &self.socket
     }
@@ -217,25 +218,24 @@ impl Claim {
 
 impl Drop for Claim {
     fn drop(&mut self) {
-        // Removed while still locked, so that no other run's files are hit. A failure leaves stale files, which the
-        // next run removes.
+        // Still locked, so these are not another run's files. After a failure the next run removes them.
         let _ = remove(&self.socket);
         let _ = remove(&self.lock_path);
     }
 }
 
-/// Whether a name may be that of a run: it is part of names of files.
-pub fn check_name(run: &str) -> Result<(), PlaceError> {
+/// Checks that a run name is valid as part of a file name.
+pub fn check_name(run: &str) -> Result<(), RunDirError> {
     let good = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'-' | b'_' | b'.');
     if run.is_empty() || run.len() > MAX_NAME || run.starts_with('.') || !run.bytes().all(good) {
-        return Err(PlaceError::BadName(run.to_owned()));
+        return Err(RunDirError::BadName(run.to_owned()));
     }
     Ok(())
 }
 
-fn remove(path: &Path) -> Result<(), PlaceError> {
+fn remove(path: &Path) -> Result<(), RunDirError> {
     match fs::remove_file(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(PlaceError::Io { path: path.to_owned(), error }),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(RunDirError::Io { path: path.to_owned(), error }),
         _ => Ok(()),
     }
 }

@@ -1,5 +1,5 @@
-//! The planner's end of the line: connects to a run, registers, and answers what the run asks, each request beside the
-//! others, until the run is gone.
+//! The planner's side of the connection: connects to a run, registers, and answers its requests concurrently until the
+//! connection ends.
 
 use std::future::Future;
 use std::io;
@@ -20,17 +20,17 @@ use super::api::{Method, PLANNER_REQUESTS, PlannerAnswer, PlannerRequest, Regist
 use super::error::RpcError;
 use super::wire::Incoming;
 
-/// Time for a run to answer a registration.
-const PATIENCE: Duration = Duration::from_secs(5);
-/// Longest line that a run sends its planner [bytes].
+/// Maximum time for a run to answer a registration.
+const REGISTER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Maximum length of a line from the run [bytes].
 const MAX_REQUEST: u64 = 1 << 20;
-/// Requests that are worked on at once.
-const AT_ONCE: usize = 32;
+/// Maximum number of requests in progress.
+const MAX_CONCURRENT: usize = 32;
 
-/// Why there is no line to a run.
+/// Why a planner is not registered.
 #[derive(Debug, thiserror::Error)]
-pub enum NoLine {
-    /// The run cannot be reached, or went away.
+pub enum RegisterError {
+    /// The run cannot be reached, or the connection ended.
     #[error("{0}")]
     Io(#[from] io::Error),
     /// The run refused the planner.
@@ -38,43 +38,44 @@ pub enum NoLine {
     Refused(RpcError),
 }
 
-/// A line to a run, the planner registered.
-pub struct PlannerEnd {
+/// A connection to a run on which the planner is registered.
+pub struct PlannerStub {
     from: BufReader<OwnedReadHalf>,
     to: OwnedWriteHalf,
-    /// What the run said.
+    /// The run's reply.
     pub registered: Registered,
 }
 
-impl PlannerEnd {
+impl PlannerStub {
     /// Connects to a run's socket and registers.
-    pub async fn register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, NoLine> {
-        let late = |_| io::Error::new(io::ErrorKind::TimedOut, format!("no answer within {} s", PATIENCE.as_secs()));
-        timeout(PATIENCE, Self::try_register(socket, planner)).await.map_err(late)?
+    pub async fn register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, RegisterError> {
+        let late =
+            |_| io::Error::new(io::ErrorKind::TimedOut, format!("no answer within {} s", REGISTER_TIMEOUT.as_secs()));
+        timeout(REGISTER_TIMEOUT, Self::try_register(socket, planner)).await.map_err(late)?
     }
 
-    async fn try_register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, NoLine> {
+    async fn try_register(socket: &Path, planner: &RegisterPlanner) -> Result<Self, RegisterError> {
         let (from, mut to) = UnixStream::connect(socket).await?.into_split();
         let mut from = BufReader::new(from);
         let line = json!({"id": 1, "method": RegisterPlanner::NAME, "params": planner}).to_string() + "\n";
         to.write_all(line.as_bytes()).await?;
         let incoming = read(&mut from).await?;
         if let Some(refusal) = incoming.error {
-            return Err(NoLine::Refused(refusal));
+            return Err(RegisterError::Refused(refusal));
         }
         let unlike = |e: serde_json::Error| io::Error::new(io::ErrorKind::InvalidData, e.to_string());
         let registered = serde_json::from_value(incoming.result).map_err(unlike)?;
         Ok(Self { from, to, registered })
     }
 
-    /// Answers requests until the run closes the line; says how it ended. Must run within a `LocalSet` or a runtime.
+    /// Answers requests until the connection ends; returns the reason. Must run within a tokio runtime.
     pub async fn serve<F>(self, answer: impl Fn(PlannerRequest) -> F) -> io::Error
     where
         F: Future<Output = Result<Value, RpcError>> + Send + 'static,
     {
         let Self { mut from, to, .. } = self;
-        let (answers, waiting) = mpsc::channel(AT_ONCE);
-        let room = Arc::new(Semaphore::new(AT_ONCE));
+        let (answers, waiting) = mpsc::channel(MAX_CONCURRENT);
+        let room = Arc::new(Semaphore::new(MAX_CONCURRENT));
         let mut working = JoinSet::new();
         working.spawn(write(to, waiting));
         loop {
@@ -87,7 +88,7 @@ impl PlannerEnd {
                 continue; // the reply to an answer
             }
             let Ok(asked) = serde_json::from_value::<PlannerRequest>(incoming.data) else { continue };
-            let Ok(seat) = room.clone().acquire_owned().await else { continue };
+            let Ok(permit) = room.clone().acquire_owned().await else { continue };
             let (request, answer, answers) = (asked.request, answer(asked), answers.clone());
             working.spawn(async move {
                 let (result, error) = match answer.await {
@@ -96,8 +97,8 @@ impl PlannerEnd {
                 };
                 let answer = PlannerAnswer { request, result, error };
                 let line = json!({"id": null, "method": PlannerAnswer::NAME, "params": answer}).to_string() + "\n";
-                let _ = answers.send(line).await; // a run that is gone is noticed by the reader
-                drop(seat);
+                let _ = answers.send(line).await; // if the run is gone, the reader notices it
+                drop(permit);
             });
         }
     }
