@@ -277,7 +277,7 @@ pub trait Gripper {
     /// Commands the opening [m].
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()>;
     /// Returns the opening when closed and when open [m], according to the data sheet; `None` if unknown.
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         None
     }
 }

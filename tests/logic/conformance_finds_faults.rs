@@ -249,7 +249,7 @@ impl<const MISTAKE: u8> Gripper for Wrong<MISTAKE> {
     fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
         self.inner.gripper().map_or(Ok(None), |gripper| gripper.read_gripper_position())
     }
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.inner.gripper().and_then(|gripper| gripper.get_gripper_range())
     }
     fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {

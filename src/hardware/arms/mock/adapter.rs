@@ -208,7 +208,7 @@ impl Gripper for MockArm {
         Ok(Some(self.device.gripper.position))
     }
 
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         Some((0.0, GRIPPER_MAX))
     }
 

@@ -340,7 +340,7 @@ impl Gripper for PiperAdapter {
         Ok(self.arm.known()?.gripper.map(|gripper| f64::from(gripper.stroke) * MICRO))
     }
 
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.options.gripper.stroke().map(|stroke| (0.0, stroke))
     }
 

@@ -11,7 +11,7 @@ use super::protocol::{DOF, decode};
 use super::tests::{START, activate, config, connected, farthest, ids, read, until};
 use super::tests_faults::{failure, other};
 use crate::clock::Mono;
-use crate::hardware::adapter::{AdapterError, ManipulatorAdapter};
+use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, ManipulatorAdapter};
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::transport::can::CanFrame;

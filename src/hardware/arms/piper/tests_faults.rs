@@ -7,7 +7,7 @@ use super::emulator::PiperEmulator;
 use super::golden;
 use super::protocol::DOF;
 use super::tests::{START, activate, config, connected, farthest, ids, pair, read, two, until};
-use crate::hardware::adapter::{AdapterError, Cartesian, Gripper, ManipulatorAdapter, Stop};
+use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::registry::Emulator;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::transport::can::{self, CanAddress, CanFrame, CanPort};

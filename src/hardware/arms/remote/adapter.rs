@@ -303,7 +303,7 @@ impl Gripper for RemoteAdapter {
         self.recent(|state| state.gripper)
     }
 
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.last.as_ref()?.gripper_range
     }
 

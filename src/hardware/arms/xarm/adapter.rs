@@ -345,7 +345,7 @@ impl Gripper for XArmAdapter {
         Ok(self.recent()?.gripper().opening())
     }
 
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         self.options.gripper.widest().map(|widest| (0.0, widest))
     }
 

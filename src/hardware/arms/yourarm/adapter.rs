@@ -337,7 +337,7 @@ impl Gripper for YourArmAdapter {
         Ok(state.gripper_fitted.then_some(state.gripper / MM_PER_M))
     }
 
-    fn get_gripper_range(&self) -> Option<(f64, f64)> {
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
         Some((0.0, super::GRIPPER_MAX))
     }
 
