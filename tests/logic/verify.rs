@@ -12,7 +12,7 @@ use dimos::control::request::{Goal, Request};
 use dimos::control::task_spec::TaskTable;
 use dimos::hardware::registry::Registry;
 use dimos::joint::{JointLimits, joints_of, make_joints};
-use dimos::recording::messages::{JointState, Text, Tick};
+use dimos::recording::messages::{ArmOutput, JointState, Text, Tick};
 use dimos::replay::recorded::RecordedError;
 use dimos::replay::verify::{Finding, Verification};
 use dimos::robot::kinematics::Kinematics;
@@ -216,6 +216,16 @@ fn one_bit_of_a_state_is_found_where_it_first_matters() {
     let d = first_difference(&copy);
     assert_eq!((d.tick, d.what), (estimated as u64, "estimated velocity"));
     assert_eq!(d.joint.as_deref(), Some("arm_joint3"));
+}
+
+#[test]
+fn a_changed_number_of_starts_is_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    tamper(&log, &copy, "/dimos/outputs/arm", 0, |m: &mut ArmOutput| m.start_seq += 1);
+    let d = first_difference(&copy);
+    assert_eq!((d.tick, d.what, d.arm.as_deref()), (0, "number of starts", Some("arm")));
 }
 
 #[test]
