@@ -153,7 +153,7 @@ fn f07_measurements_that_are_not_finite_reach_no_command() {
         }
         rig.arms[0].q = q;
         assert_eq!(rig.samples[0].cause.name(), "stale");
-        assert_eq!(rig.ask(Request::Ready { arm: 0 }).name(), "ARM_LATCHED");
+        assert_eq!(rig.ask(Request::Enabled { arm: 0 }).name(), "ARM_LATCHED");
     }
 }
 
@@ -492,7 +492,7 @@ proptest! {
                 5 => { rig.send(Request::Stop { arm: None }); }
                 _ => {
                     rig.send(Request::Reset { arm: 0 });
-                    rig.send(Request::Ready { arm: 0 });
+                    rig.send(Request::Enabled { arm: 0 });
                 }
             }
             for _ in 0..ticks {
@@ -601,7 +601,7 @@ fn scenario(seed: u64, ticks: u64) -> Vec<u64> {
             30..=33 => {
                 for arm in 0..2 {
                     rig.send(Request::Reset { arm });
-                    rig.send(Request::Ready { arm });
+                    rig.send(Request::Enabled { arm });
                 }
             }
             34 => rig.arms[0].silent = random.below(2) == 0,

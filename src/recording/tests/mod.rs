@@ -246,7 +246,7 @@ fn unknown_values_are_absent_or_nan_but_never_zero() {
 }
 
 #[test]
-fn a_request_stands_before_its_answer_and_events_are_told_in_words() {
+fn a_request_precedes_its_answer_and_events_have_text() {
     let (_folder, path) = folder();
     let notices = Notices::default();
     let (recorder, mut ring, notes) = start(&path, &notices);
