@@ -56,8 +56,8 @@ pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
     Ok(logs(folder, LOG)?.pop())
 }
 
-/// Removes all but the newest `keep` logs from `folder`, and no other files. Keeps logs that a live run writes, and logs
-/// that cannot be removed. Returns the removed paths.
+/// Removes all but the newest `keep` logs from `folder`, and no other files. Keeps logs that a live run writes, and
+/// those that cannot be removed. Returns the removed paths.
 pub fn retain(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
     retain_newest(folder, LOG, keep)
 }

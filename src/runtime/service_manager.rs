@@ -19,8 +19,8 @@ pub struct ServiceManager {
 }
 
 impl ServiceManager {
-    /// Returns the connection to the service manager that started this process, from `NOTIFY_SOCKET`; `None` if there is
-    /// none.
+    /// Returns the connection to the service manager that started this process, from `NOTIFY_SOCKET`; `None`
+    /// if there is none.
     pub fn from_env() -> Option<Self> {
         let variable = |name| std::env::var(name).ok().and_then(|value| value.parse::<u64>().ok());
         let ours = variable("WATCHDOG_PID").is_none_or(|pid| pid == u64::from(std::process::id()));
@@ -28,8 +28,8 @@ impl ServiceManager {
         Self::at(std::env::var_os("NOTIFY_SOCKET")?, watchdog).ok()
     }
 
-    /// Creates a connection to a service manager at an address (a path, or `@` and an abstract name), with this watchdog
-    /// interval.
+    /// Creates a connection to a service manager at an address (a path, or `@` and an abstract name), with this
+    /// watchdog interval.
     pub fn at(address: OsString, watchdog: Option<Duration>) -> io::Result<Self> {
         let address = match address.as_bytes().strip_prefix(b"@") {
             Some(name) => SocketAddr::from_abstract_name(name)?,
