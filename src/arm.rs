@@ -20,7 +20,7 @@ pub struct Supervision {
     pub stale_after: Duration,
     /// Largest distance of a joint from its setpoints of the last `lag` seconds [rad].
     pub tracking_tolerance: f64,
-    /// Whether a pose with every joint at exactly zero is believed without the device's confirmation.
+    /// Whether a pose with every joint at exactly zero is accepted without the device's confirmation.
     pub accept_zero_pose: bool,
 }
 
@@ -102,7 +102,7 @@ pub struct Pose {
     pub rpy: [f64; 3],
 }
 
-/// The latest that is known of an arm. Device thread → tick.
+/// Latest known state of an arm. Device thread → tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmState {
     /// Counts the states published by the device thread; 0 = none yet.
@@ -137,9 +137,9 @@ pub struct ArmState {
     pub self_held: bool,
     /// `ArmCommand::seq` of the newest command that was written to the wire.
     pub written: u64,
-    /// Seen of the arm that this run did not order. Cleared when errors are cleared.
+    /// Change of the arm's condition that this run did not order; cleared with the errors.
     pub interference: Interference,
-    /// Part of this state's age in which the device thread could not run [ns]: not the arm's fault.
+    /// Part of this state's age during which this host's device thread could not run [ns].
     pub own_delay_ns: u64,
 }
 
@@ -168,12 +168,12 @@ impl Default for ArmState {
     }
 }
 
-/// What the tick wants of an arm. Tick → device thread.
+/// Command of the tick to an arm. Tick → device thread.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ArmCommand {
     /// Counts the commands of this arm; 0 = none yet.
     pub seq: u64,
-    /// `None` leaves the arm alone (not enabled, not known, released); otherwise how to read `values`.
+    /// Control mode of `values`; `None`: the arm is not commanded (disabled, in an unknown state, or released).
     pub mode: Option<ControlMode>,
     /// Joint positions [rad] or velocities [rad/s], by `mode`.
     pub values: Joints,
@@ -181,7 +181,7 @@ pub struct ArmCommand {
     pub gripper: f64,
     /// Counts the gripper commands; 0 = none yet.
     pub gripper_seq: u32,
-    /// Ask the arm to stop by its own means (a latched hold was entered); acted on when the count changes.
+    /// Counts the stops ordered from the arm's controller, e.g. when a latched hold is entered.
     pub stop_seq: u32,
     /// When the tick will read states next: the device thread reads shortly before.
     pub next_tick: Mono,

@@ -18,11 +18,11 @@ pub const DEFAULT_JERK: f64 = 20.0;
 
 /// Standstill velocity: a slower joint is at rest, given the noise of measured velocities [rad/s].
 pub const STANDSTILL: f64 = 0.02;
-/// The same where one reading decides, which may be a difference of two positions: noisier, so the threshold of the
-/// tick is higher [rad/s].
+/// Standstill velocity in the tick. A single reading decides there, and it may be estimated from two positions: it is
+/// noisier, so the threshold is higher [rad/s].
 pub const TICK_STANDSTILL: f64 = 0.05;
 
-/// A slice as a fixed array; what does not fit is left out.
+/// Copies a slice to a fixed array. Drops values beyond [`MAX_DOF`]; missing ones are 0.
 pub fn joints_of(values: &[f64]) -> Joints {
     let mut out = [0.0; MAX_DOF];
     for (o, v) in out.iter_mut().zip(values) {
@@ -31,8 +31,8 @@ pub fn joints_of(values: &[f64]) -> Joints {
     out
 }
 
-/// The highest speed [rad/s] of a step of `dt` [s] that ends no further than `distance` [rad] when the steps after it
-/// slow down by `acceleration` [rad/s²] each. Exact in discrete time: with n more steps before the last one,
+/// Returns the highest speed [rad/s] of a step of `dt` [s] that ends within `distance` [rad] when the steps after it
+/// decelerate by `acceleration` [rad/s²] each. Exact in discrete time: with n more steps before the last one,
 /// distance / dt = (n + 1) v − c n (n + 1) / 2, where c is the change of velocity per step.
 pub fn braking_speed(distance: f64, acceleration: f64, dt: f64) -> f64 {
     let change = acceleration * dt;

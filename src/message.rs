@@ -1,5 +1,5 @@
 //! A message: what went wrong, and what to do about it. Errors of adapters and readers are text with the hint in a
-//! separate line; only this module writes and reads that line.
+//! separate line, `hint: …`; this module separates the two.
 
 use std::fmt;
 
@@ -16,7 +16,7 @@ pub struct Message {
 }
 
 impl Message {
-    /// Returns the message in the text of an error.
+    /// Splits the text of an error into what went wrong and the hint.
     pub fn of(error: impl fmt::Display) -> Self {
         error.to_string().into()
     }
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_message_survives_being_text() {
+    fn a_message_is_the_same_after_conversion_to_text_and_back() {
         let both = Message { what: "no answer".into(), hint: Some("is it powered?\nhint: look".into()) };
         assert_eq!(both.to_string(), "no answer\nhint: is it powered?\nhint: look");
         assert_eq!(Message::of(&both), both);

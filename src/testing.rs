@@ -10,7 +10,7 @@ use crate::hardware::adapter::{
 use crate::joint::{ControlMode, JointLimits};
 use crate::sync::lock;
 
-/// A call that an adapter got, with its arguments in SI units.
+/// A call to an adapter, with its arguments in SI units.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Call {
     /// A method without arguments that matter: every read, `connect`, `activate`, `write_stop` …
@@ -85,10 +85,10 @@ struct Shared {
     calls: Vec<Call>,
 }
 
-/// A test double for [`ManipulatorAdapter`]: canned answers, and a record of the calls.
+/// A mock of [`ManipulatorAdapter`]: scripted answers, and a record of the calls.
 ///
 /// Nothing moves: positions stay what they were set to, whatever is written. (For an arm that moves use the adapter
-/// `mock`.) Clones share everything, so a test keeps one and hands the other over.
+/// `mock`.) Clones share everything, so a test keeps one and passes the other on.
 ///
 /// ```
 /// use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
@@ -138,13 +138,13 @@ impl MockAdapter {
         self
     }
 
-    /// Answers of `read_joint_velocities` [rad/s]; `None`: it has no velocities.
+    /// Answers of `read_joint_velocities` [rad/s]; `None`: not supported.
     pub fn velocities(self, velocities: Option<&[f64]>) -> Self {
         self.lock().velocities = velocities.map(<[f64]>::to_vec);
         self
     }
 
-    /// Answers of `read_joint_efforts` [Nm]; `None`: it has no torques.
+    /// Answers of `read_joint_efforts` [Nm]; `None`: not supported.
     pub fn efforts(self, efforts: Option<&[f64]>) -> Self {
         self.lock().efforts = efforts.map(<[f64]>::to_vec);
         self
@@ -196,7 +196,7 @@ impl MockAdapter {
         self.lock().failures.extend(known.map(|name| (*name, error)));
     }
 
-    /// All calls so far, in order. Those of `is_connected` and the `get_…` that cannot fail are not among them.
+    /// Returns all calls so far, in order, except `is_connected` and the infallible `get_…` methods.
     pub fn calls(&self) -> Vec<Call> {
         self.lock().calls.clone()
     }

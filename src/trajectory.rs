@@ -318,6 +318,12 @@ fn quintic((p0, p1, v0, v1): (f64, f64, f64, f64), a0: f64, a1: f64, h: f64) -> 
     ]
 }
 
+/// Returns a quintic step from 0 to 1 with zero velocity and acceleration at both ends; constant outside of 0 to 1.
+pub fn smooth_step(x: f64) -> f64 {
+    let x = x.clamp(0.0, 1.0);
+    x * x * x * (10.0 + x * (6.0 * x - 15.0))
+}
+
 /// Returns the velocities of one joint at the points: those given, otherwise the monotone choice.
 fn velocities_of(trajectory: &JointTrajectory, times: &[f64], j: usize) -> Vec<f64> {
     let points = &trajectory.points;

@@ -106,7 +106,7 @@ impl Bed {
     pub fn requests(&mut self, tick: u64, tasks: &[TaskView], queue: &mut VecDeque<Envelope>) {
         if tick == 10 {
             for arm in 0..self.config.arms.len() {
-                self.send(Request::Ready { arm: arm as u16 }, queue);
+                self.send(Request::Enabled { arm: arm as u16 }, queue);
             }
         }
         // The arms are ready by then.
@@ -124,7 +124,7 @@ impl Bed {
                 }
                 "servo" => Request::Servo { task, target: swing(tick as f64 / 100.0).0 },
                 "velocity" => Request::Velocity { task, target: swing(tick as f64 / 100.0).1 },
-                _ => Request::Steer { task, goal: circle(tick as f64 / 100.0) },
+                _ => Request::CartesianTarget { task, goal: circle(tick as f64 / 100.0) },
             };
             self.send(request, queue);
         }

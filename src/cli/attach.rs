@@ -17,7 +17,7 @@ use crate::rpc::api::Status;
 use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::rpc::report::StatusReport;
-use crate::runtime::{AttachedPlanner, Ending, Turn};
+use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 
 /// A planner attached to a run, in its own process.
 pub struct Attached {
@@ -140,10 +140,10 @@ impl Attached {
         let (terminal, json) = (terminal.clone(), args.json);
         let on_event = {
             let (name, run) = (name.clone(), run.name.clone());
-            move |turn: Turn| {
+            move |turn: LinkEvent| {
                 let (event, line, why) = match turn {
-                    Turn::Back => ("attached", format!("attached to run {run} again"), None),
-                    Turn::Fault(why) => {
+                    LinkEvent::Back => ("attached", format!("attached to run {run} again"), None),
+                    LinkEvent::Fault(why) => {
                         let line = format!("planner {name}: FAULT: run {run}: {why}; retrying");
                         ("fault", line, Some(why))
                     }

@@ -114,6 +114,8 @@ fn new_text_log(run: &str) -> Result<PathBuf> {
 fn spawn(text_log: &Path) -> io::Result<(Child, UnixStream)> {
     let (ours, theirs) = UnixStream::pair()?;
     let log = OpenOptions::new().append(true).open(text_log)?;
+    // The child inherits the open file, and with it the mark.
+    files::mark_as_being_written(&log);
     let mut command = Command::new(std::env::current_exe()?);
     command.args(arguments(std::env::args_os(), text_log));
     command.stdin(Stdio::from(OwnedFd::from(theirs))).stdout(log.try_clone()?).stderr(log);

@@ -32,7 +32,7 @@ fn first_version() -> u32 {
     FIRST_CONFIG_VERSION
 }
 
-/// Everything a coordinator knows beforehand.
+/// Configuration of a coordinator.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CoordinatorConfig {
     /// [`CONFIG_VERSION`] of the program that made it.

@@ -111,7 +111,7 @@ impl Failsafe {
     }
 
     /// The arm will be disabled: refuses motion from now on, without a latch.
-    pub fn park(&mut self, now: Mono) {
+    pub fn prepare_disable(&mut self, now: Mono) {
         if matches!(self.phase, Phase::Activating | Phase::Ready) {
             self.enter(Phase::Standby, Cause::None, now);
         }
@@ -133,7 +133,7 @@ impl Failsafe {
     }
 
     /// The arm was enabled: holds it for a short time, then it is ready.
-    pub fn ready(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
+    pub fn on_enabled(&mut self, arm: u16, state: &ArmState, fresh: Freshness, now: Mono) -> Outcome {
         match self.phase {
             Phase::Activating | Phase::Ready => Outcome::Accepted,
             Phase::Held => Outcome::ArmLatched(arm, self.cause),

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::config::ArmConfig;
 use super::estimate::VelocityEstimator;
 use super::failsafe::Freshness;
-use super::plausibility::{Plausibility, Verdict};
+use super::plausibility::{JUMP_AFTER, Plausibility, Verdict};
 use super::stalls::Stalls;
 use crate::arm::{ArmState, Link, VelocitySource};
 use crate::clock::Mono;
@@ -15,8 +15,6 @@ use crate::telemetry::Age;
 
 /// A longer delay of this computer is not subtracted from a state's age.
 const MAX_OWN_DELAY: Duration = Duration::from_millis(100);
-/// Number of readings that an arm has to confirm a position that looks like a jump.
-const CONFIRMATIONS: u32 = 3;
 
 /// The latest state of one arm.
 #[derive(Debug)]
@@ -118,7 +116,7 @@ impl Feedback {
     fn age(&self, now: Mono, stalls: &Stalls) -> Freshness {
         // An arm whose readings are rejected still answers: its age counts from the latest of them until it had the
         // time to confirm a jump.
-        let confirmation = CONFIRMATIONS * self.read_period.max(Duration::from_millis(1));
+        let confirmation = JUMP_AFTER * self.read_period.max(Duration::from_millis(1));
         let waits = self.is_rejected() && now.since(self.plausibility.stamp()) <= self.max_age + confirmation;
         let stamp = self.rejected.as_ref().filter(|_| waits).map_or(self.state.stamp, |read| read.stamp);
         let age = now.since(stamp);

@@ -109,7 +109,7 @@ impl Limiter {
     }
 
     /// Checks a request during a gap without following it. The step of the next request counts from it.
-    pub fn pass(&mut self, target: f64) -> Result<(), Refusal> {
+    pub fn check_request(&mut self, target: f64) -> Result<(), Refusal> {
         match self.refuses(target, false) {
             Some(refusal) => Err(refusal),
             None => {
@@ -122,7 +122,7 @@ impl Limiter {
     /// Moves the command towards the measured position `at` [rad], by at most `step` [rad], with zero velocity: a
     /// blocked joint must not move when it is released.
     pub fn draw(&mut self, at: f64, step: f64) {
-        self.hand_over();
+        self.forget_request();
         self.position += (at - self.position).clamp(-step, step);
         self.velocity = 0.0;
     }
@@ -133,7 +133,7 @@ impl Limiter {
     }
 
     /// Forgets the last request: the step of the next one counts from the last command.
-    pub fn hand_over(&mut self) {
+    pub fn forget_request(&mut self) {
         self.request = None;
         self.request_velocity = 0.0;
     }
@@ -194,7 +194,7 @@ impl Limiter {
         if !target.is_finite() {
             return Err(Refusal::NonFinite);
         }
-        self.hand_over();
+        self.forget_request();
         let b = self.bounds;
         let change = b.acceleration * dt;
         let slowest = self.speeds_inside(b.lower, b.upper, at.0, dt).0;
@@ -217,7 +217,7 @@ impl Limiter {
 
     /// Returns the position to command without a request: decelerates to rest, then holds.
     pub fn hold_position(&mut self, dt: f64) -> f64 {
-        self.hand_over();
+        self.forget_request();
         self.slow_down(dt);
         let (lower, upper) = self.range();
         self.position = (self.position + self.velocity * dt).clamp(lower, upper);
@@ -226,7 +226,7 @@ impl Limiter {
 
     /// Returns the velocity to command without a request: decelerates to 0. `at`: measured position [rad].
     pub fn hold_velocity(&mut self, at: f64, dt: f64) -> f64 {
-        self.hand_over();
+        self.forget_request();
         self.slow_down(dt);
         self.position = at;
         self.velocity
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn a_moving_joint_that_is_let_go_comes_to_rest_within_its_acceleration() {
+    fn a_moving_joint_without_requests_decelerates_within_its_limit() {
         let mut l = limiter();
         for k in 1..100 {
             l.follow_position(0.5 * (DT * k as f64).powi(2) * 2.0, DT).unwrap();

@@ -17,7 +17,7 @@ pub mod path_clock;
 pub mod plausibility;
 pub mod point_to_point;
 pub mod request;
-pub mod set_points;
+pub mod setpoints;
 pub mod stalls;
 pub mod task;
 pub mod task_body;

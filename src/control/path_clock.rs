@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn after_a_gap_it_goes_on_from_the_point_that_was_written() {
+    fn after_a_gap_it_continues_from_the_last_written_point() {
         let mut clock = PathClock::default();
         for k in 0..100u64 {
             clock.mark(Mono(10 * k + 10));

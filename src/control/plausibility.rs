@@ -11,7 +11,7 @@ const SPEED_MARGIN: f64 = 1.5;
 /// Noise of a position that is always accepted [rad].
 const NOISE: f64 = 0.02;
 /// Number of consecutive, consistent rejected readings that are a jump.
-const JUMP_AFTER: u32 = 3;
+pub(super) const JUMP_AFTER: u32 = 3;
 /// One turn [rad].
 const TURN: f64 = std::f64::consts::TAU;
 

@@ -20,7 +20,7 @@ const LESS_JERK_TRIES: usize = 3;
 
 /// Why there is no motion.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum NoMotion {
+pub enum MotionError {
     /// A target is outside its joint's limits.
     #[error("{joint} would go to {target:.4} rad, outside its limits {lower:.4} … {upper:.4} rad by {excess:.4} rad")]
     OutOfLimits {
@@ -48,7 +48,7 @@ pub fn point_to_point(
     target: &[f64],
     limits: &JointLimits,
     speed: f64,
-) -> Result<JointTrajectory, NoMotion> {
+) -> Result<JointTrajectory, MotionError> {
     let n = joints.len();
     for (j, joint) in joints.iter().enumerate() {
         let bounds = super::limit::Bounds::inside(limits.position_lower[j], limits.position_upper[j], 1.0, 1.0);
@@ -56,7 +56,7 @@ pub fn point_to_point(
         let (lower, upper) = (bounds.lower.min(start[j]), bounds.upper.max(start[j]));
         let excess = (lower - target[j]).max(target[j] - upper);
         if excess.is_nan() || excess > 1e-9 {
-            return Err(NoMotion::OutOfLimits { joint: joint.clone(), target: target[j], lower, upper, excess });
+            return Err(MotionError::OutOfLimits { joint: joint.clone(), target: target[j], lower, upper, excess });
         }
     }
     let mut input = InputParameter::<0>::new(Some(n));
@@ -83,7 +83,7 @@ pub fn point_to_point(
     }
     // The generator's message is a page of numbers; its first line names the error.
     let first_line = |e: String| e.split("\\n").next().unwrap_or_default().to_owned();
-    result.map_err(|e| NoMotion::NotFound(first_line(format!("{e:?}"))))?;
+    result.map_err(|e| MotionError::NotFound(first_line(format!("{e:?}"))))?;
     let duration = found.get_duration();
     if duration < SHORTEST {
         return Ok(stay(joints, start, target));

@@ -43,7 +43,7 @@ pub enum Request {
         target: Joints,
     },
     /// New goal of a Cartesian task: a pose or a twist, by the task's type.
-    Steer {
+    CartesianTarget {
         /// The task.
         task: u16,
         /// The goal.
@@ -60,12 +60,12 @@ pub enum Request {
         arm: u16,
     },
     /// The arm was enabled: hold it at its position, then accept motion.
-    Ready {
+    Enabled {
         /// The arm.
         arm: u16,
     },
     /// The arm will be disabled: decelerate it to rest and refuse motion.
-    Park {
+    PrepareDisable {
         /// The arm.
         arm: u16,
     },

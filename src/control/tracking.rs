@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::config::ArmConfig;
 use super::limit::Limiter;
-use super::set_points::{Range, SetPoints};
+use super::setpoints::{Range, SetpointWindow};
 use crate::arm::ArmState;
 use crate::clock::Mono;
 use crate::joint::{Joints, MAX_DOF};
@@ -28,7 +28,7 @@ pub struct Tracking {
     window: Duration,
     /// `supervision.tracking_tolerance` [rad].
     tolerance: f64,
-    set_points: SetPoints,
+    setpoints: SetpointWindow,
     /// Distance of each joint from the range of its setpoints of the last `lag` seconds [rad]; 0 in velocity mode.
     errors: Joints,
     /// How far each joint coasts beyond the last setpoint before a gap [rad], and until when that is allowed.
@@ -47,7 +47,7 @@ impl Tracking {
             lag: s.lag,
             window: Duration::from_secs_f64(s.lag),
             tolerance: s.tracking_tolerance,
-            set_points: SetPoints::new(config.dof, span),
+            setpoints: SetpointWindow::new(config.dof, span),
             errors: [0.0; MAX_DOF],
             coast: ([0.0; MAX_DOF], Mono::ZERO),
             exceeded: 0.0,
@@ -56,18 +56,18 @@ impl Tracking {
 
     /// Forgets all setpoints: new ones do not continue them.
     pub fn restart(&mut self) {
-        self.set_points.clear();
+        self.setpoints.clear();
         self.exceeded = 0.0;
     }
 
     /// Adds the setpoints of a tick [rad or rad/s].
     pub fn push(&mut self, now: Mono, values: &Joints) {
-        self.set_points.push(now, values);
+        self.setpoints.push(now, values);
     }
 
     /// Returns the range of the setpoints that the arm may be following in this state.
     pub fn range(&self, state: &ArmState) -> Option<Range> {
-        self.set_points.range(state.stamp.before(self.window))
+        self.setpoints.range(state.stamp.before(self.window))
     }
 
     /// Returns the distance of a joint from the range of its setpoints [rad]; 0 inside, and in velocity mode.
@@ -139,7 +139,7 @@ impl Tracking {
 
     /// Returns whether there are setpoints to compare with.
     pub fn has_setpoints(&self) -> bool {
-        !self.set_points.is_empty()
+        !self.setpoints.is_empty()
     }
 }
 

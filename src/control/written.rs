@@ -1,6 +1,6 @@
-//! The setpoint that the arm has. The device thread reports the number of the newest command that it wrote; the
-//! commands of the last ticks are kept to look it up. If nothing was written for more than two periods, there is a gap:
-//! commands repeat the last written setpoint, and motion continues from there.
+//! The last setpoint that was written to the arm. The device thread reports the number of the newest command that it
+//! wrote; the commands of the last ticks are kept to look it up. If nothing was written for more than two periods, there
+//! is a gap: commands repeat the last written setpoint, and motion continues from there.
 
 use std::time::Duration;
 
@@ -33,7 +33,7 @@ pub struct Written {
 }
 
 impl Written {
-    /// Creates it for this period of the tick, and this shortest period of the arm's setpoints.
+    /// Creates it for this period of the tick, and this longest regular time between two setpoints on the wire.
     pub fn new(tick: Duration, write: Duration) -> Self {
         let limit = PERIODS * tick.max(write);
         let kept = (limit.as_nanos() / tick.as_nanos().max(1)) as usize + 4;

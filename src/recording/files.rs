@@ -1,5 +1,6 @@
 //! Log files: folder, names, and retention.
 
+use std::fs::{File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -55,8 +56,8 @@ pub fn newest(folder: &Path) -> io::Result<Option<PathBuf>> {
     Ok(logs(folder, LOG)?.pop())
 }
 
-/// Removes all but the newest `keep` logs from `folder`, and no other files. Skips logs that cannot be removed. Returns
-/// the removed paths.
+/// Removes all but the newest `keep` logs from `folder`, and no other files. Keeps logs that a live run writes, and
+/// those that cannot be removed. Returns the removed paths.
 pub fn retain(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> {
     retain_newest(folder, LOG, keep)
 }
@@ -69,8 +70,18 @@ pub fn retain_text_logs(folder: &Path, keep: usize) -> io::Result<Vec<PathBuf>> 
 fn retain_newest(folder: &Path, ending: &str, keep: usize) -> io::Result<Vec<PathBuf>> {
     let mut old = logs(folder, ending)?;
     old.truncate(old.len().saturating_sub(keep));
-    old.retain(|path| std::fs::remove_file(path).is_ok());
+    old.retain(|path| !is_being_written(path) && std::fs::remove_file(path).is_ok());
     Ok(old)
+}
+
+/// Marks a log as being written, until `file` and all its clones are closed: [`retain`] keeps it. Has no effect on file
+/// systems without locks.
+pub fn mark_as_being_written(file: &File) {
+    let _ = file.try_lock();
+}
+
+fn is_being_written(path: &Path) -> bool {
+    File::open(path).is_ok_and(|file| matches!(file.try_lock(), Err(TryLockError::WouldBlock)))
 }
 
 /// Returns all logs in `folder` with that extension, oldest first.
@@ -147,6 +158,18 @@ mod tests {
         assert!(!old.exists());
         assert!(foreign.iter().chain(&kept).all(|path| path.exists()));
         assert_eq!(newest(folder.path()).unwrap().as_ref(), Some(&kept[1]));
+    }
+
+    #[test]
+    fn the_log_of_a_live_run_is_not_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let live = touch(folder.path(), "live-20251121T141630Z.mcap");
+        let ended = touch(folder.path(), "ended-20251121T141631Z.mcap");
+        let writing = File::options().append(true).open(&live).unwrap();
+        mark_as_being_written(&writing);
+        assert_eq!(retain(folder.path(), 0).unwrap(), [ended]);
+        drop(writing);
+        assert_eq!(retain(folder.path(), 0).unwrap(), [live]);
     }
 
     #[test]

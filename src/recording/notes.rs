@@ -77,7 +77,7 @@ impl Note {
 
 /// Why a note was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum NoteLost {
+pub enum NoteError {
     /// The queue is full.
     #[error("the recorder is too far behind")]
     Full,
@@ -115,14 +115,14 @@ pub fn channel() -> (Notes, NoteReceiver) {
 
 impl Notes {
     /// Sends a note. Never blocks.
-    pub fn send(&self, note: Note) -> Result<(), NoteLost> {
+    pub fn send(&self, note: Note) -> Result<(), NoteError> {
         let size = note.size();
         if self.shared.waiting.fetch_add(size, Ordering::Relaxed) + size > MAX_QUEUED {
             self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
             self.shared.lost.fetch_add(1, Ordering::Relaxed);
-            return Err(NoteLost::Full);
+            return Err(NoteError::Full);
         }
-        self.sender.send(note).map_err(|_| NoteLost::Ended)
+        self.sender.send(note).map_err(|_| NoteError::Ended)
     }
 }
 
@@ -151,10 +151,10 @@ mod tests {
         let line = || Note::Log { severity: Severity::Info, stamp: Mono::ZERO, text: "x".repeat(1 << 20) };
         let sent = (0..200).filter(|_| notes.send(line()).is_ok()).count();
         assert!((32..64).contains(&sent), "{sent}");
-        assert_eq!(notes.send(line()), Err(NoteLost::Full));
+        assert_eq!(notes.send(line()), Err(NoteError::Full));
         assert_eq!((noted.take().len(), noted.lost(), noted.lost()), (sent, 201 - sent as u64, 0));
         notes.send(line()).unwrap();
         drop(noted);
-        assert_eq!(notes.send(line()), Err(NoteLost::Ended));
+        assert_eq!(notes.send(line()), Err(NoteError::Ended));
     }
 }

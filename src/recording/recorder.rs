@@ -13,6 +13,7 @@ use std::time::Duration;
 use thiserror::Error;
 
 use super::disk_space::Megabytes;
+use super::files;
 use super::log_writer::LogAttachment;
 pub use super::notes::Note;
 use super::notes::NoteReceiver;
@@ -206,11 +207,13 @@ impl Drop for Recorder {
 }
 
 fn create_file(path: &Path) -> Result<File, RecordError> {
-    let make = || {
+    let make = || -> std::io::Result<File> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)?;
         }
-        File::create_new(path)
+        let file = File::create_new(path)?;
+        files::mark_as_being_written(&file);
+        Ok(file)
     };
     make().map_err(|source| RecordError::Create { path: path.to_owned(), source })
 }

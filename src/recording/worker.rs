@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_ends_the_log_and_is_said_once_while_the_ring_goes_on_being_emptied() {
+    fn a_full_disk_ends_the_log_once_and_the_ring_is_still_emptied() {
         let (mut producer, ring) = rtrb::RingBuffer::new(64);
         let (_notes, receiver) = channel();
         let config = RecorderConfig {

@@ -144,6 +144,9 @@ impl<'a> Comparison<'a> {
             if wanted.stop_seq != command.stop_seq {
                 return arm("number of stops", Value::text(wanted.stop_seq), Value::text(command.stop_seq));
             }
+            if wanted.start_seq != command.start_seq {
+                return arm("number of starts", Value::text(wanted.start_seq), Value::text(command.start_seq));
+            }
             let numbers = (wanted.seq, wanted.next_tick_ns) == (command.seq, command.next_tick.0);
             if then.output_is_new && !numbers {
                 let text = |seq, next| Value::Text(format!("command {seq}, next tick at {next} ns"));

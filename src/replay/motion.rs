@@ -9,6 +9,7 @@ use std::path::Path;
 use super::recorded::{Recorded, RecordedError};
 use crate::recording::messages::JointState;
 use crate::recording::replay::{LogReader, Payload, ReplayError, Selection};
+use crate::trajectory::smooth_step;
 
 /// Measured positions are averaged over this time before and after [s].
 const AVERAGING_TIME: f64 = 0.1;
@@ -111,8 +112,7 @@ fn column(rows: &[Row], joint: usize, period: f64) -> Option<Vec<f64>> {
         }
         by_command = Some(is_commanded);
         age += 1.0;
-        let x: f64 = (age / steps).min(1.0);
-        let left = 1.0 - x * x * x * (10.0 + x * (6.0 * x - 15.0));
+        let left = 1.0 - smooth_step(age / steps);
         let value = source + offset * left;
         if !value.is_finite() {
             return None;

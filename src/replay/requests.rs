@@ -62,16 +62,16 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         LoggedRequest::Velocity { task, target } => Request::Velocity { task, target: values(&target) },
         LoggedRequest::Pose { task, position, orientation } => {
             let goal = Goal::Pose { position: numbers(position), orientation: numbers(orientation) };
-            Request::Steer { task, goal }
+            Request::CartesianTarget { task, goal }
         }
         LoggedRequest::Twist { task, linear, angular, tool } => {
             let goal = Goal::Twist { linear: numbers(linear), angular: numbers(angular), tool };
-            Request::Steer { task, goal }
+            Request::CartesianTarget { task, goal }
         }
         LoggedRequest::Stop { arm } => Request::Stop { arm },
         LoggedRequest::Reset { arm } => Request::Reset { arm },
-        LoggedRequest::Ready { arm } => Request::Ready { arm },
-        LoggedRequest::Park { arm } => Request::Park { arm },
+        LoggedRequest::Enabled { arm } => Request::Enabled { arm },
+        LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
         LoggedRequest::Gripper { arm, opening } => Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN) },
         LoggedRequest::Shutdown {} => Request::Shutdown,
     })
@@ -104,19 +104,19 @@ mod tests {
             Request::Cancel { task: Some(3) },
             Request::Servo { task: 1, target },
             Request::Velocity { task: 2, target },
-            Request::Steer {
+            Request::CartesianTarget {
                 task: 3,
                 goal: Goal::Pose { position: [0.1 + 0.2, -0.0, 1e-300], orientation: [f64::NAN, 0.0, 0.6, 0.8] },
             },
-            Request::Steer {
+            Request::CartesianTarget {
                 task: 4,
                 goal: Goal::Twist { linear: [0.1 + 0.2, -0.0, 1e300], angular: [0.0, f64::NAN, 1.0], tool: true },
             },
             Request::Stop { arm: None },
             Request::Stop { arm: Some(1) },
             Request::Reset { arm: 1 },
-            Request::Ready { arm: 0 },
-            Request::Park { arm: 2 },
+            Request::Enabled { arm: 0 },
+            Request::PrepareDisable { arm: 2 },
             Request::Gripper { arm: 1, opening: 0.1 + 0.2 },
             Request::Shutdown,
         ] {

@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_written_stays() {
+    fn a_value_is_repeated_until_the_next_write() {
         let (mut writer, mut reader) = slot(7);
         assert_eq!((reader.read(), reader.read()), (7, 7));
         assert!(!writer.write(&8));

@@ -31,7 +31,7 @@ const ORDER_LIMIT: Duration = Duration::from_secs(8);
 /// Maximum number of reports until an arm reports the effect of an order.
 const REPORTS: u32 = 3;
 /// Period of the requests to an enabled arm that is not ready yet.
-const ASK_AGAIN: Duration = Duration::from_millis(100);
+const RETRY_PERIOD: Duration = Duration::from_millis(100);
 /// Timeout for an enabled arm to be ready.
 const READY_LIMIT: Duration = Duration::from_secs(2);
 
@@ -111,7 +111,7 @@ impl Service {
             Phase::Ready | Phase::Activating => {}
             _ => {
                 order(self.device(arm)?.activate()).await.map_err(|e| refused(&id, "was not enabled", &e))?;
-                self.ask(Request::Ready { arm }).await?;
+                self.ask(Request::Enabled { arm }).await?;
             }
         }
         let settled = |phase| matches!(phase, Phase::Ready | Phase::Held);
@@ -140,12 +140,12 @@ impl Service {
                 if !matches!(self.phase(arm), Phase::Activating | Phase::Ready | Phase::Held) {
                     // The arm's phase shows whether it was accepted. On a busy host its state may be stale for a
                     // moment.
-                    let ready = Request::Ready { arm: arm as u16 };
+                    let ready = Request::Enabled { arm: arm as u16 };
                     let log = log_of(&ready);
                     let _ = self.parts.dispatcher.send(ready, log);
                 }
             }
-            let round = limit.min(Instant::now() + ASK_AGAIN);
+            let round = limit.min(Instant::now() + RETRY_PERIOD);
             if self.until(round, || arms().all(settled).then_some(())).await.is_some() {
                 return;
             }
@@ -156,7 +156,7 @@ impl Service {
     pub(super) async fn disable(&self, id: String, now: bool) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&id)?;
         let limit = Instant::now() + self.braking_limit(arm);
-        self.ask(Request::Park { arm }).await?;
+        self.ask(Request::PrepareDisable { arm }).await?;
         if !now {
             self.wait_for_rest(&id, arm, limit).await?;
         }

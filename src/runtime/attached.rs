@@ -10,7 +10,7 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 
 use super::StartError;
-use super::planner_link::answer_travelling;
+use super::planner_link::answer_encoded;
 use super::planner_port::{PlannerPort, registered};
 use super::start::robots;
 use crate::planning::config::PlannerConfig;
@@ -25,7 +25,7 @@ const LONGEST_PAUSE: Duration = Duration::from_secs(3);
 
 /// Change of the connection to the run.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Turn {
+pub enum LinkEvent {
     /// The run is back, and the planner is attached again.
     Back,
     /// The run is gone, or rejects the planner, for this reason. The planner keeps trying.
@@ -46,7 +46,7 @@ impl AttachedPlanner {
         name: &str,
         config: &PlannerConfig,
         socket: &Path,
-        report: impl FnMut(Turn) + Send + 'static,
+        report: impl FnMut(LinkEvent) + Send + 'static,
     ) -> Result<Self, StartError> {
         let setup = robots(config)?;
         let robots = registered(&setup);
@@ -99,7 +99,12 @@ struct Process {
 
 impl Process {
     /// Attaches, reports it, and answers requests until the connection ends.
-    async fn live(self, setup: PlanningScene, ready: &Sender<Result<(), StartError>>, mut report: impl FnMut(Turn)) {
+    async fn live(
+        self,
+        setup: PlanningScene,
+        ready: &Sender<Result<(), StartError>>,
+        mut report: impl FnMut(LinkEvent),
+    ) {
         let begun = async {
             let end = PlannerStub::register(&self.socket, &self.registration).await.map_err(refused)?;
             let limits = &end.registered.limits;
@@ -120,20 +125,20 @@ impl Process {
             let answering = port.clone();
             let lost = end.serve(move |asked| {
                 let port = answering.clone();
-                async move { answer_travelling(&port, asked).await }
+                async move { answer_encoded(&port, asked).await }
             });
             let lost = lost.await;
             // Numbers of plans are not valid in the next run.
             port.thread.forget();
-            report(Turn::Fault(format!("the run is gone ({lost})")));
+            report(LinkEvent::Fault(format!("the run is gone ({lost})")));
             end = self.again(&limits, &mut report).await;
             port.thread.forget();
-            report(Turn::Back);
+            report(LinkEvent::Back);
         }
     }
 
     /// Retries until the run is back and accepts the planner. A refusal is reported once.
-    async fn again(&self, limits: &Limits, report: &mut impl FnMut(Turn)) -> PlannerStub {
+    async fn again(&self, limits: &Limits, report: &mut impl FnMut(LinkEvent)) -> PlannerStub {
         let (mut pause, mut last) = (FIRST_PAUSE, String::new());
         loop {
             tokio::time::sleep(pause).await;
@@ -145,7 +150,7 @@ impl Process {
                 Err(RegisterError::Refused(refusal)) => refusal.message,
             };
             if why != last {
-                report(Turn::Fault(why.clone()));
+                report(LinkEvent::Fault(why.clone()));
                 last = why;
             }
         }

@@ -8,7 +8,7 @@ use crate::hardware::registry::{AdapterSpec, Registry};
 use crate::planning::planner_thread::Solver;
 use crate::rpc::run_dir::RunDir;
 
-/// A run that is not up yet. What is not said is as the blueprint says.
+/// A run that is not started yet. Settings that are not changed here come from the blueprint.
 ///
 /// ```
 /// use dimos::runtime::{Record, Run};
@@ -86,26 +86,25 @@ impl Builder {
         self
     }
 
-    /// Says where it is logged.
+    /// Sets the destination of the log.
     pub fn record(mut self, record: Record) -> Self {
         self.options.record = record;
         self
     }
 
-    /// Adapters besides the built-in ones; they win over those of the same name.
+    /// Adds adapters; they replace built-in ones of the same name.
     pub fn adapters(mut self, more: &[AdapterSpec]) -> Self {
         self.adapters = Registry::with(more);
         self
     }
 
-    /// Task types besides the built-in ones, which win over those of the same name.
+    /// Adds task types; they replace built-in ones of the same name.
     pub fn tasks(mut self, more: &[TaskSpec]) -> Self {
         self.tasks = TaskTable::with(more);
         self
     }
 
-    /// What answers the planner's requests in the place of this program's own planner; it is called on the planner's
-    /// thread.
+    /// Replaces the built-in planner; called on the planner thread.
     pub fn solver(mut self, solver: Solver) -> Self {
         self.options.solver = Some(solver);
         self
@@ -135,8 +134,8 @@ impl Builder {
         Ok(())
     }
 
-    /// Starts the run; assets that it needs are fetched first, its arms are up then. When this fails nothing has moved,
-    /// and all that was connected is disconnected again.
+    /// Fetches missing assets and starts the run; returns once all arms are connected. On failure everything is stopped
+    /// again, and nothing has moved.
     pub fn start(self) -> Result<Run, StartError> {
         self.fetch()?;
         let loaded = self.check();

@@ -26,7 +26,7 @@ pub struct DeviceLock(#[expect(dead_code, reason = "the names are ours while the
 
 /// Why a device cannot be locked.
 #[derive(Debug, thiserror::Error)]
-pub enum DeviceTaken {
+pub enum DeviceLockError {
     /// Another process holds it.
     #[error("{adapter} at {address} is in use by process {pid}")]
     By {
@@ -50,17 +50,17 @@ pub enum DeviceTaken {
 }
 
 /// Locks the device at a complete address; the error names the process that holds it. Resolves host names.
-pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceTaken> {
-    let names = places(address).into_iter().map(|place| name(adapter, &place));
+pub fn take(adapter: &str, address: &str) -> Result<DeviceLock, DeviceLockError> {
+    let names = canonical_addresses(address).into_iter().map(|place| name(adapter, &place));
     let mut taken = Vec::new();
     for name in names {
         let (adapter, address) = (adapter.to_owned(), address.to_owned());
         taken.push(take_name(&name).map_err(|refused| match refused {
             Refused::Taken(pid) => {
                 let pid = pid.map_or_else(|| "unknown".to_owned(), |pid| pid.to_string());
-                DeviceTaken::By { adapter, address, pid }
+                DeviceLockError::By { adapter, address, pid }
             }
-            Refused::Io(error) => DeviceTaken::Io { adapter, address, error },
+            Refused::Io(error) => DeviceLockError::Io { adapter, address, error },
         })?);
     }
     Ok(DeviceLock(taken))
@@ -100,7 +100,7 @@ fn holder(name: &str) -> Result<i32, Errno> {
 
 /// Returns canonical addresses of a device, the same for every spelling: the addresses of its host, each with the first
 /// port, or the device file behind a link. At least one.
-fn places(address: &str) -> BTreeSet<String> {
+fn canonical_addresses(address: &str) -> BTreeSet<String> {
     let text = address.trim();
     if text.starts_with("memory:") {
         // A bus in memory belongs to its process: others have their own with the same number.
@@ -209,7 +209,7 @@ mod tests {
 
     #[test]
     fn names_fit_and_differ_by_host_and_port() {
-        let all = |address: &str| places(address).iter().map(|place| name("a", place)).collect::<Vec<_>>();
+        let all = |address: &str| canonical_addresses(address).iter().map(|place| name("a", place)).collect::<Vec<_>>();
         let long = |end: &str| name("adapter", &format!("{}{end}", "h".repeat(300)));
         assert!(long(":1").len() <= MAX_NAME && long("ä").len() <= MAX_NAME);
         assert_ne!(long(":1"), long(":2"));
@@ -219,8 +219,8 @@ mod tests {
     #[test]
     fn every_spelling_of_an_address_is_the_same_device() {
         let same = |spellings: &[&str]| {
-            let first = places(spellings[0]);
-            spellings.iter().for_each(|other| assert_eq!(places(other), first, "{other}"));
+            let first = canonical_addresses(spellings[0]);
+            spellings.iter().for_each(|other| assert_eq!(canonical_addresses(other), first, "{other}"));
             first
         };
         let v4 = same(&[
@@ -231,10 +231,10 @@ mod tests {
         ]);
         assert_eq!(v4, BTreeSet::from(["127.0.0.65:502".to_owned()]));
         same(&["[fe80::2]:502", "[FE80:0:0:0::2]:502:31000"]);
-        assert!(places("localhost:9").is_superset(&places("127.0.0.1:9")));
-        assert_eq!(places("0.0.0.0:9"), places("127.0.0.1:9"));
-        assert_ne!(places("127.0.0.1:9"), places("127.0.0.1:10"));
-        assert_eq!((places("can0").len(), places("CAN0").len()), (1, 1));
+        assert!(canonical_addresses("localhost:9").is_superset(&canonical_addresses("127.0.0.1:9")));
+        assert_eq!(canonical_addresses("0.0.0.0:9"), canonical_addresses("127.0.0.1:9"));
+        assert_ne!(canonical_addresses("127.0.0.1:9"), canonical_addresses("127.0.0.1:10"));
+        assert_eq!((canonical_addresses("can0").len(), canonical_addresses("CAN0").len()), (1, 1));
         let folder = tempfile::tempdir().unwrap();
         let (device, link) = (folder.path().join("ttyACM0"), folder.path().join("by-id"));
         std::fs::write(&device, "").unwrap();

@@ -132,16 +132,16 @@ pub fn log_of(request: &Request) -> Value {
         Request::Cancel { task } => json!({"cancel": {"task": task}}),
         Request::Servo { task, target } => json!({"servo": {"task": task, "target": target}}),
         Request::Velocity { task, target } => json!({"velocity": {"task": task, "target": target}}),
-        Request::Steer { task, goal: Goal::Pose { position, orientation } } => {
+        Request::CartesianTarget { task, goal: Goal::Pose { position, orientation } } => {
             json!({"pose": {"task": task, "position": position, "orientation": orientation}})
         }
-        Request::Steer { task, goal: Goal::Twist { linear, angular, tool } } => {
+        Request::CartesianTarget { task, goal: Goal::Twist { linear, angular, tool } } => {
             json!({"twist": {"task": task, "linear": linear, "angular": angular, "tool": tool}})
         }
         Request::Stop { arm } => json!({"stop": {"arm": arm}}),
         Request::Reset { arm } => json!({"reset": {"arm": arm}}),
-        Request::Ready { arm } => json!({"ready": {"arm": arm}}),
-        Request::Park { arm } => json!({"park": {"arm": arm}}),
+        Request::Enabled { arm } => json!({"ready": {"arm": arm}}),
+        Request::PrepareDisable { arm } => json!({"park": {"arm": arm}}),
         Request::Gripper { arm, opening } => json!({"gripper": {"arm": arm, "opening": opening}}),
         Request::Shutdown => json!({"shutdown": {}}),
     }

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::in_process;
 use super::service::Service;
+use super::{in_process, watchdog};
 use crate::rpc::api::{
     ArmDisable, ArmEnable, ArmReply, ArmReset, Cancel, CancelReply, Execute, ExecuteReply, Gripper, Method, Move,
     MoveReply, Servo, Stop, StopReply, Trajectory, Velocity,
@@ -13,7 +13,7 @@ use crate::rpc::report::{MotionReport, StateReport, StatusReport};
 use crate::rpc::{Code, RpcError};
 
 /// Poll period while waiting for a motion.
-const INTERVAL: Duration = Duration::from_millis(10);
+const POLL_PERIOD: Duration = Duration::from_millis(10);
 
 /// Handle of a run in this process. Clones refer to the same run, from any thread.
 ///
@@ -60,9 +60,11 @@ impl Handle {
     }
 
     /// Waits for the end of a motion. Its `state` is `COMPLETED` if the arm arrived, otherwise `error` has the reason.
-    /// After replanning around an obstacle, returns the report of the motion that continued.
+    /// After replanning around an obstacle, returns the report of the motion that continued. An error if the run shuts
+    /// down or its tick hangs.
     pub fn wait(&self, motion: u64) -> Result<MotionReport, RpcError> {
-        let mut motion = motion;
+        let (mut motion, mut last_beat, mut silent_for) = (motion, None, Duration::ZERO);
+        let limit = 2 * watchdog::tick_timeout(self.service.period());
         loop {
             let report = self.motion(motion)?;
             match report.next {
@@ -73,7 +75,15 @@ impl Handle {
             if self.service.is_closed() {
                 return Err(RpcError::new(Code::ShuttingDown, format!("the run ends during motion {motion}")));
             }
-            std::thread::sleep(INTERVAL);
+            // Counts only the time in which this thread could run: a stall of the host also stops the tick.
+            let beat = self.service.parts.pulse.beat.last();
+            silent_for = if beat == last_beat { silent_for + POLL_PERIOD } else { Duration::ZERO };
+            last_beat = beat;
+            if silent_for > limit {
+                let what = format!("no tick for {} ms during motion {motion}", silent_for.as_millis());
+                return Err(RpcError::new(Code::NoAnswer, what).hint("the tick hangs or has panicked: stop the run"));
+            }
+            std::thread::sleep(POLL_PERIOD);
         }
     }
 

@@ -76,6 +76,6 @@ impl Service {
         };
         self.parts.dispatcher.log(described.severity, described.text.clone());
         let tick = self.parts.pulse.ticks.load(Ordering::Relaxed);
-        self.tell(tick, &described, wall);
+        self.report_event(tick, &described, wall);
     }
 }

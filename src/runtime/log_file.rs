@@ -84,7 +84,7 @@ pub(super) fn metadata(blueprint: &Blueprint, config: &CoordinatorConfig) -> BTr
 }
 
 /// Logs and records an episode of a device.
-pub(super) fn tell_device_note(notes: &Notes, names: &Names, arm: usize, note: device::Note) {
+pub(super) fn log_device_note(notes: &Notes, names: &Names, arm: usize, note: device::Note) {
     let id = names.arm(arm as u16);
     let (severity, text) = match note {
         device::Note::Began(text) => (Severity::Warn, format!("{id}: {text}")),

@@ -42,9 +42,9 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
-pub use attached::{AttachedPlanner, Turn};
+pub use attached::{AttachedPlanner, LinkEvent};
 pub use builder::Builder;
-pub use device_lock::DeviceTaken;
+pub use device_lock::DeviceLockError;
 pub use dispatch::log_of;
 pub use handle::Handle;
 pub use service_manager::ServiceManager;
@@ -283,8 +283,8 @@ impl Run {
     }
 
     fn come_to_rest(&self, ended: &mut Ended) {
-        let told = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
-        let Ok(mut answer) = told else { return ended.troubles.push("the coordinator takes no requests".to_owned()) };
+        let sent = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
+        let Ok(mut answer) = sent else { return ended.troubles.push("the coordinator accepts no requests".to_owned()) };
         let (service, tick, pulse) = (&self.handle.service, &self.tick, &self.pulse);
         let (mut taken, mut still_since) = (false, Instant::now());
         let look = || {

@@ -7,7 +7,7 @@ use serde_json::json;
 use super::motions::{Carried, Planned};
 use super::service::{Service, internal};
 use crate::control::limit::Bounds;
-use crate::control::point_to_point::{NoMotion, point_to_point};
+use crate::control::point_to_point::{MotionError, point_to_point};
 use crate::control::request::Motion;
 use crate::control::task_body::TargetKind;
 use crate::rpc::api::{self, Reply};
@@ -56,13 +56,15 @@ impl Service {
         let start = start.get(..config.dof).unwrap_or_default().to_vec();
         let names = self.parts.names.arms[arm as usize].joints.clone();
         let motion = point_to_point(&names, &start, &call.target, &config.limits, call.speed).map_err(|e| match e {
-            NoMotion::OutOfLimits { ref joint, excess, .. } => {
+            MotionError::OutOfLimits { ref joint, excess, .. } => {
                 let data = json!({"joint": joint, "by": excess});
                 RpcError::new(Code::OutOfLimits, e.to_string())
                     .hint("limits are the arm's own, narrowed by `limits` in the blueprint; commands stay 0.01 rad inside")
                     .data(data)
             }
-            NoMotion::NotFound(_) => RpcError::new(Code::OutOfLimits, e.to_string()),
+            MotionError::NotFound(_) => {
+                RpcError::new(Code::OutOfLimits, e.to_string()).hint("try another speed, or a slightly different target")
+            }
         })?;
         let duration = motion.duration();
         let number = self.begin(task, joints, motion, None).await?;

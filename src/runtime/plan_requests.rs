@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index};
+use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking};
 use super::service::internal;
 use crate::collision::Stop;
 use crate::planning::padded::GivenUp;
@@ -55,7 +55,7 @@ impl PlannerPort {
             first += robot.joints.len();
         }
         let summary = summary(&job, &found);
-        Ok(api::PreviewReply { plan: job.id, summary, trajectory: travelling(&found), end_effectors })
+        Ok(api::PreviewReply { plan: job.id, summary, trajectory: api_trajectory(&found), end_effectors })
     }
 
     /// Returns a plan for the coordinator to execute, if it is still collision-free.
@@ -70,14 +70,14 @@ impl PlannerPort {
         let version = self.thread.version();
         self.still_free(&job, &found, moment).await?;
         self.remember(job.id, found.clone(), version);
-        Ok(ReleasedPlan { plan: job.id, trajectory: travelling(&found), task })
+        Ok(ReleasedPlan { plan: job.id, trajectory: api_trajectory(&found), task })
     }
 
     /// Checks a plan again: the world may have changed, or a robot that it does not move may have moved.
     async fn still_free(&self, job: &Job, found: &Arc<PlannedMotion>, moment: &Moment) -> Result<(), RpcError> {
         let positions = all_positions(self.thread.setup(), moment)?;
         let stop = Stop::new(Some(Instant::now() + REVIEW_LIMIT), None);
-        apart(self.thread.revalidate(found.clone(), positions, stop)).await?.map_err(|failure| {
+        run_blocking(self.thread.revalidate(found.clone(), positions, stop)).await?.map_err(|failure| {
             let what = format!("plan {} is no longer free: {}", job.id, failure.what);
             RpcError::new(Code::PlanOutdated, what).hint("plan again: the world is not as it was")
         })
@@ -224,7 +224,7 @@ fn given_up(given_up: &GivenUp) -> api::PaddingGivenUp {
 }
 
 /// Converts a trajectory to its rpc type.
-fn travelling(found: &PlannedMotion) -> api::Trajectory {
+fn api_trajectory(found: &PlannedMotion) -> api::Trajectory {
     let point = |point: &crate::trajectory::TrajectoryPoint| api::Point {
         time_from_start: point.time_from_start,
         positions: point.positions.clone(),

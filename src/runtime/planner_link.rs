@@ -24,13 +24,13 @@ use crate::sync::lock;
 use crate::telemetry::describe::Names;
 
 /// Maximum age of a state to plan from.
-const FRESH: Duration = Duration::from_secs(1);
+const MAX_STATE_AGE: Duration = Duration::from_secs(1);
 /// Timeout for a reply of an attached planner that needs no computation.
-const QUICK: Duration = Duration::from_secs(3);
+const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
 /// Timeout for a reply for which it reads files or checks a motion.
-const LONG: Duration = Duration::from_secs(9);
+const SLOW_QUERY_TIMEOUT: Duration = Duration::from_secs(9);
 /// Timeout for its part of `status`.
-const GLANCE: Duration = Duration::from_millis(500);
+const STATUS_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A planner in another process.
 pub(super) struct Attached {
@@ -79,7 +79,7 @@ impl Planner<'_> {
             Self::Own(port) => port.release(plan, &moment).await,
             Self::Attached(planner) => {
                 let (method, params) = Call::ExecutePlan(api::ExecutePlan { plan, ..Default::default() }).written();
-                let released = planner.line.ask(method, params, moment, LONG).await?;
+                let released = planner.line.ask(method, params, moment, SLOW_QUERY_TIMEOUT).await?;
                 serde_json::from_value(released)
                     .map_err(|e| RpcError::new(Code::Internal, format!("the planner released no plan: {e}")))
             }
@@ -103,7 +103,7 @@ impl Service {
     /// Answers the planner's methods.
     pub(super) async fn planner_call(&self, call: Call) -> Result<Reply, RpcError> {
         let planner = self.planner()?;
-        let limit = if matches!(call, Call::WorldAdd(_)) { LONG } else { QUICK };
+        let limit = if matches!(call, Call::WorldAdd(_)) { SLOW_QUERY_TIMEOUT } else { QUERY_TIMEOUT };
         match call {
             Call::ExecutePlan(execute) => {
                 let released = planner.release(execute.plan, self.moment(0)).await?;
@@ -152,14 +152,14 @@ impl Service {
     /// Cancels planning. Returns whether a request was being planned.
     pub(super) async fn cancel_planning(&self) -> bool {
         let Ok(planner) = self.planner() else { return false };
-        let cancelled = planner.answer(Call::Cancel(api::Cancel::default()), Moment::default(), QUICK).await;
+        let cancelled = planner.answer(Call::Cancel(api::Cancel::default()), Moment::default(), QUERY_TIMEOUT).await;
         matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
     }
 
     /// Returns a plan's number, by default the newest, and the coordinator's joints that it moves.
     pub(super) async fn plan_and_its_joints(&self, plan: Option<u64>) -> Result<(u64, Vec<String>), RpcError> {
         let planner = self.planner()?;
-        let answer = |call| planner.answer(call, Moment::default(), QUICK);
+        let answer = |call| planner.answer(call, Moment::default(), QUERY_TIMEOUT);
         let number = match plan {
             Some(number) => number,
             None => match answer(Call::Planner(api::Planner {})).await? {
@@ -206,7 +206,7 @@ impl Service {
             Ok(planner) => planner,
             Err(_) => return None,
         };
-        let mut status = match self.planner_report(&planner, GLANCE).await {
+        let mut status = match self.planner_report(&planner, STATUS_TIMEOUT).await {
             Ok(report) => PlannerStatus {
                 robots: report.robots.into_iter().map(|robot| robot.name).collect(),
                 state: report.state,
@@ -273,7 +273,8 @@ impl Service {
     pub(super) fn moment(&self, plan: u64) -> Moment {
         let (now, mut positions, mut grippers) = (self.now(), BTreeMap::new(), BTreeMap::new());
         for (index, arm) in self.parts.names.arms.iter().enumerate() {
-            let fresh = |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= FRESH;
+            let fresh =
+                |view: &crate::telemetry::ArmSample| view.state.seq > 0 && now.since(view.state.stamp) <= MAX_STATE_AGE;
             let Some(view) = self.arm_view(index).filter(fresh) else { continue };
             let commanded = view.command.mode.is_some_and(|mode| mode.is_position());
             let values = if commanded { view.command.values } else { view.state.position };
@@ -310,7 +311,7 @@ pub(super) fn command_limits(names: &Names, config: &CoordinatorConfig) -> BTree
 }
 
 /// Answers an encoded request of a run, in the process of an attached planner.
-pub(super) async fn answer_travelling(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
+pub(super) async fn answer_encoded(port: &PlannerPort, asked: api::PlannerRequest) -> Result<Value, RpcError> {
     let encoded = |e: serde_json::Error| RpcError::new(Code::Internal, e.to_string());
     if asked.method == RECHECK {
         let call = serde_json::from_value(asked.params).map_err(encoded)?;

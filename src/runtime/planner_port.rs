@@ -104,7 +104,7 @@ pub(super) fn positions_of(robot: &str, joints: &[String], moment: &Moment) -> R
 
 /// Runs work of the planner on another thread: neither reading files nor a panic may delay other requests, above all
 /// `stop`.
-pub(super) async fn apart<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, RpcError> {
+pub(super) async fn run_blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, RpcError> {
     let failed = |_| RpcError::new(Code::Internal, "the planner failed at this request: a defect of the program");
     tokio::task::spawn_blocking(work).await.map_err(failed)
 }

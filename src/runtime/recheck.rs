@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::motions::UnderWay;
 use super::plan_requests::all_positions;
 use super::planner_link::Planner;
-use super::planner_port::{PlannerPort, apart};
+use super::planner_port::{PlannerPort, run_blocking};
 use super::service::Service;
 use crate::collision::Stop;
 use crate::control::request::Request;
@@ -48,7 +48,7 @@ impl PlannerPort {
         }
         let positions = all_positions(self.thread.setup(), moment)?;
         let stop = Stop::new(Some(Instant::now() + LIMIT), None);
-        let blocked = apart(self.thread.look_ahead(found, positions, call.elapsed, stop)).await?;
+        let blocked = run_blocking(self.thread.look_ahead(found, positions, call.elapsed, stop)).await?;
         let blocked = blocked.map_err(|failure| RpcError::new(Code::PlanOutdated, failure.what))?;
         if blocked.is_none()
             && let Some(released) = lock(&self.released).get_mut(&call.plan)

@@ -12,9 +12,9 @@ use crate::sync::lock;
 use crate::telemetry::{Phase, TaskState};
 
 /// Timeout for the arm to decelerate to rest.
-const REST: Duration = Duration::from_secs(10);
+const REST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Poll period while waiting for the arm and the planner.
-const INTERVAL: Duration = Duration::from_millis(10);
+const POLL_PERIOD: Duration = Duration::from_millis(10);
 /// Maximum number of requests for plans kept.
 const REMEMBERED: usize = 64;
 
@@ -61,7 +61,7 @@ impl Service {
             let asked = Call::Planning(Planning { plan: begun.plan });
             let Reply::Planning(report) = self.planner_call(asked).await? else { return Err(internal()) };
             match report.state.as_str() {
-                "PLANNING" => tokio::time::sleep(INTERVAL).await,
+                "PLANNING" => tokio::time::sleep(POLL_PERIOD).await,
                 "PLANNED" => break,
                 _ => return Err(RpcError::new(Code::UnknownPlan, report.error.unwrap_or(report.state))),
             }
@@ -89,11 +89,11 @@ impl Service {
             if !ends && motion.joints.iter().all(|joint| still(joint).unwrap_or(false)) {
                 return Ok(());
             }
-            if began.elapsed() > REST {
-                let what = format!("the arm does not rest after {} s", REST.as_secs());
+            if began.elapsed() > REST_TIMEOUT {
+                let what = format!("the arm does not rest after {} s", REST_TIMEOUT.as_secs());
                 return Err(RpcError::new(Code::NoAnswer, what));
             }
-            tokio::time::sleep(INTERVAL).await;
+            tokio::time::sleep(POLL_PERIOD).await;
         }
     }
 

@@ -55,7 +55,7 @@ impl Service {
             }),
             arms: (0..parts.config.arms.len()).filter_map(|i| self.arm_report(i)).collect(),
             tasks: (0..parts.config.tasks.len()).filter_map(|i| self.task_report(i)).collect(),
-            planner: None, // asked when somebody waits for the answer
+            planner: None, // filled in by the `status` method
         }
     }
 
@@ -95,7 +95,7 @@ impl Service {
             measured_rate_hz: Some(health.rate()).filter(|r| *r > 0.0),
             native_rate_hz: info.native_rate,
             faults: faults.collect(),
-            commander: None, // the connections know
+            commander: None, // filled in by the connection
             gripper_range: gripper_range.map(|(closed, open)| [closed, open]),
             position_limits: self.position_limits(index),
             on_exit: match arm.on_exit {
@@ -246,7 +246,7 @@ impl Service {
                 error.hint(format!("when it may move again: `dimos arm reset {a}`, then `dimos arm enable {a}`"))
             }
             Outcome::StillFaulted(a, _) => {
-                error.hint(format!("remove the cause, then again: `dimos arm reset {}`", arm(a)))
+                error.hint(format!("remove the cause, then repeat `dimos arm reset {}`", arm(a)))
             }
             Outcome::OutOfLimits(joint, by) => error
                 .hint("limits are the arm's own, narrowed by `limits` in the blueprint")
@@ -289,7 +289,7 @@ impl Service {
     }
 
     /// Logs an event and publishes it to subscribers.
-    pub(super) fn tell(&self, tick: u64, described: &Described, wall: WallOffset) {
+    pub(super) fn report_event(&self, tick: u64, described: &Described, wall: WallOffset) {
         if let Some(line) = self.log_throttle.line(described, Instant::now()) {
             match described.severity {
                 Severity::Info => tracing::debug!("{line}"),

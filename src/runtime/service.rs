@@ -155,7 +155,7 @@ impl Service {
                     let actual = self.positions();
                     lock(&self.motions).task_changed(*task, *state, *reason, &actual);
                 }
-                self.tell(tick, described, wall);
+                self.report_event(tick, described, wall);
             }
             Notice::Lost(count) => tracing::warn!("the recorder fell behind: {count} samples are missing in the log"),
             Notice::Unsynced(after) => tracing::warn!(

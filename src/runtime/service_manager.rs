@@ -19,7 +19,8 @@ pub struct ServiceManager {
 }
 
 impl ServiceManager {
-    /// Returns the one that started this process, from `NOTIFY_SOCKET`; `None` if there is none.
+    /// Returns the connection to the service manager that started this process, from `NOTIFY_SOCKET`; `None`
+    /// if there is none.
     pub fn from_env() -> Option<Self> {
         let variable = |name| std::env::var(name).ok().and_then(|value| value.parse::<u64>().ok());
         let ours = variable("WATCHDOG_PID").is_none_or(|pid| pid == u64::from(std::process::id()));
@@ -27,7 +28,8 @@ impl ServiceManager {
         Self::at(std::env::var_os("NOTIFY_SOCKET")?, watchdog).ok()
     }
 
-    /// Creates one that listens at an address (a path, or `@` and an abstract name), with this watchdog interval.
+    /// Creates a connection to a service manager at an address (a path, or `@` and an abstract name), with this
+    /// watchdog interval.
     pub fn at(address: OsString, watchdog: Option<Duration>) -> io::Result<Self> {
         let address = match address.as_bytes().strip_prefix(b"@") {
             Some(name) => SocketAddr::from_abstract_name(name)?,
@@ -40,34 +42,33 @@ impl ServiceManager {
 
     /// Reports that the run is up, with a status line.
     pub fn ready(&self, status: &str) {
-        self.tell(&format!("READY=1\nSTATUS={}", one_line(status)));
+        self.notify(&format!("READY=1\nSTATUS={}", one_line(status)));
     }
 
     /// Reports a status line.
     pub fn status(&self, status: &str) {
-        self.tell(&format!("STATUS={}", one_line(status)));
+        self.notify(&format!("STATUS={}", one_line(status)));
     }
 
     /// Reports that the run shuts down.
     pub fn stopping(&self) {
-        self.tell("STOPPING=1\nSTATUS=decelerating, then releasing the arms");
+        self.notify("STOPPING=1\nSTATUS=decelerating, then releasing the arms");
     }
 
     /// Returns the watchdog's work at each check that finds the tick alive: a ping, twice per requested interval.
-    pub fn signs_of_life(&self) -> io::Result<impl FnMut() + Send + 'static> {
-        let of_its_own =
-            Self { socket: self.socket.try_clone()?, address: self.address.clone(), watchdog: self.watchdog };
+    pub fn watchdog_ping(&self) -> io::Result<impl FnMut() + Send + 'static> {
+        let pinger = Self { socket: self.socket.try_clone()?, address: self.address.clone(), watchdog: self.watchdog };
         let mut last: Option<Instant> = None;
         Ok(move || {
-            let due = of_its_own.watchdog.filter(|every| last.is_none_or(|last| last.elapsed() >= *every / 2));
+            let due = pinger.watchdog.filter(|every| last.is_none_or(|last| last.elapsed() >= *every / 2));
             if due.is_some() {
                 last = Some(Instant::now());
-                of_its_own.tell("WATCHDOG=1");
+                pinger.notify("WATCHDOG=1");
             }
         })
     }
 
-    fn tell(&self, message: &str) {
+    fn notify(&self, message: &str) {
         let _ = self.socket.send_to_addr(message.as_bytes(), &self.address);
     }
 }
@@ -80,7 +81,7 @@ fn one_line(text: &str) -> String {
 mod tests {
     use super::*;
 
-    fn heard(socket: &UnixDatagram) -> Vec<String> {
+    fn received(socket: &UnixDatagram) -> Vec<String> {
         socket.set_nonblocking(true).unwrap();
         let mut buffer = [0; 256];
         let next = || socket.recv(&mut buffer).ok().map(|n| String::from_utf8_lossy(&buffer[..n]).into_owned());
@@ -88,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_told_at_a_path_and_at_an_abstract_name() {
+    fn messages_reach_a_path_and_an_abstract_name() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("notify");
         let name = format!("@dimos-test-{}", std::process::id());
@@ -98,27 +99,27 @@ mod tests {
             let manager = ServiceManager::at(address, None).unwrap();
             manager.ready("one\ntwo");
             manager.stopping();
-            let told = heard(socket);
-            assert_eq!(told[0], "READY=1\nSTATUS=one; two");
-            assert!(told[1].starts_with("STOPPING=1\n") && told.len() == 2);
+            let messages = received(socket);
+            assert_eq!(messages[0], "READY=1\nSTATUS=one; two");
+            assert!(messages[1].starts_with("STOPPING=1\n") && messages.len() == 2);
         }
     }
 
     #[test]
-    fn signs_of_life_come_only_where_they_are_asked_for() {
+    fn pings_are_sent_only_with_a_watchdog_interval() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("notify");
         let socket = UnixDatagram::bind(&path).unwrap();
         for (watchdog, expected) in [(None, 0), (Some(Duration::from_secs(3600)), 1), (Some(Duration::ZERO), 3)] {
             let manager = ServiceManager::at(path.clone().into_os_string(), watchdog).unwrap();
-            let mut alive = manager.signs_of_life().unwrap();
+            let mut alive = manager.watchdog_ping().unwrap();
             (0..3).for_each(|_| alive());
-            assert_eq!(heard(&socket).len(), expected, "{watchdog:?}");
+            assert_eq!(received(&socket).len(), expected, "{watchdog:?}");
         }
     }
 
     #[test]
-    fn that_nobody_listens_is_no_trouble() {
+    fn a_missing_notify_socket_is_ignored() {
         ServiceManager::at("/nonexistent/notify".into(), None).unwrap().ready("x");
         assert!(ServiceManager::at("/".repeat(200).into(), None).is_err());
     }

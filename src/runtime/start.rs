@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex};
 use super::arms::{self, Arms, BroughtUp, Slots};
 use super::control_config::{coordinator_config, names_of, tasks};
 use super::dispatch::{Dispatcher, OutcomeThread};
-use super::log_file::{attachments, log_path, metadata, no_log, retain, tell_device_note};
+use super::log_file::{attachments, log_device_note, log_path, metadata, no_log, retain};
 use super::planner_link::command_limits;
 use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
@@ -56,7 +56,7 @@ impl Run {
             run.handle.service.keep(claim);
         }
         if let Some(manager) = &run.manager {
-            manager.ready(&in_short(&run.status()));
+            manager.ready(&status_line(&run.status()));
         }
         Ok(run)
     }
@@ -103,7 +103,7 @@ impl<'a> Prepared<'a> {
         let (notes, noted) = notes::channel();
         let device_notes = {
             let (notes, names) = (notes.clone(), self.names.clone());
-            move |arm: usize, note: device::Note| tell_device_note(&notes, &names, arm, note)
+            move |arm: usize, note: device::Note| log_device_note(&notes, &names, arm, note)
         };
         let BroughtUp { arms, slots, connected } = arms::bring_up(self.blueprint, &pulse.beat, device_notes)?;
         let config = coordinator_config(self.blueprint, &connected, std::mem::take(&mut self.task_configs));
@@ -203,8 +203,8 @@ fn start_recorder(
         wall,
         min_free: blueprint.recording.min_free.0,
     };
-    let told = service.clone();
-    let notice = move |notice: Notice<'_>| told.notice(notice, wall);
+    let receiver = service.clone();
+    let notice = move |notice: Notice<'_>| receiver.notice(notice, wall);
     let recorder = Recorder::start(record, samples, noted, notice).map_err(no_log)?;
     service.set_recorder(recorder.stats());
     retain(blueprint, &prepared.log);
@@ -226,7 +226,7 @@ fn start_watchdog(
     endings: &Sender<Ending>,
     manager: Option<&ServiceManager>,
 ) -> Result<Watchdog, StartError> {
-    let alive = signs_of_life(manager);
+    let alive = watchdog_ping(manager);
     let watchdog = Watchdog::start(pulse.beat.clone(), config.period(), endings.clone(), alive);
     watchdog.map_err(no_thread("watchdog"))
 }
@@ -251,8 +251,8 @@ pub(super) fn robots(config: &PlannerConfig) -> Result<PlanningScene, StartError
 }
 
 /// Returns the watchdog's work at each check that finds the tick alive.
-fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
-    match manager.map(ServiceManager::signs_of_life) {
+fn watchdog_ping(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
+    match manager.map(ServiceManager::watchdog_ping) {
         Some(Ok(alive)) => Box::new(alive),
         Some(Err(e)) => {
             tracing::warn!("the service manager's watchdog is not fed: {e}");
@@ -263,7 +263,7 @@ fn signs_of_life(manager: Option<&ServiceManager>) -> Box<dyn FnMut() + Send> {
 }
 
 /// Returns a line about the run.
-fn in_short(report: &StatusReport) -> String {
+fn status_line(report: &StatusReport) -> String {
     let arms: Vec<String> = report.arms.iter().map(|a| format!("{} {}", a.hardware_id, a.phase)).collect();
     let simulated = if report.simulated { ", SIMULATED" } else { "" };
     format!("{}: {}{simulated}", report.run, arms.join(", "))

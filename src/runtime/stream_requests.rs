@@ -14,7 +14,7 @@ impl Service {
         let width = self.parts.config.tasks[index as usize].joints.len();
         if values.len() != width {
             let what = format!("{task} has {width} joints, the target {} values", values.len());
-            return Err(RpcError::new(Code::InvalidParams, what));
+            return Err(RpcError::new(Code::InvalidParams, what).hint("give one value per joint of the task, in order"));
         }
         let target = joints_of(&values);
         self.ask(match positions {
@@ -39,7 +39,7 @@ impl Service {
 
     async fn steer(&self, task: &str, goal: Goal) -> Result<Done, RpcError> {
         let task = self.task_index(task)?;
-        self.ask(Request::Steer { task, goal }).await?;
+        self.ask(Request::CartesianTarget { task, goal }).await?;
         Ok(Done {})
     }
 }

@@ -18,7 +18,7 @@ use crate::rt::host;
 /// Timeout for the thread to end.
 const END_LIMIT: Duration = Duration::from_millis(300);
 /// Poll period while waiting for that.
-const LOOK_EVERY: Duration = Duration::from_millis(1);
+const POLL_PERIOD: Duration = Duration::from_millis(1);
 
 /// The running tick. Ends when dropped.
 pub(super) struct Tick {
@@ -54,7 +54,7 @@ impl Tick {
     pub fn is_alive(&self) -> bool {
         let silence = self.pulse.beat.silence(MonotonicClock.now());
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
-            && silence.is_none_or(|silence| silence < watchdog::silence_limit(self.period))
+            && silence.is_none_or(|silence| silence < watchdog::tick_timeout(self.period))
     }
 
     /// Ends it after the current tick. Returns `false` if it hangs and was abandoned.
@@ -64,7 +64,7 @@ impl Tick {
         let Some(thread) = self.thread.take() else { return true };
         let began = Instant::now();
         while !thread.is_finished() && began.elapsed() < limit {
-            std::thread::sleep(LOOK_EVERY);
+            std::thread::sleep(POLL_PERIOD);
         }
         let ended = thread.is_finished();
         if ended {

@@ -13,11 +13,11 @@ use crate::rt::heartbeat::Heartbeat;
 use crate::rt::host;
 
 /// Period of the check: each one costs a wake-up of the processor.
-const LOOK_EVERY: Duration = Duration::from_millis(100);
+const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
-/// Time without a tick after which it counts as hung: longer than stalls of the computer, short enough to end a run
-/// within a second.
-pub fn silence_limit(period: Duration) -> Duration {
+/// Returns the time without a tick after which the tick counts as hung: longer than usual stalls of the host, short
+/// enough to end a run within a second.
+pub fn tick_timeout(period: Duration) -> Duration {
     (5 * period).max(Duration::from_millis(400))
 }
 
@@ -39,22 +39,21 @@ impl Watchdog {
         let stopping = stop.clone();
         let thread = std::thread::Builder::new().name("watchdog".into()).stack_size(host::STACK).spawn(move || {
             host::enter_realtime(host::WATCHDOG_PRIORITY);
-            let limit = silence_limit(period);
-            let (mut last, mut silent_for, mut looked) = (None, Duration::ZERO, MonotonicClock.now());
+            let limit = tick_timeout(period);
+            let (mut last, mut silent_for, mut checked) = (None, Duration::ZERO, MonotonicClock.now());
             while !stopping.load(Ordering::Acquire) {
-                std::thread::park_timeout(LOOK_EVERY);
+                std::thread::park_timeout(CHECK_PERIOD);
                 let now = MonotonicClock.now();
                 let beat = beat.last();
-                // After SIGSTOP and SIGCONT there was no tick, but the tick could not run: only time counts in which
-                // this thread could run.
-                let passed = now.since(looked).min(2 * LOOK_EVERY);
+                // Counts only the time in which this thread could run: a SIGSTOP also stops the tick.
+                let passed = now.since(checked).min(2 * CHECK_PERIOD);
                 silent_for = if beat == last { silent_for + passed } else { Duration::ZERO };
                 if beat != last {
                     alive();
                 }
-                (last, looked) = (beat, now);
+                (last, checked) = (beat, now);
                 if beat.is_some() && silent_for > limit && !stopping.load(Ordering::Acquire) {
-                    let what = format!("the tick has been silent for {} ms", silent_for.as_millis());
+                    let what = format!("no tick for {} ms (limit {} ms)", silent_for.as_millis(), limit.as_millis());
                     let _ = endings.send(Ending::Fault(what));
                     return;
                 }
@@ -63,7 +62,7 @@ impl Watchdog {
         Ok(Self { stop, thread: Some(thread) })
     }
 
-    /// Ends the check: no further ticks are expected.
+    /// Ends the checks: no further ticks are expected.
     pub fn stand_down(&self) {
         self.stop.store(true, Ordering::Release);
     }
@@ -87,18 +86,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sign_of_life_is_given_for_a_beat_and_for_nothing_else() {
-        let (beat, signs, (endings, ended)) =
+    fn watchdog_pings_only_while_ticks_arrive() {
+        let (beat, pings, (endings, ended)) =
             (Arc::new(Heartbeat::default()), Arc::new(AtomicUsize::new(0)), channel());
-        let given = signs.clone();
+        let counted = pings.clone();
         let alive = move || {
-            given.fetch_add(1, Ordering::Relaxed);
+            counted.fetch_add(1, Ordering::Relaxed);
         };
         let _watchdog = Watchdog::start(beat.clone(), Duration::from_millis(10), endings, alive).unwrap();
-        assert!(ended.recv_timeout(3 * LOOK_EVERY).is_err(), "before the first beat nothing is silent");
-        assert_eq!(signs.load(Ordering::Relaxed), 0);
+        assert!(ended.recv_timeout(3 * CHECK_PERIOD).is_err(), "no fault before the first beat");
+        assert_eq!(pings.load(Ordering::Relaxed), 0);
         beat.beat(MonotonicClock.now());
-        assert!(matches!(ended.recv().unwrap(), Ending::Fault(what) if what.contains("silent")));
-        assert_eq!(signs.load(Ordering::Relaxed), 1);
+        assert!(matches!(ended.recv().unwrap(), Ending::Fault(what) if what.contains("no tick for")));
+        assert_eq!(pings.load(Ordering::Relaxed), 1);
     }
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use nalgebra::Isometry3;
 
-use super::planner_port::{PlannerPort, apart, isometry, positions_of, robot_index, spec};
+use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking, spec};
 use super::service::internal;
 use crate::collision::Solid;
 use crate::collision::world::{Attached, Obstacle, World};
@@ -78,7 +78,7 @@ impl PlannerPort {
     pub(super) async fn put(&self, object: WorldObject) -> Result<Done, RpcError> {
         not_held(self, &object.name)?;
         let config = configured(&object, isometry(&object.pose));
-        let made = apart(move || obstacle(&config)).await?.map_err(wrong)?;
+        let made = run_blocking(move || obstacle(&config)).await?.map_err(wrong)?;
         // Another client may have attached it meanwhile.
         not_held(self, &object.name)?;
         self.thread.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;

@@ -172,7 +172,7 @@ named! {
         Cancelling = "CANCELLING",
         /// Reached its goal.
         Completed = "COMPLETED",
-        /// Ended elsewhere.
+        /// Ended before its goal: cancelled, preempted, out of tolerance, or the arm was held.
         Aborted = "ABORTED",
         /// A command was rejected as unsafe for the arm.
         Fault = "FAULT",

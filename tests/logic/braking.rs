@@ -80,7 +80,7 @@ impl Virtual {
         let task = (TaskState::Idle, 0.0);
         let mut run = Self { coordinator, arm, now: Mono(1_000_000_000), inbox: VecDeque::new(), task };
         run.step();
-        run.ask(Request::Ready { arm: 0 });
+        run.ask(Request::Enabled { arm: 0 });
         (0..30).for_each(|_| run.step());
         let joints = (0..DOF as u16).collect();
         let motion = Box::new(Motion { id: 7, joints, spline: Spline::new(&found.trajectory).unwrap() });

@@ -72,14 +72,14 @@ fn between(a: &DAffine3, b: &DAffine3) -> (f64, f64) {
 }
 
 fn steer(rig: &mut Rig, task: u16, goal: Goal) -> Outcome {
-    rig.ask(Request::Steer { task, goal })
+    rig.ask(Request::CartesianTarget { task, goal })
 }
 
 /// Repeats a goal every 20 ms.
 fn stream(rig: &mut Rig, task: u16, goal: Goal, seconds: f64, mut after: impl FnMut(&Rig)) {
     for k in 0..(seconds * 100.0) as u32 {
         if k % 2 == 0 {
-            rig.send(Request::Steer { task, goal });
+            rig.send(Request::CartesianTarget { task, goal });
         }
         rig.tick();
         after(rig);

@@ -213,7 +213,7 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
         let id = rig.send(Request::Execute { task: 0, motion: sweep(2, 0..6, rest, 1.2, 1.0) });
         rig.tick();
         assert_eq!(rig.outcome(id), Outcome::ArmLatched(0, Cause::Operator));
-        assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
         assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
         assert_eq!(rig.phase(0), Phase::Standby);
         rig.run_for(0.5);
@@ -221,7 +221,7 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
         let id = rig.send(Request::Execute { task: 0, motion: sweep(3, 0..6, rest, 1.2, 1.0) });
         rig.tick();
         assert_eq!(rig.outcome(id).name(), "ARM_NOT_READY");
-        assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
         let before = rig.events.len();
         for _ in 0..100 {
             rig.tick();
@@ -235,18 +235,18 @@ fn stop_reset_and_enable_are_three_acts_and_none_moves_the_arm() {
 #[test]
 fn an_arm_that_is_being_disabled_or_enabled_may_be_silent_meanwhile() {
     let mut rig = Rig::one_arm(one(trajectory()));
-    assert_eq!(rig.ask(Request::Park { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::PrepareDisable { arm: 0 }), Outcome::Accepted);
     rig.run_for(0.6);
     rig.arms[0].silent = true; // its device thread waits for the motors
     rig.run_for(0.5);
     assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "no fault, and nothing is sent");
-    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::StartStateUnavailable(0), "not on an old state");
+    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::StartStateUnavailable(0), "not on an old state");
     (rig.arms[0].silent, rig.arms[0].enabled) = (false, false);
     rig.run(3);
     assert_eq!(rig.phase(0), Phase::Disabled);
 
     let mut rig = Rig::one_arm(one(trajectory()));
-    rig.ask(Request::Park { arm: 0 });
+    rig.ask(Request::PrepareDisable { arm: 0 });
     rig.run_for(0.6);
     rig.arms[0].link = Link::Faulted;
     rig.run(3);
@@ -262,11 +262,11 @@ fn a_stop_while_an_arm_is_being_enabled_is_not_lost() {
     assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
     rig.arms[0].enabled = true; // the motors were on their way
     rig.run(3);
-    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
+    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::Operator));
     rig.run_for(0.5);
     assert_eq!((rig.phase(0), rig.commands[0].mode, rig.arms[0].stops), (Phase::Held, None, 1));
     assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
-    assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+    assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
 }
 
 #[test]
@@ -283,7 +283,7 @@ fn activating_again_and_again_does_not_sink() {
         rig.ask(Request::Stop { arm: Some(0) });
         rig.run_for(1.0);
         rig.ask(Request::Reset { arm: 0 });
-        rig.ask(Request::Ready { arm: 0 });
+        rig.ask(Request::Enabled { arm: 0 });
         rig.run_for(0.5);
     }
     assert_eq!(rig.phase(0), Phase::Ready);
@@ -294,7 +294,7 @@ fn activating_again_and_again_does_not_sink() {
 fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
     let mut rig = Rig::one_arm(one(trajectory()));
     for (off, carried) in [(true, 0.03), (true, 0.4), (false, 0.4)] {
-        assert_eq!(rig.ask(Request::Park { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.ask(Request::PrepareDisable { arm: 0 }), Outcome::Accepted);
         rig.run_for(0.6);
         rig.arms[0].enabled = !off;
         rig.run(3);
@@ -308,7 +308,7 @@ fn an_arm_that_was_carried_away_while_off_is_held_where_it_is() {
         rig.run(3);
         rig.arms[0].enabled = true;
         rig.run(3);
-        assert_eq!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
         rig.run_for(0.5);
         assert!((rig.arms[0].q[0] - there).abs() < 0.005, "{} from {there}", rig.arms[0].q[0]);
         assert_eq!(rig.phase(0), Phase::Ready);
@@ -324,7 +324,7 @@ fn the_first_command_after_activation_holds() {
     rig.run(2);
     assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Standby, None), "nothing is sent before `enable`");
     assert_eq!(rig.execute(0, sweep(1, 0..6, 0.0, 0.1, 1.0)), Outcome::ArmNotReady(0, Phase::Standby, Cause::None));
-    rig.ask(Request::Ready { arm: 0 });
+    rig.ask(Request::Enabled { arm: 0 });
     assert_eq!(rig.phase(0), Phase::Activating);
     let ready_after = rig.run_until(1.0, |r| r.phase(0) == Phase::Ready);
     assert!(ready_after >= 0.2, "{ready_after}");
@@ -340,7 +340,7 @@ fn an_arm_is_not_taken_up_without_a_fresh_state() {
     rig.run(2);
     rig.arms[0].silent = true;
     rig.run(10);
-    assert_ne!(rig.ask(Request::Ready { arm: 0 }), Outcome::Accepted);
+    assert_ne!(rig.ask(Request::Enabled { arm: 0 }), Outcome::Accepted);
     assert_eq!(rig.commands[0].mode, None);
 }
 
@@ -452,7 +452,7 @@ fn requests_for_what_does_not_exist_are_refused() {
     assert_eq!(rig.execute(0, sweep(1, 3..9, 0.0, 0.1, 1.0)), Outcome::WrongTask(0));
     assert_eq!(rig.ask(Request::Servo { task: 0, target: [0.0; 16] }), Outcome::WrongTask(0));
     assert_eq!(rig.ask(Request::Velocity { task: 4, target: [0.0; 16] }), Outcome::WrongTask(4));
-    for request in [Request::Stop { arm: Some(5) }, Request::Reset { arm: 5 }, Request::Ready { arm: 5 }] {
+    for request in [Request::Stop { arm: Some(5) }, Request::Reset { arm: 5 }, Request::Enabled { arm: 5 }] {
         assert_ne!(rig.ask(request), Outcome::Accepted);
     }
     assert_eq!(rig.ask(Request::Cancel { task: Some(5) }), Outcome::WrongTask(5));

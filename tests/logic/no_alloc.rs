@@ -79,9 +79,9 @@ fn ticks_with_every_task_type_do_not_allocate() {
             831..=860 => _ = rig.velocity(4, &[0.2 * to; 6]),
             870..=875 => _ = rig.servo(5, &[left; 2]),
             880 => _ = rig.servo(3, &[f64::NAN; 7]),
-            500..=540 => _ = rig.send(Request::Steer { task: 6, goal: pose }),
-            541..=590 => _ = rig.send(Request::Steer { task: 7, goal: twist }),
-            595 => _ = rig.send(Request::Steer { task: 6, goal: nowhere }),
+            500..=540 => _ = rig.send(Request::CartesianTarget { task: 6, goal: pose }),
+            541..=590 => _ = rig.send(Request::CartesianTarget { task: 7, goal: twist }),
+            595 => _ = rig.send(Request::CartesianTarget { task: 6, goal: nowhere }),
             900 => _ = rig.servo(3, &[left + 0.01; 7]),
             901 => _ = rig.servo(3, &[left + 0.7; 7]),
             910 => _ = rig.send(Request::Gripper { arm: 0, opening: 0.03 }),
@@ -92,7 +92,7 @@ fn ticks_with_every_task_type_do_not_allocate() {
             970 => {
                 for arm in 0..3 {
                     rig.send(Request::Reset { arm });
-                    rig.send(Request::Ready { arm });
+                    rig.send(Request::Enabled { arm });
                 }
             }
             975 => (0..200).for_each(|_| _ = rig.servo(3, &[left; 7])),
@@ -203,7 +203,7 @@ fn the_tick_loop_does_not_allocate() {
             Phase::Ready if round % 40 == 30 => ask(Request::Velocity { task: 1, target: joints_of(&[0.1]) }),
             Phase::Ready => {}
             Phase::Held => ask(Request::Reset { arm: 0 }),
-            _ => ask(Request::Ready { arm: 0 }),
+            _ => ask(Request::Enabled { arm: 0 }),
         }
         round += 1;
         while reply_consumer.pop().is_ok() {}

@@ -12,7 +12,7 @@ use dimos::control::request::{Goal, Request};
 use dimos::control::task_spec::TaskTable;
 use dimos::hardware::registry::Registry;
 use dimos::joint::{JointLimits, joints_of, make_joints};
-use dimos::recording::messages::{JointState, Text, Tick};
+use dimos::recording::messages::{ArmOutput, JointState, Text, Tick};
 use dimos::replay::recorded::RecordedError;
 use dimos::replay::verify::{Finding, Verification};
 use dimos::robot::kinematics::Kinematics;
@@ -59,7 +59,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     };
     let steps = |run: &mut VirtualRun, n: usize| (0..n).for_each(|_| run.step());
     run.step();
-    run.ask(Request::Ready { arm: 0 });
+    run.ask(Request::Enabled { arm: 0 });
     steps(&mut run, 120); // the servo task starts automatically, and times out
     go(&mut run, 0.5);
     go(&mut run, 0.6); // refused: it is executing already
@@ -75,7 +75,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
         }
         run.step();
     }
-    for request in [Request::Reset { arm: 0 }, Request::Ready { arm: 0 }] {
+    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0 }] {
         run.ask(request);
         steps(&mut run, 40);
     }
@@ -94,7 +94,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     steps(&mut run, 10);
     run.overrun(15); // more than an arm may lose: it holds
     steps(&mut run, 20);
-    for request in [Request::Reset { arm: 0 }, Request::Ready { arm: 0 }] {
+    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0 }] {
         run.ask(request);
         steps(&mut run, 40);
     }
@@ -111,7 +111,7 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     run.ask(Request::Stop { arm: None });
     run.ask(Request::Stop { arm: Some(9) });
     run.ask(Request::Servo { task: 1, target: [f64::NAN; 16] });
-    run.ask(Request::Park { arm: 0 });
+    run.ask(Request::PrepareDisable { arm: 0 });
     steps(&mut run, 5);
     run.ask(Request::Shutdown);
     steps(&mut run, 50);
@@ -150,15 +150,15 @@ fn motions_of_an_end_effector_come_out_the_same_again() {
     let mut run = VirtualRun::start(&config, &log);
     run.states[0].position = joints_of(&[0.1, -0.3, 0.6, 0.0, 0.8, 0.2]);
     run.step();
-    run.ask(Request::Ready { arm: 0 });
+    run.ask(Request::Enabled { arm: 0 });
     (0..40).for_each(|_| run.step());
     for k in 0..400u32 {
         let (turn, t) = (0.1 * f64::from(k), f64::from(k) * 0.01);
         let pose = Goal::Pose { position: [0.3 + 0.05 * t.sin(), 0.1 * t, 0.4], orientation: [0.0, 1.0, 0.0, 0.0] };
         let linear = [0.1 * turn.cos(), 0.1 * turn.sin(), if k == 333 { f64::NAN } else { 0.02 }];
         match k % 200 {
-            0..100 if k % 2 == 0 => run.ask(Request::Steer { task: 1, goal: pose }),
-            120..180 => run.ask(Request::Steer {
+            0..100 if k % 2 == 0 => run.ask(Request::CartesianTarget { task: 1, goal: pose }),
+            120..180 => run.ask(Request::CartesianTarget {
                 task: 2,
                 goal: Goal::Twist { linear, angular: [0.1 + 0.2, 0.0, -0.0], tool: k > 200 },
             }),
@@ -219,6 +219,16 @@ fn one_bit_of_a_state_is_found_where_it_first_matters() {
 }
 
 #[test]
+fn a_changed_number_of_starts_is_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let (log, _) = eventful(folder.path());
+    let copy = folder.path().join("copy.mcap");
+    tamper(&log, &copy, "/dimos/outputs/arm", 0, |m: &mut ArmOutput| m.start_seq += 1);
+    let d = first_difference(&copy);
+    assert_eq!((d.tick, d.what, d.arm.as_deref()), (0, "number of starts", Some("arm")));
+}
+
+#[test]
 fn a_changed_request_or_time_shows_in_what_came_of_it() {
     let folder = tempfile::tempdir().unwrap();
     let (log, _) = eventful(folder.path());
@@ -273,7 +283,7 @@ fn damaged_messages_break_nothing() {
     let (log, copy) = (folder.path().join("short.mcap"), folder.path().join("copy.mcap"));
     let mut run = VirtualRun::start(&one_arm(2), &log);
     run.step();
-    run.ask(Request::Ready { arm: 0 });
+    run.ask(Request::Enabled { arm: 0 });
     (0..30).for_each(|_| run.step());
     let limits = JointLimits::uniform(2, 3.0, 2.0).with_defaults();
     run.execute(0, &point_to_point(&make_joints("arm", 2), &[0.0; 2], &[0.05; 2], &limits, 1.0).unwrap());

@@ -1,13 +1,16 @@
 //! Runs inside of a program, where the examples of docs/library.md say nothing.
 
 use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use dimos::control::task_spec::TaskTable;
 use dimos::rpc::Code;
 use dimos::rpc::api::Move;
 use dimos::rpc::run_dir::RunDir;
 use dimos::rpc::streams::{Stream, Subscribe};
-use dimos::runtime::{Builder, Ending, Record, Run, StartError};
+use dimos::runtime::{Builder, Ending, Options, Record, Run, StartError};
 
 fn mock(folder: &Path) -> Builder {
     Run::from_name("coordinator-mock").unwrap().record(Record::Off).folder(RunDir::at(folder))
@@ -75,6 +78,31 @@ fn a_handle_may_be_used_on_a_thread_of_an_async_program() {
         handle.call(Move { arm: "arm".into(), target, speed: 1.0 })
     });
     assert_eq!(run.wait(moved.unwrap().motion).unwrap().state, "COMPLETED");
+}
+
+#[test]
+fn waiting_for_a_motion_ends_with_an_error_when_the_tick_hangs() {
+    let folder = tempfile::tempdir().unwrap();
+    let hung = Arc::new(AtomicBool::new(false));
+    let flag = hung.clone();
+    let probe = move |_| {
+        if flag.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_secs(20));
+        }
+    };
+    let options = Options {
+        name: Some(format!("hung-{}", std::process::id())),
+        record: Record::Off,
+        probe: Some(Box::new(probe)),
+        hold_latency: false,
+        ..Options::default()
+    };
+    let loaded = mock(folder.path()).check();
+    let run = Run::start(loaded.blueprint.as_ref().unwrap(), options).unwrap();
+    let motion = run.move_arm("arm", &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 0.1).unwrap().motion;
+    hung.store(true, Ordering::Relaxed);
+    let error = run.wait(motion).unwrap_err();
+    assert!(error.code == Code::NoAnswer && error.message.contains("no tick for"), "{error}");
 }
 
 #[test]

@@ -337,7 +337,7 @@ impl Rig {
     pub fn make_ready(&mut self) {
         self.run(2);
         for i in 0..self.arms.len() {
-            assert_eq!(self.ask(Request::Ready { arm: i as u16 }), Outcome::Accepted);
+            assert_eq!(self.ask(Request::Enabled { arm: i as u16 }), Outcome::Accepted);
         }
         self.run_for(0.3);
         assert!((0..self.arms.len()).all(|i| self.phase(i) == Phase::Ready));

@@ -1,5 +1,5 @@
-//! Whether commands reach the arm: a start is made from the newest measurement until its first setpoint is written; a
-//! gap in what is written takes the commands back to the last one that was.
+//! Delivery of commands: until the first setpoint of a start is written, it is recomputed from the newest measurement;
+//! after a gap in delivery, motion continues from the last written setpoint.
 
 use super::ArmControl;
 use crate::arm::Link;

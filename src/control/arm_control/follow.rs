@@ -1,6 +1,6 @@
 //! How an arm follows the requests of tasks: in the mode that they need, each joint within its limits.
 
-use super::{ArmControl, Ask, Routed};
+use super::{ArmControl, JointRequest, Routed};
 use crate::control::limit::Refusal;
 use crate::control::task_body::Demand;
 use crate::joint::{ControlMode, MAX_DOF};
@@ -11,7 +11,7 @@ impl ArmControl {
     pub(super) fn follow(
         &mut self,
         demand: Demand,
-        ask: impl Fn(usize) -> Option<Ask>,
+        ask: impl Fn(usize) -> Option<JointRequest>,
         dt: f64,
         mut report: impl FnMut(usize, LimitKind, f64),
     ) -> Routed {
@@ -51,7 +51,7 @@ impl ArmControl {
                 None => limiter.hold_position(dt),
                 Some(ask) => {
                     if ask.new_task {
-                        limiter.hand_over();
+                        limiter.forget_request();
                     }
                     let limited = match mode {
                         ControlMode::Velocity => {
@@ -83,11 +83,11 @@ impl ArmControl {
     }
 
     /// Nothing reaches the arm: repeats the last written setpoint. Requests are still checked for jumps.
-    fn wait_in_gap(&mut self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>, dt: f64) -> Routed {
+    fn wait_in_gap(&mut self, mode: ControlMode, ask: impl Fn(usize) -> Option<JointRequest>, dt: f64) -> Routed {
         let mut refused = None;
         for (j, limiter) in self.limiters.iter_mut().enumerate() {
             if let (Some(ask), true) = (ask(j), mode.is_position()) {
-                refused = refused.or(limiter.pass(ask.value).err().map(|refusal| (j, refusal)));
+                refused = refused.or(limiter.check_request(ask.value).err().map(|refusal| (j, refusal)));
             }
             if let Some(out) = self.command.values.get_mut(j) {
                 *out = if mode == ControlMode::Velocity { limiter.velocity() } else { limiter.position() };
@@ -119,7 +119,7 @@ impl ArmControl {
     }
 
     /// Returns the first request that must be refused, and the reason.
-    fn refused(&self, mode: ControlMode, ask: impl Fn(usize) -> Option<Ask>) -> Option<(usize, Refusal)> {
+    fn refused(&self, mode: ControlMode, ask: impl Fn(usize) -> Option<JointRequest>) -> Option<(usize, Refusal)> {
         self.limiters.iter().enumerate().find_map(|(j, limiter)| {
             let ask = ask(j)?;
             let refusal = match mode {

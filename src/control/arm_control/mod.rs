@@ -58,7 +58,7 @@ pub struct ArmControl {
 
 /// Request to one joint in this tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Ask {
+pub struct JointRequest {
     /// [rad] or [rad/s], by the arm's demand.
     pub value: f64,
     /// Whether another task won the joint in the previous tick.
@@ -200,7 +200,7 @@ impl ArmControl {
     /// index, for the outcome.
     pub fn activate(&mut self, arm: u16, now: Mono) -> Outcome {
         let before = self.failsafe.phase();
-        let outcome = self.failsafe.ready(arm, self.feedback.state(), self.feedback.freshness(), now);
+        let outcome = self.failsafe.on_enabled(arm, self.feedback.state(), self.feedback.freshness(), now);
         let begins = outcome == Outcome::Accepted && !matches!(before, Phase::Activating | Phase::Ready);
         if begins && self.command.mode.is_none() {
             self.start();
@@ -221,7 +221,7 @@ impl ArmControl {
     pub fn route(
         &mut self,
         demand: Demand,
-        ask: impl Fn(usize) -> Option<Ask>,
+        ask: impl Fn(usize) -> Option<JointRequest>,
         dt: f64,
         now: Mono,
         next_tick: Mono,

@@ -114,7 +114,7 @@ impl Bench {
     /// Resets the arm's latch, enables it and waits until it is ready.
     pub fn enable(&mut self) -> Result<(), String> {
         self.ask(Request::Reset { arm: 0 });
-        self.ask(Request::Ready { arm: 0 });
+        self.ask(Request::Enabled { arm: 0 });
         self.run(0.5);
         if self.phase == Phase::Ready { Ok(()) } else { Err(format!("the simulated arm is {:?}", self.phase)) }
     }
@@ -207,11 +207,11 @@ impl Bench {
                 let mut position = flange.translation.to_array();
                 position[2] += 0.05;
                 let orientation = glamx::DQuat::from_mat3(&flange.matrix3).to_array();
-                Request::Steer { task: TESTED, goal: Goal::Pose { position, orientation } }
+                Request::CartesianTarget { task: TESTED, goal: Goal::Pose { position, orientation } }
             }
             TargetKind::Twist => {
                 let goal = Goal::Twist { linear: [0.0, 0.0, 0.05], angular: [0.0; 3], tool: false };
-                Request::Steer { task: TESTED, goal }
+                Request::CartesianTarget { task: TESTED, goal }
             }
         })
     }
@@ -223,13 +223,13 @@ impl Bench {
             TargetKind::Trajectory => return None,
             TargetKind::Positions => Request::Servo { task, target: [odd; MAX_DOF] },
             TargetKind::Velocities => Request::Velocity { task, target: [odd; MAX_DOF] },
-            TargetKind::Pose => Request::Steer {
+            TargetKind::Pose => Request::CartesianTarget {
                 task,
                 goal: Goal::Pose { position: [0.3, odd, 0.4], orientation: [0.0, 0.0, 0.0, 1.0] },
             },
             TargetKind::Twist => {
                 let goal = Goal::Twist { linear: [0.0, f64::INFINITY, 0.0], angular: [odd; 3], tool: true };
-                Request::Steer { task, goal }
+                Request::CartesianTarget { task, goal }
             }
         })
     }

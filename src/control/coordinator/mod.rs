@@ -8,7 +8,7 @@ mod tick_output;
 use std::time::Duration;
 
 use super::arbitrate::Arbiter;
-use super::arm_control::{ArmControl, Ask, Routed};
+use super::arm_control::{ArmControl, JointRequest, Routed};
 use super::config::CoordinatorConfig;
 use super::limit::Refusal;
 use super::request::Envelope;
@@ -99,7 +99,7 @@ impl Coordinator {
     ) -> &mut TickOutput {
         self.output.arms.clear();
         self.output.events.clear();
-        // The caller has taken the motions, to free them on another thread; the rest did not fit its ring.
+        // Empty in a run: the tick thread has drained it. A replay frees the motions here.
         self.output.retired.clear();
         let late = Duration::from_nanos(time.woke_late_ns);
         self.stalls.note(time.now.after(Duration::from_nanos(time.woke_late_ns % self.period_ns)), late);
@@ -235,7 +235,7 @@ impl Coordinator {
                 arbiter.demand(i),
                 |j| {
                     let (_, value) = arbiter.winner(first + j)?;
-                    Some(Ask { value, new_task: arbiter.winner_changed(first + j) })
+                    Some(JointRequest { value, new_task: arbiter.winner_changed(first + j) })
                 },
                 self.period,
                 time.now,

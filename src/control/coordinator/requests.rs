@@ -25,12 +25,12 @@ impl Coordinator {
             Request::Execute { task, motion } => self.execute(now, task, motion),
             Request::Servo { task, target } => self.offer(now, task, &Target::Positions(target)),
             Request::Velocity { task, target } => self.offer(now, task, &Target::Velocities(target)),
-            Request::Steer { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
+            Request::CartesianTarget { task, goal } => self.offer(now, task, &Target::EndEffector(goal)),
             Request::Reset { arm } => self.with_arm(arm, |a| a.reset(arm, now)),
-            Request::Ready { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
-            Request::Park { arm } => {
+            Request::Enabled { arm } => self.with_arm(arm, |a| a.activate(arm, now)),
+            Request::PrepareDisable { arm } => {
                 let outcome = self.with_arm(arm, |a| {
-                    a.failsafe.park(now);
+                    a.failsafe.prepare_disable(now);
                     Outcome::Accepted
                 });
                 self.end_tasks_of_held_arms();

@@ -106,7 +106,7 @@ fn a_schema_is_its_fields_and_then_what_they_need() {
 }
 
 #[test]
-fn a_log_says_who_made_it_and_when() {
+fn a_log_names_its_run_and_time_span() {
     let (_folder, path) = folder();
     record(&path, (0..11).flat_map(tick));
     let mut log = LogReader::open(&path).unwrap();

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 
+use super::files;
 use super::log_writer::LogAttachment;
 use super::messages::{ArmInput, JointState};
 use super::notes::{Notes, channel};
@@ -245,7 +246,7 @@ fn unknown_values_are_absent_or_nan_but_never_zero() {
 }
 
 #[test]
-fn a_request_stands_before_its_answer_and_events_are_told_in_words() {
+fn a_request_precedes_its_answer_and_events_have_text() {
     let (_folder, path) = folder();
     let notices = Notices::default();
     let (recorder, mut ring, notes) = start(&path, &notices);
@@ -315,6 +316,16 @@ fn a_log_is_never_overwritten() {
     let e = Recorder::start(config(path.clone()), consumer, channel().1, |_| {}).unwrap_err();
     assert!(e.to_string().contains("hint: a log is never overwritten"), "{e}");
     assert_eq!(read(&path).unwrap().1.map(|e| e.to_string()), None);
+}
+
+#[test]
+fn a_log_is_not_removed_while_it_is_recorded() {
+    let (_folder, path) = folder();
+    let path = path.with_file_name("test-20261121T141630Z.mcap");
+    let (recorder, _ring, _notes) = start(&path, &Notices::default());
+    assert!(files::retain(path.parent().unwrap(), 0).unwrap().is_empty());
+    recorder.finish().unwrap();
+    assert!(path.exists());
 }
 
 #[test]

@@ -113,7 +113,7 @@ fn f21_a_tick_that_panics_leaves_the_arm_held_and_ends_the_run() {
 fn f22_a_tick_that_hangs_leaves_the_arm_held_and_ends_the_run() {
     let mut exits = Vec::new();
     within("F22 hold", 50.0, || {
-        let (hold, exit) = break_the_tick("hang", "silent");
+        let (hold, exit) = break_the_tick("hang", "no tick for");
         exits.push(exit);
         hold
     });

@@ -18,7 +18,7 @@ const APPROACH: f64 = 0.8;
 /// Maximum deviation of a quaternion's length from 1.
 const QUATERNION_SLACK: f64 = 0.01;
 /// Tolerance of the goal [m, rad].
-const THERE: f64 = 1e-9;
+const GOAL_TOLERANCE: f64 = 1e-9;
 
 /// A goal in the frame of the model's root.
 #[derive(Debug, Clone, Copy)]
@@ -121,7 +121,7 @@ impl TaskBody for CartesianTask {
 fn towards(p: &CartesianParams, way: &Velocity, dt: f64) -> Velocity {
     let (far, turned) = (way.linear.length(), way.angular.length());
     // Fraction of the way per second.
-    let rate = |length: f64, fastest: f64, acceleration: f64| match length > THERE {
+    let rate = |length: f64, fastest: f64, acceleration: f64| match length > GOAL_TOLERANCE {
         true => braking_speed(length, APPROACH * acceleration, dt).min(fastest) / length,
         false => f64::INFINITY,
     };

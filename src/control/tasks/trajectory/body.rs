@@ -7,7 +7,7 @@ use crate::control::request::Motion;
 use crate::control::task_body::{Claim, Context, OnCancel, Step, Target, TaskBody};
 use crate::joint::TICK_STANDSTILL;
 use crate::telemetry::{Outcome, Reason, TaskState, TaskView};
-use crate::trajectory::{Cursor, Sample};
+use crate::trajectory::{Cursor, Sample, smooth_step};
 
 /// Minimum time for fading out the offset between the last command and the first point [s].
 const SHORTEST_FADE: f64 = 0.2;
@@ -216,10 +216,4 @@ fn rate_limits(cx: &Context<'_>, motion: &Motion, samples: &[Sample], rate: f64)
         second = second.min(cx.joint(joint).jerk / s.velocity.abs().max(1e-3));
     }
     RateLimits { first: steepest_slowdown(cx, motion, samples, rate), second }
-}
-
-/// Quintic step from 0 to 1 with zero velocity and acceleration at both ends.
-fn smooth_step(x: f64) -> f64 {
-    let x = x.clamp(0.0, 1.0);
-    x * x * x * (10.0 + x * (6.0 * x - 15.0))
 }

@@ -20,7 +20,7 @@ struct Part {
 
 /// Setpoints of one arm over its `lag`.
 #[derive(Debug, Clone)]
-pub struct SetPoints {
+pub struct SetpointWindow {
     dof: usize,
     /// Length of a part [ns].
     part: u64,
@@ -29,7 +29,7 @@ pub struct SetPoints {
     count: usize,
 }
 
-impl SetPoints {
+impl SetpointWindow {
     /// Creates the window of an arm of `dof` joints, over `span` [s]: its lag and the age of its states.
     pub fn new(dof: usize, span: f64) -> Self {
         let none = Part { from: Mono::ZERO, to: Mono::ZERO, low: [0.0; MAX_DOF], high: [0.0; MAX_DOF] };
@@ -120,8 +120,8 @@ mod tests {
         Mono(t * 1_000_000)
     }
 
-    fn ramp() -> SetPoints {
-        let mut points = SetPoints::new(1, 0.06);
+    fn ramp() -> SetpointWindow {
+        let mut points = SetpointWindow::new(1, 0.06);
         for k in 0..100u64 {
             points.push(ms(10 * k), &crate::joint::joints_of(&[0.03 * k as f64]));
         }
@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn a_fast_tick_needs_no_more_room() {
-        let mut points = SetPoints::new(1, 0.06);
+        let mut points = SetpointWindow::new(1, 0.06);
         for k in 0..1000u64 {
             points.push(ms(k), &crate::joint::joints_of(&[0.003 * k as f64]));
         }
