@@ -249,7 +249,8 @@ fn meshes(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, model: &RobotM
     if let Some((link, mesh)) = model.collada_collision().filter(|_| !robot.auto_convert_meshes) {
         let (name, uri) = (quote(&link.name), &mesh.uri);
         let what = format!("the collision mesh of the link {name} is a Collada file: {uri}");
-        checker.error(at, Diag::error(what).hint("set auto_convert_meshes to true, or give the link an STL or OBJ file"));
+        checker
+            .error(at, Diag::error(what).hint("set auto_convert_meshes to true, or give the link an STL or OBJ file"));
     }
 }
 

@@ -15,8 +15,8 @@ use crate::blueprint::Blueprint;
 use crate::planning::config::RobotConfig;
 use crate::rpc::api::Status;
 use crate::rpc::client::{self, Client, ClientError};
-use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::rpc::report::StatusReport;
+use crate::rpc::run_dir::{Claim, LiveRun, RunDir};
 use crate::runtime::{AttachedPlanner, Ending, LinkEvent};
 
 /// A planner attached to a run, in its own process.

@@ -25,8 +25,8 @@ use super::run_record::last_lines;
 use super::{check, output};
 use crate::blueprint::Catalog;
 use crate::recording::files::{self, KEPT_LOGS};
-use crate::rpc::run_dir;
 use crate::rpc::report::StatusReport;
+use crate::rpc::run_dir;
 
 /// Last line of the banner of a run without a terminal.
 pub const HOW_TO_END: &str = "Run `dimos down` for a controlled stop.";

@@ -10,8 +10,8 @@ use super::output::{self, Table, Tone, number, span, toned};
 use super::run_record::{RunRecord, RunState};
 use crate::rpc::api::Status;
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::run_dir::LiveRun;
 use crate::rpc::report::{ArmReport, Percentiles, PlannerStatus, StatusReport, TaskReport};
+use crate::rpc::run_dir::LiveRun;
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]

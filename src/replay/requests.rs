@@ -70,7 +70,7 @@ fn request(logged: LoggedRequest, joints: &[String]) -> Result<Request, String> 
         }
         LoggedRequest::Stop { arm } => Request::Stop { arm },
         LoggedRequest::Reset { arm } => Request::Reset { arm },
-        LoggedRequest::Enabled { arm } => Request::Enabled { arm },
+        LoggedRequest::Ready { arm } => Request::Enabled { arm },
         LoggedRequest::Park { arm } => Request::PrepareDisable { arm },
         LoggedRequest::Gripper { arm, opening } => Request::Gripper { arm, opening: opening.unwrap_or(f64::NAN) },
         LoggedRequest::Shutdown {} => Request::Shutdown,

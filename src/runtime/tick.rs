@@ -14,6 +14,7 @@ use crate::control::coordinator::Coordinator;
 use crate::control::task::Task;
 use crate::control::tick_loop::{self, Probe, Pulse, TickPorts};
 use crate::rt::host;
+use crate::sync::panic_text;
 
 /// Timeout for the thread to end.
 const END_LIMIT: Duration = Duration::from_millis(300);
@@ -42,9 +43,7 @@ impl Tick {
                 tick_loop::run(coordinator, ports, period, &MonotonicClock, probe);
             }));
             if let Err(panic) = ran {
-                let text = panic.downcast_ref::<&str>().map(|s| (*s).to_owned());
-                let text = text.or_else(|| panic.downcast_ref::<String>().cloned()).unwrap_or_default();
-                let _ = endings.send(Ending::Fault(format!("the tick thread panicked: {text}")));
+                let _ = endings.send(Ending::Fault(format!("the tick thread panicked: {}", panic_text(&*panic))));
             }
         })?;
         Ok(Self { pulse, period, thread: Some(thread) })

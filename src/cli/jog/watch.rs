@@ -11,8 +11,8 @@ use serde_json::Value;
 use crate::cli::exit::{Failure, Result};
 use crate::rpc::api::{State, Status};
 use crate::rpc::client::{Client, ClientError};
-use crate::rpc::run_dir::RunDir;
 use crate::rpc::report::{ArmReport, ArmStateReport, TaskReport};
+use crate::rpc::run_dir::RunDir;
 use crate::rpc::streams::{Stream, Subscribe};
 use crate::sync::lock;
 

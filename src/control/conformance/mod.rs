@@ -14,6 +14,7 @@ pub use bench::Bench;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use super::task_spec::TaskSpec;
+use crate::sync::panic_text;
 
 /// A rule for every task.
 #[derive(Debug, Clone, Copy)]
@@ -41,9 +42,5 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
 /// far, where the program has a counting allocator. A panic in the task is a failure.
 pub fn run(row: &TaskSpec, check: &Check, allocations: Option<fn() -> u64>) -> Result<(), String> {
     let attempt = catch_unwind(AssertUnwindSafe(|| (check.run)(&mut Bench::new(row, allocations)?)));
-    attempt.unwrap_or_else(|panic| {
-        let text = panic.downcast_ref::<String>().map(String::as_str);
-        let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
-        Err(format!("panicked: {text}"))
-    })
+    attempt.unwrap_or_else(|panic| Err(format!("panicked: {}", panic_text(&*panic))))
 }

@@ -121,7 +121,11 @@ fn f07_measurements_that_are_not_finite_reach_no_command() {
             states[0].stamp = rig.now;
             rig.tick_with(&states, 0);
             assert!(rig.samples[0].state.position.iter().all(|p| p.is_finite()));
-            assert_eq!(rig.phase(0), if k < 2 { Phase::Ready } else { Phase::Held }, "the last valid state becomes stale");
+            assert_eq!(
+                rig.phase(0),
+                if k < 2 { Phase::Ready } else { Phase::Held },
+                "the last valid state becomes stale"
+            );
         }
         rig.arms[0].q = q;
         assert_eq!(rig.samples[0].cause.name(), "stale");
