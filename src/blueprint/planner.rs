@@ -78,7 +78,7 @@ pub struct RobotEntry {
     pub base_link: String,
     /// The link that pose goals refer to.
     pub end_effector_link: Located<String>,
-    /// The planned joints by their names in the model, from the base; or `{group: NAME}`, a group of the SRDF.
+    /// The planned joints by their names in the model, from the base; or `{group: NAME}`: a `group` of the SRDF.
     pub joint_names: Located<RobotJoints>,
     /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.
     #[serde(default)]

@@ -1,6 +1,6 @@
 //! The last setpoint that was written to the arm. The device thread reports the number of the newest command that it
-//! wrote; the commands of the last ticks are kept to look it up. If nothing was written for more than two periods, there
-//! is a gap: commands repeat the last written setpoint, and motion continues from there.
+//! wrote; the commands of the last ticks are kept to look it up. If nothing was written for more than two periods,
+//! there is a gap: commands repeat the last written setpoint, and motion continues from there.
 
 use std::time::Duration;
 

@@ -73,7 +73,8 @@ impl<C: Controller> TcpServer<C> {
         Self::with_ports(name, controller, vec![(listener, Port::Requests)], 1).map_err(failed)
     }
 
-    /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in this order.
+    /// Serves several ports, and at most `max_clients` clients with requests at a time. Ports are numbered in this
+    /// order.
     pub fn with_ports(
         name: &str,
         controller: C,
