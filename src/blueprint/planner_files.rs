@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::Isometry3;
 
 use crate::blueprint::planner::{ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ShapeEntry};
 use crate::blueprint::planner_models::Described;
 use crate::blueprint::resolve::Checker;
 use crate::planning::config::{GripperJoint, ObjectConfig, ObjectShape, PlannerConfig, RobotConfig};
+use crate::pose;
 use crate::robot::Source;
 use crate::yaml::{Located, NodeId};
 
@@ -87,7 +88,7 @@ fn object(checker: &Checker<'_>, name: &str, entry: &Located<ObjectEntry>) -> Ob
         ShapeEntry::Mesh(path) => ObjectShape::Mesh(file(checker, entry.shape.at, path)),
         ShapeEntry::Cloud(path) => ObjectShape::Cloud(file(checker, entry.shape.at, path)),
     };
-    ObjectConfig { name: name.to_owned(), shape, pose: pose(&entry.pose), padding: entry.padding }
+    ObjectConfig { name: name.to_owned(), shape, pose: isometry(&entry.pose), padding: entry.padding }
 }
 
 /// Returns a path into an asset, or a path relative to the file that names it; relative to the working directory if
@@ -104,12 +105,6 @@ pub(super) fn file(checker: &Checker<'_>, at: NodeId, path: &str) -> PathBuf {
     folder.unwrap_or(Path::new("")).join(path)
 }
 
-fn pose(entry: &PoseEntry) -> Isometry3<f64> {
-    let [x, y, z] = entry.xyz;
-    let rotation = match (entry.quat, entry.rpy) {
-        (Some([x, y, z, w]), _) => UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
-        (None, Some([roll, pitch, yaw])) => UnitQuaternion::from_euler_angles(roll, pitch, yaw),
-        (None, None) => UnitQuaternion::identity(),
-    };
-    Isometry3::from_parts(Translation3::new(x, y, z), rotation)
+fn isometry(entry: &PoseEntry) -> Isometry3<f64> {
+    pose::from_written(entry.xyz, entry.quat, entry.rpy)
 }

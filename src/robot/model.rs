@@ -302,8 +302,3 @@ impl RobotModel {
         })
     }
 }
-
-/// Returns a pose from a position [m] and URDF's fixed-axis roll, pitch, yaw [rad].
-pub fn pose(xyz: [f64; 3], rpy: [f64; 3]) -> Isometry3<f64> {
-    Isometry3::from_parts(xyz.into(), nalgebra::UnitQuaternion::from_euler_angles(rpy[0], rpy[1], rpy[2]))
-}

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::Isometry3;
 
 use super::plan_requests::job;
 use super::recheck::Released;
@@ -15,6 +15,7 @@ use crate::planning::pipeline::solve;
 use crate::planning::planner_thread::{PlannerThread, Solver};
 use crate::planning::planning_scene::PlanningScene;
 use crate::planning::unplanned_joints::Measured;
+use crate::pose;
 use crate::rpc::api::{CancelReply, CommandLimits, Moment, PoseSpec, RegisteredRobot, Reply, WorldObject};
 use crate::rpc::api::{Request as Call, WorldAdd, WorldReport};
 use crate::rpc::{Code, RpcError};
@@ -115,13 +116,7 @@ pub(super) fn robot_index(setup: &PlanningScene, name: &str) -> Result<usize, Rp
 }
 
 pub(super) fn isometry(spec: &PoseSpec) -> Isometry3<f64> {
-    let [x, y, z] = spec.xyz;
-    let rotation = match (spec.quat, spec.rpy) {
-        (Some([x, y, z, w]), _) => UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
-        (None, Some([roll, pitch, yaw])) => UnitQuaternion::from_euler_angles(roll, pitch, yaw),
-        (None, None) => UnitQuaternion::identity(),
-    };
-    Isometry3::from_parts(Translation3::new(x, y, z), rotation)
+    pose::from_written(spec.xyz, spec.quat, spec.rpy)
 }
 
 pub(super) fn spec(pose: &Isometry3<f64>) -> PoseSpec {

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 
 /// Every module of `src/`, with the modules that it may use besides itself. `ALL`: everything above it.
 const ALL: &[&str] = &["*"];
-const VOCABULARY: &[&str] = &["message", "named", "sync", "joint", "arm", "trajectory", "clock", "telemetry", "yaml"];
+const VOCABULARY: &[&str] =
+    &["message", "named", "sync", "joint", "arm", "trajectory", "pose", "clock", "telemetry", "yaml"];
 const LAYERS: &[(&str, &[&str])] = &[
     ("message", &[]),
     ("named", &[]),
@@ -14,6 +15,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("joint", &[]),
     ("arm", &[]),
     ("trajectory", &[]),
+    ("pose", &[]),
     ("clock", &[]),
     ("telemetry", &[]),
     ("yaml", &[]),

@@ -62,7 +62,7 @@ fn another_reader_reads_the_same() {
         for joint in &theirs.joints {
             let own = &ours.joints[ours.joint_index(&joint.name).unwrap()];
             let [r, p, y] = *joint.origin.rpy;
-            let pose = dimos::robot::model::pose(*joint.origin.xyz, [r, p, y]);
+            let pose = dimos::pose::from_xyz_rpy(*joint.origin.xyz, [r, p, y]);
             assert!((own.origin.to_homogeneous() - pose.to_homogeneous()).norm() < 1e-15, "{name} {}", joint.name);
             assert_eq!(ours.links[own.parent].name, joint.parent.link);
             assert_eq!(ours.links[own.child].name, joint.child.link);

@@ -6,6 +6,7 @@ use super::File;
 use crate::cli::arguments::finite;
 use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
+use crate::pose::to_xyz_rpy;
 use crate::robot::RobotModel;
 use crate::robot::urdf::Meshes;
 use crate::yaml::did_you_mean;
@@ -60,19 +61,19 @@ pub fn run(args: &Args) -> Result {
     let poses = robot.link_poses(&robot.positions(&named));
     let at = |link: usize| poses.get(link).copied().unwrap_or_default();
     let pose = at(base).inverse() * at(tip);
-    let (xyz, (r, p, y)) = (pose.translation.vector, pose.rotation.euler_angles());
+    let (xyz, rpy) = to_xyz_rpy(&pose);
     let q = pose.rotation.quaternion().coords;
     if args.file.json {
         output::json(&json!({
             "link": name(tip), "base": name(base), "joints": moving, "positions": args.positions,
-            "xyz": xyz.as_slice(), "rpy": [r, p, y], "quat_xyzw": q.as_slice(),
+            "xyz": xyz, "rpy": rpy, "quat_xyzw": q.as_slice(),
         }));
         return Ok(Exit::Ok);
     }
     let row = |values: &[f64]| values.iter().map(|v| output::fixed(*v, 6)).collect::<Vec<_>>().join(" ");
     output::line(format_args!("{} in {}", name(tip), name(base)));
-    output::line(format_args!("xyz   {}  m", row(xyz.as_slice())));
-    output::line(format_args!("rpy   {}  rad", row(&[r, p, y])));
+    output::line(format_args!("xyz   {}  m", row(&xyz)));
+    output::line(format_args!("rpy   {}  rad", row(&rpy)));
     output::line(format_args!("quat  {}  x y z w", row(q.as_slice())));
     Ok(Exit::Ok)
 }

@@ -1,7 +1,6 @@
 //! `dimos model ik`: joint positions for a pose of a link.
 
 use glamx::{DAffine3, DQuat, DVec3};
-use nalgebra::UnitQuaternion;
 use serde_json::json;
 
 use super::File;
@@ -11,6 +10,7 @@ use crate::cli::exit::{Exit, Failure, Result};
 use crate::cli::output;
 use crate::collision::checker::Stop;
 use crate::planning::ik::{Ik, IkSettings};
+use crate::pose::from_xyz_rpy;
 use crate::robot::kinematics::Kinematics;
 use crate::robot::urdf::Meshes;
 
@@ -104,7 +104,7 @@ pub fn run(args: &Args) -> Result {
 /// Returns the requested orientation, if any.
 fn orientation(args: &Args) -> Result<Option<DQuat>> {
     if let Some([r, p, y]) = args.rpy.as_deref() {
-        let q = UnitQuaternion::from_euler_angles(*r, *p, *y).coords;
+        let q = from_xyz_rpy([0.0; 3], [*r, *p, *y]).rotation.coords;
         return Ok(Some(DQuat::from_xyzw(q.x, q.y, q.z, q.w)));
     }
     let Some([x, y, z, w]) = args.quat.as_deref() else { return Ok(None) };

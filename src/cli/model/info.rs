@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 use super::File;
 use crate::cli::exit::{Exit, Result};
 use crate::cli::output::{self, Table};
+use crate::pose::to_xyz_rpy;
 use crate::robot::mesh::Mesh;
 use crate::robot::srdf::Semantics;
 use crate::robot::urdf::Meshes;
@@ -187,8 +188,8 @@ fn to_json(robot: &RobotModel, semantics: &Semantics, meshes: &mut MeshCounts) -
     let name = |link: usize| robot.links.get(link).map(|l| l.name.as_str());
     let finite = |value: f64| Some(value).filter(|v| v.is_finite());
     let pose = |p: &nalgebra::Isometry3<f64>| {
-        let (r, y, w) = p.rotation.euler_angles();
-        json!({"xyz": p.translation.vector.as_slice(), "rpy": [r, y, w]})
+        let (xyz, rpy) = to_xyz_rpy(p);
+        json!({"xyz": xyz, "rpy": rpy})
     };
     let joints: Vec<Value> = robot
         .joints

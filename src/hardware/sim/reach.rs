@@ -1,6 +1,6 @@
 //! Poses of an emulated arm's end effector (x, y, z, roll, pitch, yaw), and inverse kinematics.
 
-use nalgebra::{Isometry3, Matrix6, SMatrix, Translation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Isometry3, Matrix6, SMatrix, Vector3, Vector6};
 
 /// Maximum number of iterations.
 const STEPS: usize = 200;
@@ -67,17 +67,6 @@ pub trait Chain {
         }
         jacobian
     }
-}
-
-/// Returns x, y, z [m], roll, pitch, yaw [rad] (R = Rz·Ry·Rx) of a pose.
-pub fn to_values(pose: &Isometry3<f64>) -> [f64; 6] {
-    let (v, (roll, pitch, yaw)) = (pose.translation.vector, pose.rotation.euler_angles());
-    [v.x, v.y, v.z, roll, pitch, yaw]
-}
-
-/// Returns the pose with x, y, z [m], roll, pitch, yaw [rad].
-pub fn from_values([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Isometry3<f64> {
-    Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
 }
 
 #[cfg(test)]

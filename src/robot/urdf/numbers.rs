@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
 use super::Reader;
-use crate::robot::model::pose;
+use crate::pose::from_xyz_rpy;
 use crate::robot::xml::{Attribute, Element};
 use crate::yaml::quote;
 
@@ -68,6 +68,6 @@ impl Reader<'_> {
             return Some(Isometry3::from_parts(xyz?.into(), rotation));
         }
         let rpy = three(self, "rpy");
-        Some(pose(xyz?, rpy?))
+        Some(from_xyz_rpy(xyz?, rpy?))
     }
 }

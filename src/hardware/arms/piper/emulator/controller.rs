@@ -17,10 +17,11 @@ use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
 use crate::hardware::sim::can_server::CanController;
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
-use crate::hardware::sim::reach::{self, Chain};
+use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::trace::Trace;
 use crate::hardware::transport::can::{CanFilter, CanFrame};
 use crate::joint::Joints;
+use crate::pose;
 
 /// Commands, beside which a Piper hears nothing: 0x150–0x15F and 0x470–0x47F, and the question for its firmware.
 const FILTERS: &[CanFilter] =
@@ -219,7 +220,7 @@ impl Controller {
         let [x, y, z, roll, pitch, yaw] = six(self.pose);
         let [x, y, z] = [x, y, z].map(|v| f64::from(v) * 1e-6);
         let [roll, pitch, yaw] = [roll, pitch, yaw].map(radians);
-        let goal = reach::from_values([x, y, z, roll, pitch, yaw]);
+        let goal = pose::from_xyz_rpy([x, y, z], [roll, pitch, yaw]);
         let found = Links.inverse(&goal, &self.six()).map(|joints| joints.map(millidegrees));
         match found.filter(|joints| self.outside(joints) == 0) {
             None => self.arm.fail(state::NO_SOLUTION),

@@ -5,8 +5,9 @@ use super::controller::{Controller, first, millidegrees};
 use super::kinematics::Links;
 use super::wire::{self, Status};
 use crate::hardware::sim::faults::FaultKind;
-use crate::hardware::sim::reach::{self, Chain};
+use crate::hardware::sim::reach::Chain;
 use crate::hardware::transport::can::CanFrame;
+use crate::pose;
 
 /// Torque per current [Nm/A] of joints 1–3 and 4–6, and what firmware up to 1.8-2 leaves of the former's currents.
 const TORQUE: [f64; 2] = [1.18125, 0.95844];
@@ -34,9 +35,8 @@ impl Controller {
             limits: self.beyond,
         };
         out.push(status.frame());
-        let [x, y, z, roll, pitch, yaw] = reach::to_values(&Links.forward(&positions));
-        let ([x, y, z], [roll, pitch, yaw]) =
-            ([x, y, z].map(|v| (v * 1e6).round() as i32), [roll, pitch, yaw].map(millidegrees));
+        let (xyz, rpy) = pose::to_xyz_rpy(&Links.forward(&positions));
+        let ([x, y, z], [roll, pitch, yaw]) = (xyz.map(|v| (v * 1e6).round() as i32), rpy.map(millidegrees));
         out.extend(wire::triple(0x2A2, [x, y, z, roll, pitch, yaw]));
         out.extend(wire::triple(0x2A5, positions.map(millidegrees)));
         if self.has_gripper {

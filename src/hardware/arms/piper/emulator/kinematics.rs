@@ -31,7 +31,8 @@ impl Chain for Links {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hardware::sim::reach::{tests::leads_back, to_values};
+    use crate::hardware::sim::reach::tests::leads_back;
+    use crate::pose::to_xyz_rpy;
 
     /// Poses as the vendor's SDK computes them [mm, deg].
     #[test]
@@ -41,7 +42,7 @@ mod tests {
             ([0.1, 0.6, -0.7, 0.05, 0.4, -0.1], [119.1448, 13.7344, 363.413, -167.0061, 77.5146, -159.832]),
             ([-0.5, 1.2, -1.1, 0.7, -0.6, 1.0], [212.5119, -153.8147, 457.3204, 64.5483, -11.3688, 43.0656]),
         ] {
-            let [x, y, z, roll, pitch, yaw] = to_values(&Links.forward(&joints));
+            let ([x, y, z], [roll, pitch, yaw]) = to_xyz_rpy(&Links.forward(&joints));
             let found = [x * 1e3, y * 1e3, z * 1e3, roll.to_degrees(), pitch.to_degrees(), yaw.to_degrees()];
             for (found, expected) in found.iter().zip(expected) {
                 assert!((found - expected).abs() < 1e-3, "{joints:?}: {found} is not {expected}");

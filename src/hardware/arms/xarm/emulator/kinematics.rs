@@ -6,7 +6,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
 use super::super::model::Model;
-use crate::hardware::sim::reach::{Chain, from_values, to_values};
+use crate::hardware::sim::reach::Chain;
+use crate::pose::{from_xyz_rpy, to_xyz_rpy};
 
 type Offset = ([f64; 3], [f64; 3]);
 
@@ -78,20 +79,20 @@ impl Chain for Links {
     fn link(&self, joint: usize, position: f64) -> Option<Isometry3<f64>> {
         let ([x, y, z], [roll, pitch, yaw]) = *self.0.get(joint)?;
         let turn = UnitQuaternion::from_scaled_axis(Vector3::z() * position);
-        Some(from_values([x, y, z, roll, pitch, yaw]) * turn)
+        Some(from_xyz_rpy([x, y, z], [roll, pitch, yaw]) * turn)
     }
 }
 
 /// x, y, z [mm], roll, pitch, yaw [rad] (R = Rz·Ry·Rx) of a pose.
 pub fn to_wire(pose: &Isometry3<f64>) -> [f32; 6] {
-    let [x, y, z, roll, pitch, yaw] = to_values(pose);
+    let ([x, y, z], [roll, pitch, yaw]) = to_xyz_rpy(pose);
     [x * 1000.0, y * 1000.0, z * 1000.0, roll, pitch, yaw].map(|value| value as f32)
 }
 
 /// The pose of x, y, z [mm], roll, pitch, yaw [rad].
 pub fn from_wire(values: [f32; 6]) -> Isometry3<f64> {
     let [x, y, z, roll, pitch, yaw] = values.map(f64::from);
-    from_values([x / 1000.0, y / 1000.0, z / 1000.0, roll, pitch, yaw])
+    from_xyz_rpy([x, y, z].map(|v| v / 1000.0), [roll, pitch, yaw])
 }
 
 #[cfg(test)]

@@ -9,11 +9,12 @@ use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
-use crate::hardware::sim::reach::{self, Chain};
+use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::stream;
 use crate::hardware::sim::trace::Trace;
 use crate::hardware::transport::Scan;
 use crate::joint::{ControlMode, Joints};
+use crate::pose;
 
 /// Pose at power-up [rad] if the options give none: not zero, so that mistakes show.
 const INITIAL: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
@@ -105,7 +106,7 @@ impl Controller {
                 arm.may_move(ControlMode::Position)?;
                 let [x, y, z] = [x, y, z].map(|mm| f64::from(mm) / 1000.0);
                 let [roll, pitch, yaw] = [roll, pitch, yaw].map(|deg| f64::from(deg).to_radians());
-                let goal = reach::from_values([x, y, z, roll, pitch, yaw]);
+                let goal = pose::from_xyz_rpy([x, y, z], [roll, pitch, yaw]);
                 let joints = Links.inverse(&goal, &first(&arm.joints().0)).ok_or(Refusal::OutOfRange)?;
                 arm.move_to(&joints, f64::from(speed) / 100.0)
             }
@@ -131,7 +132,7 @@ impl Controller {
         let measured = arm.measured();
         let floats = |values: &Joints| first(values).map(|v| v as f32);
         let degrees = |values: &Joints| floats(&values.map(f64::to_degrees));
-        let [x, y, z, roll, pitch, yaw] = reach::to_values(&Links.forward(&first(&arm.joints().0)));
+        let ([x, y, z], [roll, pitch, yaw]) = pose::to_xyz_rpy(&Links.forward(&first(&arm.joints().0)));
         let report = Report {
             time_us: arm.uptime().as_micros() as u64,
             state: arm.state_code(),
