@@ -113,7 +113,7 @@ fn what_cannot_be_planned_is_refused_in_words() {
         ("plan arm 0 0 0", 2, &["arm has 6 joints, the goal 3 values"]),
         ("plan arm --named hme", 2, &["no named pose named `hme`", "did you mean `home`?"]),
         ("plan amr --named home", 1, &["UNKNOWN_ROBOT", "did you mean `arm`?"]),
-        ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has the length 1.414"]),
+        ("plan arm --pose 0.3 0 0.3 --quat 1 1 0 0", 2, &["goals[0].pose.quat has length 1.414"]),
         ("plan arm 0 0 0 0 0 0 --linear", 2, &["linear needs a pose"]),
         ("plan arm", 2, &["required"]),
         ("preview", 1, &["UNKNOWN_PLAN", "hint: `dimos plan` makes one"]),

@@ -51,6 +51,7 @@ fn shim_of(python: &str, class: &str, home: &Home, at: &str, arguments: &[&str])
     command.args([&in_tree("assets/python/dimos_shim.py"), class, "--at", at]);
     home.settle(command.args(arguments).stdin(Stdio::null()));
     command.current_dir(in_tree("tests/python")).env("PYTHONPYCACHEPREFIX", home.path());
+    command.env_remove("PYTHONDONTWRITEBYTECODE");
     command
 }
 
