@@ -121,7 +121,7 @@ fn streams(effort: Effort) -> Result<(), String> {
             xarm::emulator::XArmEmulator::start(&settings, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?,
         );
         emulator.record();
-        let address = dimos::hardware::registry::Emulator::address(&*emulator);
+        let address = registry::Emulator::address(&*emulator);
         let adapter = registry::create("xarm", &address, 6).map_err(|e| e.to_string())?;
         let arm = Arm::new(adapter, Box::new(emulator.clone()), period, beat, room)?;
         let points = move || emulator.trace().iter().filter(|request| request.register == SETPOINT).count() as u64;
@@ -134,7 +134,7 @@ fn streams(effort: Effort) -> Result<(), String> {
             piper::emulator::PiperEmulator::start(&settings, &EmulatorAddress::InProcess).map_err(|e| e.to_string())?,
         );
         emulator.record();
-        let address = dimos::hardware::registry::Emulator::address(&*emulator);
+        let address = registry::Emulator::address(&*emulator);
         let adapter = registry::create("piper", &address, 6).map_err(|e| e.to_string())?;
         let arm = Arm::new(adapter, Box::new(emulator.clone()), period, beat, room)?;
         // A setpoint is complete with its last frame.

@@ -70,7 +70,7 @@ fn tar_gz(entries: &[(&str, tar::EntryType, &str)]) -> Vec<u8> {
 }
 
 fn zip_of(entries: &[(&str, &str)]) -> Vec<u8> {
-    let mut archive = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let mut archive = zip::ZipWriter::new(io::Cursor::new(Vec::new()));
     for (name, content) in entries {
         archive.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
         archive.write_all(content.as_bytes()).unwrap();
@@ -256,7 +256,7 @@ fn archives_with_links_or_paths_outside_their_folder_are_rejected() {
         assert!(left.is_empty(), "{what}: {left:?}");
         assert!(!folder.path().join("evil").exists() && !cache.0.join("evil").exists(), "{what}");
     }
-    let mut link = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let mut link = zip::ZipWriter::new(io::Cursor::new(Vec::new()));
     link.add_symlink("a", "/etc/passwd", zip::write::SimpleFileOptions::default()).unwrap();
     let bytes = link.finish().unwrap().into_inner();
     let error = cache.fetch(&asset(&put(folder.path(), "l.zip", &bytes), &bytes), &mut NoProgress).unwrap_err();

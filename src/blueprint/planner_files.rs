@@ -55,7 +55,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Describ
         joint_limits: source.joint_limits,
         shapes: typed.collision_shapes.0.iter().map(|(link, mode)| (link.value.clone(), mode.value)).collect(),
         convert_meshes: typed.auto_convert_meshes,
-        base_pose: pose(&typed.base_pose),
+        base_pose: isometry(&typed.base_pose),
         base_link: typed.base_link.clone(),
         end_effector_link: typed.end_effector_link.value.clone(),
         coordinator_joints: joints.iter().map(ours).collect(),

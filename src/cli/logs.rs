@@ -10,7 +10,7 @@ use anyhow::Context;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{RunRecord, RunState};
-use crate::rpc::client::{self, ClientError};
+use crate::rpc::client::ClientError;
 use crate::rpc::run_dir::RunDir;
 
 /// Poll period of --follow.
@@ -64,7 +64,7 @@ fn find(name: Option<&str>) -> Result<RunRecord> {
             let name = live.pop().map(|run| run.name).unwrap_or_default();
             RunRecord::of(&name).ok_or_else(|| unknown(&name))
         }
-        (None, _) => Err(client::ClientError::SeveralRuns(live).into()),
+        (None, _) => Err(ClientError::SeveralRuns(live).into()),
     }
 }
 

@@ -148,6 +148,7 @@ pub fn run(
         for motion in output.retired.drain(..) {
             // The ring has room for all motions that can exist. One that does not fit is leaked, not freed.
             if let Err(rtrb::PushError::Full(motion)) = ports.retired.push(motion) {
+                #[expect(clippy::mem_forget, reason = "the tick frees nothing")]
                 std::mem::forget(motion);
             }
         }

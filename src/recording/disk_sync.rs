@@ -79,7 +79,7 @@ mod tests {
     #[test]
     fn a_sync_that_fails_is_reported() {
         // A pipe has no disk.
-        let (_reader, writer) = std::io::pipe().unwrap();
+        let (_reader, writer) = io::pipe().unwrap();
         let sync = DiskSync::start(File::from(std::os::fd::OwnedFd::from(writer))).unwrap();
         assert!(sync.finish(Duration::from_secs(30)).is_err());
     }

@@ -175,7 +175,7 @@ fn has_capability(bit: u32) -> bool {
 
 /// Locks the pages of a buffer, as far as the limit allows; for processes that may not lock everything.
 pub fn lock_pages<T>(buffer: &[T]) {
-    let length = std::mem::size_of_val(buffer);
+    let length = size_of_val(buffer);
     // SAFETY: the range is that of a live slice; locking changes nothing visible to Rust.
     unsafe { libc::mlock2(buffer.as_ptr().cast(), length, libc::MLOCK_ONFAULT as libc::c_uint) };
 }

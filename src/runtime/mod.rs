@@ -283,7 +283,7 @@ impl Run {
     }
 
     fn come_to_rest(&self, ended: &mut Ended) {
-        let sent = self.dispatcher.send(Request::Shutdown, dispatch::log_of(&Request::Shutdown));
+        let sent = self.dispatcher.send(Request::Shutdown, log_of(&Request::Shutdown));
         let Ok(mut answer) = sent else { return ended.troubles.push("the coordinator accepts no requests".to_owned()) };
         let (service, tick, pulse) = (&self.handle.service, &self.tick, &self.pulse);
         let (mut taken, mut still_since) = (false, Instant::now());

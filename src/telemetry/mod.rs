@@ -9,7 +9,7 @@ use crate::named::named;
 
 /// One entry of the ring.
 // The ring holds values: a box would allocate in the tick.
-#[allow(clippy::large_enum_variant)]
+#[expect(clippy::large_enum_variant, reason = "samples go through a ring of fixed slots")]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Sample {
     /// An arm's sample. One per arm and tick, before the tick's `Tick`.

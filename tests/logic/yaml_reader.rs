@@ -105,7 +105,7 @@ fn every_mistake_is_found_at_its_place() {
 fn a_misspelt_key_is_not_missing_too() {
     #[derive(Debug, Deserialize)]
     #[serde(deny_unknown_fields)]
-    #[allow(dead_code)]
+    #[allow(dead_code, reason = "read by deserialization only")]
     struct Two {
         address: String,
         port: u16,

@@ -139,7 +139,7 @@ tasks:
     assert_eq!(run.servo("stick", &[0.0; 2]).unwrap_err().code, Code::WrongTask);
     for _ in 0..50 {
         run.velocity("stick", &[0.4, 0.0]).unwrap();
-        std::thread::sleep(std::time::Duration::from_millis(10));
+        std::thread::sleep(Duration::from_millis(10));
     }
     let moved = run.state().arms[0].joints[0].position.unwrap();
     assert!(moved > 0.02, "{moved}");

@@ -23,21 +23,25 @@ fn count(allocates: bool) {
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count(true);
+        // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         count(true);
+        // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         count(true);
+        // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.
         unsafe { System.realloc(pointer, layout, size) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         count(false);
+        // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.
         unsafe { System.dealloc(pointer, layout) }
     }
 }

@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 #[derive(Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-#[allow(dead_code)]
+#[allow(dead_code, reason = "shared by test programs that use parts of it")]
 struct NetOptions {
     /// How long to wait for an answer [s].
     timeout: f64,

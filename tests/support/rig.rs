@@ -2,7 +2,7 @@
 //! is checked here against what no command may ever do; the tests look at the rest.
 
 // The check compares several lists joint by joint.
-#![allow(clippy::needless_range_loop)]
+#![allow(clippy::needless_range_loop, reason = "joints are indices into several arrays at once")]
 
 use std::collections::VecDeque;
 use std::time::Duration;

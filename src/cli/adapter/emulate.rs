@@ -30,6 +30,7 @@ A fault script: at=2,kind=stall,duration=0.5 (repeatable), or a YAML or JSON fil
 `at` counts seconds from the first client's connection. `--fault list` shows the kinds that this arm's emulator can play.
 Clients that connect and leave, and faults that begin, are logged on stderr, in seconds since the start.")]
 pub struct Args {
+    /// The adapter and its options.
     #[command(flatten)]
     pub choice: Choice,
     /// Listen on this loopback address, at the arm's own ports [default for arms on TCP: 127.0.0.1]

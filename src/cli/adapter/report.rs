@@ -294,7 +294,7 @@ fn lag_part(lag: &Lag) -> Part {
 
 fn motion_part(motion: &Motion) -> Part {
     let degrees = |v: f64| {
-        let text = output::fixed(v.to_degrees(), 2);
+        let text = fixed(v.to_degrees(), 2);
         if text.starts_with('-') { text } else { format!("+{text}") }
     };
     let rows = motion.ways.iter().map(|way| {

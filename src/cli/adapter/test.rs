@@ -35,6 +35,7 @@ Stay within reach of the arm's own E-stop button.
 
 Exit codes: 0 all passed, 1 something failed, 2 usage, 3 the arm cannot be reached.")]
 pub struct Args {
+    /// The adapter and its options.
     #[command(flatten)]
     pub choice: Choice,
     /// Where the arm is, as in a blueprint; `sim` for its emulator

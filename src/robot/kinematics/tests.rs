@@ -234,9 +234,9 @@ fn kinematics_are_unchanged_by_a_log() {
 fn solving_with_cholesky_solves() {
     let mut random = Random::new(6);
     let columns: Vec<Column> = (0..7).map(|_| std::array::from_fn(|_| random.between(-1.0, 1.0))).collect();
-    let matrix = super::jacobian::gram(&columns, 0.1);
+    let matrix = jacobian::gram(&columns, 0.1);
     let b: Column = std::array::from_fn(|_| random.between(-1.0, 1.0));
-    let x = super::jacobian::solve(&super::jacobian::cholesky(&matrix).unwrap(), &b);
+    let x = jacobian::solve(&jacobian::cholesky(&matrix).unwrap(), &b);
     for (row, b) in matrix.iter().zip(&b) {
         assert!((row.iter().zip(&x).map(|(a, x)| a * x).sum::<f64>() - b).abs() < 1e-12);
     }

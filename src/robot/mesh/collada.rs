@@ -183,7 +183,7 @@ impl<'a, 'i: 'a> Scene<'a, 'i> {
 
     /// Returns the positions that a primitive's indices refer to, the offset of their index, and the number of indices
     /// per vertex.
-    #[allow(clippy::type_complexity)]
+    #[expect(clippy::type_complexity, reason = "indices, stride and offset, used once")]
     fn inputs(&self, primitive: Node<'a, 'i>) -> Result<Option<(Vec<Point3<f64>>, usize, usize)>, String> {
         let number = |node: Node<'_, '_>, name: &str| node.attribute(name).and_then(|t| t.trim().parse::<usize>().ok());
         let inputs: Vec<_> = children(primitive, "input").collect();

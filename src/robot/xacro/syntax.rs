@@ -252,7 +252,7 @@ impl Parser {
         }
     }
 
-    #[allow(clippy::type_complexity)]
+    #[expect(clippy::type_complexity, reason = "positional and named arguments, used once")]
     fn arguments(&mut self) -> Result<(Vec<Expr>, Vec<(String, Expr)>), String> {
         let (mut values, mut named) = (Vec::new(), Vec::new());
         while !self.sign(")") {

@@ -391,7 +391,7 @@ impl Session {
             let what = format!("{name}: the drivers of joints {silent} have said nothing for {within} ms");
             return Err(AdapterError::Timeout(what));
         }
-        let wrong = |(_, driver): &(usize, &protocol::Driver)| driver.enabled() != on;
+        let wrong = |(_, driver): &(usize, &Driver)| driver.enabled() != on;
         let joints: Vec<String> =
             (1..).zip(&self.feedback.drivers).filter(wrong).map(|(joint, _)| joint.to_string()).collect();
         let (joints, word) = (joints.join(", "), if on { "on" } else { "off" });

@@ -271,7 +271,7 @@ fn sag_and_zero_state_and_blocked_joints_can_be_played() {
 
 #[test]
 fn an_address_in_full_has_its_port() {
-    let full = |address| (super::SPEC.address.check)(address).unwrap();
+    let full = |address| (SPEC.address.check)(address).unwrap();
     assert_eq!(full("arm.local"), format!("arm.local:{}", super::protocol::PORT));
     assert_eq!(full("[::1]:7"), "[::1]:7");
 }

@@ -195,7 +195,7 @@ fn wrong_options_are_refused() {
     );
     assert!(start(serde_json::json!({"sim": {"firmware": "new"}}), 6).contains("not a version"));
     assert!(start(serde_json::json!({"sim": {"faults": [{"kind": "panic"}]}}), 6).contains("cannot play"));
-    let denied = std::io::Error::from(io::ErrorKind::PermissionDenied);
+    let denied = io::Error::from(io::ErrorKind::PermissionDenied);
     let text = cannot_listen(WHO, "127.0.0.5:502".parse().unwrap(), &denied).to_string();
     assert!(text.contains("\nhint: ") && text.contains("ip_unprivileged_port_start=502"), "{text}");
     let config =

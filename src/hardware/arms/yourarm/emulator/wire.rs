@@ -5,7 +5,7 @@ use crate::hardware::transport::tcp::Scan;
 
 /// Status bytes of replies, as on the sheet.
 pub mod status {
-    #![allow(missing_docs)]
+    #![expect(missing_docs, reason = "the names of the protocol sheet")]
     pub const OK: u8 = 0;
     pub const UNKNOWN_COMMAND: u8 = 1;
     pub const MALFORMED: u8 = 2;
