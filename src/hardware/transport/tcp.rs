@@ -285,6 +285,8 @@ mod tests {
         let mut link = TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap();
         let (mut peer, _) = listener.accept().unwrap();
         let noise = std::thread::spawn(move || while peer.write_all(&[b'x'; BUFFER]).is_ok() {});
+        link.receive(Duration::from_secs(10), |bytes| Scan::Take(bytes.len(), ())).unwrap();
+        std::thread::sleep(Duration::from_millis(20));
         let mut scans = 0;
         let found = link.poll(|bytes| {
             scans += 1;
