@@ -95,8 +95,6 @@ pub struct Scene {
     pub(super) links: Vec<LinkShape>,
     pub(super) pairs: Vec<LinkPair>,
     pub(super) obstacles: Vec<PlacedObstacle>,
-    /// `allowed[link][obstacle]`
-    pub(super) allowed: Vec<Vec<bool>>,
     pub(super) limits: Vec<Limits>,
     turns: Vec<bool>,
     joint_names: Vec<String>,
@@ -145,9 +143,6 @@ impl Scene {
         }
         scene.make_pairs(world, &origins);
         scene.obstacles = world.obstacles().iter().map(place).collect();
-        let names: Vec<&str> = scene.obstacles.iter().map(|o| o.name.as_str()).collect();
-        let row = |link: &LinkShape| names.iter().map(|o| world.is_allowed(&link.name, o)).collect();
-        scene.allowed = scene.links.iter().map(row).collect();
         scene
     }
 

@@ -1,6 +1,5 @@
-//! A world that can change: robots, obstacles, held objects, allowed pairs. Planning uses its snapshots.
+//! A world that can change: robots, obstacles, held objects. Planning uses its snapshots.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use glamx::DAffine3;
@@ -89,8 +88,6 @@ pub struct World {
     robots: Vec<Robot>,
     obstacles: Vec<Obstacle>,
     attached: Vec<Attached>,
-    /// Allowed pairs of a link and an obstacle, by name.
-    allowed: BTreeSet<(String, String)>,
 }
 
 fn check_padding(padding: f64) -> Result<(), WorldError> {
@@ -206,16 +203,6 @@ impl World {
     pub fn detach(&mut self, name: &str) -> Result<Attached, WorldError> {
         let at = self.attached(name).ok_or_else(|| WorldError::Unknown(name.to_owned()))?;
         Ok(self.attached.remove(at))
-    }
-
-    /// Allows a link or a held object to touch an obstacle.
-    pub fn allow(&mut self, link: &str, obstacle: &str) {
-        self.allowed.insert((link.to_owned(), obstacle.to_owned()));
-    }
-
-    /// Returns whether a link may touch an obstacle.
-    pub fn is_allowed(&self, link: &str, obstacle: &str) -> bool {
-        self.allowed.contains(&(link.to_owned(), obstacle.to_owned()))
     }
 
     /// Returns an immutable snapshot of the current world.

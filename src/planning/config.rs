@@ -94,6 +94,37 @@ impl RobotConfig {
     }
 }
 
+#[cfg(test)]
+impl RobotConfig {
+    /// Returns the built-in robot `yourarm` at the origin.
+    pub fn yourarm() -> Self {
+        let joints: Vec<String> = (1..=6).map(|k| format!("joint{k}")).collect();
+        Self {
+            name: "arm".into(),
+            model_path: "builtin:yourarm".into(),
+            packages: BTreeMap::new(),
+            xacro_args: BTreeMap::new(),
+            srdf: None,
+            joint_limits: None,
+            shapes: BTreeMap::new(),
+            convert_meshes: true,
+            base_pose: Isometry3::identity(),
+            base_link: "base_link".into(),
+            end_effector_link: "flange".into(),
+            coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
+            joints,
+            joint_prefix: String::new(),
+            gripper_joint: None,
+            task: None,
+            exclusions: Vec::new(),
+            max_velocity: 1.0,
+            max_acceleration: 2.0,
+            max_jerk: None,
+            named_poses: BTreeMap::new(),
+        }
+    }
+}
+
 /// Limits of one joint as the executing arm enforces them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JointBounds {

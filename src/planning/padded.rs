@@ -2,10 +2,11 @@
 //! that are closer at the start or goal, near that configuration, and pairs that are closer in every configuration.
 //! Contact is never allowed.
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use super::path::between;
+use crate::collision::allowed_pairs::sample;
 use crate::collision::report::{Contact, Pair};
 use crate::collision::{CollisionChecker, ExactChecker, Resolution, Scene, Stop};
 use crate::named::named;
@@ -151,7 +152,7 @@ impl Padded {
         let mut random = Random::new(0);
         let limits = self.full.limits().to_vec();
         (0..POSES).all(|_| {
-            let q: Vec<f64> = limits.iter().map(|l| random.between(l.lower.max(-PI), l.upper.min(PI))).collect();
+            let q: Vec<f64> = limits.iter().map(|l| sample(l.lower, l.upper, &mut random)).collect();
             !self.full.keeps(pair, &q)
         })
     }

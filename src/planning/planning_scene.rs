@@ -166,8 +166,7 @@ impl PlannedRobot {
         let posed = model.positions(&idle);
         let kinematics = Kinematics::new(&model, &joints, &posed).map_err(|e| e.to_string())?;
         let limits = kinematics.limits().to_vec();
-        let rest = model.positions(&HashMap::new());
-        let base_in_model = model.link_poses(&rest).get(base).copied().unwrap_or_default();
+        let base_in_model = model.link_poses(&posed).get(base).copied().unwrap_or_default();
         let model = Arc::new(model);
         let body = Robot {
             name: config.name.clone(),
@@ -255,4 +254,40 @@ pub fn obstacle(object: &ObjectConfig) -> Result<Obstacle, String> {
     };
     let solid = solid.map_err(|e| e.to_string())?;
     Ok(Obstacle { name: object.name.clone(), solid, padding: object.padding })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::planning::config::GripperJoint;
+    use crate::robot::kinematics::pose;
+
+    const ON_A_SLIDE: &str = r#"<robot name="r"><link name="root"/><link name="base"/><link name="l"/>
+<joint name="slide" type="prismatic"><parent link="root"/><child link="base"/><axis xyz="1 0 0"/>
+<limit lower="0" upper="0.3" velocity="1" effort="1"/></joint>
+<joint name="j" type="revolute"><parent link="base"/><child link="l"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" velocity="1" effort="1"/></joint></robot>"#;
+
+    #[test]
+    fn the_base_link_is_at_its_pose_if_a_joint_before_it_is_not_at_zero() {
+        let folder = tempfile::tempdir().unwrap();
+        let model_path = folder.path().join("slide.urdf");
+        std::fs::write(&model_path, ON_A_SLIDE).unwrap();
+        let config = RobotConfig {
+            model_path,
+            base_pose: nalgebra::Isometry3::translation(1.0, 2.0, 3.0),
+            base_link: "base".into(),
+            end_effector_link: "l".into(),
+            joints: vec!["j".into()],
+            coordinator_joints: vec!["arm_j".into()],
+            gripper_joint: Some(GripperJoint { joint: "slide".into(), closed: 0.0, open: 0.2 }),
+            ..RobotConfig::yourarm()
+        };
+        let robot = PlannedRobot::load(&config).unwrap();
+        let kinematics = &robot.body.kinematics;
+        let mut frames = kinematics.frames();
+        kinematics.forward_from(&robot.body.base, &[0.0], &mut frames);
+        let is_at = pose(&kinematics.link_frame(robot.model.link_index("base").unwrap(), &frames));
+        assert!((is_at.translation.vector - config.base_pose.translation.vector).norm() < 1e-9, "{is_at}");
+    }
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use glamx::{DAffine3, DVec3};
 
+use super::padded::{Near, Padded};
 use super::path::{distance, length};
 use super::path_planner::{PlanError, PlanSettings, plan};
 use crate::collision::body::{MeshMode, solids};
@@ -106,14 +107,15 @@ fn a_search_without_a_path_ends_at_its_maximum_counts() {
     );
 }
 
-#[test]
-fn a_start_in_slight_contact_is_escaped_and_a_deep_one_is_reported() {
-    let text = r#"<robot name="r"><link name="base"/><link name="l"><collision><origin xyz="0.5 0 0"/>
+/// An arm with one joint about z within these limits [rad], and a ball 0.5 m from it.
+fn pointer(lower: f64, upper: f64) -> Robot {
+    let text = format!(
+        r#"<robot name="r"><link name="base"/><link name="l"><collision><origin xyz="0.5 0 0"/>
 <geometry><sphere radius="0.05"/></geometry></collision></link><joint name="j" type="revolute"><parent link="base"/>
-<child link="l"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1" effort="1"/></joint></robot>"#;
-    let model = Arc::new(from_text("r.urdf", text).unwrap());
-    let mut world = World::new();
-    let robot = Robot {
+<child link="l"/><axis xyz="0 0 1"/><limit lower="{lower}" upper="{upper}" velocity="1" effort="1"/></joint></robot>"#
+    );
+    let model = Arc::new(from_text("r.urdf", &text).unwrap());
+    Robot {
         name: String::new(),
         kinematics: Arc::new(Kinematics::whole(&model).unwrap()),
         solids: solids(&model, MeshMode::Hull).unwrap(),
@@ -121,8 +123,26 @@ fn a_start_in_slight_contact_is_escaped_and_a_deep_one_is_reported() {
         base: DAffine3::IDENTITY,
         padding: 0.0,
         allowed: vec![],
-    };
-    world.add_robot(robot).unwrap();
+    }
+}
+
+#[test]
+fn a_pair_is_always_closer_than_the_padding_if_it_is_so_within_the_limits() {
+    let mut world = World::new();
+    // A range beyond a half turn.
+    world.add_robot(pointer(4.0, 4.2)).unwrap();
+    let below = DAffine3::from_translation(DVec3::new(0.5 * 4.1_f64.cos(), 0.5 * 4.1_f64.sin(), -0.11));
+    world.add(Obstacle { name: "post".into(), solid: Solid::sphere(0.05, below).unwrap(), padding: 0.0 }).unwrap();
+    let mut checker = Padded::new(world.snapshot(), 0.03);
+    checker.give_up(Near::Start, &[4.1]);
+    let near: Vec<Near> = checker.given_up().iter().map(|given_up| given_up.near).collect();
+    assert_eq!(near, [Near::Everywhere]);
+}
+
+#[test]
+fn a_start_in_slight_contact_is_escaped_and_a_deep_one_is_reported() {
+    let mut world = World::new();
+    world.add_robot(pointer(-2.0, 2.0)).unwrap();
     let mut from = |overlap: f64| {
         let at = DAffine3::from_translation(DVec3::new(0.5, 0.1 - overlap, 0.0));
         let solid = Solid::sphere(0.05, at).unwrap();

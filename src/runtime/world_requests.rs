@@ -1,6 +1,7 @@
 //! Requests that change the planner's world: add, move, remove, attach, detach. [`PlannerPort::objects`] has the
-//! objects as given, the planner thread's world has their shapes; both change together.
+//! objects as given, the planner thread's world has their shapes; both change together, under the lock of the objects.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use nalgebra::Isometry3;
@@ -16,13 +17,17 @@ use crate::rpc::api::{self, Done, Moment, ShapeSpec, WorldObject};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 
+/// The objects by name.
+type Objects = BTreeMap<String, WorldObject>;
+
 impl PlannerPort {
     pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<Done, RpcError> {
         self.measured(moment);
         let setup = &*self.thread.now();
         let index = robot_index(setup, &call.robot)?;
         let robot = setup.robots.get(index).ok_or_else(internal)?;
-        let mut object = named(self, &call.name)?;
+        let objects = &mut *lock(&self.objects);
+        let mut object = named(objects, &call.name)?;
         let link = call.link.clone().unwrap_or_else(|| robot.config.end_effector_link.clone());
         for link in &call.touch_links {
             link_index(robot, link)?;
@@ -48,17 +53,18 @@ impl PlannerPort {
         self.thread.world(held).map_err(|e| wrong(e.to_string()))?;
         object.pose = spec(&at);
         object.held_by = Some([call.robot.clone(), link]);
-        lock(&self.objects).insert(call.name.clone(), object);
+        objects.insert(call.name.clone(), object);
         Ok(Done {})
     }
 
     pub(super) fn detach(&self, name: &str, moment: &Moment) -> Result<Done, RpcError> {
-        let mut object = known(self, name)?;
+        self.measured(moment);
+        let setup = &*self.thread.now();
+        let objects = &mut *lock(&self.objects);
+        let mut object = known(objects, name)?;
         let Some([robot, link]) = object.held_by.take() else {
             return Err(wrong(format!("no robot holds {name}")));
         };
-        self.measured(moment);
-        let setup = &*self.thread.now();
         let robot = setup.robots.get(robot_index(setup, &robot)?).ok_or_else(internal)?;
         let at = link_pose(robot, &link, moment)? * isometry(&object.pose);
         let let_go = |world: &mut World| {
@@ -70,40 +76,43 @@ impl PlannerPort {
         };
         self.thread.world(let_go).map_err(|e| wrong(e.to_string()))?;
         object.pose = spec(&at);
-        lock(&self.objects).insert(name.to_owned(), object);
+        objects.insert(name.to_owned(), object);
         Ok(Done {})
     }
 
     /// Adds an object to the world. Reads its file on another thread: it may be large.
     pub(super) async fn put(&self, object: WorldObject) -> Result<Done, RpcError> {
-        not_held(self, &object.name)?;
+        not_held(&lock(&self.objects), &object.name)?;
         let config = configured(&object, isometry(&object.pose));
         let made = run_blocking(move || obstacle(&config)).await?.map_err(wrong)?;
+        let objects = &mut *lock(&self.objects);
         // Another client may have attached it meanwhile.
-        not_held(self, &object.name)?;
+        not_held(objects, &object.name)?;
         self.thread.world(|world| world.put(made)).map_err(|e| wrong(e.to_string()))?;
-        lock(&self.objects).insert(object.name.clone(), object);
+        objects.insert(object.name.clone(), object);
         Ok(Done {})
     }
 
     pub(super) fn move_to(&self, call: &api::WorldMove) -> Result<Done, RpcError> {
-        let mut object = named(self, &call.name)?;
+        let objects = &mut *lock(&self.objects);
+        let mut object = named(objects, &call.name)?;
         let at = frame(&isometry(&call.pose));
         self.thread.world(|world| world.move_to(&call.name, at)).map_err(|e| wrong(e.to_string()))?;
         object.pose = call.pose;
-        lock(&self.objects).insert(call.name.clone(), object);
+        objects.insert(call.name.clone(), object);
         Ok(Done {})
     }
 
     pub(super) fn remove(&self, name: Option<&str>) -> Result<Done, RpcError> {
+        let objects = &mut *lock(&self.objects);
         let mut gone: Vec<String> = Vec::new();
         match name {
-            Some(name) => gone.push(named(self, name)?.name),
-            None => gone.extend(lock(&self.objects).values().filter(|o| o.held_by.is_none()).map(|o| o.name.clone())),
+            Some(name) => gone.push(named(objects, name)?.name),
+            None => gone.extend(objects.values().filter(|o| o.held_by.is_none()).map(|o| o.name.clone())),
         }
         for name in gone {
             self.thread.world(|world| world.remove(&name)).map_err(|e| wrong(e.to_string()))?;
-            lock(&self.objects).remove(&name);
+            objects.remove(&name);
         }
         Ok(Done {})
     }
@@ -123,11 +132,6 @@ fn wrong(what: impl Into<String>) -> RpcError {
     RpcError::new(Code::InvalidParams, what)
 }
 
-fn unknown_object(port: &PlannerPort, name: &str) -> RpcError {
-    let names: Vec<String> = lock(&port.objects).keys().cloned().collect();
-    RpcError::unknown(Code::UnknownObject, "object", name, &names)
-}
-
 fn link_index(robot: &PlannedRobot, link: &str) -> Result<usize, RpcError> {
     let names: Vec<&str> = robot.model.links.iter().map(|link| link.name.as_str()).collect();
     let unknown = || RpcError::unknown(Code::InvalidParams, "link", link, &names);
@@ -135,20 +139,21 @@ fn link_index(robot: &PlannedRobot, link: &str) -> Result<usize, RpcError> {
 }
 
 /// Returns an object that no robot holds.
-fn named(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
-    not_held(port, name)?;
-    known(port, name)
+fn named(objects: &Objects, name: &str) -> Result<WorldObject, RpcError> {
+    not_held(objects, name)?;
+    known(objects, name)
 }
 
-fn known(port: &PlannerPort, name: &str) -> Result<WorldObject, RpcError> {
-    // Not in one expression: the lock would still be held when the error path locks again.
-    let object = lock(&port.objects).get(name).cloned();
-    object.ok_or_else(|| unknown_object(port, name))
+fn known(objects: &Objects, name: &str) -> Result<WorldObject, RpcError> {
+    let unknown = || {
+        let names: Vec<&String> = objects.keys().collect();
+        RpcError::unknown(Code::UnknownObject, "object", name, &names)
+    };
+    objects.get(name).cloned().ok_or_else(unknown)
 }
 
-fn not_held(port: &PlannerPort, name: &str) -> Result<(), RpcError> {
-    let holder = lock(&port.objects).get(name).and_then(|object| object.held_by.clone());
-    match holder {
+fn not_held(objects: &Objects, name: &str) -> Result<(), RpcError> {
+    match objects.get(name).and_then(|object| object.held_by.as_ref()) {
         Some([robot, _]) => {
             Err(wrong(format!("{robot} holds {name}")).hint(format!("`dimos world detach {name}` lets go of it")))
         }
@@ -178,4 +183,66 @@ pub(super) fn typed(object: &ObjectConfig) -> WorldObject {
     };
     let pose = spec(&object.pose);
     WorldObject { name: object.name.clone(), shape, pose, padding: object.padding, held_by: None }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use crate::planning::config::{PlannerConfig, RobotConfig};
+    use crate::planning::planning_scene::PlanningScene;
+
+    /// A planner with the built-in robot and a ball in its world, and its present state.
+    fn with_a_ball(at: [f64; 3]) -> (PlannerPort, Moment) {
+        let ball = ObjectConfig {
+            name: "ball".into(),
+            shape: ObjectShape::Sphere(0.02),
+            pose: Isometry3::translation(at[0], at[1], at[2]),
+            padding: 0.0,
+        };
+        let (robots, timeout) = (vec![RobotConfig::yourarm()], Duration::from_secs(1));
+        let config = PlannerConfig { timeout, padding: 0.0, robots, objects: vec![ball] };
+        let setup = PlanningScene::load(&config).unwrap();
+        let joints = setup.robots[0].config.coordinator_joints.iter();
+        let moment =
+            Moment { plan: 1, positions: joints.map(|j| (j.clone(), 0.0)).collect(), grippers: BTreeMap::new() };
+        (PlannerPort::start(&config, setup, &BTreeMap::new(), None).unwrap(), moment)
+    }
+
+    /// Where a pose that is given relative to the end-effector link is in `map` [m].
+    fn in_map(port: &PlannerPort, moment: &Moment, held: &Isometry3<f64>) -> [f64; 3] {
+        let robot = &port.thread.setup().robots[0];
+        let at = link_pose(robot, &robot.config.end_effector_link, moment).unwrap() * held;
+        at.translation.vector.into()
+    }
+
+    #[test]
+    fn an_object_that_is_moved_and_attached_in_parallel_is_held_where_it_is() {
+        let (before, after) = ([0.5, 0.0, 0.2], [0.5, 0.3, 0.4]);
+        let (port, moment) = with_a_ball(before);
+        let to =
+            api::WorldMove { name: "ball".into(), pose: spec(&Isometry3::translation(after[0], after[1], after[2])) };
+        let attach = api::Attach { name: "ball".into(), robot: "arm".into(), link: None, touch_links: Vec::new() };
+        let moved = std::thread::scope(|scope| {
+            // Both requests wait for the world, the move first.
+            let moved = port.thread.world(|_| {
+                let moved = scope.spawn(|| port.move_to(&to).is_ok());
+                std::thread::sleep(Duration::from_millis(100));
+                scope.spawn(|| port.attach(&attach, &moment).unwrap());
+                std::thread::sleep(Duration::from_millis(100));
+                moved
+            });
+            moved.join().unwrap()
+        });
+        // On a stalled computer the object may be attached first; then the move is refused.
+        let expected = if moved { after } else { before };
+        let object = lock(&port.objects)["ball"].clone();
+        assert!(object.held_by.is_some(), "{object:?}");
+        let in_world = port.thread.world(|world| pose(&world.held()[0].solids[0].frame));
+        for held in [in_world, isometry(&object.pose)] {
+            let at = in_map(&port, &moment, &held);
+            assert!(at.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9), "{at:?}, not {expected:?}");
+        }
+    }
 }

@@ -32,8 +32,11 @@ fn bench(native_rate: f64) -> Bench {
     bench_of(Box::new(mock.clone()), mock, native_rate)
 }
 
-/// A device thread with this adapter; `mock` is that adapter, or unused.
-fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
+/// A device thread with this adapter, and the tick's ends: heartbeat, states and commands.
+fn spawn(
+    adapter: Box<dyn ManipulatorAdapter>,
+    native_rate: f64,
+) -> (Device, Arc<Heartbeat>, SlotReader<ArmState>, SlotWriter<ArmCommand>) {
     let beat = Arc::new(Heartbeat::default());
     let (state_writer, states) = slot(ArmState::default());
     let (commands, command_reader) = slot(ArmCommand::default());
@@ -48,6 +51,12 @@ fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate
         notes: Box::new(|_| {}),
     };
     let device = Device::spawn(config, adapter, state_writer, command_reader).unwrap();
+    (device, beat, states, commands)
+}
+
+/// A connected and enabled arm with this adapter; `mock` is that adapter, or unused.
+fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
+    let (device, beat, states, commands) = spawn(adapter, native_rate);
     device.connect().wait(LIMIT).unwrap();
     device.activate().wait(LIMIT).unwrap();
     Bench { device, beat, states, commands, command: ArmCommand::default(), mock }
@@ -205,6 +214,32 @@ fn the_reason_for_a_refused_reconnect_is_reported() {
     let texts: Vec<_> = bench.device.health().episodes().into_iter().map(|episode| episode.text).collect();
     assert!(texts.iter().any(|text| text == "cannot reconnect: another arm"), "{texts:?}");
     bench.end();
+}
+
+#[test]
+fn the_end_of_a_run_reports_an_arm_that_was_lost() {
+    for (disable, orders) in [(false, "no stop"), (true, "neither a stop nor a disable")] {
+        let mut bench = bench(100.0);
+        for _ in 0..100 {
+            bench.mock.fail("connect", AdapterError::Io("unplugged".into()));
+        }
+        bench.mock.fail("read_joint_positions", AdapterError::NotConnected);
+        bench.until("the loss", |b| b.states.read().link == Link::Faulted);
+        let expected = AdapterError::Io(format!("the connection is lost: {orders} reached the arm"));
+        assert_eq!(bench.device.finish(disable).wait(LIMIT), Err(expected));
+        assert_eq!(bench.states.read().link, Link::Down);
+        bench.device.join();
+    }
+}
+
+#[test]
+fn an_arm_that_was_never_connected_is_released_without_an_error() {
+    let mock = MockAdapter::new(6);
+    mock.fail("connect", AdapterError::Io("unplugged".into()));
+    let (device, ..) = spawn(Box::new(mock), 100.0);
+    assert!(device.connect().wait(LIMIT).is_err());
+    device.finish(true).wait(LIMIT).unwrap();
+    device.join();
 }
 
 /// The stop of an xArm does not reach its gripper: the device thread holds it.

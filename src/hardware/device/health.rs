@@ -14,6 +14,10 @@ const EPISODES: usize = 16;
 /// Maximum log lines per episode.
 const MAX_LINES_PER_EPISODE: usize = 8;
 
+/// Longest interval between states, in units of their average, that counts in full: the average of a fast arm must not
+/// take an outage for its rate.
+const MAX_INTERVAL_RATIO: f64 = 10.0;
+
 /// A period during which one kind of trouble lasted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
@@ -87,7 +91,7 @@ impl Health {
         self.reads.fetch_add(1, Ordering::Relaxed);
         if interval > 0.0 {
             let (old, new) = (self.interval_ns.load(Ordering::Relaxed) as f64, interval * 1e9);
-            let mean = if old > 0.0 { old + 0.05 * (new - old) } else { new };
+            let mean = if old > 0.0 { old + 0.05 * (new.min(MAX_INTERVAL_RATIO * old) - old) } else { new };
             self.interval_ns.store(mean.max(1.0) as u64, Ordering::Relaxed);
         }
     }
@@ -195,6 +199,18 @@ mod tests {
         assert!(matches!(health.gripper_answer(2), Some(Err(AdapterError::Rejected(_)))), "it never reached the arm");
         health.answer_gripper(u32::MAX, Ok(()));
         assert_eq!(health.gripper_answer(0), None, "numbers wrap around");
+    }
+
+    #[test]
+    fn an_outage_changes_the_rate_little_and_a_slower_arm_much() {
+        let health = Health::default();
+        let states = |count: usize, interval: f64| (0..count).for_each(|_| health.state_came(interval));
+        states(100, 0.004);
+        assert!((health.rate() - 250.0).abs() < 1.0, "{}", health.rate());
+        states(1, 60.0);
+        assert!(health.rate() > 150.0, "after an outage: {}", health.rate());
+        states(150, 1.0);
+        assert!((health.rate() - 1.0).abs() < 0.1, "{}", health.rate());
     }
 
     #[test]

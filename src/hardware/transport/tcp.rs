@@ -13,6 +13,9 @@ use crate::hardware::adapter::{AdapterError, AdapterResult};
 /// A peer that acknowledges nothing for this time is lost [ms].
 const USER_TIMEOUT_MS: u32 = 1000;
 
+/// Maximum number of reads in search of a frame that is not waited for: endless noise must not block the caller.
+const MAX_READS: usize = 16;
+
 /// Address of a controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
@@ -166,10 +169,11 @@ impl TcpLink {
         })
     }
 
-    /// Returns the next frame among the received bytes, without waiting; `None` if there is none. `scan` as above.
+    /// Returns the next frame among the received bytes, without waiting; `None` if there is none, or if too much noise
+    /// comes before it: the connection is still readable then. `scan` as above.
     pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
         let Self { stream, peer, incoming, .. } = self;
-        loop {
+        for _ in 0..MAX_READS {
             if let Some(frame) = incoming.next(&mut scan) {
                 return Ok(Some(frame));
             }
@@ -185,6 +189,7 @@ impl TcpLink {
                 return Ok(None);
             }
         }
+        Ok(incoming.next(&mut scan))
     }
 }
 
@@ -271,6 +276,28 @@ mod tests {
         let mut link = TcpLink::connect("test", &peer(vec![endless]), Duration::from_secs(2)).unwrap();
         let result = link.receive::<()>(Duration::from_secs(5), |_| Scan::More);
         assert!(matches!(result, Err(AdapterError::Protocol(_))), "{result:?}");
+    }
+
+    #[test]
+    fn endless_noise_does_not_block_a_poll() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let endpoint = Endpoint { host: "127.0.0.1".into(), port: listener.local_addr().unwrap().port() };
+        let mut link = TcpLink::connect("test", &endpoint, Duration::from_secs(5)).unwrap();
+        let (mut peer, _) = listener.accept().unwrap();
+        let noise = std::thread::spawn(move || while peer.write_all(&[b'x'; BUFFER]).is_ok() {});
+        link.receive(Duration::from_secs(10), |bytes| Scan::Take(bytes.len(), ())).unwrap();
+        std::thread::sleep(Duration::from_millis(20));
+        let mut scans = 0;
+        let found = link.poll(|bytes| {
+            scans += 1;
+            assert!(scans <= 10 * MAX_READS, "the poll does not end");
+            // More noise arrives meanwhile.
+            std::thread::sleep(Duration::from_millis(2));
+            Scan::<()>::Skip(bytes.len())
+        });
+        assert_eq!(found, Ok(None));
+        drop(link);
+        noise.join().unwrap();
     }
 
     /// What a slow peer finally receives: the number of bytes sent and received, and how the connection ended.

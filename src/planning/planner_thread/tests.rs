@@ -1,7 +1,5 @@
 //! Tests of the planner thread with the built-in robot.
 
-use std::collections::BTreeMap;
-
 use nalgebra::Isometry3;
 
 use super::*;
@@ -18,34 +16,10 @@ fn object(name: &str, size: [f64; 3], at: [f64; 3]) -> ObjectConfig {
 }
 
 fn yourarm(objects: Vec<ObjectConfig>) -> PlanningScene {
-    let joints: Vec<String> = (1..=6).map(|k| format!("joint{k}")).collect();
-    let robot = RobotConfig {
-        name: "arm".into(),
-        model_path: "builtin:yourarm".into(),
-        packages: BTreeMap::new(),
-        xacro_args: BTreeMap::new(),
-        srdf: None,
-        joint_limits: None,
-        shapes: BTreeMap::new(),
-        convert_meshes: true,
-        base_pose: Isometry3::identity(),
-        base_link: "base_link".into(),
-        end_effector_link: "flange".into(),
-        coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
-        joints,
-        task: None,
-        exclusions: Vec::new(),
-        max_velocity: 1.0,
-        max_acceleration: 2.0,
-        max_jerk: None,
-        joint_prefix: String::new(),
-        gripper_joint: None,
-        named_poses: BTreeMap::new(),
-    };
     PlanningScene::load(&PlannerConfig {
         timeout: Duration::from_secs(60),
         padding: 0.003,
-        robots: vec![robot],
+        robots: vec![RobotConfig::yourarm()],
         objects,
     })
     .unwrap()

@@ -160,25 +160,10 @@ mod tests {
         let robot = RobotConfig {
             name: "arm".into(),
             model_path: path,
-            packages: BTreeMap::new(),
-            xacro_args: BTreeMap::new(),
-            srdf: None,
-            joint_limits: None,
-            shapes: BTreeMap::new(),
-            convert_meshes: true,
-            base_pose: Isometry3::identity(),
-            base_link: "base_link".into(),
-            end_effector_link: "flange".into(),
             coordinator_joints: joints.clone(),
             joints,
-            task: None,
-            exclusions: Vec::new(),
-            max_velocity: 1.0,
-            max_acceleration: 2.0,
-            max_jerk: None,
-            joint_prefix: String::new(),
-            gripper_joint: None,
             named_poses: BTreeMap::from([("home".to_owned(), home), ("zero".to_owned(), vec![0.0; dof.into()])]),
+            ..RobotConfig::yourarm()
         };
         let table = ObjectConfig {
             name: "table".into(),

@@ -78,15 +78,18 @@ fn after(a: u32, b: u32) -> bool {
 }
 
 impl Heard {
-    /// Takes a reply. An error ends the session.
-    fn take(&mut self, reply: &Reply) -> AdapterResult<()> {
+    /// Takes a reply; `cycling` is the number of the last cycle. An error ends the session.
+    fn take(&mut self, reply: &Reply, cycling: u32) -> AdapterResult<()> {
         let trouble = reply.trouble(&self.peer);
         if reply.lost() {
             return Err(AdapterError::Io(format!("{} has lost its arm: {}", self.peer, reply.text())));
         } else if reply.id == self.awaited {
             self.acted = Some(trouble.map_or(Ok(()), Err));
         } else if trouble.is_some() {
-            self.trouble = trouble;
+            // A late error reply to an act that a newer one has replaced says nothing about the states.
+            if reply.id == cycling {
+                self.trouble = trouble;
+            }
         } else if let Some(measured) = &reply.state {
             match measured.check(self.dof) {
                 Ok(()) => self.take_measured(*measured, reply.id),
@@ -203,7 +206,7 @@ impl Session {
         let mut any = false;
         while let Some(line) = self.link.next()? {
             match Reply::decode(line) {
-                Ok(reply) => self.heard.take(&reply)?,
+                Ok(reply) => self.heard.take(&reply, self.cycling)?,
                 Err(what) => return Err(self.link.nonsense(&what)),
             }
             any = true;

@@ -1,10 +1,14 @@
 //! The protocol against the sheet, and the adapter against the emulator over real sockets.
 
+use std::io::{BufRead, BufReader, Write};
+use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use super::SPEC;
+use super::address::Address;
 use super::emulator::wire;
 use super::protocol::{self, Act, Command, Description, Reply, WirePose};
+use super::session::Session;
 use crate::hardware::adapter::{AdapterError, JointReading, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{self, AdapterConfig, Emulator};
 use crate::hardware::sim::faults::{Fault, FaultKind};
@@ -151,6 +155,48 @@ fn refusals_come_with_the_next_command_and_stale_states_are_said() {
     assert!(arm.is_connected(), "late is not gone");
     assert!(matches!(arm.write_stop(), Err(AdapterError::Timeout(_))), "no confirmation");
     until("the end", || arm.read_joints(&mut reading).is_err() && !arm.is_connected());
+}
+
+/// Serves one client: sends the lines that `answer` returns for each request.
+fn scripted(mut answer: impl FnMut(&wire::Request) -> String + Send + 'static) -> Address {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = Address::parse(&listener.local_addr().unwrap().to_string()).unwrap();
+    std::thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let requests = BufReader::new(stream.try_clone().unwrap());
+        for line in requests.lines().map_while(Result::ok) {
+            let Scan::Take(_, Ok(request)) = wire::scan(format!("{line}\n").as_bytes()) else { panic!("{line}") };
+            stream.write_all(answer(&request).as_bytes()).unwrap();
+        }
+    });
+    address
+}
+
+#[test]
+fn a_late_refusal_of_an_earlier_act_does_not_fail_the_reads() {
+    let [hello, _, refused, state] = sheet("{ \"id\":")[..] else { panic!("four replies") };
+    let numbered = |line: &str, id: u64| {
+        let mut reply: serde_json::Value = serde_json::from_str(line).unwrap();
+        reply["id"] = id.into();
+        format!("{reply}\n")
+    };
+    let mut enable = 0;
+    let address = scripted(move |request| match request.what.as_str() {
+        "hello" => numbered(hello, request.id),
+        "cycle" => numbered(state, request.id),
+        "write_enable" => {
+            enable = request.id;
+            String::new()
+        }
+        // The late reply to `write_enable` comes first.
+        "write_stop" => numbered(refused, enable) + &numbered("{}", request.id),
+        other => panic!("{other}"),
+    });
+    let mut session = Session::open(&address, 2).unwrap();
+    assert_eq!(session.act(&Act::Enable(true), Duration::from_millis(20)), Ok(None));
+    assert_eq!(session.act(&Act::Stop, Duration::from_secs(10)), Ok(Some(Ok(()))));
+    let state = session.newest();
+    assert!(matches!(state, Ok(Ok(_))), "{state:?}");
 }
 
 #[test]

@@ -124,12 +124,16 @@ impl Worker {
     pub(super) fn finish(&mut self, adapter: &mut dyn ManipulatorAdapter, disable: bool) -> AdapterResult<()> {
         let mut result = Ok(());
         // An arm that another program has taken over is not stopped.
-        if self.connected && self.state.interference != Interference::Mode {
+        let ours = self.state.interference != Interference::Mode;
+        if ours && self.connected {
             result = adapter.deactivate();
             if disable {
                 self.wait_for_standstill(adapter);
                 result = result.and(adapter.write_enable(false));
             }
+        } else if ours && self.should_reconnect {
+            let orders = if disable { "neither a stop nor a disable" } else { "no stop" };
+            result = Err(AdapterError::Io(format!("the connection is lost: {orders} reached the arm")));
         }
         adapter.disconnect();
         self.connected = false;

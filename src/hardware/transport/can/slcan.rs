@@ -5,6 +5,7 @@
 //! commands (a carriage return, or a bell for "no") are ignored, since many models do not reply. The `z` that some send
 //! for each frame is counted, and limits the number of waiting frames.
 
+use std::cell::Cell;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
@@ -24,8 +25,6 @@ const BAUD: u32 = 115_200;
 pub(super) const MAX_LINE: usize = 32;
 /// Length of a frame's line without its data: `tIIIL`.
 const HEAD: usize = 5;
-/// Maximum number of replies that are skipped in search of a frame.
-const MAX_REPLIES: usize = 64;
 /// A reply that is missing for this time was lost.
 const REPLY_LOST: Duration = Duration::from_millis(200);
 /// Minimum number of waiting frames when the kernel has no room for more.
@@ -42,13 +41,6 @@ pub struct SlcanPort {
     unanswered: usize,
     replies: bool,
     written_at: Instant,
-}
-
-/// A message of an adapter.
-enum Reply {
-    Frame(CanFrame),
-    /// A frame was taken.
-    Taken,
 }
 
 /// Opens the serial CAN adapter at `path` and its channel with `bit_rate` [bit/s], one of [`SLCAN_RATES`].
@@ -76,25 +68,24 @@ impl CanPort for SlcanPort {
     }
 
     fn receive(&mut self) -> AdapterResult<Option<CanEvent>> {
-        let filters = &self.filters;
+        let (filters, taken) = (&self.filters, Cell::new(0_usize));
         let wanted = |line: &[u8]| match line {
-            [b'z' | b'Z'] => Some(Reply::Taken),
-            line => decode(line).filter(|frame| CanFilter::any(filters, frame.id)).map(Reply::Frame),
-        };
-        for _ in 0..MAX_REPLIES {
-            match self.line.next(wanted, read_line)? {
-                None => break,
-                Some(Reply::Taken) => (self.replies, self.unanswered) = (true, self.unanswered.saturating_sub(1)),
-                Some(Reply::Frame(frame)) => {
-                    // An adapter that passes on frames has processed earlier lines: the reply was lost.
-                    if self.unanswered > 0 && self.written_at.elapsed() > REPLY_LOST {
-                        self.unanswered = 0;
-                    }
-                    return Ok(Some(CanEvent::Frame(frame)));
-                }
+            [b'z' | b'Z'] => {
+                taken.set(taken.get() + 1);
+                None
             }
+            line => decode(line).filter(|frame| CanFilter::any(filters, frame.id)),
+        };
+        let found = self.line.next(wanted, read_line);
+        if taken.get() > 0 {
+            (self.replies, self.unanswered) = (true, self.unanswered.saturating_sub(taken.get()));
         }
-        Ok(None)
+        let Some(frame) = found? else { return Ok(None) };
+        // An adapter that passes on frames has processed earlier lines: the reply was lost.
+        if self.unanswered > 0 && self.written_at.elapsed() > REPLY_LOST {
+            self.unanswered = 0;
+        }
+        Ok(Some(CanEvent::Frame(frame)))
     }
 
     fn fd(&self) -> BorrowedFd<'_> {

@@ -2,10 +2,13 @@
 
 use std::time::{Duration, Instant};
 
+use rustix::event::PollFlags;
+
 use super::super::slcan::{encode, open};
 use super::*;
 use crate::hardware::adapter::AdapterError;
 use crate::hardware::transport::can::CanFilter;
+use crate::hardware::transport::serial::wait;
 
 const WAIT: Duration = Duration::from_secs(10);
 
@@ -138,6 +141,20 @@ fn a_port_finds_frames_among_replies_noise_and_pieces() {
     pty.write(&[b'x'; 3000]).unwrap();
     pty.write(b"\rt2A01FF\r").unwrap();
     assert_eq!(events(&mut port, 1), [CanFrame::new(0x2A0, &[0xFF])], "after a flood of noise");
+}
+
+#[test]
+fn a_frame_behind_many_replies_is_found() {
+    let pty = Pty::open().unwrap();
+    let mut port = open("arm", pty.path(), 1_000_000, &[]).unwrap();
+    pty.write(format!("{}t0001F0\r", "z\r".repeat(1000)).as_bytes()).unwrap();
+    let found = loop {
+        assert!(wait(&port.fd(), PollFlags::IN, WAIT).unwrap(), "a received frame must not wait for further bytes");
+        if let Some(event) = port.receive().unwrap() {
+            break event;
+        }
+    };
+    assert_eq!(found, CanEvent::Frame(CanFrame::new(0, &[0xF0])));
 }
 
 #[test]
