@@ -8,12 +8,13 @@ use dimos::rpc::api::{ArmEnable, ArmReset, Cancel, Motion, Move};
 use dimos::rpc::client::Client;
 use rustix::process::Signal;
 
+use crate::support::loopback::own_address;
 use crate::support::program;
 use crate::support::program::{Home, Started, eventually};
 use crate::support::wire::arms::{PERIOD, YOURARM, furthest};
 use crate::support::wire::decode;
 use crate::support::wire::judge::Bounds;
-use crate::support::wire::stream::{Proxy, own_address};
+use crate::support::wire::stream::Proxy;
 use crate::support::wire::{Gate, now};
 
 /// A stop that took longer than planned, on a busy computer, is no longer a short one.
