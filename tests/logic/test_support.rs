@@ -3,10 +3,12 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::net::TcpListener;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use crate::support::loopback::{numbered, own_address};
 use crate::support::skip::required;
+use crate::support::wire::watch::Watch;
 
 #[test]
 fn only_the_value_1_makes_a_skipped_test_fail() {
@@ -43,4 +45,16 @@ fn no_two_tests_have_the_same_address() {
     let own: BTreeSet<_> = (0..300).map(|_| own_address()).collect();
     assert_eq!(own.len(), 300);
     assert!(own.iter().all(|address| TcpListener::bind((*address, 0)).is_ok()));
+}
+
+#[test]
+fn a_failure_without_a_stall_is_final() {
+    let host = Watch::of_programs();
+    let mut attempts = 0;
+    let mut attempt = || {
+        attempts += 1;
+        if attempts == 1 { Err("wrong".to_owned()) } else { Ok(()) }
+    };
+    let ended = catch_unwind(AssertUnwindSafe(|| host.unless_stalled(&mut attempt)));
+    assert!(ended.is_err(), "it was repeated");
 }
