@@ -12,6 +12,8 @@ use crate::support::skip::skip_port_502;
 fn emulate(home: &Home, arguments: &str) -> Started {
     let emulator = home.start(&format!("adapter emulate {arguments}"));
     emulator.until("Ctrl-C ends it");
+    // The last line of stdout, which another thread collects.
+    emulator.until("  blueprint  adapter_type: ");
     emulator
 }
 
