@@ -46,7 +46,7 @@ fn planned(run: &Run, plan: Plan) -> (u64, String, String) {
 
 /// Number of ticks since `began`, without the time in which this computer ran no program.
 fn ticks_due(host: &Watch, began: Instant) -> f64 {
-    (began.elapsed().saturating_sub(host.lost_since(began, PERIOD))).as_secs_f64() / PERIOD.as_secs_f64()
+    began.elapsed().saturating_sub(host.lost_since(began, PERIOD)).as_secs_f64() / PERIOD.as_secs_f64()
 }
 
 #[test]
