@@ -12,6 +12,9 @@ mod problems;
 mod machine;
 #[path = "../../tests/support/python.rs"]
 mod python;
+#[path = "../../tests/support/skip.rs"]
+#[allow(dead_code, reason = "shared with tests")]
+mod skip;
 
 use std::error::Error;
 use std::path::PathBuf;

@@ -36,6 +36,7 @@ mod rpc;
 mod surface;
 mod task_conformance;
 mod templates;
+mod test_support;
 mod verify;
 mod xacro;
 mod yaml_reader;

@@ -12,12 +12,7 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 use serde_json::json;
 
 use crate::support::program;
-
-/// Skips a test whose tools are missing; an error where nothing may be skipped.
-fn skip(what: &str) {
-    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{what}");
-    println!("SKIPPED: {what}");
-}
+use crate::support::skip::{skip_port_502, skip_tool};
 
 /// An emulator at the arm's own ports of a loopback address; `None` where port 502 cannot be had.
 fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmulator, String)> {
@@ -32,7 +27,7 @@ fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmu
             let text = error.to_string();
             assert!(text.contains(":502: ") && text.contains("\nhint: "), "{text}");
             assert!(text.contains("net.ipv4.ip_unprivileged_port_start=502"), "{text}");
-            skip("port 502 (root, or sysctl net.ipv4.ip_unprivileged_port_start=502)");
+            skip_port_502();
             None
         }
     }
@@ -51,7 +46,7 @@ fn client(scenario: &str, host: &str) -> Option<Client> {
     let mut import = Command::new(&python);
     import.args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null());
     if !import.status().is_ok_and(|status| status.success()) {
-        skip("xarm-python-sdk (make test-tools)");
+        skip_tool("xarm-python-sdk");
         return None;
     }
     let home = tempfile::tempdir().unwrap();

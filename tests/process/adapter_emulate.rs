@@ -4,24 +4,22 @@ use dimos::hardware::registry;
 use dimos::joint::ControlMode;
 use rustix::process::Signal;
 
+use crate::support::loopback::own_address;
 use crate::support::program::{Home, Started, eventually};
-
-/// A loopback address that no other test uses.
-fn loopback(test: u32) -> String {
-    let id = std::process::id() * 8 + test;
-    format!("127.{}.{}.{}", 64 + (id >> 16) % 128, (id >> 8) % 256, 1 + id % 254)
-}
+use crate::support::skip::skip_port_502;
 
 /// An emulator that is up.
 fn emulate(home: &Home, arguments: &str) -> Started {
     let emulator = home.start(&format!("adapter emulate {arguments}"));
     emulator.until("Ctrl-C ends it");
+    // The last line of stdout, which another thread collects.
+    emulator.until("  blueprint  adapter_type: ");
     emulator
 }
 
 #[test]
 fn a_run_in_another_process_moves_the_emulated_arm() {
-    let (home, address) = (Home::new(), loopback(1));
+    let (home, address) = (Home::new(), own_address());
     let emulator = emulate(&home, &format!("yourarm --bind {address}"));
     let said = emulator.out();
     let command = said.lines().find_map(|line| line.trim().strip_prefix("reach it")).unwrap().trim().to_owned();
@@ -42,10 +40,10 @@ fn a_run_in_another_process_moves_the_emulated_arm() {
 
 #[test]
 fn a_scripted_fault_occurs() {
-    let (home, address) = (Home::new(), loopback(2));
+    let (home, address) = (Home::new(), own_address());
     home.write("faults.yaml", "- {at: 0.5, kind: error_code, code: 3}\n");
     let emulator = emulate(&home, &format!("yourarm --bind {address} --fault faults.yaml --fault at=1e5,kind=estop"));
-    let mut adapter = registry::create("yourarm", &address, 6).unwrap();
+    let mut adapter = registry::create("yourarm", &address.to_string(), 6).unwrap();
     adapter.connect().unwrap();
     adapter.activate().unwrap();
     adapter.set_control_mode(ControlMode::Position).unwrap();
@@ -101,7 +99,7 @@ fn what_cannot_be_is_refused() {
         ("yourarm --dof 7", "6 joints, not 7"),
         ("nobodysarm", "there are mock, yourarm"),
     ] {
-        let address = loopback(3);
+        let address = own_address();
         let place = if arguments.contains("--") { String::new() } else { format!(" --bind {address}") };
         home.dimos(&format!("adapter emulate {arguments}{place} --duration 1s")).with(2).says(&[says]);
     }
@@ -109,13 +107,9 @@ fn what_cannot_be_is_refused() {
 
 #[test]
 fn what_it_says_fits_the_model() {
-    let (home, address) = (Home::new(), loopback(5));
-    if std::net::TcpListener::bind((address.as_str(), 502))
-        .is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied)
-    {
-        println!("SKIPPED: port 502 (sysctl net.ipv4.ip_unprivileged_port_start=502)");
-        assert!(std::env::var("DIMOS_NO_SKIP").is_err(), "DIMOS_NO_SKIP is set");
-        return;
+    let (home, address) = (Home::new(), own_address());
+    if std::net::TcpListener::bind((address, 502)).is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied) {
+        return skip_port_502();
     }
     for (model, blueprint) in [("lite6", Some("coordinator-lite6")), ("xarm850", None)] {
         let line = format!("adapter emulate xarm --model {model} --bind {address} --duration 100ms");
@@ -129,7 +123,7 @@ fn what_it_says_fits_the_model() {
 
 #[test]
 fn a_program_finds_the_address_and_an_end() {
-    let (home, address) = (Home::new(), loopback(4));
+    let (home, address) = (Home::new(), own_address());
     let started =
         home.dimos(&format!("adapter emulate yourarm --bind {address} --duration 100ms --json")).with(0).json();
     assert!(started["address"].as_str().unwrap().starts_with(&format!("{address}:")), "{started}");

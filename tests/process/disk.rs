@@ -6,8 +6,10 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
+use rustix::thread::CapabilitySet;
 
 use crate::support::program::{Home, Started, UP, eventually};
+use crate::support::skip::skip_privileged;
 
 const RUN: &str = "coordinator-mock";
 
@@ -15,17 +17,19 @@ const RUN: &str = "coordinator-mock";
 struct Disk(PathBuf);
 
 impl Disk {
-    /// `None`: this user may not mount one, which is said.
+    /// Returns `None` where a mount fails; the test is skipped then.
     fn mount(home: &Home, megabytes: u64) -> Option<Self> {
         let at = home.path().join("disk");
         std::fs::create_dir(&at).unwrap();
         let mut mount = Command::new("mount");
         mount.args(["-t", "tmpfs", "-o", &format!("size={megabytes}m"), "dimos-test"]).arg(&at);
-        let mounted = mount.output().is_ok_and(|output| output.status.success());
-        if !mounted {
-            println!("not checked: no file system can be mounted here");
+        let output = mount.output().unwrap();
+        if !output.status.success() {
+            let why = String::from_utf8_lossy(&output.stderr);
+            skip_privileged(&format!("a mounted file system: {}", why.trim()), CapabilitySet::SYS_ADMIN);
+            return None;
         }
-        mounted.then(|| Self(at))
+        Some(Self(at))
     }
 
     fn write(&self, name: &str, megabytes: usize) {

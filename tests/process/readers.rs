@@ -14,6 +14,8 @@ use dimos::recording::replay::LogReader;
 use dimos::telemetry::describe::{ArmNames, Names, Severity};
 use dimos::telemetry::{ArmSample, Cause, Event, Outcome, Phase, Reason, Sample, TaskState, TickSample};
 
+use crate::support::skip::skip_tool;
+
 const WALL: u64 = 1_795_270_590_123_456_789;
 
 /// A log with every topic, every optional value present and absent, and texts that are not ASCII.
@@ -98,12 +100,6 @@ fn log_and_expected(folder: &Path) -> (PathBuf, PathBuf) {
     (log, expected)
 }
 
-/// Says that a tool is missing; fails where nothing may be skipped.
-fn skip(tool: &str) {
-    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{tool} is missing (make test-tools)");
-    println!("SKIPPED: {tool} (make test-tools)");
-}
-
 fn succeed(command: &mut Command) -> String {
     let output = command.output().unwrap();
     let out = String::from_utf8_lossy(&output.stdout).into_owned();
@@ -120,7 +116,7 @@ fn root() -> &'static Path {
 fn python_readers_find_the_same_messages() {
     let python = root().join(".venv/bin/python");
     if !python.exists() {
-        return skip("the Python readers in .venv");
+        return skip_tool("the Python readers in .venv");
     }
     let folder = tempfile::tempdir().unwrap();
     let (log, expected) = log_and_expected(folder.path());
@@ -131,7 +127,7 @@ fn python_readers_find_the_same_messages() {
 #[test]
 fn foxgloves_readers_find_the_same_messages() {
     if !root().join("tests/readers/node_modules/@mcap/core").exists() {
-        return skip("Foxglove's readers in tests/readers/node_modules");
+        return skip_tool("Foxglove's readers in tests/readers/node_modules");
     }
     let folder = tempfile::tempdir().unwrap();
     let (log, expected) = log_and_expected(folder.path());

@@ -18,6 +18,7 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;
 
 use crate::support::program::{Home, Started, eventually};
+use crate::support::skip::{skip, skip_port_502, skip_tool};
 
 pub(super) const BLUEPRINT: &str = "
 hardware:
@@ -30,17 +31,11 @@ fn in_tree(name: &str) -> String {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(name).display().to_string()
 }
 
-/// Skips a test whose tools are missing; an error where nothing may be skipped.
-fn skip(what: &str) {
-    assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "{what}");
-    println!("SKIPPED: {what}");
-}
-
 /// Whether there is a Python; without one a test ends.
 fn has_python() -> bool {
     let found = Command::new("python3").arg("--version").stdout(Stdio::null()).status().is_ok();
     if !found {
-        skip("python3 (make test-tools)");
+        skip("python3");
     }
     found
 }
@@ -270,13 +265,15 @@ fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
     let python = in_tree(".venv/bin/python");
     let import = Command::new(&python).args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null()).status();
     if !import.is_ok_and(|status| status.success()) {
-        return skip("xarm-python-sdk (make test-tools)");
+        return skip_tool("xarm-python-sdk");
     }
     let (ip, options) = (IpAddr::V4(Ipv4Addr::new(127, 0, 7, 2)), serde_json::json!({}));
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
     let emulator = match XArmEmulator::start(&config, &EmulatorAddress::Bind(ip)) {
         Ok(emulator) => emulator,
-        Err(error) if error.to_string().contains(":502: ") => return skip("port 502"),
+        Err(error) if error.to_string().contains(":502: ") => {
+            return skip_port_502();
+        }
         Err(error) => panic!("{error}"),
     };
     let start = emulator.joints().0;

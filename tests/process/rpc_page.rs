@@ -12,6 +12,7 @@ use dimos::rpc::streams::Stream;
 use serde_json::Value;
 
 use crate::support::program::{Home, TIMEOUT, eventually};
+use crate::support::wire::watch::Watch;
 
 const PAGE: &str = include_str!("../../docs/rpc.md");
 
@@ -152,8 +153,7 @@ impl Stage {
         Ok(())
     }
 
-    /// On a machine that is busy with other things, the emulator may miss its time, and the arm is held for that.
-    /// Makes it ready again and says whether that was so.
+    /// Makes an arm ready again that a stall of this computer held; returns whether there was one.
     fn recovers(&mut self) -> bool {
         let arm = self.watcher.call(Status {}).unwrap().arms.remove(0);
         let held = arm.cause.is_some_and(|cause| cause.name != "operator_stop");
@@ -174,15 +174,16 @@ fn every_example_is_what_a_run_says() {
     let mut stage = Stage { home, watcher, motion: (Value::Null, Value::Null), plan: Default::default() };
     let examples = examples();
     assert!(examples.len() > 10, "examples are not found");
+    let host = Watch::of_processors();
     for example in &examples {
-        for attempt in 1.. {
+        host.unless_stalled(|| {
             stage.comes_to_rest();
-            match stage.play(example) {
-                Ok(()) => break,
-                Err(_) if attempt < 5 && stage.recovers() => {}
-                Err(difference) => panic!("{difference}"),
+            let played = stage.play(example);
+            if let Err(difference) = &played {
+                assert!(stage.recovers(), "{difference}");
             }
-        }
+            played
+        });
     }
 }
 

@@ -21,9 +21,12 @@ use dimos::rpc::client::{Client, ClientError};
 use dimos::rpc::run_dir::RunDir;
 use dimos::runtime::{Record, Run};
 use dimos::testing::{Call, MockAdapter};
+use rustix::thread::CapabilitySet;
 use serde_json::{Value, json};
 
+use crate::support::loopback::own_address;
 use crate::support::program::{Home, Started, eventually};
+use crate::support::skip::skip_privileged;
 
 const BLUEPRINT: &str = "
 hardware:
@@ -268,9 +271,8 @@ fn runs_of_other_users_are_named_as_not_stopped() {
     std::fs::create_dir_all(&folder).unwrap();
     let socket = folder.join("their-cell.sock");
     let _theirs = UnixListener::bind(&socket).unwrap();
-    if std::os::unix::fs::chown(&socket, Some(65534), None).is_err() {
-        println!("not checked: this user cannot give a file away");
-        return;
+    if let Err(error) = std::os::unix::fs::chown(&socket, Some(65534), None) {
+        return skip_privileged(&format!("a socket of another user: {error}"), CapabilitySet::CHOWN);
     }
     let stopped = home.dimos("stop").with(0).says(&["not stopped: run their-cell of user "]);
     assert!(stopped.out.contains("confirmed") && !stopped.out.contains("their-cell"), "{}", stopped.out);
@@ -280,8 +282,8 @@ fn runs_of_other_users_are_named_as_not_stopped() {
 #[test]
 fn a_stop_that_arrives_after_the_reconnect_is_reported() {
     let home = Home::new();
-    // A loopback address of its own, where the arm can come back.
-    let ip = IpAddr::from([127, 78, (std::process::id() >> 8) as u8, std::process::id() as u8 | 1]);
+    // A fixed address, where the arm can come back.
+    let ip = IpAddr::from(own_address());
     let power_on = || {
         let config = AdapterConfig { hardware_id: "arm".into(), address: ip.to_string(), dof: 6, options: json!({}) };
         (yourarm::SPEC.emulate.unwrap())(&config, &EmulatorAddress::Bind(ip)).unwrap()

@@ -7,14 +7,14 @@
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
-use dimos::rpc::api::{ArmEnable, ArmReset, Execute, Point, State, Trajectory};
+use dimos::rpc::api::{ArmEnable, ArmReset, Execute, Point, State, Status, Trajectory};
 use dimos::rpc::client::Client;
 use rustix::process::Signal;
 use rustix::thread::CapabilitySet;
 
 use crate::support::busy::Busy;
 use crate::support::program::{Home, Started, UP};
-use crate::support::wire::watch::{Delay, Watch};
+use crate::support::wire::watch::{Delay, HOLDS, Watch};
 
 /// An arm behind another process.
 const REMOTE: &str = "
@@ -32,6 +32,9 @@ fn number(variable: &str, otherwise: f64) -> f64 {
 struct Soaked {
     name: String,
     realtime: bool,
+    /// Requested motions, and those of them that began.
+    turns: usize,
+    moved: usize,
     home: Home,
     run: Option<Started>,
     /// The process behind a remote arm, outlived by nothing.
@@ -58,21 +61,38 @@ impl Soaked {
         let what = if name == "remote" { "run remote.yaml".to_owned() } else { format!("run {name} --sim") };
         let mut command = home.command(&what);
         command.stdin(Stdio::null());
-        Self { name: name.to_owned(), realtime, run: Some(started(command, realtime)), home, _shim: shim }
+        Self {
+            name: name.to_owned(),
+            realtime,
+            turns: 0,
+            moved: 0,
+            run: Some(started(command, realtime)),
+            home,
+            _shim: shim,
+        }
     }
 
     fn up(&self) {
         self.run.as_ref().unwrap().until(UP);
     }
 
-    /// Swings every joint by 0.2 rad for this time [s].
+    /// Swings every joint by 0.2 rad for this time [s]. A hold in this moment refuses the motion; it counts.
+    fn turn(&mut self, seconds: f64) {
+        self.turns += 1;
+        match self.move_all(seconds) {
+            Ok(()) => self.moved += 1,
+            Err(refused) => println!("{refused}"),
+        }
+    }
+
     fn move_all(&self, seconds: f64) -> Result<(), String> {
         let mut client: Client = self.home.client();
-        for arm in client.call(State {}).unwrap().arms {
+        let ranges = client.call(Status {}).unwrap().arms.into_iter().map(|arm| arm.position_limits);
+        for (arm, ranges) in client.call(State {}).unwrap().arms.into_iter().zip(ranges.collect::<Vec<_>>()) {
             let start: Vec<f64> = arm.joints.iter().map(|j| j.command.or(j.position).unwrap()).collect();
-            let joint_names = arm.joints.iter().map(|j| j.name.clone()).collect();
-            // Inwards, so that no joint leaves its range.
-            let inwards: Vec<f64> = start.iter().map(|q| if *q > 0.0 { -0.1 } else { 0.1 }).collect();
+            let joint_names: Vec<String> = arm.joints.iter().map(|j| j.name.clone()).collect();
+            assert_eq!(start.len(), ranges.len(), "{}: {joint_names:?}", self.name);
+            let inwards: Vec<f64> = start.iter().zip(&ranges).map(|(q, range)| inwards(*q, *range)).collect();
             let turn = std::f64::consts::TAU / 4.0;
             let points = (0..=16 * (seconds / 4.0).floor() as usize).map(|i| {
                 let (time, rests) = (i as f64 * 0.25, i % 16 == 0);
@@ -101,6 +121,11 @@ impl Soaked {
         }
     }
 
+    /// Returns a failure if fewer than half of its motions began: then the soak has judged no moving arm.
+    fn idle(&self) -> Option<String> {
+        (2 * self.moved < self.turns).then(|| format!("{}: {} of {} motions began", self.name, self.moved, self.turns))
+    }
+
     /// Shuts it down. Returns what held an arm, and when.
     fn end(mut self, what: &str) -> Vec<Hold> {
         let status = self.home.status();
@@ -115,6 +140,11 @@ impl Soaked {
     }
 }
 
+/// Half the swing of a joint at `start` [rad], to the side with more room in its range.
+fn inwards(start: f64, [lower, upper]: [f64; 2]) -> f64 {
+    if upper - start < start - lower { -0.1 } else { 0.1 }
+}
+
 /// An arm was held.
 struct Hold {
     at: SystemTime,
@@ -123,7 +153,7 @@ struct Hold {
 
 impl Hold {
     /// A processor that runs nothing for this time must hold an arm.
-    const LIMIT: Duration = Duration::from_millis(100);
+    const LIMIT: Duration = HOLDS;
     /// The last effects of a stall are logged this much later: states of a remote arm are valid for 200 ms, and the
     /// text log is written by an ordinary thread.
     const AFTER: Duration = Duration::from_secs(1);
@@ -159,10 +189,10 @@ fn blueprints() -> Vec<String> {
 /// How long one request moves an arm [s].
 const LONGEST_MOTION: f64 = 120.0;
 
-/// Watches runs, of each blueprint one idle and one moving. Returns what was held.
-fn watched(names: &[String], realtime: bool, time: f64) -> Vec<Hold> {
+/// Watches runs, of each blueprint one idle and one moving. Returns what was held; adds to `idle` what did not move.
+fn watched(names: &[String], realtime: bool, time: f64, idle: &mut Vec<String>) -> Vec<Hold> {
     let start = |moving| names.iter().map(move |name| (moving, Soaked::start(name, realtime)));
-    let runs: Vec<(bool, Soaked)> = start(false).chain(start(true)).collect();
+    let mut runs: Vec<(bool, Soaked)> = start(false).chain(start(true)).collect();
     runs.iter().for_each(|(_, run)| run.up());
     let _busy = Busy::start(number("DIMOS_SOAK_BUSY", 8.0) as usize);
     let began = Instant::now();
@@ -171,13 +201,13 @@ fn watched(names: &[String], realtime: bool, time: f64) -> Vec<Hold> {
         if left <= 4.0 {
             break;
         }
-        for (_, run) in runs.iter().filter(|(moving, _)| *moving) {
-            // A hold in this moment refuses the motion; it counts.
-            let _ = run.move_all(left.min(LONGEST_MOTION)).inspect_err(|refused| println!("{refused}"));
+        for (_, run) in runs.iter_mut().filter(|(moving, _)| *moving) {
+            run.turn(left.min(LONGEST_MOTION));
         }
         std::thread::sleep(Duration::from_secs_f64(left.min(LONGEST_MOTION + 1.0)));
         runs.iter().for_each(|(_, run)| run.recover());
     }
+    idle.extend(runs.iter().filter_map(|(_, run)| run.idle()));
     runs.into_iter().flat_map(|(moving, run)| run.end(if moving { "moving" } else { "idle" })).collect()
 }
 
@@ -185,7 +215,8 @@ fn soak(realtime: bool) {
     let host = Watch::of_processors();
     let time = number("DIMOS_SOAK", 10.0);
     // A few at a time: all of them share two cores with the busy ones.
-    let holds: Vec<Hold> = blueprints().chunks(3).flat_map(|names| watched(names, realtime, time)).collect();
+    let (mut holds, mut idle) = (Vec::new(), Vec::new());
+    blueprints().chunks(3).for_each(|names| holds.extend(watched(names, realtime, time, &mut idle)));
     let stalls = host.delays(Hold::LIMIT);
     for stall in &stalls {
         let ended = jiff::Timestamp::try_from(stall.ended).unwrap();
@@ -200,7 +231,15 @@ fn soak(realtime: bool) {
         let near = shorter.iter().filter(|delay| hold.cause(std::slice::from_ref(delay)).is_some());
         println!("longest delay of a processor before: {:?}: {}", near.map(|d| d.length).max(), hold.what);
     }
-    assert!(failures.is_empty(), "{} holds, see above", failures.len());
+    assert!(failures.is_empty() && idle.is_empty(), "{} holds, see above; {idle:?}", failures.len());
+}
+
+#[test]
+fn a_joint_swings_inside_its_range() {
+    // Joint 3 of an xArm a little below zero, and a Piper's joint at the end of its range.
+    assert_eq!(inwards(-0.02, [-3.81, 0.165]), -0.1);
+    assert_eq!(inwards(0.0, [-2.97, 0.0]), -0.1);
+    assert_eq!(inwards(0.0, [0.0, 3.14]), 0.1);
 }
 
 #[test]

@@ -35,6 +35,8 @@ use std::time::{Duration, Instant};
 
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 
+use super::skip::skip_tool;
+
 /// The kernel's modules for CAN, in the order in which they can be loaded.
 pub const MODULES: &[&str] = &[
     "net/can/can",
@@ -105,8 +107,7 @@ pub fn in_guest(module: &str, name: &str, guest: &Guest, body: impl FnOnce()) {
 /// about it, when this computer lacks the tools. Panics when the guest does not come to the script's end in time.
 pub fn run(modules: &[&str], script: &str, limit: Duration) -> Option<Ran> {
     let Some(library) = library() else {
-        assert_ne!(std::env::var("DIMOS_NO_SKIP").as_deref(), Ok("1"), "user-mode-linux is missing (make test-tools)");
-        println!("SKIPPED: user-mode-linux (make test-tools)");
+        skip_tool("user-mode-linux");
         return None;
     };
     let folder = tempfile::tempdir().expect("a folder for the guest");

@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 use super::can::CanProxy;
 use super::judge::Bounds;
 use super::stream::Proxy;
+use super::watch::Watch;
 use super::{Gate, decode, lock};
 
 /// Nothing here takes longer.
@@ -268,19 +269,14 @@ impl Bed {
         });
     }
 
-    /// Goes from one end to the other as fast as the arm can, and returns in the middle of the way. A busy computer may
-    /// hold the arm on its way: then it begins again.
+    /// Goes from one end to the other as fast as the arm can, and returns in the middle of the way.
     #[track_caller]
     pub fn at_full_speed(&self) {
-        let mut said = String::new();
-        for _ in 0..5 {
+        Watch::shared().unless_stalled(|| {
             self.ready();
-            match self.try_full_speed() {
-                Ok(()) => return,
-                Err(why) => said = why,
-            }
-        }
-        panic!("{}: it does not reach its full speed: {said}", self.arm.name);
+            let fast = self.try_full_speed();
+            fast.map_err(|why| format!("{}: it does not reach its full speed: {why}", self.arm.name))
+        });
     }
 
     fn try_full_speed(&self) -> Result<(), String> {

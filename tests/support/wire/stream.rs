@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -15,6 +15,7 @@ use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
 
 use super::{Decoder, Gate, NewDecoder, Passage, TRICKLE, Way};
+use crate::support::loopback::own_address;
 
 /// How often a thread looks whether the wire is gone.
 const LOOK: Duration = Duration::from_millis(20);
@@ -24,13 +25,6 @@ pub struct Proxy {
     pub address: String,
     closing: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
-}
-
-/// A loopback address that no other test uses: it distinguishes connections.
-pub fn own_address() -> Ipv4Addr {
-    static NEXT: AtomicU32 = AtomicU32::new(0);
-    let n = std::process::id().wrapping_mul(61).wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed));
-    Ipv4Addr::new(127, 192 + (n >> 16) as u8 % 60, (n >> 8) as u8, (n as u8).clamp(2, 250))
 }
 
 impl Proxy {

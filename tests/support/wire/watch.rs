@@ -1,7 +1,7 @@
 //! Whether this computer was stalled during a measurement.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -12,6 +12,10 @@ use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 const ABOVE_ALL: i32 = 95;
 /// Shorter delays are not recorded.
 const SHORTEST: Duration = Duration::from_millis(2);
+/// A shorter delay of this computer holds no arm (`docs/faults.md`, F32).
+pub const HOLDS: Duration = Duration::from_millis(100);
+/// Maximum repetitions of what such delays spoil.
+const REPETITIONS: usize = 5;
 
 /// A time in which a thread should have run and did not.
 #[derive(Clone, Copy, Debug)]
@@ -56,6 +60,12 @@ impl Watch {
         Self::start((0..CpuSet::MAX_CPU).filter(|cpu| allowed.is_set(*cpu)).map(bound).collect())
     }
 
+    /// [`Watch::of_processors`] for all tests of this process, until it ends.
+    pub fn shared() -> &'static Self {
+        static SHARED: OnceLock<Watch> = OnceLock::new();
+        SHARED.get_or_init(Self::of_processors)
+    }
+
     fn start(preparations: Vec<Box<dyn Fn() + Send>>) -> Self {
         let (delays, closing) = (Arc::new(Mutex::new(Vec::new())), Arc::new(AtomicBool::new(false)));
         let one = |prepare: Box<dyn Fn() + Send>| {
@@ -86,6 +96,30 @@ impl Watch {
         let delays = self.delays.lock().unwrap();
         let since = delays.iter().rev().take_while(|delay| delay.began + delay.length >= from);
         since.map(|delay| delay.length).max().unwrap_or_default()
+    }
+
+    /// The sum of the delays of at least `shortest` that ended after `from`, of all threads.
+    pub fn lost_since(&self, from: Instant, shortest: Duration) -> Duration {
+        let delays = self.delays.lock().unwrap();
+        let since = delays.iter().rev().take_while(|delay| delay.began + delay.length >= from);
+        since.map(|delay| delay.length).filter(|length| *length >= shortest).sum()
+    }
+
+    /// Returns the first success of `attempt`. A failure is final, and fails the test, unless a delay of at least
+    /// [`HOLDS`] was recorded during that attempt: such an attempt is not judged, and is repeated.
+    #[track_caller]
+    pub fn unless_stalled<T>(&self, mut attempt: impl FnMut() -> Result<T, String>) -> T {
+        for _ in 0..REPETITIONS {
+            let began = Instant::now();
+            let why = match attempt() {
+                Ok(value) => return value,
+                Err(why) => why,
+            };
+            let longest = self.longest_since(began);
+            assert!(longest >= HOLDS, "{why}\n(longest delay of this computer: {longest:?})");
+            println!("not judged, this computer was stalled for {longest:?}: {why}");
+        }
+        panic!("this computer was stalled in {REPETITIONS} attempts");
     }
 }
 
