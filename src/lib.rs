@@ -16,7 +16,7 @@
 //!
 //! As a library: [`runtime::Run`] builds a run from a blueprint, [`hardware::registry`] makes adapters,
 //! [`hardware::adapter::ManipulatorAdapter`] is what a new arm implements, [`testing`] has a mock for unit tests,
-//! [`cli::main_with`] is the whole program with more arms. `docs/library.md` shows each.
+//! [`cli::Program`] is the whole program with more arms or task types. `docs/library.md` shows each.
 //!
 //! ```
 //! use dimos::runtime::{Record, Run};

@@ -103,7 +103,7 @@ pub struct EventReport {
     /// Its severity.
     pub level: Level,
     /// Its kind, for programs: `request`, `task`, `preempted`, `mode_conflict`, `arm`, `limited`, `overrun`,
-    /// `degraded`.
+    /// `degraded`, `stop`.
     pub kind: String,
     /// The arm that it concerns.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -40,7 +40,7 @@ fn is_at(home: &Home, arm: &str, goal: &[f64]) {
 }
 
 /// Where the planner says that an arm's end effector will be when a plan has been carried out [m].
-fn end(preview: &serde_json::Value) -> Vec<f64> {
+fn end(preview: &Value) -> Vec<f64> {
     let way = preview["end_effectors"]["arm"].as_array().unwrap();
     way.last().unwrap().as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
 }

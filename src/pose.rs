@@ -1,0 +1,63 @@
+//! Poses as people and controllers write them, and as the program computes with them ([`Isometry3`]).
+//!
+//! Lengths are in m, angles in rad. Roll, pitch and yaw turn about fixed axes: R = Rz(yaw)·Ry(pitch)·Rx(roll), as in
+//! URDF. Quaternions are x, y, z, w.
+
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+/// Returns the pose with this position [m] and these roll, pitch, yaw [rad].
+pub fn from_xyz_rpy(xyz: [f64; 3], [roll, pitch, yaw]: [f64; 3]) -> Isometry3<f64> {
+    Isometry3::from_parts(xyz.into(), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
+}
+
+/// Returns position [m] and roll, pitch, yaw [rad] of a pose.
+pub fn to_xyz_rpy(pose: &Isometry3<f64>) -> ([f64; 3], [f64; 3]) {
+    let (roll, pitch, yaw) = pose.rotation.euler_angles();
+    (pose.translation.vector.into(), [roll, pitch, yaw])
+}
+
+/// Returns the pose with this position [m] and this orientation: the quaternion, which is normalized, else roll, pitch
+/// and yaw [rad], else none.
+pub fn from_written(xyz: [f64; 3], quat: Option<[f64; 4]>, rpy: Option<[f64; 3]>) -> Isometry3<f64> {
+    match quat {
+        Some([x, y, z, w]) => {
+            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            Isometry3::from_parts(Translation3::from(xyz), rotation)
+        }
+        None => from_xyz_rpy(xyz, rpy.unwrap_or_default()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
+    use nalgebra::{Point3, Vector3};
+
+    use super::*;
+
+    #[test]
+    fn angles_turn_about_fixed_axes_roll_first() {
+        let pose = from_xyz_rpy([1.0, 2.0, 3.0], [FRAC_PI_2, 0.0, FRAC_PI_2]);
+        // Roll takes y to z, which yaw leaves; yaw takes x to y.
+        assert!((pose.rotation * Vector3::y() - Vector3::z()).norm() < 1e-12);
+        assert!((pose.rotation * Vector3::x() - Vector3::y()).norm() < 1e-12);
+        assert_eq!(pose * Point3::origin(), Point3::new(1.0, 2.0, 3.0));
+    }
+
+    #[test]
+    fn what_is_written_comes_back() {
+        let (xyz, rpy) = ([0.1, -0.2, 0.3], [0.4, -0.5, 2.6]);
+        let (there, back) = to_xyz_rpy(&from_xyz_rpy(xyz, rpy));
+        assert!(there == xyz && back.iter().zip(rpy).all(|(a, b)| (a - b).abs() < 1e-12), "{back:?}");
+    }
+
+    #[test]
+    fn a_quaternion_is_normalized_and_goes_before_angles() {
+        let half = from_written([0.0; 3], Some([0.0, 0.0, 2.0, 0.0]), Some([0.1, 0.2, 0.3]));
+        assert!((half.rotation * Vector3::x() + Vector3::x()).norm() < 1e-12);
+        let angles = from_written([0.0; 3], None, Some([0.1, 0.2, 0.3]));
+        assert_eq!(angles, from_xyz_rpy([0.0; 3], [0.1, 0.2, 0.3]));
+        assert_eq!(from_written([1.0, 0.0, 0.0], None, None), Isometry3::translation(1.0, 0.0, 0.0));
+    }
+}
