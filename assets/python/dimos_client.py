@@ -28,6 +28,7 @@ from typing import Any, Callable, Deque, Dict, Iterator, List, Optional, Sequenc
 MAX_LINE = 256 * 1024  # bytes of a request
 IN_FLIGHT = 16  # targets that may wait for their reply
 Policy = Callable[["JointState", float], Optional[Sequence[float]]]  # from joints and time [s] to positions [rad]
+_STALLED = 15.0  # s without progress, after which `wait` cancels a motion
 KEPT = 256  # messages of a subscription that wait to be read; older ones are lost and counted
 
 
@@ -159,15 +160,19 @@ class Client:
         return self._next_id
 
     def _answer(self, number: int) -> Dict[str, Any]:
-        deadline = time.monotonic() + self.timeout
-        while number not in self._replies:
-            if not self._read(deadline):
-                raise ConnectionLost("NO_ANSWER", f"no answer within {self.timeout} s", "`dimos status` may say why")
+        self._await(lambda: number in self._replies, self.timeout, "answer", "`dimos status` may say why")
         reply = self._replies.pop(number)
         if "error" in reply:
             error = reply["error"]
             raise _REFUSALS.get(error["code"], Refused)(*map(error.get, ("code", "message", "hint", "data")))
         return reply["result"]
+
+    def _await(self, ready: Callable[[], Any], limit: float, what: str, hint: str) -> None:
+        """Takes in what the run says until `ready`, at most for `limit` [s]; then raises ConnectionLost."""
+        deadline = time.monotonic() + limit
+        while not ready():
+            if not self._read(deadline) or time.monotonic() > deadline and not ready():
+                raise ConnectionLost("NO_ANSWER", f"no {what} within {limit} s", hint)
 
     def _read(self, deadline: float) -> bool:
         """Takes in what the run says next; False when nothing came until `deadline` (monotonic) [s]."""
@@ -210,8 +215,10 @@ class Client:
         number = self._subscribe(stream, rate, KEPT)
         try:
             while True:
-                while not self._queues[number]:
-                    self._read(time.monotonic() + self.timeout)
+                while stream == "events" and not self._queues[number]:  # the run may be silent, but answers
+                    self._read(time.monotonic() + self.timeout) or self.status()
+                limit = self.timeout + (1 / rate if rate else 0)
+                self._await(lambda: self._queues[number], limit, "joint state", "is publish_joint_state on?")
                 yield self._queues[number].popleft()
         finally:
             self._unsubscribe(number)
@@ -251,13 +258,18 @@ class Client:
         return self.wait(begun["motion"]) if wait else begun
 
     def wait(self, motion: int) -> Dict[str, Any]:
-        """Waits for a motion's end. Ctrl-C cancels it. Raises MotionFailed when it ended elsewhere than it should."""
-        report = self.call("motion", motion=motion)
+        """Waits for a motion's end. Ctrl-C cancels it, and so do 15 s without progress. Raises MotionFailed when it
+        ended elsewhere than it should, or made no progress."""
+        report, elapsed, deadline = self.call("motion", motion=motion), None, 0.0
         try:
             while not report["done"]:
+                if report["elapsed"] != elapsed or report.get("replanning"):
+                    elapsed, deadline = report["elapsed"], time.monotonic() + _STALLED
+                elif time.monotonic() > deadline:
+                    raise MotionFailed(report["state"], f"no progress within {_STALLED} s: cancelled", data=report)
                 time.sleep(0.02)
                 report = self.call("motion", motion=motion)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, MotionFailed):
             self.cancel(task=report["task"])
             raise
         if report["state"] != "COMPLETED":
@@ -298,9 +310,7 @@ class Client:
         number = self._subscribe("coordinator_joint_state", 2 * rate, 1)
         queue, sent, missed, worst = self._queues[number], 0, 0, 0.0
         try:
-            while not queue:
-                if not self._read(time.monotonic() + self.timeout):
-                    raise ConnectionLost("NO_ANSWER", "no joint state came", "is publish_joint_state on?")
+            self._await(lambda: queue, self.timeout, "joint state", "is publish_joint_state on?")
             start = beat = time.monotonic()
             while duration is None or beat - start < duration:
                 while (now := time.monotonic()) < beat:
@@ -345,6 +355,5 @@ class Client:
 
 
 def _joint_state(message: Dict[str, Any]) -> JointState:
-    data = message["data"]
-    values = (data["name"], data["position"], data["velocity"], data["effort"])
-    return JointState(data["tick"], data["stamp"], *values, message.get("lost", 0))
+    values = map(message["data"].get, ("tick", "stamp", "name", "position", "velocity", "effort"))
+    return JointState(*values, message.get("lost", 0))

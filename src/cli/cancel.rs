@@ -21,7 +21,7 @@ pub struct Args {
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let mut client = args.target_run.connect()?;
-    let reply = client.call(Cancel { arm: args.arm.clone(), task: args.task.clone() })?;
+    let reply = client.call(Cancel { arm: args.arm.clone(), task: args.task.clone(), plan: None })?;
     if args.target_run.json {
         output::json(&reply);
         return Ok(Exit::Ok);

@@ -47,7 +47,7 @@ pub fn follow(client: &mut Client, motion: u64, task: &str, signals: &Signals, j
         }
         if cancelled.is_none() && signals.last().is_some() {
             bar.suspend(|| output::note(format_args!("cancelling motion {motion}: the arm decelerates")));
-            client.call(Cancel { task: Some(task.to_owned()), arm: None })?;
+            client.call(Cancel { task: Some(task.to_owned()), ..Cancel::default() })?;
             cancelled = Some(Instant::now());
         }
         if cancelled.is_some_and(|since| since.elapsed() > REST_TIMEOUT) {
@@ -86,6 +86,14 @@ impl Signals {
         let signals = Self::watch();
         let _ = signal_hook::flag::register_usize(libc::SIGHUP, signals.0.clone(), libc::SIGHUP as usize);
         signals
+    }
+
+    /// Fails if a signal was received. Call it right before the request that begins a motion.
+    pub fn check(&self) -> Result<()> {
+        match self.last() {
+            Some(signal) => Err(Failure::new(Exit::by_signal(signal), "interrupted: no motion was started")),
+            None => Ok(()),
+        }
     }
 
     /// Returns the last signal received.

@@ -157,7 +157,7 @@ pub fn plan(client: &mut Client, request: Plan, signals: &Signals) -> Result<Pla
         bar.set_message(format!("{:.1} s", report.elapsed));
         bar.tick();
         if signals.last().is_some() && !std::mem::replace(&mut cancelled, true) {
-            client.call(Cancel::default())?;
+            client.call(Cancel { plan: Some(begun.plan), ..Cancel::default() })?;
         }
         sleep(POLL_PERIOD);
     };

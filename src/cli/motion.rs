@@ -41,7 +41,7 @@ pub fn run(args: &Args) -> Result {
     let signals = Signals::watch();
     let planned = !args.direct && has_planner(&mut client)?;
     let (motion, task, reply) =
-        if planned { plan_and_begin(args, &mut client, &signals)? } else { begin_direct(args, &mut client)? };
+        if planned { plan_and_begin(args, &mut client, &signals)? } else { begin_direct(args, &mut client, &signals)? };
     if !args.no_wait {
         return follow(&mut client, motion, &task, &signals, args.target_run.json);
     }
@@ -59,17 +59,19 @@ fn plan_and_begin(args: &Args, client: &mut Client, signals: &Signals) -> Result
     if !args.target_run.json {
         show(&planned);
     }
+    signals.check()?;
     let begun = client.call(ExecutePlan { plan: Some(planned.plan), replan: args.replan, presence: None })?;
     output::note(format_args!("motion {} on {}: planned, collision-checked", begun.motion, begun.task));
     let reply = serde_json::to_value(&begun).unwrap_or_default();
     Ok((begun.motion, begun.task, reply))
 }
 
-fn begin_direct(args: &Args, client: &mut Client) -> Result<Begun> {
+fn begin_direct(args: &Args, client: &mut Client, signals: &Signals) -> Result<Begun> {
     let (Some(arm), Some(target)) = (&args.arm, args.goal.joints()) else {
         let failure = Failure::new(Exit::Failed, "poses, names and --goal need a planner, and this run has none");
         return Err(failure.hint("run a planner blueprint, such as yourarm-planner, or give joint positions"));
     };
+    signals.check()?;
     let begun = client.call(Move { arm: arm.clone(), target: target.to_vec(), speed: args.search.speed })?;
     output::note(format_args!(
         "motion {} on {}: {:.2} s, direct, not collision-checked",

@@ -6,10 +6,10 @@ use super::arguments::Target;
 use super::exit::{Exit, Failure};
 use super::other_users;
 use super::output::{self, Table, Tone, toned};
-use crate::rpc::Code;
 use crate::rpc::api::{Confirmation, Stop, StopReply};
 use crate::rpc::client::{Client, ClientError};
 use crate::rpc::run_dir::LiveRun;
+use crate::rpc::{Code, RpcError};
 
 /// Arguments of `stop`.
 #[derive(Debug, clap::Args)]
@@ -29,15 +29,12 @@ pub struct Args {
 }
 
 type Result<T = Exit, E = Failure> = std::result::Result<T, E>;
+type Replies<'a> = Vec<(&'a LiveRun, Result<StopReply, ClientError>)>;
 
 /// Runs the verb.
 pub fn run(args: &Args) -> Result {
     let runs = args.target_run.named_or_all()?;
-    // A run that does not answer must not delay the stop of the others.
-    let replies: Vec<(&LiveRun, Result<StopReply, ClientError>)> = std::thread::scope(|scope| {
-        let asked: Vec<_> = runs.iter().map(|run| (run, scope.spawn(|| stop(run, args)))).collect();
-        asked.into_iter().filter_map(|(run, answer)| Some((run, answer.join().ok()?))).collect()
-    });
+    let replies = of_each(&runs, |run| stop(run, args));
     let done: BTreeMap<&str, &StopReply> =
         replies.iter().filter_map(|(run, r)| r.as_ref().ok().map(|r| (run.name.as_str(), r))).collect();
     if args.target_run.json {
@@ -53,8 +50,14 @@ pub fn run(args: &Args) -> Result {
     if runs.is_empty() {
         return Err(ClientError::NoRun.into());
     }
-    let confirmed = done.values().flat_map(|r| r.arms.values()).all(|c| *c == Confirmation::Confirmed);
-    let stopped_any = !done.is_empty();
+    result(replies)
+}
+
+/// Returns the result of the verb: a failure unless every arm of every run confirmed.
+fn result(replies: Replies<'_>) -> Result {
+    let stopped = || replies.iter().filter_map(|(_, reply)| reply.as_ref().ok());
+    let confirmed = stopped().flat_map(|reply| reply.arms.values()).all(|c| *c == Confirmation::Confirmed);
+    let stopped_any = stopped().next().is_some();
     // A run without the arm is not a failure as long as another one has it.
     let is_elsewhere = |e: &ClientError| matches!(e, ClientError::Refused(e) if e.code == Code::UnknownArm);
     let failures = replies.into_iter().filter_map(|(_, reply)| reply.err());
@@ -68,6 +71,21 @@ pub fn run(args: &Args) -> Result {
         return Err(Failure::new(Exit::Failed, what).hint("watch the arm; `dimos state` shows whether it is moving"));
     }
     Ok(Exit::Ok)
+}
+
+/// Calls `stop` for every run and returns every result. The calls are concurrent: a run that does not answer must not
+/// delay the stop of the others. A panic counts as a failure.
+fn of_each(runs: &[LiveRun], stop: impl Fn(&LiveRun) -> Result<StopReply, ClientError> + Sync) -> Replies<'_> {
+    let panicked = |run: &LiveRun| {
+        let what = format!("run {:?} may not be stopped: the request failed unexpectedly", run.name);
+        let hint = format!("repeat `dimos stop --run {}`; `dimos state` shows whether its arms are moving", run.name);
+        ClientError::from(RpcError::new(Code::Internal, what).hint(hint))
+    };
+    let stop = &stop;
+    std::thread::scope(|scope| {
+        let calls: Vec<_> = runs.iter().map(|run| (run, scope.spawn(move || stop(run)))).collect();
+        calls.into_iter().map(|(run, call)| (run, call.join().unwrap_or_else(|_| Err(panicked(run))))).collect()
+    })
 }
 
 fn stop(run: &LiveRun, args: &Args) -> Result<StopReply, ClientError> {
@@ -87,4 +105,22 @@ fn print(done: &BTreeMap<&str, &StopReply>) {
         }
     }
     table.print();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_whose_stop_panics_is_not_stopped() {
+        let run = |name: &str| LiveRun { name: name.into(), pid: 1, socket: "none".into() };
+        let runs = [run("left"), run("right")];
+        let stopped = |_: &LiveRun| Ok(StopReply { arms: [("arm".into(), Confirmation::Confirmed)].into() });
+        assert_eq!(result(of_each(&runs, stopped)), Ok(Exit::Ok));
+        let replies = of_each(&runs, |run| if run.name == "right" { panic!("on purpose") } else { stopped(run) });
+        assert!(matches!(replies[..], [(_, Ok(_)), (_, Err(_))]), "{replies:?}");
+        let failure = result(replies).unwrap_err();
+        assert_eq!(failure.exit, Exit::Failed);
+        assert!(failure.what.contains("run \"right\" may not be stopped"), "{failure}");
+    }
 }

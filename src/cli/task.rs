@@ -126,7 +126,7 @@ fn invoke(task: &str, method: Method, target_run: &Target) -> Result {
             if target_run.json { output::json(&report) } else { status::print_tasks(&[report]) }
         }
         Method::Cancel => {
-            let reply = client.call(Cancel { task: Some(task.to_owned()), arm: None })?;
+            let reply = client.call(Cancel { task: Some(task.to_owned()), ..Cancel::default() })?;
             if target_run.json {
                 output::json(&reply);
             } else {
@@ -237,6 +237,6 @@ fn send(client: &mut Client, task: &TaskReport, targets: Targets, target: Vec<f6
 
 /// Ends the stream's task at once; otherwise it would continue until its timeout, or hold its joints at zero velocity.
 fn end(client: &mut Client, task: &TaskReport) -> Result<()> {
-    client.call(Cancel { task: Some(task.name.clone()), arm: None })?;
+    client.call(Cancel { task: Some(task.name.clone()), ..Cancel::default() })?;
     Ok(())
 }

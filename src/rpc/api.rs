@@ -160,8 +160,9 @@ methods! {
     "execute" Execute -> ExecuteReply, check Execute::valid;
     /// Progress or result of a motion.
     "motion" Motion -> MotionReport;
-    /// Ends motions by decelerating within limits: those of a task, of an arm, or all.
-    "cancel" Cancel -> CancelReply;
+    /// Ends motions by decelerating within limits: those of a task, of an arm, or all. With a plan, ends its planning
+    /// only.
+    "cancel" Cancel -> CancelReply, check Cancel::valid;
     /// Holds one arm or all at once: tasks end, arms are held until `arm_reset`. An operational stop.
     "stop" Stop -> StopReply;
     /// Clears a latched hold or a fault. Moves nothing, enables nothing.

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
@@ -17,6 +17,8 @@ use crate::yaml::{did_you_mean, quote};
 
 /// Timeout for a reply: a little longer than the run's own.
 const REPLY_TIMEOUT: Duration = CALL_TIMEOUT.saturating_add(Duration::from_secs(2));
+/// Minimum time for one read, so that what has arrived already is read after the deadline too.
+const MIN_READ_TIMEOUT: Duration = Duration::from_millis(1);
 /// Stream messages buffered while waiting for a reply; older ones are dropped and counted.
 const MAX_BUFFERED: usize = 1024;
 
@@ -102,6 +104,9 @@ pub struct Message {
 pub struct Client {
     run: String,
     from: BufReader<UnixStream>,
+    /// Beginning of a line whose end has not arrived yet.
+    line: Vec<u8>,
+    timeout: Duration,
     next: u64,
     buffered: VecDeque<Message>,
 }
@@ -128,14 +133,15 @@ impl Client {
 
     /// Connects to a socket; `run` is the name used in errors.
     pub fn connect(run: &str, socket: &Path) -> Result<Self, ClientError> {
-        let connect = || {
-            let stream = UnixStream::connect(socket)?;
-            stream.set_read_timeout(Some(REPLY_TIMEOUT))?;
-            stream.set_write_timeout(Some(REPLY_TIMEOUT))?;
-            Ok(stream)
-        };
-        let stream = connect().map_err(|error| ClientError::Io { run: run.to_owned(), error })?;
-        Ok(Self { run: run.to_owned(), from: BufReader::new(stream), next: 1, buffered: VecDeque::new() })
+        UnixStream::connect(socket)
+            .and_then(|stream| Self::over(stream, run, REPLY_TIMEOUT))
+            .map_err(|error| ClientError::Io { run: run.to_owned(), error })
+    }
+
+    fn over(stream: UnixStream, run: &str, timeout: Duration) -> io::Result<Self> {
+        stream.set_write_timeout(Some(timeout))?;
+        let (run, from) = (run.to_owned(), BufReader::new(stream));
+        Ok(Self { run, from, line: Vec::new(), timeout, next: 1, buffered: VecDeque::new() })
     }
 
     /// Returns the run's name.
@@ -143,7 +149,7 @@ impl Client {
         &self.run
     }
 
-    /// Sends a request and waits for its reply. Buffers stream messages that arrive meanwhile for
+    /// Sends a request and waits for its reply, at most 12 s. Buffers stream messages that arrive meanwhile for
     /// [`next_message`](Self::next_message).
     pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
         let id = self.next;
@@ -153,15 +159,16 @@ impl Client {
             let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
             return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());
         }
+        let deadline = Instant::now() + self.timeout;
         if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
             // A run that refuses the connection sends the reason before it closes it.
-            return Err(match self.read() {
+            return Err(match self.read(deadline) {
                 Ok(Incoming { error: Some(refusal), .. }) => refusal.into(),
                 _ => self.io(error),
             });
         }
         loop {
-            let incoming = self.read()?;
+            let incoming = self.read(deadline)?;
             if incoming.stream.is_some() {
                 if self.buffered.len() == MAX_BUFFERED
                     && let Some(lost) = self.buffered.pop_front()
@@ -175,16 +182,21 @@ impl Client {
             } else if incoming.id == Some(id) {
                 return serde_json::from_value(incoming.result).map_err(|e| self.protocol(e.to_string()));
             }
+            // A run that only streams must not extend the wait.
+            if Instant::now() >= deadline {
+                return Err(self.io(self.timed_out()));
+            }
         }
     }
 
-    /// Waits for the next message of any subscription.
+    /// Waits for the next message of any subscription, at most 12 s.
     pub fn next_message(&mut self) -> Result<Message, ClientError> {
         if let Some(message) = self.buffered.pop_front() {
             return Ok(message);
         }
+        let deadline = Instant::now() + self.timeout;
         loop {
-            let incoming = self.read()?;
+            let incoming = self.read(deadline)?;
             if incoming.stream.is_some() {
                 return Ok(message(incoming));
             }
@@ -196,13 +208,42 @@ impl Client {
         self.buffered.pop_front()
     }
 
-    fn read(&mut self) -> Result<Incoming, ClientError> {
-        let mut line = String::new();
-        match self.from.read_line(&mut line) {
-            Ok(0) => Err(self.io(io::Error::new(io::ErrorKind::UnexpectedEof, "the run closed the connection"))),
-            Ok(_) => serde_json::from_str(&line).map_err(|e| self.protocol(e.to_string())),
-            Err(error) => Err(self.io(error)),
+    fn read(&mut self, deadline: Instant) -> Result<Incoming, ClientError> {
+        let line = self.read_line(deadline).map_err(|error| self.io(error))?;
+        serde_json::from_slice(&line).map_err(|e| self.protocol(e.to_string()))
+    }
+
+    /// Reads a line. At the deadline it fails, and the next call continues with the same line.
+    fn read_line(&mut self, deadline: Instant) -> io::Result<Vec<u8>> {
+        loop {
+            if self.from.buffer().is_empty() {
+                let left = deadline.saturating_duration_since(Instant::now());
+                self.from.get_ref().set_read_timeout(Some(left.max(MIN_READ_TIMEOUT)))?;
+            }
+            let chunk = match self.from.fill_buf() {
+                Ok([]) => {
+                    return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the run closed the connection"));
+                }
+                Ok(chunk) => chunk,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Err(self.timed_out()),
+                Err(error) => return Err(error),
+            };
+            let end = chunk.iter().position(|byte| *byte == b'\n');
+            let take = end.map_or(chunk.len(), |at| at + 1);
+            self.line.extend(chunk.iter().take(take));
+            self.from.consume(take);
+            if end.is_some() {
+                return Ok(std::mem::take(&mut self.line));
+            }
+            if Instant::now() >= deadline {
+                return Err(self.timed_out());
+            }
         }
+    }
+
+    fn timed_out(&self) -> io::Error {
+        io::Error::new(io::ErrorKind::TimedOut, format!("no answer within {} s", self.timeout.as_secs_f64()))
     }
 
     fn io(&self, error: io::Error) -> ClientError {
@@ -220,5 +261,54 @@ fn message(incoming: Incoming) -> Message {
         subscription: incoming.subscription,
         lost: incoming.lost,
         data: incoming.data,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread::{sleep, spawn};
+
+    use super::*;
+    use crate::rpc::api::Status;
+
+    const TIMEOUT: Duration = Duration::from_millis(200);
+
+    /// Sends `text` every 10 ms until the client closes its end, for at most 5 s; then closes this end.
+    fn repeats(text: &'static str) -> Client {
+        let (mut run, client) = UnixStream::pair().unwrap();
+        spawn(move || {
+            for _ in 0..500 {
+                if run.write_all(text.as_bytes()).is_err() {
+                    return;
+                }
+                sleep(Duration::from_millis(10));
+            }
+        });
+        Client::over(client, "test", TIMEOUT).unwrap()
+    }
+
+    #[test]
+    fn a_run_that_streams_and_does_not_reply_ends_the_call_at_its_deadline() {
+        // A message of a subscription; a line without end.
+        for text in ["{\"stream\": \"events\", \"data\": 1}\n", "1"] {
+            let mut client = repeats(text);
+            let error = client.call(Status {}).unwrap_err();
+            assert!(
+                matches!(&error, ClientError::Io { error, .. } if error.kind() == io::ErrorKind::TimedOut),
+                "{error}"
+            );
+            assert_eq!(error.to_string(), "run \"test\": no answer within 0.2 s");
+            assert!(error.hint().unwrap().contains("does not answer"));
+        }
+    }
+
+    #[test]
+    fn a_message_cut_by_the_deadline_is_read_by_the_next_call() {
+        let (mut run, client) = UnixStream::pair().unwrap();
+        let mut client = Client::over(client, "test", TIMEOUT).unwrap();
+        run.write_all(b"{\"stream\": \"events\", ").unwrap();
+        client.next_message().unwrap_err();
+        run.write_all(b"\"data\": 1}\n").unwrap();
+        assert_eq!(client.next_message().unwrap().data, 1);
     }
 }

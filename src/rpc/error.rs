@@ -107,7 +107,7 @@ impl Code {
             Outcome::WrongTask(_) => Some(Self::WrongTask),
             Outcome::NonFinite(_) => Some(Self::NonFinite),
             Outcome::InvalidTarget(_) => Some(Self::InvalidParams),
-            Outcome::OutOfLimits(..) => Some(Self::OutOfLimits),
+            Outcome::OutOfLimits(..) | Outcome::GripperOutOfLimits(..) => Some(Self::OutOfLimits),
             Outcome::NoGripper(_) => Some(Self::NoGripper),
             Outcome::ShuttingDown => Some(Self::ShuttingDown),
         }

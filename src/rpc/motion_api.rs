@@ -158,6 +158,18 @@ pub struct Cancel {
     /// Ends the motion of this task.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<String>,
+    /// Ends only the planning of the plan with this number, and no motion. Excludes `arm` and `task`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<u64>,
+}
+
+impl Cancel {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        if self.plan.is_some() && (self.arm.is_some() || self.task.is_some()) {
+            return Err("plan excludes arm and task".into());
+        }
+        Ok(())
+    }
 }
 
 /// Reply to `cancel`.

@@ -114,9 +114,38 @@ async fn write(mut to: OwnedWriteHalf, mut waiting: mpsc::Receiver<String>) {
 
 async fn read(from: &mut BufReader<OwnedReadHalf>) -> io::Result<Incoming> {
     let mut line = Vec::new();
-    (&mut *from).take(MAX_REQUEST).read_until(b'\n', &mut line).await?;
+    (&mut *from).take(MAX_REQUEST + 1).read_until(b'\n', &mut line).await?;
+    if line.len() as u64 > MAX_REQUEST {
+        let what = format!("the run sent a line of more than {MAX_REQUEST} bytes");
+        return Err(io::Error::new(io::ErrorKind::InvalidData, what));
+    }
     if line.last() != Some(&b'\n') {
         return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the run closed the connection"));
     }
     serde_json::from_slice(&line).map_err(|e| io::Error::new(io::ErrorKind::InvalidData, e.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reads what a run sends before it closes the connection.
+    async fn read_from(sent: String) -> io::Result<Incoming> {
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        let (from, _to) = ours.into_split();
+        let (mut from, mut theirs) = (BufReader::new(from), theirs);
+        let writes = async move { theirs.write_all(sent.as_bytes()).await };
+        tokio::join!(read(&mut from), writes).0
+    }
+
+    #[tokio::test]
+    async fn a_line_that_is_too_long_is_not_reported_as_a_closed_connection() {
+        let line = |length: u64| "{\"id\": 1}".to_owned() + &" ".repeat(length as usize - 9);
+        let max = read_from(line(MAX_REQUEST - 1) + "\n").await.unwrap();
+        assert_eq!(max.id, Some(1));
+        let too_long = read_from(line(MAX_REQUEST) + "\n").await.unwrap_err();
+        assert_eq!(too_long.to_string(), "the run sent a line of more than 1048576 bytes");
+        let closed = read_from(line(20)).await.unwrap_err();
+        assert_eq!(closed.to_string(), "the run closed the connection");
+    }
 }

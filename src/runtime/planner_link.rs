@@ -149,10 +149,11 @@ impl Service {
         Ok(Reply::ExecutePlan(begun))
     }
 
-    /// Cancels planning. Returns whether a request was being planned.
-    pub(super) async fn cancel_planning(&self) -> bool {
+    /// Cancels the planning of this plan; `None`: of any. Returns whether it was being planned.
+    pub(super) async fn cancel_planning(&self, plan: Option<u64>) -> bool {
         let Ok(planner) = self.planner() else { return false };
-        let cancelled = planner.answer(Call::Cancel(api::Cancel::default()), Moment::default(), QUERY_TIMEOUT).await;
+        let cancel = Call::Cancel(api::Cancel { plan, ..Default::default() });
+        let cancelled = planner.answer(cancel, Moment::default(), QUERY_TIMEOUT).await;
         matches!(cancelled, Ok(Reply::Cancel(reply)) if reply.planning)
     }
 

@@ -67,8 +67,8 @@ impl PlannerPort {
             }
             Call::Preview(preview) => self.preview(preview.plan).map(Reply::Preview),
             Call::Planner(_) => Ok(Reply::Planner(self.report())),
-            Call::Cancel(_) => {
-                Ok(Reply::Cancel(CancelReply { planning: self.thread.cancel(), ..CancelReply::default() }))
+            Call::Cancel(cancel) => {
+                Ok(Reply::Cancel(CancelReply { planning: self.thread.cancel(cancel.plan), ..CancelReply::default() }))
             }
             Call::World(_) => {
                 let objects = lock(&self.objects).values().cloned().collect();

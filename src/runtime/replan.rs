@@ -55,7 +55,7 @@ impl Service {
         let Reply::Plan(begun) = self.planner_call(Call::Plan(request)).await? else { return Err(internal()) };
         loop {
             if let Err(ended) = self.may_go_on(motion) {
-                self.cancel_planning().await;
+                self.cancel_planning(Some(begun.plan)).await;
                 return Err(ended);
             }
             let asked = Call::Planning(Planning { plan: begun.plan });

@@ -251,6 +251,9 @@ impl Service {
             Outcome::OutOfLimits(joint, by) => error
                 .hint("limits are the arm's own, narrowed by `limits` in the blueprint")
                 .data(serde_json::json!({"joint": names.joint(*joint), "by": by})),
+            Outcome::GripperOutOfLimits(a, opening) => error
+                .hint("`dimos status --json` shows its range [m] as `gripper_range`")
+                .data(serde_json::json!({"arm": arm(a), "opening": opening})),
             Outcome::WrongTask(_) => error.hint("`dimos status` lists the tasks and their types"),
             _ => error,
         })

@@ -232,6 +232,10 @@ impl Service {
     }
 
     async fn cancel(&self, call: api::Cancel) -> Result<Reply, RpcError> {
+        if call.plan.is_some() {
+            let planning = self.cancel_planning(call.plan).await;
+            return Ok(Reply::Cancel(api::CancelReply { planning, ..Default::default() }));
+        }
         let arm = call.arm.as_deref().map(|a| self.arm_index(a)).transpose()?;
         let task = call.task.as_deref().map(|t| self.task_index(t)).transpose()?;
         let moves = |joints: &[u16]| arm.is_none_or(|a| joints.iter().any(|j| self.joints_of_arm(a).contains(j)));
@@ -244,7 +248,7 @@ impl Service {
             }
         }
         // Last: a planner in another process may be slow.
-        let planning = call.task.is_none() && self.cancel_planning().await;
+        let planning = call.task.is_none() && self.cancel_planning(None).await;
         Ok(Reply::Cancel(api::CancelReply { tasks, planning }))
     }
 

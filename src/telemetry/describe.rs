@@ -144,6 +144,10 @@ fn request(id: u64, outcome: Outcome, names: &Names) -> Described {
             d.joint = Some(names.joint(joint));
             d.values = vec![by];
         }
+        Outcome::GripperOutOfLimits(arm, opening) => {
+            d.arm = Some(names.arm(arm));
+            d.values = vec![opening];
+        }
         Outcome::StartStateUnavailable(arm) | Outcome::NoGripper(arm) => d.arm = Some(names.arm(arm)),
         Outcome::ArmNotReady(arm, _, cause) | Outcome::ArmLatched(arm, cause) | Outcome::StillFaulted(arm, cause) => {
             d.arm = Some(names.arm(arm));
@@ -173,6 +177,9 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
         Outcome::NonFinite(joint) => format!("the target of {} is not a finite number", names.joint(joint)),
         Outcome::OutOfLimits(joint, by) => {
             format!("the target of {} is outside its limits by {by:.4}", names.joint(joint))
+        }
+        Outcome::GripperOutOfLimits(arm, opening) => {
+            format!("the gripper of {} cannot open to {opening:.4} m: the opening must be 0 m or more", names.arm(arm))
         }
         Outcome::InvalidTarget(task) => {
             format!("the target of task {} is not finite, or its orientation is invalid", names.task(task))
@@ -362,5 +369,9 @@ mod tests {
         let d = describe(&Event::Request(7, Outcome::StartStateMismatch(0, 0.5)), &names());
         assert_eq!((d.request, d.status), (Some(7), "START_STATE_MISMATCH"));
         assert_eq!(d.text, "request 7: the trajectory starts 0.5000 rad (28.65°) from the position of left_joint1");
+        let d = describe(&Event::Request(8, Outcome::GripperOutOfLimits(1, -0.01)), &names());
+        let text = "request 8: the gripper of right cannot open to -0.0100 m: the opening must be 0 m or more";
+        assert_eq!((d.text.as_str(), d.status), (text, "OUT_OF_LIMITS"));
+        assert_eq!((d.arm.as_deref(), d.joint, d.values), (Some("right"), None, vec![-0.01]));
     }
 }

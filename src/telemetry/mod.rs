@@ -285,6 +285,8 @@ pub enum Outcome {
     NonFinite(u16),
     /// A target is outside the joint's limits: joint, by how much [rad or rad/s].
     OutOfLimits(u16, f64),
+    /// A gripper opening is negative or not finite: the arm, the opening [m].
+    GripperOutOfLimits(u16, f64),
     /// The target is not finite, or its orientation is invalid: the task.
     InvalidTarget(u16),
     /// The arm has no gripper: the arm.
@@ -308,7 +310,7 @@ impl Outcome {
             Self::StillFaulted(..) => "STILL_FAULTED",
             Self::WrongTask(_) => "WRONG_TASK",
             Self::NonFinite(_) => "NON_FINITE",
-            Self::OutOfLimits(..) => "OUT_OF_LIMITS",
+            Self::OutOfLimits(..) | Self::GripperOutOfLimits(..) => "OUT_OF_LIMITS",
             Self::InvalidTarget(_) => "INVALID_TARGET",
             Self::NoGripper(_) => "NO_GRIPPER",
             Self::ShuttingDown => "SHUTTING_DOWN",

@@ -442,6 +442,9 @@ fn grippers_open_on_request_and_only_where_there_is_one() {
     for unfit in [f64::NAN, f64::INFINITY, -0.1] {
         assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit }).name(), "OUT_OF_LIMITS");
     }
+    // The gripper is refused, not a joint of the arm.
+    let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1 });
+    assert_eq!(negative, Outcome::GripperOutOfLimits(0, -0.1));
     assert_eq!(rig.arms[0].gripper, 0.04);
 }
 

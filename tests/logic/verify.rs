@@ -367,7 +367,7 @@ fn exercise(name: &str, dof: usize) {
     let motion = begin(&mut client, goal.clone()).expect("the arm is ready");
     wait_for_end(&mut client, motion);
     let motion = begin(&mut client, vec![0.0; dof]);
-    client.call(api::Cancel { task: None, arm: None }).unwrap();
+    client.call(api::Cancel::default()).unwrap();
     motion.map(|motion| wait_for_end(&mut client, motion));
     let _ = client.call(api::Gripper { arm: "arm".into(), position: 0.03 });
     begin(&mut client, vec![0.25; dof]);

@@ -1,13 +1,14 @@
 //! The verbs that talk to a run, as a user types them: the real binary against a scripted run.
 
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::atomic::Ordering;
 
 use dimos::rpc::Request;
 use dimos::rpc::api::{Cancel, Gripper};
 use serde_json::Value;
 
-use crate::support::fake_run::{FakeBackend, start};
+use crate::support::fake_run::{FakeBackend, PLAN, start};
 use crate::support::program::eventually;
 
 /// A folder for `XDG_RUNTIME_DIR`; the runs in it are the only ones that the binary sees.
@@ -32,6 +33,23 @@ impl Home {
     fn run(&self, arguments: &str) -> Ended {
         Ended::from(self.command(arguments).output().unwrap())
     }
+
+    fn spawn(&self, arguments: &str) -> Child {
+        self.command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    }
+}
+
+/// Sends SIGINT.
+fn interrupt(child: &Child) {
+    let pid = rustix::process::Pid::from_child(child);
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+}
+
+/// Sends SIGINT and waits for the end, with its exit code.
+#[track_caller]
+fn interrupted(child: Child) -> Ended {
+    interrupt(&child);
+    Ended::from(child.wait_with_output().unwrap()).with(130)
 }
 
 struct Ended {
@@ -173,15 +191,40 @@ fn a_motion_that_ends_elsewhere_is_a_failure() {
 fn ctrl_c_cancels_the_motion() {
     let home = Home::new();
     let (_server, run) = start(&home.runs(), "test", FakeBackend { endless: true, ..Default::default() });
-    let mut command = home.command("move arm 0.3 -0.2");
-    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let child = home.spawn("move arm 0.3 -0.2");
     eventually("the motion is waited for", || run.asked().iter().any(|r| matches!(r, Request::Motion(_))));
-    let pid = rustix::process::Pid::from_child(&child);
-    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
-    let ended = Ended::from(child.wait_with_output().unwrap()).with(130);
+    let ended = interrupted(child);
     assert!(ended.err.contains("cancelling motion 7"), "{}", ended.err);
-    let cancel = Request::Cancel(Cancel { task: Some("traj_arm".into()), arm: None });
+    let cancel = Request::Cancel(Cancel { task: Some("traj_arm".into()), ..Cancel::default() });
     assert!(run.asked().contains(&cancel));
+}
+
+#[test]
+fn ctrl_c_while_planning_cancels_this_plan_and_no_motion() {
+    let home = Home::new();
+    let (_server, run) = start(&home.runs(), "test", FakeBackend { plans: true, ..Default::default() });
+    for verb in ["plan", "move"] {
+        run.asked.lock().unwrap().clear();
+        let child = home.spawn(&format!("{verb} arm 0.3 -0.2"));
+        eventually("it plans", || run.asked().iter().any(|r| matches!(r, Request::Planning(_))));
+        let ended = interrupted(child);
+        assert!(ended.err.contains("planning was cancelled: nothing has moved"), "{}", ended.err);
+        let cancels: Vec<_> = run.asked().into_iter().filter(|r| matches!(r, Request::Cancel(_))).collect();
+        assert_eq!(cancels, [Request::Cancel(Cancel { plan: Some(PLAN), ..Cancel::default() })], "{verb}");
+    }
+}
+
+#[test]
+fn ctrl_c_before_a_direct_motion_begins_none() {
+    let home = Home::new();
+    let (_server, run) = start(&home.runs(), "test", FakeBackend { holds_planner: true.into(), ..Default::default() });
+    let child = home.spawn("move arm 0.3 -0.2");
+    eventually("it asks for a planner", || !run.asked().is_empty());
+    interrupt(&child);
+    run.holds_planner.store(false, Ordering::Relaxed);
+    let ended = Ended::from(child.wait_with_output().unwrap()).with(130);
+    assert!(ended.err.contains("interrupted: no motion was started"), "{}", ended.err);
+    assert!(matches!(run.asked()[..], [Request::Planner(_)]), "{:?}", run.asked());
 }
 
 #[test]

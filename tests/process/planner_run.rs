@@ -180,7 +180,11 @@ fn cancel_and_ctrl_c_end_planning_at_once() {
     let planning = home.start(&format!("plan arm {RIGHT} --timeout 60s"));
     eventually("the planner is busy", || home.status()["planner"]["state"] == "PLANNING");
     home.dimos("plan arm --named home").with(1).says(&["PLANNING", "hint: "]);
+    // The motion of another client continues.
+    let moving = home.start("move arm 1.5 -0.3 0.6 0 0.8 0.8 --direct --speed 0.2");
+    eventually("it moves", || home.positions("arm")[5] > 0.05);
     planning.end(Signal::INT).with(130).says(&["planning was cancelled: nothing has moved"]);
+    moving.wait().with(0);
     assert!(began.elapsed().as_secs() < 40, "nothing waits for the 60 s");
     // A request that runs out of time says so, and the arm did not notice any of it.
     home.dimos(&format!("plan arm {RIGHT} --timeout 300ms")).with(1).says(&["in time", "--timeout"]);

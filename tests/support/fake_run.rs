@@ -1,8 +1,9 @@
 //! A run without arms: a scripted backend behind a real socket.
 
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use dimos::rpc::api::*;
 use dimos::rpc::report::*;
@@ -25,7 +26,14 @@ pub struct FakeBackend {
     pub aborts: bool,
     /// When set, stops are not confirmed.
     pub unconfirmed: bool,
+    /// When set, the run has a planner, and planning does not end until it is cancelled.
+    pub plans: bool,
+    /// While set, `planner` is not answered.
+    pub holds_planner: AtomicBool,
 }
+
+/// Number of every plan.
+pub const PLAN: u64 = 5;
 
 impl FakeBackend {
     pub fn asked(&self) -> Vec<Request> {
@@ -56,12 +64,29 @@ impl FakeBackend {
             deviation: done.then(|| vec![joint("arm_joint1", 0.3, 0.3004), joint("arm_joint2", -0.2, -0.1)]),
         }
     }
+
+    fn planning(&self, plan: u64) -> PlanningReport {
+        let ends =
+            |r: &Request| matches!(r, Request::Cancel(c) if c.task.is_none() && c.plan.is_none_or(|p| p == plan));
+        let cancelled = self.asked().iter().any(ends);
+        PlanningReport {
+            plan,
+            state: if cancelled { "CANCELLED" } else { "PLANNING" }.into(),
+            elapsed: 0.1,
+            error: None,
+            hint: None,
+            summary: None,
+        }
+    }
 }
 
 impl Backend for FakeBackend {
     fn call(&self, request: Request) -> BoxFuture<'_, Result<Reply, RpcError>> {
         self.asked.lock().unwrap().push(request.clone());
         Box::pin(async move {
+            while matches!(request, Request::Planner(_)) && self.holds_planner.load(Ordering::Relaxed) {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
             Ok(match request {
                 Request::Status(_) => Reply::Status(status()),
                 Request::State(_) => Reply::State(state()),
@@ -105,6 +130,9 @@ impl Backend for FakeBackend {
                 Request::Servo(_) => std::future::pending().await,
                 Request::Velocity(_) => panic!("a defect of the backend"),
                 Request::Shutdown(_) => Reply::Shutdown(Done {}),
+                Request::Planner(_) if self.plans => Reply::Planner(PlannerReport::default()),
+                Request::Plan(_) if self.plans => Reply::Plan(PlanReply { plan: PLAN }),
+                Request::Planning(p) if self.plans => Reply::Planning(self.planning(p.plan)),
                 // The rest is the planner's.
                 _ => return Err(RpcError::new(Code::NoPlanner, "this run has no planner")),
             })

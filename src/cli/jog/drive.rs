@@ -162,7 +162,7 @@ impl Stream {
 
     /// Ends the task: its joints decelerate to rest and become free for other tasks.
     pub fn end(&self, client: &mut Client) -> Sent {
-        client.call(Cancel { task: Some(self.drive.task.clone()), arm: None })?;
+        client.call(Cancel { task: Some(self.drive.task.clone()), ..Cancel::default() })?;
         Ok(())
     }
 

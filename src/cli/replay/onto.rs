@@ -254,7 +254,7 @@ impl Driver<'_> {
     /// Cancels motions and waits for their end. A motion that cannot be cancelled ends with the run.
     fn cancel(&self, motions: &[u64]) -> std::result::Result<(), End> {
         let limit = Instant::now() + REST_TIMEOUT;
-        if self.run.call(Cancel { task: None, arm: None }).is_ok() {
+        if self.run.call(Cancel::default()).is_ok() {
             while Instant::now() < limit && !self.reports(motions)?.iter().all(|r| r.done) {
                 std::thread::sleep(POLL_PERIOD);
             }

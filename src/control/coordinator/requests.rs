@@ -129,7 +129,7 @@ impl Coordinator {
             return Outcome::NoGripper(arm);
         }
         if !opening.is_finite() || opening < 0.0 {
-            return Outcome::OutOfLimits(a.first() as u16, opening);
+            return Outcome::GripperOutOfLimits(arm, opening);
         }
         match a.failsafe.admits(arm) {
             Ok(()) => {

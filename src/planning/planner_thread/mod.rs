@@ -124,24 +124,23 @@ impl PlannerThread {
         Ok(())
     }
 
-    /// Cancels the request that is being planned. Returns whether there was one.
-    pub fn cancel(&self) -> bool {
+    /// Cancels the request that is being planned, if it has this id; `None`: whichever it is. Returns whether it was
+    /// being planned.
+    pub fn cancel(&self, id: Option<u64>) -> bool {
         // Before the cancel flag, as in `begin`: the flag and the job must belong to the same request.
         let mut jobs = lock(&self.shared.jobs);
+        let is_meant = |job: &&mut Job| job.is_planning() && id.is_none_or(|id| job.id == id);
+        let Some(job) = jobs.iter_mut().find(is_meant) else { return false };
+        job.deadline = job.deadline.min(Instant::now());
         if let Some(cancel) = &*lock(&self.shared.cancel) {
             cancel.store(true, Ordering::Relaxed);
         }
-        let mut planning = false;
-        for job in jobs.iter_mut().filter(|job| job.is_planning()) {
-            job.deadline = job.deadline.min(Instant::now());
-            planning = true;
-        }
-        planning
+        true
     }
 
     /// Discards all plans: their ids belong to a run that has ended.
     pub fn forget(&self) {
-        self.cancel();
+        self.cancel(None);
         lock(&self.shared.jobs).retain(Job::is_planning);
     }
 
@@ -203,7 +202,7 @@ impl PlannerThread {
 
 impl Drop for PlannerThread {
     fn drop(&mut self) {
-        self.cancel();
+        self.cancel(None);
         let mut worker = lock(&self.worker);
         worker.work = None;
         let Some(thread) = worker.thread.take() else { return };

@@ -128,10 +128,12 @@ fn a_request_ends_at_its_timeout() {
 #[test]
 fn a_cancel_ends_the_request_and_frees_the_planner() {
     let planner = PlannerThread::start(walled(), TIMEOUT).unwrap();
-    assert!(!planner.cancel());
+    assert!(!planner.cancel(None));
     planner.begin(1, turn(1.5, -1.5, 0), None).unwrap();
     assert_eq!(planner.begin(2, turn(1.5, 1.4, 0), None), Err(BeginError::Busy));
-    assert!(planner.cancel());
+    assert!(!planner.cancel(Some(2)), "the plan of another client");
+    assert!(planner.newest(false).unwrap().is_planning());
+    assert!(planner.cancel(Some(1)));
     let cancelled = outcome(&planner, 1);
     assert!(matches!(&cancelled, Progress::Failed(f, took) if f.cancelled && *took < TIMEOUT / 4), "{cancelled:?}");
     found(&planner, 2, turn(1.5, 1.4, 0));
