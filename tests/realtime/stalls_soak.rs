@@ -239,7 +239,7 @@ fn a_joint_swings_inside_its_range() {
     // Joint 3 of an xArm a little below zero, and a Piper's joint at the end of its range.
     assert_eq!(inwards(-0.02, [-3.81, 0.165]), -0.1);
     assert_eq!(inwards(0.0, [-2.97, 0.0]), -0.1);
-    assert_eq!(inwards(0.0, [0.0, 3.14]), 0.1);
+    assert_eq!(inwards(0.0, [0.0, 3.0]), 0.1);
 }
 
 #[test]

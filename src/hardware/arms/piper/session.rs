@@ -219,7 +219,10 @@ impl Session {
         }
         let answered = |p: &Feedback| p.firmware().is_some() && p.limits.iter().all(Option::is_some);
         if !self.watch(ANSWER_TIMEOUT / 2, answered)? {
-            self.send(&questions)?;
+            // Questions that still wait for the bus are not lost, and would leave no room for the repetition.
+            if self.wire.as_ref().is_some_and(Wire::is_clear) {
+                self.send(&questions)?;
+            }
             self.watch(ANSWER_TIMEOUT / 2, answered)?; // what stays unanswered is known from the data sheet
         }
         let (limits, _) = self.limits();

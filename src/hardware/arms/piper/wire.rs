@@ -71,6 +71,11 @@ impl Wire {
         if taken == frames.len() { Ok(()) } else { Err(self.no_room()) }
     }
 
+    /// Whether no frame waits for the bus.
+    pub fn is_clear(&self) -> bool {
+        self.port.waiting() == 0
+    }
+
     /// Whether another setpoint may wait for the bus.
     pub fn has_room(&self) -> bool {
         let waiting = self.port.waiting();

@@ -149,7 +149,7 @@ fn a_frame_behind_many_replies_is_found() {
     let mut port = open("arm", pty.path(), 1_000_000, &[]).unwrap();
     pty.write(format!("{}t0001F0\r", "z\r".repeat(1000)).as_bytes()).unwrap();
     let found = loop {
-        assert!(wait(&port.fd(), PollFlags::IN, WAIT).unwrap(), "a received frame must not wait for further bytes");
+        assert!(wait(port.fd(), PollFlags::IN, WAIT).unwrap(), "a received frame must not wait for further bytes");
         if let Some(event) = port.receive().unwrap() {
             break event;
         }
