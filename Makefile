@@ -17,7 +17,7 @@ PREFIX ?= $(if $(filter 0,$(shell id -u)),/usr/local,$(HOME)/.local)
 # Without objcopy the linker drops the debug information.
 STRIP := $(if $(shell command -v objcopy),,CARGO_PROFILE_DIST_STRIP=symbols)
 
-.PHONY: run install dist shipped check test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
+.PHONY: run install dist shipped check lint spelling licences test test-fast test-tools test-rerun deny mutants bench bench-quick jitter soak
 
 # Builds the program to try it, not optimized, and starts the shipped blueprint; its arm is simulated. Ends with Ctrl-C.
 run:
@@ -41,12 +41,18 @@ shipped:
 	@size=$$(stat -c %s $(SHIPPED)/dimos); [ $$size -le $(LARGEST) ] || \
 	{ echo "error: the program has $$size bytes (limit $(LARGEST))" >&2; exit 1; }
 
-check:
+check: lint spelling licences
+
+lint:
 	cargo fmt --check
 	cargo clippy --all-targets --locked -- -D warnings
 	cargo clippy --no-default-features --locked -- -D warnings
+
+spelling:
 	@if [ -x .venv/bin/codespell ]; then .venv/bin/codespell; \
 	else echo "note: spelling is not checked; make test-tools installs codespell"; fi
+
+licences:
 	@if cargo deny --version >/dev/null 2>&1; then $(MAKE) --no-print-directory deny; \
 	else echo "note: licences and sources of crates are not checked; cargo install --locked cargo-deny"; fi
 
@@ -120,8 +126,8 @@ jitter:
 # Arms idle and moving beside eight busy processes for half an hour, with and without real-time permission, and runs that
 # are stopped and continued 200 times: no arm may be held by that. Two and a half hours on a machine without other work.
 soak:
-	DIMOS_SOAK=1800 cargo test --locked --test realtime stalls_soak -- --nocapture --test-threads 1
-	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --locked --test realtime stalls_soak -- --nocapture --test-threads 1
-	DIMOS_STALLS=200 cargo test --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
-	DIMOS_WIRE=full cargo test --locked --test realtime wire_stalls -- --nocapture --test-threads 1
+	DIMOS_SOAK=1800 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
+	DIMOS_SOAK=120 DIMOS_SOAK_ALL=1 cargo test --release --locked --test realtime stalls_soak -- --nocapture --test-threads 1
+	DIMOS_STALLS=200 cargo test --release --locked --test realtime stalls:: -- --skip wire_stalls --nocapture --test-threads 1
+	DIMOS_WIRE=full cargo test --release --locked --test realtime wire_stalls -- --nocapture --test-threads 1
 	DIMOS_BRAKING=1000 cargo test --locked --test logic braking

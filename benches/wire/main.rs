@@ -5,6 +5,8 @@
 
 mod bed;
 mod decoding;
+#[path = "../../tests/support/delegate.rs"]
+mod delegate;
 mod relay;
 mod round_trip;
 #[path = "../support/mod.rs"]

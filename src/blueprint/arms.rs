@@ -105,6 +105,7 @@ fn arm(
         true => limits::resolve(checker, &entry.limits, joints, own.as_ref()),
         false => Vec::new(),
     };
+    let simulated = address == SIM && row.emulate.is_some();
     let default_on_exit = if row.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
     Arm {
         hardware_id: id.to_owned(),
@@ -112,24 +113,29 @@ fn arm(
         joints: joints.to_vec(),
         adapter: row,
         adapter_type: row.name.to_owned(),
-        simulated: address == SIM && row.emulate.is_some(),
+        simulated,
         address,
         auto_enable: entry.auto_enable,
         on_exit: entry.on_exit.unwrap_or(default_on_exit),
         on_exit_given: entry.on_exit.is_some(),
-        supervision: supervision(entry, &row),
+        supervision: supervision(entry, &row, simulated),
         options,
         own_limits: own.unwrap_or_default(),
         limits,
     }
 }
 
+/// Shortest default of `stale_after` for a simulated arm: its emulator is a thread and waits for a processor like any
+/// other; the electronics of an arm do not.
+const SIMULATED_STALE_AFTER: Duration = Duration::from_millis(100);
+
 /// Returns the adapter's supervision figures, overridden by those of the blueprint.
-fn supervision(entry: &HardwareEntry, row: &AdapterSpec) -> Supervision {
+fn supervision(entry: &HardwareEntry, row: &AdapterSpec, simulated: bool) -> Supervision {
+    let stale_after = if simulated { row.stale_after.max(SIMULATED_STALE_AFTER) } else { row.stale_after };
     Supervision {
         accuracy: entry.accuracy.unwrap_or(row.accuracy),
         lag: entry.lag.unwrap_or(row.lag),
-        stale_after: entry.stale_after.map_or(row.stale_after, Duration::from_secs_f64),
+        stale_after: entry.stale_after.map_or(stale_after, Duration::from_secs_f64),
         tracking_tolerance: entry.tracking_tolerance.unwrap_or(Supervision::TRACKING_TOLERANCE),
         accept_zero_pose: entry.accept_zero_pose,
     }

@@ -13,13 +13,14 @@ use crate::hardware::registry::Registry;
 
 /// Returns the JSON Schema (draft 2020-12) of blueprints with the adapters and task types of the catalog.
 pub fn json_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
-    let mut schema = full_schema(catalog.into());
+    let mut schema = full_schema(catalog);
     allow_partial_entries(&mut schema);
     schema
 }
 
-/// Returns the schema of a blueprint without includes: every necessary key is required.
-pub(super) fn full_schema(Catalog { adapters, tasks }: Catalog<'_>) -> Value {
+/// Returns the JSON Schema of a blueprint without includes: every necessary key is required.
+pub fn full_schema<'a>(catalog: impl Into<Catalog<'a>>) -> Value {
+    let Catalog { adapters, tasks } = catalog.into();
     let mut generator = SchemaSettings::draft2020_12().into_generator();
     // One generator for all: it distinguishes types of the same name.
     let options: Vec<(&str, Value)> =
@@ -53,7 +54,7 @@ pub(super) fn home_of(key: &str) -> Option<String> {
     static HOMES: OnceLock<BTreeMap<String, Vec<&'static str>>> = OnceLock::new();
     let homes = HOMES.get_or_init(|| {
         let mut homes: BTreeMap<String, Vec<&'static str>> = BTreeMap::new();
-        let schema = full_schema(Catalog::from(&Registry::default()));
+        let schema = full_schema(&Registry::default());
         for (pointer, name) in GROUPS {
             let keys = schema.pointer(&format!("{pointer}/properties")).and_then(Value::as_object);
             for key in keys.into_iter().flat_map(|keys| keys.keys()) {

@@ -111,6 +111,7 @@ pub fn run(
     let mut states = vec![ArmState::default(); ports.states.len()];
     let mut deadline = clock.now().after(period);
     let (mut tick, mut skips_before, mut late_before, mut dropped) = (0u64, 0u32, 0u64, 0u32);
+    pulse.beat.adopt_thread();
     pulse.beat.beat(clock.now());
     while !pulse.stop.load(Ordering::Relaxed) {
         pulse.beat.sleep_until(deadline);

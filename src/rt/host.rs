@@ -206,9 +206,41 @@ pub fn thread_cpu_time() -> Duration {
     Duration::new(t.tv_sec as u64, t.tv_nsec as u32)
 }
 
+/// Returns the kernel's number of the calling thread's processor clock.
+pub fn cpu_clock() -> Option<libc::clockid_t> {
+    let mut clock = 0;
+    // SAFETY: the thread exists, because it calls; the pointer is valid for the call.
+    let error = unsafe { libc::pthread_getcpuclockid(libc::pthread_self(), &mut clock) };
+    (error == 0).then_some(clock)
+}
+
+/// Returns the processor time of the thread with this clock; `None` once the thread has ended.
+pub fn cpu_time_of(clock: libc::clockid_t) -> Option<Duration> {
+    let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: the pointer is valid for the call; an unknown clock is an error.
+    let error = unsafe { libc::clock_gettime(clock, &mut time) };
+    (error == 0).then(|| Duration::new(time.tv_sec.unsigned_abs(), time.tv_nsec.unsigned_abs() as u32))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_cpu_time_of_another_thread_is_known_until_it_ends() {
+        let (clocks, clock) = std::sync::mpsc::channel();
+        let busy = std::thread::spawn(move || {
+            while thread_cpu_time() < Duration::from_millis(5) {}
+            clocks.send(cpu_clock().unwrap()).unwrap();
+            std::thread::park();
+        });
+        let clock = clock.recv().unwrap();
+        let time = cpu_time_of(clock).unwrap();
+        assert!(time >= Duration::from_millis(5), "{time:?}");
+        busy.thread().unpark();
+        busy.join().unwrap();
+        assert_eq!(cpu_time_of(clock), None);
+    }
 
     #[test]
     fn an_ordinary_timed_thread_has_short_slices() {

@@ -12,6 +12,7 @@ use dimos::joint::joints_of;
 use dimos::replay::verify::{Finding, verify};
 use dimos::telemetry::{Reason, TaskState};
 
+use super::blueprint_reference::reference;
 use super::task_conformance::failures;
 use crate::support::rig::{Rig, arm};
 use crate::support::virtual_run::{VirtualRun, one_arm};
@@ -75,7 +76,7 @@ fn the_schema_and_the_reference_have_its_parameters() {
     assert!(
         types["description"].as_str().unwrap().ends_with("`joystick` follows the velocities of a stick, in positions.")
     );
-    let page = blueprint::reference(catalog);
+    let page = reference(catalog);
     let section = page.split("## `params` of `joystick`\n").nth(1).unwrap().split("\n## ").next().unwrap();
     let keys: Vec<usize> =
         ["timeout", "dead_band", "acceleration"].map(|k| section.find(&format!("`{k}`")).unwrap()).to_vec();

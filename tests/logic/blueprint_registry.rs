@@ -3,11 +3,10 @@
 use std::fs;
 use std::path::Path;
 
-use dimos::blueprint::{
-    Found, Origin, Overrides, SearchPath, Source, Summary, find, json_schema, load_from, reference,
-};
+use dimos::blueprint::{Found, Origin, Overrides, SearchPath, Source, Summary, find, json_schema, load_from};
 use dimos::hardware::registry::{Absent, Registry};
 
+use super::blueprint_reference::reference;
 use crate::support::fake_arms;
 
 /// Two folders: the first has `one` and a broken one, the second has another `one` and `two`.

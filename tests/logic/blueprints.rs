@@ -197,6 +197,18 @@ fn sim_gives_every_arm_its_emulator() {
 }
 
 #[test]
+fn a_simulated_arm_may_be_silent_for_100_ms() {
+    let stale_after = |sim: bool, set: &[&str]| {
+        let set = set.iter().map(|&s| s.to_owned()).collect();
+        let loaded = load(&find("coordinator-xarm7").unwrap(), &Overrides { set, sim }, &Registry::builtin());
+        loaded.blueprint.unwrap().arms[0].supervision.stale_after.as_millis()
+    };
+    assert_eq!(stale_after(false, &[]), 50);
+    assert_eq!(stale_after(true, &[]), 100);
+    assert_eq!(stale_after(true, &["hardware.arm.stale_after=0.05"]), 50, "what is written counts");
+}
+
+#[test]
 fn sim_refuses_an_arm_that_would_stay_real() {
     let loaded = load_fixture("serial.yaml", &Overrides { sim: true, ..Overrides::default() });
     assert!(loaded.blueprint.is_none());

@@ -1,16 +1,15 @@
 //! The conformance suite must be able to fail: adapters with one mistake each, and the check that finds it.
 
-use std::os::fd::BorrowedFd;
-
 use dimos::clock::{Clock, MonotonicClock};
 use dimos::hardware::adapter::*;
 use dimos::hardware::arms::{mock, xarm, yourarm};
 use dimos::hardware::conformance::first_motion::{Motion, refusal, run_first_motion};
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::joint::{ControlMode, JointLimits};
+use dimos::joint::ControlMode;
 
 use crate::support::counting;
+use crate::support::delegate::delegate;
 
 type Inner = Box<dyn ManipulatorAdapter>;
 
@@ -100,6 +99,11 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
 }
 
 impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
+    delegate!(
+        inner: disconnect, get_info, state_fd, get_dof, get_limits, get_control_mode, read_state, read_enabled,
+        write_joint_velocities, write_enable, write_clear_errors
+    );
+
     fn connect(&mut self) -> AdapterResult<()> {
         let result = self.inner.connect();
         if MISTAKE == IGNORES_MODEL {
@@ -120,44 +124,32 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             _ => Ok(()),
         }
     }
-    fn disconnect(&mut self) {
-        self.inner.disconnect();
-    }
+
     fn is_connected(&self) -> bool {
         MISTAKE == CLAIMS_TO_BE_CONNECTED || self.inner.is_connected()
     }
+
     fn activate(&mut self) -> AdapterResult<()> {
         self.inner.activate()?;
         if MISTAKE == MOVES_ON_ACTIVATION { self.inner.write_joint_positions(&[0.1; 6], 0.5) } else { Ok(()) }
     }
+
     fn deactivate(&mut self) -> AdapterResult<()> {
         self.inner.deactivate()?;
         if MISTAKE == DROPS_POWER_ON_LEAVING { self.inner.write_enable(false) } else { Ok(()) }
     }
-    fn get_info(&self) -> ManipulatorInfo {
-        self.inner.get_info()
-    }
-    fn state_fd(&self) -> Option<BorrowedFd<'_>> {
-        self.inner.state_fd()
-    }
-    fn get_dof(&self) -> usize {
-        self.inner.get_dof()
-    }
-    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        self.inner.get_limits()
-    }
+
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
         let result = self.inner.set_control_mode(mode);
         if MISTAKE == ACCEPTS_ANY_MODE { Ok(()) } else { result }
     }
-    fn get_control_mode(&self) -> ControlMode {
-        self.inner.get_control_mode()
-    }
+
     fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
         self.inner.read_joint_positions(positions)?;
         Self::spoil(positions);
         Ok(())
     }
+
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         if let Some(last) = self.last.filter(|_| std::mem::take(&mut self.repeat)) {
             *reading = last;
@@ -183,6 +175,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         self.last = Some(*reading);
         Ok(())
     }
+
     fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
         let known = self.inner.read_joint_velocities(velocities)?;
         if MISTAKE == ZERO_VELOCITIES {
@@ -190,16 +183,12 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         }
         Ok(known)
     }
-    fn read_state(&mut self) -> AdapterResult<RobotState> {
-        self.inner.read_state()
-    }
+
     fn read_error(&mut self) -> AdapterResult<(i32, String)> {
         let error = self.inner.read_error()?;
         Ok(if MISTAKE == HIDES_ERRORS { (0, String::new()) } else { error })
     }
-    fn read_enabled(&mut self) -> AdapterResult<bool> {
-        self.inner.read_enabled()
-    }
+
     fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
         if MISTAKE == STOP_IS_FINAL && self.stopped {
             return Err(AdapterError::Rejected("stopped".into()));
@@ -211,9 +200,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         let result = self.inner.write_joint_positions(positions, velocity);
         if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
     }
-    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
-        self.inner.write_joint_velocities(velocities)
-    }
+
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         self.stopped = true;
         match MISTAKE {
@@ -231,15 +218,11 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             _ => self.inner.write_stop(),
         }
     }
-    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
-        self.inner.write_enable(enable)
-    }
-    fn write_clear_errors(&mut self) -> AdapterResult<()> {
-        self.inner.write_clear_errors()
-    }
+
     fn gripper(&mut self) -> Option<&mut dyn Gripper> {
         if self.inner.gripper().is_some() { Some(self) } else { None }
     }
+
     fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
         if MISTAKE == FAILS_WITHOUT_SENSOR { Some(self) } else { None }
     }

@@ -12,7 +12,8 @@ use dimos::hardware::adapter::*;
 use dimos::hardware::arms::mock;
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
-use dimos::joint::{ControlMode, JointLimits};
+
+use crate::support::delegate::delegate;
 
 /// What is wrong with an adapter.
 const NOTHING: u8 = 0;
@@ -62,6 +63,11 @@ impl<const MISTAKE: u8> Pushed<MISTAKE> {
 }
 
 impl<const MISTAKE: u8> ManipulatorAdapter for Pushed<MISTAKE> {
+    delegate!(
+        inner: get_dof, get_limits, set_control_mode, get_control_mode, read_joint_positions, read_state, read_error,
+        read_enabled, write_joint_positions, write_stop, write_enable, write_clear_errors
+    );
+
     fn connect(&mut self) -> AdapterResult<()> {
         self.disconnect();
         self.inner.connect()?;
@@ -78,6 +84,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Pushed<MISTAKE> {
         }
         Ok(())
     }
+
     fn disconnect(&mut self) {
         self.inner.disconnect();
         if let Some((wire, device)) = self.wire.take() {
@@ -86,33 +93,22 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Pushed<MISTAKE> {
         }
         self.stamp = None;
     }
+
     fn is_connected(&self) -> bool {
         self.wire.is_some()
     }
+
     fn get_info(&self) -> ManipulatorInfo {
         ManipulatorInfo { native_rate: 200.0, ..self.inner.get_info() }
     }
-    fn get_dof(&self) -> usize {
-        self.inner.get_dof()
-    }
-    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        self.inner.get_limits()
-    }
-    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
-        self.inner.set_control_mode(mode)
-    }
-    fn get_control_mode(&self) -> ControlMode {
-        self.inner.get_control_mode()
-    }
+
     fn state_fd(&self) -> Option<BorrowedFd<'_>> {
         match MISTAKE {
             NEVER_WAKES => Some(self.deaf.0.as_fd()),
             _ => self.wire.as_ref().map(|(wire, _)| wire.as_fd()),
         }
     }
-    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
-        self.inner.read_joint_positions(positions)
-    }
+
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         let mut news = self.take()?;
         while MISTAKE == WAITS_FOR_NEWS && !news {
@@ -127,27 +123,6 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Pushed<MISTAKE> {
             _ => self.stamp,
         };
         Ok(())
-    }
-    fn read_state(&mut self) -> AdapterResult<RobotState> {
-        self.inner.read_state()
-    }
-    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
-        self.inner.read_error()
-    }
-    fn read_enabled(&mut self) -> AdapterResult<bool> {
-        self.inner.read_enabled()
-    }
-    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
-        self.inner.write_joint_positions(positions, velocity)
-    }
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
-        self.inner.write_stop()
-    }
-    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
-        self.inner.write_enable(enable)
-    }
-    fn write_clear_errors(&mut self) -> AdapterResult<()> {
-        self.inner.write_clear_errors()
     }
 }
 

@@ -25,10 +25,6 @@ fn ready(config: ArmConfig, tasks: Vec<TaskConfig>) -> Rig {
     rig
 }
 
-fn one(kind: dimos::control::config::TaskKind) -> Vec<TaskConfig> {
-    vec![task("t", kind, 0..6, 10)]
-}
-
 /// The largest commanded acceleration and jerk of joint 1 over some ticks from rest, by differences [rad/s², rad/s³].
 fn steepest(rig: &mut Rig, ticks: u32) -> (f64, f64) {
     let (mut q, mut v, mut a) = (rig.commanded(0)[0], 0.0, 0.0);

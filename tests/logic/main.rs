@@ -8,8 +8,10 @@ mod support;
 static ALLOCATOR: support::counting::Counting = support::counting::Counting;
 
 mod adding_a_task;
+mod arm_phases;
 mod blueprint_fuzz;
 mod blueprint_one_mistake;
+mod blueprint_reference;
 mod blueprint_registry;
 mod blueprints;
 mod braking;

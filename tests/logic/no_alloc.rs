@@ -16,7 +16,7 @@ use dimos::hardware::adapter::*;
 use dimos::hardware::arms::mock::SPEC;
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::AdapterConfig;
-use dimos::joint::{ControlMode, JointLimits, joints_of};
+use dimos::joint::{ControlMode, joints_of};
 use dimos::robot::kinematics::Kinematics;
 use dimos::robot::{Source, load};
 use dimos::rt::heartbeat::Heartbeat;
@@ -25,6 +25,7 @@ use dimos::rt::wake::Wake;
 use dimos::telemetry::{ArmSample, Cause, Event, Phase, Sample, TaskState, TaskView};
 
 use crate::support::counting::{watch, watched_calls};
+use crate::support::delegate::delegate;
 use crate::support::rig::*;
 
 #[test]
@@ -231,6 +232,12 @@ struct Watched {
 const READINGS: u64 = 300;
 
 impl ManipulatorAdapter for Watched {
+    delegate!(
+        inner: connect, disconnect, is_connected, get_info, get_dof, get_limits, set_control_mode, get_control_mode,
+        read_joint_positions, read_state, read_error, read_enabled, gripper, force_torque, cartesian,
+        write_joint_positions, write_joint_velocities, write_stop, write_enable, write_clear_errors
+    );
+
     fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
         self.readings += 1;
         match self.readings {
@@ -242,67 +249,6 @@ impl ManipulatorAdapter for Watched {
             _ => {}
         }
         self.inner.read_joints(reading)
-    }
-
-    fn connect(&mut self) -> AdapterResult<()> {
-        self.inner.connect()
-    }
-    fn disconnect(&mut self) {
-        self.inner.disconnect();
-    }
-    fn is_connected(&self) -> bool {
-        self.inner.is_connected()
-    }
-    fn get_info(&self) -> ManipulatorInfo {
-        self.inner.get_info()
-    }
-    fn get_dof(&self) -> usize {
-        self.inner.get_dof()
-    }
-    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
-        self.inner.get_limits()
-    }
-    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
-        self.inner.set_control_mode(mode)
-    }
-    fn get_control_mode(&self) -> ControlMode {
-        self.inner.get_control_mode()
-    }
-    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
-        self.inner.read_joint_positions(positions)
-    }
-    fn read_state(&mut self) -> AdapterResult<RobotState> {
-        self.inner.read_state()
-    }
-    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
-        self.inner.read_error()
-    }
-    fn read_enabled(&mut self) -> AdapterResult<bool> {
-        self.inner.read_enabled()
-    }
-    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
-        self.inner.gripper()
-    }
-    fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
-        self.inner.force_torque()
-    }
-    fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
-        self.inner.cartesian()
-    }
-    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
-        self.inner.write_joint_positions(positions, velocity)
-    }
-    fn write_joint_velocities(&mut self, velocities: &[f64]) -> AdapterResult<()> {
-        self.inner.write_joint_velocities(velocities)
-    }
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
-        self.inner.write_stop()
-    }
-    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
-        self.inner.write_enable(enable)
-    }
-    fn write_clear_errors(&mut self) -> AdapterResult<()> {
-        self.inner.write_clear_errors()
     }
 }
 

@@ -90,6 +90,8 @@ fn a_log_that_is_removed_ends_the_run() {
     let first = run(&home, &folder.join("run.mcap"), "");
     std::fs::remove_dir_all(&folder).unwrap();
     first.wait().with(5).says(&["it was removed or replaced", "the log is incomplete"]);
+    let status = home.dimos("status").with(0).out;
+    assert!(status.contains("LOG ENDED") && !status.contains("FAULT"), "{status}");
     // In the background no terminal shows it: `down` and `status` say what became of the run.
     let log = folder.join("again.mcap");
     home.dimos(&format!("run {RUN} -d --record {}", log.display())).with(0);

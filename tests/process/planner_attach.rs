@@ -68,6 +68,17 @@ fn is_at(home: &Home, goal: &[f64]) {
 }
 
 #[test]
+fn down_without_a_name_ends_no_planner_while_several_runs_are_live() {
+    let (home, _run, planner) = up();
+    let _other = home.run("cell.yaml --no-record --name other");
+    home.dimos("down").with(2).says(&["cell", "other", "hint: "]);
+    assert!(home.dimos("status").with(0).out.contains("other"));
+    assert_eq!(home.dimos("status --run cell --json").with(0).json()["planner"]["state"], "COMPLETED");
+    home.dimos("down lab").with(0);
+    planner.wait().with(143);
+}
+
+#[test]
 fn every_verb_goes_on_addressing_one_run() {
     let (home, _run, planner) = up();
     let planned = home.dimos("plan arm 0.3 -0.2 0.5 0 0.4 0").with(0).says(&["nothing has moved"]);

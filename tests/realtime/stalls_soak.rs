@@ -1,9 +1,11 @@
 //! `make soak`: runs with simulated arms, idle and moving at the same time, beside busy processes, with and without
 //! real-time permission: no arm is held. Only a hold at which a processor ran no program at all for 100 ms (the host of
 //! a virtual machine did not schedule it) is not counted: it is printed, the arm is reset, and the soak continues.
+//! Every other hold fails it; how long an ordinary thread of the test waited for a processor at that time is printed.
 //! `DIMOS_SOAK` is the duration [s] (10), `DIMOS_SOAK_BUSY` the number of busy processes (8), `DIMOS_SOAK_ALL=1` takes
 //! every shipped blueprint.
 
+use std::collections::{HashMap, HashSet};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -85,14 +87,25 @@ impl Soaked {
         }
     }
 
+    /// One trajectory per task: that of two arms gets one for both.
     fn move_all(&self, seconds: f64) -> Result<(), String> {
         let mut client: Client = self.home.client();
-        let ranges = client.call(Status {}).unwrap().arms.into_iter().map(|arm| arm.position_limits);
-        for (arm, ranges) in client.call(State {}).unwrap().arms.into_iter().zip(ranges.collect::<Vec<_>>()) {
-            let start: Vec<f64> = arm.joints.iter().map(|j| j.command.or(j.position).unwrap()).collect();
-            let joint_names: Vec<String> = arm.joints.iter().map(|j| j.name.clone()).collect();
-            assert_eq!(start.len(), ranges.len(), "{}: {joint_names:?}", self.name);
-            let inwards: Vec<f64> = start.iter().zip(&ranges).map(|(q, range)| inwards(*q, *range)).collect();
+        let (status, state) = (client.call(Status {}).unwrap(), client.call(State {}).unwrap());
+        let mut ranged: HashMap<&str, (f64, [f64; 2])> = HashMap::new();
+        for (arm, ranges) in state.arms.iter().zip(status.arms.iter().map(|arm| &arm.position_limits)) {
+            assert_eq!(arm.joints.len(), ranges.len(), "{}: {}", self.name, arm.hardware_id);
+            let starts = arm.joints.iter().map(|joint| (&*joint.name, joint.command.or(joint.position).unwrap()));
+            ranged.extend(starts.zip(ranges).map(|((joint, start), range)| (joint, (start, *range))));
+        }
+        let mut moved = HashSet::new();
+        for task in status.tasks.iter().filter(|task| task.takes.iter().any(|method| method == "execute")) {
+            if task.joints.iter().any(|joint| moved.contains(joint)) {
+                continue;
+            }
+            moved.extend(&task.joints);
+            let start: Vec<f64> = task.joints.iter().map(|joint| ranged[&**joint].0).collect();
+            let inwards: Vec<f64> =
+                task.joints.iter().map(|joint| ranged[&**joint]).map(|(q, r)| inwards(q, r)).collect();
             let turn = std::f64::consts::TAU / 4.0;
             let points = (0..=16 * (seconds / 4.0).floor() as usize).map(|i| {
                 let (time, rests) = (i as f64 * 0.25, i % 16 == 0);
@@ -104,9 +117,11 @@ impl Soaked {
                     accelerations: None,
                 }
             });
-            let trajectory = Trajectory { joint_names, points: points.collect() };
-            client.call(Execute { trajectory, task: None }).map_err(|e| format!("{}: {e}", self.name))?;
+            let trajectory = Trajectory { joint_names: task.joints.clone(), points: points.collect() };
+            let task = Some(task.name.clone());
+            client.call(Execute { trajectory, task }).map_err(|e| format!("{}: {e}", self.name))?;
         }
+        assert_eq!(moved.len(), ranged.len(), "{}: every joint moves: {moved:?}", self.name);
         Ok(())
     }
 
@@ -212,7 +227,7 @@ fn watched(names: &[String], realtime: bool, time: f64, idle: &mut Vec<String>) 
 }
 
 fn soak(realtime: bool) {
-    let host = Watch::of_processors();
+    let (host, ordinary) = (Watch::of_processors(), Watch::of_ordinary_threads());
     let time = number("DIMOS_SOAK", 10.0);
     // A few at a time: all of them share two cores with the busy ones.
     let (mut holds, mut idle) = (Vec::new(), Vec::new());
@@ -226,10 +241,18 @@ fn soak(realtime: bool) {
     for hold in explained {
         println!("not counted, a processor ran nothing for {:?}: {}", hold.cause(&stalls).unwrap().length, hold.what);
     }
-    let shorter = host.delays(Duration::ZERO);
+    let (shorter, waits) = (host.delays(Duration::ZERO), ordinary.delays(Duration::ZERO));
     for hold in &failures {
-        let near = shorter.iter().filter(|delay| hold.cause(std::slice::from_ref(delay)).is_some());
-        println!("longest delay of a processor before: {:?}: {}", near.map(|d| d.length).max(), hold.what);
+        let longest = |delays: &[Delay]| {
+            let near = delays.iter().filter(|delay| hold.cause(std::slice::from_ref(delay)).is_some());
+            near.map(|delay| delay.length).max().unwrap_or_default()
+        };
+        println!("{}", hold.what);
+        println!(
+            "  before it a processor ran nothing for {:?}, an ordinary thread waited for {:?}",
+            longest(&shorter),
+            longest(&waits)
+        );
     }
     assert!(failures.is_empty() && idle.is_empty(), "{} holds, see above; {idle:?}", failures.len());
 }

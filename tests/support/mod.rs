@@ -5,6 +5,7 @@
 pub mod busy;
 pub mod counting;
 pub mod crates;
+pub mod delegate;
 pub mod fake_arms;
 pub mod fake_run;
 pub mod file_server;
@@ -13,6 +14,7 @@ pub mod program;
 pub mod python;
 pub mod rig;
 pub mod shared;
+pub mod sim_arm;
 pub mod skip;
 pub mod tampered;
 pub mod terminal;

@@ -6,8 +6,10 @@ use dimos::hardware::adapter::{AdapterResult, Gripper, ManipulatorAdapter, Manip
 use dimos::hardware::arms::mock;
 use dimos::hardware::check::Checked;
 use dimos::hardware::registry::{AdapterSpec, AddressForm};
-use dimos::joint::{ControlMode, JointLimits};
+use dimos::joint::JointLimits;
 use dimos::testing::MockAdapter;
+
+use super::delegate::delegate;
 
 /// Hands everything on to a mock adapter.
 #[derive(Clone)]
@@ -38,61 +40,17 @@ pub const ROW: AdapterSpec = AdapterSpec {
 };
 
 impl ManipulatorAdapter for Wrapped {
-    fn connect(&mut self) -> AdapterResult<()> {
-        self.mock.connect()
-    }
-    fn disconnect(&mut self) {
-        self.mock.disconnect();
-    }
-    fn is_connected(&self) -> bool {
-        self.mock.is_connected()
-    }
-    fn activate(&mut self) -> AdapterResult<()> {
-        self.mock.activate()
-    }
-    fn get_info(&self) -> ManipulatorInfo {
-        self.mock.get_info()
-    }
-    fn get_dof(&self) -> usize {
-        self.mock.get_dof()
-    }
+    delegate!(
+        mock: connect, disconnect, is_connected, activate, get_info, get_dof, set_control_mode, get_control_mode,
+        read_joint_positions, read_joint_velocities, read_state, read_error, read_enabled, write_joint_positions,
+        write_stop, write_enable, write_clear_errors
+    );
+
     fn get_limits(&mut self) -> AdapterResult<JointLimits> {
         let own = self.mock.get_limits()?;
         Ok(self.limits.clone().unwrap_or(own))
     }
-    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
-        self.mock.set_control_mode(mode)
-    }
-    fn get_control_mode(&self) -> ControlMode {
-        self.mock.get_control_mode()
-    }
-    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
-        self.mock.read_joint_positions(positions)
-    }
-    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
-        self.mock.read_joint_velocities(velocities)
-    }
-    fn read_state(&mut self) -> AdapterResult<RobotState> {
-        self.mock.read_state()
-    }
-    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
-        self.mock.read_error()
-    }
-    fn read_enabled(&mut self) -> AdapterResult<bool> {
-        self.mock.read_enabled()
-    }
-    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
-        self.mock.write_joint_positions(positions, velocity)
-    }
-    fn write_stop(&mut self) -> AdapterResult<Stop> {
-        self.mock.write_stop()
-    }
-    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
-        self.mock.write_enable(enable)
-    }
-    fn write_clear_errors(&mut self) -> AdapterResult<()> {
-        self.mock.write_clear_errors()
-    }
+
     fn gripper(&mut self) -> Option<&mut dyn Gripper> {
         Some(self)
     }

@@ -139,7 +139,10 @@ fn in_tree(args: &Args, arm: &Arm) -> Result<(Plan, Vec<Line>, Next)> {
     let new = arm.in_tree().into_iter().map(|(path, text)| (root.join(path), text)).collect();
     let folder = root.join("src/hardware/arms").join(name);
     let next = [
-        ("DIMOS_REGENERATE=1 cargo test --lib blueprint".to_owned(), "brings the generated pages up to date"),
+        (
+            "DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference".to_owned(),
+            "brings the generated pages up to date",
+        ),
         ("cargo test --test logic conformance::".to_owned(), "every arm of the table, this one too"),
         (format!("cargo run -- run {}", arm.blueprint()), "with its emulator"),
         (

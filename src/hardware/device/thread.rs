@@ -81,8 +81,8 @@ pub(super) struct Worker {
     ordered_power: Option<bool>,
     /// Consecutive readings that disagree with what was ordered.
     disagreeing: u32,
-    /// The tick's latest heartbeat, and how late this thread has woken in total since then.
-    delay: (Option<Mono>, Duration),
+    /// The tick, as seen by this thread.
+    tick: tick_monitor::Seen,
     last_read: Mono,
     next_read: Mono,
     read_time: f64,
@@ -107,7 +107,7 @@ impl Worker {
             ordered_mode: None,
             ordered_power: None,
             disagreeing: 0,
-            delay: (None, Duration::ZERO),
+            tick: tick_monitor::Seen::default(),
             speed: 0.0,
             config,
             states,
@@ -167,7 +167,7 @@ impl Worker {
             }
         };
         self.due.awake();
-        self.add_delay(self.config.clock.now().since(due));
+        self.see_tick(self.config.clock.now().since(due));
         loop {
             match orders.try_recv() {
                 Ok(order) => {

@@ -24,33 +24,26 @@ pub trait ByteLink {
     }
 }
 
-impl ByteLink for TcpLink {
-    fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
-        self.send(bytes)
-    }
+/// The methods of these links are those of the trait.
+macro_rules! byte_links {
+    ($($link:ty),+) => {$(
+        impl ByteLink for $link {
+            fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
+                self.send(bytes)
+            }
 
-    fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
-        self.receive(timeout, scan)
-    }
+            fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
+                self.receive(timeout, scan)
+            }
 
-    fn abort(self) {
-        self.abort();
-    }
+            fn abort(self) {
+                self.abort();
+            }
+        }
+    )+};
 }
 
-impl ByteLink for SerialLink {
-    fn send(&mut self, bytes: &[u8]) -> AdapterResult<()> {
-        self.send(bytes)
-    }
-
-    fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
-        self.receive(timeout, scan)
-    }
-
-    fn abort(self) {
-        self.abort();
-    }
-}
+byte_links!(TcpLink, SerialLink);
 
 /// Timeout and attempts of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

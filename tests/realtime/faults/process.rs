@@ -39,12 +39,14 @@ fn f20_a_process_that_was_stopped_does_not_catch_up() {
     home.dimos("move arm 0 -0.3 0.6 0 0.8 0 --speed 1").with(0);
 }
 
+/// A pause of the tick: longer than the heartbeat's timeout, shorter than what holds an arm.
+const WAITS: Duration = Duration::from_millis(70);
+
 /// Not a test: a child process that does what `dimos run` does, until its tick breaks.
 #[test]
 fn child_whose_tick_breaks() {
     let Ok(how) = std::env::var("DIMOS_TEST_CHILD") else { return };
-    let (how, address) = how.split_once(' ').unwrap();
-    let hangs = how == "hang";
+    let (how, address) = how.split_once(' ').map(|(how, address)| (how.to_owned(), address.to_owned())).unwrap();
     let found = dimos::blueprint::find(RUN).ok().unwrap();
     let set = vec![format!("hardware.arm.address={address}")];
     let overrides = dimos::blueprint::Overrides { set, sim: false };
@@ -54,10 +56,15 @@ fn child_whose_tick_breaks() {
     let probe = move |_| {
         if flag.load(Ordering::Relaxed) {
             when.store(now().0, Ordering::Release);
-            assert!(hangs, "a defect of the tick");
-            loop {
-                std::hint::spin_loop();
+            match how.as_str() {
+                "hang" => loop {
+                    std::hint::spin_loop();
+                },
+                // From outside, a thread that sleeps and one whose processor runs others look the same.
+                "wait" => std::thread::sleep(WAITS),
+                _ => panic!("a defect of the tick"),
             }
+            flag.store(false, Ordering::Relaxed);
         }
     };
     let options = dimos::runtime::Options { probe: Some(Box::new(probe)), ..Default::default() };
@@ -74,17 +81,23 @@ fn child_whose_tick_breaks() {
     std::process::exit(exit as i32);
 }
 
+/// A process whose tick breaks at a line on its standard input, in mid-motion, with the wire on record.
+fn moving_child(home: &Home, arm: &YourArmEmulator, how: &str) -> Started {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    home.settle(command.args(["--exact", "faults::process::child_whose_tick_breaks", "--nocapture"]));
+    command.env("DIMOS_TEST_CHILD", format!("{how} {}", arm.address())).stdin(Stdio::piped());
+    let child = Started::of(&mut command);
+    child.until(UP);
+    begin_long_move(home, arm);
+    arm.record();
+    child
+}
+
 /// Breaks the tick in mid-motion. Returns the times until the stop command and until the end of the process [ms].
 fn break_the_tick(how: &str, says: &str) -> (f64, f64) {
     let home = Home::new();
     let arm = arm();
-    let mut command = Command::new(std::env::current_exe().unwrap());
-    home.settle(command.args(["--exact", "faults::process::child_whose_tick_breaks", "--nocapture"]));
-    command.env("DIMOS_TEST_CHILD", format!("{how} {}", arm.address())).stdin(Stdio::piped());
-    let mut child = Started::of(&mut command);
-    child.until(UP);
-    begin_long_move(&home, &arm);
-    arm.record();
+    let mut child = moving_child(&home, &arm, how);
     child.stdin().write_all(b"now\n").unwrap();
     let ended = child.wait().with(4).says(&["FAULT: ", says]);
     let gone = now();
@@ -118,6 +131,26 @@ fn f22_a_tick_that_hangs_leaves_the_arm_held_and_ends_the_run() {
         hold
     });
     judge("F22 exit", 1000.0, exits);
+}
+
+#[test]
+fn a_tick_that_gets_no_processor_for_70_ms_holds_no_arm() {
+    for _ in 0..REPEATS {
+        let home = Home::new();
+        let arm = arm();
+        let mut child = moving_child(&home, &arm, "wait");
+        std::thread::sleep(WAITS);
+        child.stdin().write_all(b"now\n").unwrap();
+        child.until("broke=");
+        std::thread::sleep(3 * WAITS);
+        let trace = arm.trace();
+        let gap = setpoints(&trace).windows(2).map(|w| ms(w[0].0, w[1].0)).fold(0.0, f64::max);
+        assert!(!trace.iter().any(|r| r.request == Request::Stop), "the arm was stopped; longest gap {gap:.0} ms");
+        assert!(gap >= 60.0, "the tick waited: {gap:.0} ms");
+        assert_eq!(home.status()["arms"][0]["phase"], "ready");
+        assert_eq!(home.status()["tasks"][0]["state"], "EXECUTING");
+        child.end(Signal::INT).with(130);
+    }
 }
 
 #[test]

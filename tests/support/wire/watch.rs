@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 use dimos::rt::host;
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use rustix::thread::{CapabilitySet, CpuSet, capabilities, sched_getaffinity, sched_setaffinity, set_capabilities};
 
 /// Above every thread of a run.
 const ABOVE_ALL: i32 = 95;
@@ -36,9 +36,10 @@ pub struct Watch {
 impl Watch {
     /// A thread at the priority of emulators.
     pub fn of_emulators() -> Self {
-        Self::start(vec![Box::new(|| {
+        let emulator = || {
             host::enter_realtime(host::EMULATOR_PRIORITY);
-        })])
+        };
+        Self::start(vec![Box::new(emulator)])
     }
 
     /// An ordinary thread.
@@ -48,16 +49,24 @@ impl Watch {
 
     /// A thread on each processor, above all others: only the kernel, or the host of a virtual machine, delays it.
     pub fn of_processors() -> Self {
-        let allowed = sched_getaffinity(None).unwrap();
-        let bound = |cpu: usize| -> Box<dyn Fn() + Send> {
-            Box::new(move || {
-                let mut only = CpuSet::new();
-                only.set(cpu);
-                sched_setaffinity(None, &only).unwrap();
-                host::enter_realtime(ABOVE_ALL);
-            })
+        let prepare = || {
+            host::enter_realtime(ABOVE_ALL);
         };
-        Self::start((0..CpuSet::MAX_CPU).filter(|cpu| allowed.is_set(*cpu)).map(bound).collect())
+        Self::start(on_each_processor(prepare))
+    }
+
+    /// A thread on each processor, with the slices of a run's timed threads and, like these, without the right to
+    /// schedule in real time.
+    pub fn of_ordinary_threads() -> Self {
+        let prepare = || {
+            let mut own = capabilities(None).unwrap();
+            for set in [&mut own.effective, &mut own.permitted, &mut own.inheritable] {
+                set.remove(CapabilitySet::SYS_NICE);
+            }
+            set_capabilities(None, own).unwrap();
+            assert!(!host::enter_realtime(ABOVE_ALL), "a limit permits real-time scheduling");
+        };
+        Self::start(on_each_processor(prepare))
     }
 
     /// [`Watch::of_processors`] for all tests of this process, until it ends.
@@ -121,6 +130,20 @@ impl Watch {
         }
         panic!("this computer was stalled in {REPETITIONS} attempts");
     }
+}
+
+/// The preparation of one thread for each processor: binds it, and calls `prepare`.
+fn on_each_processor(prepare: fn()) -> Vec<Box<dyn Fn() + Send>> {
+    let allowed = sched_getaffinity(None).unwrap();
+    let bound = |cpu: usize| -> Box<dyn Fn() + Send> {
+        Box::new(move || {
+            let mut only = CpuSet::new();
+            only.set(cpu);
+            sched_setaffinity(None, &only).unwrap();
+            prepare();
+        })
+    };
+    (0..CpuSet::MAX_CPU).filter(|cpu| allowed.is_set(*cpu)).map(bound).collect()
 }
 
 impl Drop for Watch {

@@ -1,18 +1,16 @@
-//! Writes `docs/blueprint-reference.md` from the JSON Schema, so that it never differs from what is accepted.
+//! `docs/blueprint-reference.md` and `assets/blueprint.schema.json` are generated, so that they never differ from what
+//! is accepted. `DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference` writes them.
 
 use std::fmt::Write;
+use std::path::Path;
 
+use dimos::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
+use dimos::blueprint::schema::{AssetEntry, BlueprintFile, CountedJoints, HardwareEntry, TaskEntry};
+use dimos::blueprint::{Catalog, CoordinatorConfig, LimitsEntry, RecordingConfig, RpcConfig, full_schema, json_schema};
+use dimos::control::task_spec::{TaskSpec, TaskTable};
+use dimos::hardware::registry::Registry;
+use dimos::yaml::keys;
 use serde_json::Value;
-
-use crate::blueprint::catalog::Catalog;
-use crate::blueprint::json_schema::full_schema;
-use crate::blueprint::limits::LimitsEntry;
-use crate::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
-use crate::blueprint::schema::{
-    AssetEntry, BlueprintFile, CoordinatorConfig, CountedJoints, HardwareEntry, RecordingConfig, RpcConfig, TaskEntry,
-};
-use crate::control::task_spec::{TaskSpec, TaskTable};
-use crate::yaml::keys;
 
 const INTRODUCTION: &str = "\
 # Blueprint reference
@@ -28,7 +26,7 @@ Units are SI: rad, rad/s, m, s, Hz.
 Blueprints are YAML 1.2: booleans are `true` and `false` (`yes` is a text). Keys must be unique, numbers finite, and a
 file has at most 1 MiB.
 
-This page is generated. Regenerate it with `DIMOS_REGENERATE=1 cargo test --lib blueprint`.
+This page is generated. Regenerate it with `DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference`.
 
 ";
 
@@ -229,43 +227,36 @@ fn plural(kind: &str) -> String {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::blueprint::json_schema::json_schema;
-    use crate::hardware::registry::Registry;
-
-    /// Compares a generated file with the committed one.
-    fn check(path: &str, generated: &str) {
-        let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
-        if std::env::var_os("DIMOS_REGENERATE").is_some() {
-            std::fs::write(&file, generated).unwrap();
-        }
-        let committed = std::fs::read_to_string(&file).unwrap_or_default();
-        assert!(
-            committed == generated,
-            "{path} is out of date; regenerate it with: DIMOS_REGENERATE=1 cargo test --lib blueprint"
-        );
+/// Compares a generated file with the committed one.
+fn check(path: &str, generated: &str) {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
+    if std::env::var_os("DIMOS_REGENERATE").is_some() {
+        std::fs::write(&file, generated).unwrap();
     }
+    let committed = std::fs::read_to_string(&file).unwrap_or_default();
+    assert!(
+        committed == generated,
+        "{path} is out of date; regenerate it with: DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference"
+    );
+}
 
-    #[test]
-    fn the_committed_reference_is_up_to_date() {
-        check("docs/blueprint-reference.md", &reference(&Registry::builtin()));
-    }
+#[test]
+fn the_committed_reference_is_up_to_date() {
+    check("docs/blueprint-reference.md", &reference(&Registry::builtin()));
+}
 
-    #[test]
-    fn the_committed_schema_is_up_to_date() {
-        let schema = serde_json::to_string_pretty(&json_schema(&Registry::builtin())).unwrap();
-        check("assets/blueprint.schema.json", &format!("{schema}\n"));
-    }
+#[test]
+fn the_committed_schema_is_up_to_date() {
+    let schema = serde_json::to_string_pretty(&json_schema(&Registry::builtin())).unwrap();
+    check("assets/blueprint.schema.json", &format!("{schema}\n"));
+}
 
-    #[test]
-    fn the_reference_names_every_key_of_the_schema() {
-        let schema = json_schema(&Registry::default());
-        let page = reference(&Registry::default());
-        let groups = schema["$defs"].as_object().unwrap().values().chain([&schema]);
-        for key in groups.filter_map(|g| g.get("properties")?.as_object()).flat_map(|keys| keys.keys()) {
-            assert!(page.contains(&format!("`{key}`")), "{key} is not in the reference");
-        }
+#[test]
+fn the_reference_names_every_key_of_the_schema() {
+    let schema = json_schema(&Registry::default());
+    let page = reference(&Registry::default());
+    let groups = schema["$defs"].as_object().unwrap().values().chain([&schema]);
+    for key in groups.filter_map(|g| g.get("properties")?.as_object()).flat_map(|keys| keys.keys()) {
+        assert!(page.contains(&format!("`{key}`")), "{key} is not in the reference");
     }
 }
