@@ -6,6 +6,7 @@
 
 pub mod arbitrate;
 pub mod arm_control;
+pub mod coast;
 pub mod config;
 pub mod conformance;
 pub mod coordinator;

@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use super::coast::Coast;
 use super::config::ArmConfig;
 use super::limit::Limiter;
 use super::setpoints::{Range, SetpointWindow};
@@ -28,11 +29,12 @@ pub struct Tracking {
     window: Duration,
     /// `supervision.tracking_tolerance` [rad].
     tolerance: f64,
+    /// `supervision.accuracy` [rad].
+    accuracy: f64,
     setpoints: SetpointWindow,
     /// Distance of each joint from the range of its setpoints of the last `lag` seconds [rad]; 0 in velocity mode.
     errors: Joints,
-    /// How far each joint coasts beyond the last setpoint before a gap [rad], and until when that is allowed.
-    coast: (Joints, Mono),
+    coast: Coast,
     /// How long the tolerance has been exceeded [s].
     exceeded: f64,
 }
@@ -47,9 +49,10 @@ impl Tracking {
             lag: s.lag,
             window: Duration::from_secs_f64(s.lag),
             tolerance: s.tracking_tolerance,
+            accuracy: s.accuracy,
             setpoints: SetpointWindow::new(config.dof, span),
             errors: [0.0; MAX_DOF],
-            coast: ([0.0; MAX_DOF], Mono::ZERO),
+            coast: Coast::default(),
             exceeded: 0.0,
         }
     }
@@ -89,32 +92,24 @@ impl Tracking {
             return;
         }
         let Some(range) = self.range(state) else { return };
-        let coasting = state.stamp < self.coast.1;
-        let joints = state.position.iter().zip(limiters).zip(&self.coast.0).enumerate();
-        for ((j, ((q, limiter), coast)), error) in joints.zip(&mut self.errors) {
+        let coasting = self.coast.is_possible(state.stamp);
+        let joints = state.position.iter().zip(limiters).zip(&mut self.errors).enumerate();
+        for (j, ((q, limiter), error)) in joints {
             if near((q, limiter)) {
                 continue;
             }
-            let distance = range.distance(j, *q);
-            *error = if coasting && coast * distance > 0.0 {
-                distance - distance.clamp(-coast.abs(), coast.abs())
-            } else {
-                distance
-            };
+            *error = if coasting { self.coast.error(j, *q, &range) } else { range.distance(j, *q) };
         }
     }
 
-    /// A gap begins: an arm at speed stops on its own beyond its last setpoint, and returns to it afterwards. Neither
-    /// counts as a tracking error.
+    /// A gap begins.
     pub fn begin_to_coast(&mut self, now: Mono, limiters: &[Limiter]) {
-        let mut longest = 0.0f64;
-        for (coast, limiter) in self.coast.0.iter_mut().zip(limiters) {
-            let (v, a) = (limiter.velocity(), limiter.bounds().acceleration);
-            *coast = v * v.abs() / (2.0 * a);
-            longest = longest.max(v.abs() / a);
-        }
-        let time = (2.0 * longest + self.lag).clamp(0.0, 60.0);
-        self.coast.1 = now.after(Duration::from_secs_f64(time));
+        self.coast.begin(now, limiters, self.lag);
+    }
+
+    /// Returns whether the arm may still be on its way back to the last setpoint before a gap.
+    pub fn is_coasting(&mut self, now: Mono, state: &ArmState, limiters: &[Limiter]) -> bool {
+        self.coast.goes_on(now, state, limiters, AT_SETPOINT + self.accuracy)
     }
 
     /// Returns the cause for a hold if the tolerance has been exceeded for too long. `velocity`: the arm is in velocity

@@ -13,6 +13,7 @@ use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::joint::ControlMode;
 use dimos::rt::heartbeat::Heartbeat;
+use dimos::rt::host;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
 use dimos::testing::{Call, MockAdapter};
 
@@ -134,6 +135,27 @@ fn a_tick_that_gets_no_processor_holds_no_arm_for_less_than_a_tenth_of_a_second(
     bench.until("the hold", |b| b.states.read().self_held);
     let held_after = MonotonicClock.now().since(began);
     assert!(held_after >= Duration::from_millis(105), "it sleeps and was not woken: held after {held_after:?}");
+    bench.end();
+}
+
+#[test]
+fn a_tick_that_was_charged_for_a_pause_of_the_computer_does_not_hang() {
+    let mut bench = bench(100.0);
+    // Linux charges a pause of a virtual machine to the thread that ran, as if it had computed all the time.
+    let beat = bench.beat.clone();
+    let tick = std::thread::spawn(move || {
+        beat.adopt_thread();
+        let charged = host::thread_cpu_time() + Duration::from_millis(28);
+        while host::thread_cpu_time() < charged {}
+        std::thread::park();
+    });
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.03));
+    let began = MonotonicClock.now();
+    bench.until("the hold", |b| b.states.read().self_held);
+    let held_after = MonotonicClock.now().since(began);
+    assert!(held_after >= Duration::from_millis(105), "it waits, and was held after {held_after:?}");
+    tick.thread().unpark();
+    tick.join().unwrap();
     bench.end();
 }
 

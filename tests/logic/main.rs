@@ -24,6 +24,7 @@ mod coordinator;
 mod device_stops;
 mod english;
 mod faults;
+mod gaps;
 mod guards_virtual;
 mod kinematics;
 mod layering;

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use dimos::rpc::api::{ArmEnable, ArmReset, Cancel, Motion, Move};
 use dimos::rpc::client::Client;
+use dimos::rpc::report::MotionReport;
 use rustix::process::Signal;
 
 use crate::support::loopback::own_address;
@@ -99,11 +100,12 @@ impl Three {
         })
     }
 
-    fn done(&mut self, motion: u64) -> String {
+    /// Waits for the end of a motion; returns its report.
+    fn done(&mut self, motion: u64) -> MotionReport {
         loop {
             let report = self.client.call(Motion { motion }).unwrap();
             if report.done {
-                return report.state;
+                return report;
             }
             std::thread::sleep(Duration::from_millis(10));
         }
@@ -136,8 +138,9 @@ fn spread(i: usize) -> Duration {
     Duration::from_millis(20 + (70.0 * (i as f64 * 0.618).fract()) as u64)
 }
 
-/// Stops a run at full speed several times for less than 0.1 s, then once for longer.
-fn stopped_repeatedly(with_emulator: bool) {
+/// Stops a run at full speed several times for less than 0.1 s, then once for longer. `again`: after each of the short
+/// stops, this much later, another of 40 ms.
+fn stopped_repeatedly(with_emulator: bool, again: Option<Duration>) {
     let mut three = Three::start();
     let (mut held, mut failures) = (0, Vec::new());
     for i in 0..times() {
@@ -145,14 +148,19 @@ fn stopped_repeatedly(with_emulator: bool) {
         let motion = three.at_full_speed();
         let (began, time) = (now(), spread(i));
         let emulator = with_emulator.then_some(&three.emulator);
-        let took = stop(&[&three.run].into_iter().chain(emulator).collect::<Vec<_>>(), time);
-        let state = three.done(motion);
+        let stopped = [&three.run].into_iter().chain(emulator).collect::<Vec<_>>();
+        let mut took = stop(&stopped, time);
+        if let Some(later) = again {
+            std::thread::sleep(later);
+            took = took.max(stop(&stopped, Duration::from_millis(40)));
+        }
+        let report = three.done(motion);
         let (sent, delivered) = (three.gate.sent(), three.gate.delivered());
         let wire = bounds().neighbours(&sent, began).and_then(|()| bounds().windows(&delivered, began));
         failures.extend(wire.err().map(|e| format!("stopped for {time:?}: {e}")));
-        if state != "COMPLETED" {
+        if report.state != "COMPLETED" {
             let arm = three.home.status()["arms"][0].clone();
-            println!("stopped for {time:?} ({took:?}): {state}, {} {}", arm["phase"], arm["cause"]);
+            println!("stopped for {time:?} ({took:?}): {:?}, {} {}", report.error, arm["phase"], arm["cause"]);
             held += usize::from(took < LONGEST);
         }
         three.ready();
@@ -173,12 +181,18 @@ fn stopped_repeatedly(with_emulator: bool) {
 
 #[test]
 fn a_run_that_is_stopped_with_its_emulator_goes_on() {
-    stopped_repeatedly(true);
+    stopped_repeatedly(true, None);
 }
 
 #[test]
 fn a_run_that_is_stopped_alone_goes_on() {
-    stopped_repeatedly(false);
+    stopped_repeatedly(false, None);
+}
+
+/// The arm still coasts from the first stop when the second begins.
+#[test]
+fn a_run_that_is_stopped_twice_in_a_row_goes_on() {
+    stopped_repeatedly(false, Some(Duration::from_millis(60)));
 }
 
 #[test]

@@ -126,8 +126,8 @@ impl Rig {
             mode: None,
             values: vec![0.0; a.dof],
             velocity: vec![0.0; a.dof],
-            lowest: vec![-SOFT; a.dof],
-            highest: vec![SOFT; a.dof],
+            lowest: a.limits.position_lower.iter().map(|low| low + POSITION_MARGIN).collect(),
+            highest: a.limits.position_upper.iter().map(|high| high - POSITION_MARGIN).collect(),
         };
         Self {
             coordinator: Coordinator::new(&config, table.build(&config.tasks).unwrap()),
@@ -322,7 +322,8 @@ impl Rig {
                 wire.velocity.fill(0.0);
                 for j in 0..arm.dof {
                     let q = arm.state.position[j];
-                    (wire.lowest[j], wire.highest[j]) = (q.min(-SOFT), q.max(SOFT));
+                    wire.lowest[j] = q.min(limits.position_lower[j] + POSITION_MARGIN);
+                    wire.highest[j] = q.max(limits.position_upper[j] - POSITION_MARGIN);
                 }
             }
             for j in 0..arm.dof {

@@ -26,7 +26,7 @@ impl ArmControl {
             return self.tracking.clear_errors();
         }
         // Before the comparison: an arm without new setpoints moves beyond the last one.
-        if self.gap_since.is_none() && self.written.gap(now) {
+        if self.gap_since.is_none() && !self.returning && self.written.gap(now) {
             self.tracking.begin_to_coast(now, &self.limiters);
         }
         self.tracking.compare(self.feedback.state(), &self.limiters);
@@ -52,7 +52,8 @@ impl ArmControl {
         }
     }
 
-    /// Finds out whether commands reach the arm. During a gap, takes the limiters back to what was written last.
+    /// Finds out whether commands reach the arm, and after a gap, whether the arm is back at what was written last.
+    /// During a gap, takes the limiters back to that.
     pub(super) fn check_gap(&mut self, now: Mono) {
         if let Some(first) = self.starting {
             // Each tick makes the first setpoint again from the newest measurement, until one is written.
@@ -68,12 +69,14 @@ impl ArmControl {
         let started = self.starting.is_none() && self.command.mode.is_some();
         // A command from before the gap may be written after the gap was noticed.
         let late = self.gap_since.is_some_and(|first| self.written.last().seq < first);
+        let position = self.command.mode.is_some_and(ControlMode::is_position);
         if !(started && (late || self.written.gap(now))) {
             self.gap_since = None;
+            self.returning =
+                started && position && self.tracking.is_coasting(now, self.feedback.state(), &self.limiters);
             return;
         }
         self.gap_since.get_or_insert(self.command.seq);
-        let position = self.command.mode.is_some_and(ControlMode::is_position);
         let last = self.written.last();
         for (limiter, (q, v)) in self.limiters.iter_mut().zip(last.position.iter().zip(&last.velocity)) {
             // In position mode the joints are at rest at the last setpoint; in velocity mode they continue.

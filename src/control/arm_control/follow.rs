@@ -36,7 +36,7 @@ impl ArmControl {
             self.hold(mode, dt);
             return Routed::Waiting;
         }
-        if self.gap_since.is_some() {
+        if self.gap_since.is_some() || self.returning {
             return self.wait_in_gap(mode, ask, dt);
         }
         if let Some((j, refusal)) = self.refused(mode, &ask) {
@@ -82,7 +82,8 @@ impl ArmControl {
         Routed::Sent
     }
 
-    /// Nothing reaches the arm: repeats the last written setpoint. Requests are still checked for jumps.
+    /// Nothing reaches the arm, or it is on its way back: repeats the last written setpoint. Requests are still checked
+    /// for jumps.
     fn wait_in_gap(&mut self, mode: ControlMode, ask: impl Fn(usize) -> Option<JointRequest>, dt: f64) -> Routed {
         let mut refused = None;
         for (j, limiter) in self.limiters.iter_mut().enumerate() {

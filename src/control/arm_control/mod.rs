@@ -53,6 +53,8 @@ pub struct ArmControl {
     starting: Option<u64>,
     /// While there is a gap in what is written: the number of the first command made from what had been written.
     gap_since: Option<u64>,
+    /// The arm is on its way back to the last setpoint before a gap.
+    returning: bool,
     rest: Rest,
 }
 
@@ -105,6 +107,7 @@ impl ArmControl {
             enabled_at: [0.0; MAX_DOF],
             starting: None,
             gap_since: None,
+            returning: false,
             rest: Rest::default(),
         }
     }

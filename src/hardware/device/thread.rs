@@ -156,7 +156,7 @@ impl Worker {
         let due = if self.connected { self.next_read } else { self.reconnect.0 };
         let now = self.config.clock.now();
         let idle = if self.should_reconnect { due.since(now) } else { Duration::from_secs(1) };
-        let idle = idle.min(Duration::from_secs(1)).min(self.until_tick_timeout(now));
+        let idle = idle.min(Duration::from_secs(1)).min(self.until_tick_check(now));
         let due = now.after(idle);
         self.due.wait_until(due);
         let arrived = match adapter.state_fd() {
@@ -167,7 +167,8 @@ impl Worker {
             }
         };
         self.due.awake();
-        self.see_tick(self.config.clock.now().since(due));
+        let woke = self.config.clock.now();
+        self.see_tick(woke, woke.since(due));
         loop {
             match orders.try_recv() {
                 Ok(order) => {
