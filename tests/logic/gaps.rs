@@ -1,6 +1,6 @@
 //! A run that gets no processor for less than 0.1 s while its arm moves: the arm stops on its own beyond the last
-//! setpoint and returns, the motion continues from rest at that setpoint, and the arm follows again. However fast it is,
-//! and whatever gap follows, that is no tracking error.
+//! setpoint and returns, and the motion continues there, from rest. However fast it is, and whatever gap follows, that
+//! is no tracking error, and the arm follows its setpoints afterwards.
 
 use std::time::Duration;
 
