@@ -3,7 +3,6 @@
 #![cfg(all(feature = "can", target_os = "linux"))]
 
 use std::io::{BufRead, BufReader, Write};
-use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
@@ -16,7 +15,7 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::joint::ControlMode;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-use crate::support::skip::skip_tool;
+use crate::support::python::python_with;
 use crate::support::uml;
 use crate::support::uml::{Guest, in_guest, sh};
 
@@ -194,7 +193,7 @@ fn stream_until_changed(arm: &mut PiperAdapter, reading: &mut JointReading) {
 /// The vendor's SDK beside the adapter on one interface: the adapter does not hear it, and sees in the arm's feedback
 /// what its calls change. They are not undone.
 fn interfere(test: &str, kinds: &[&str], pauses: &[u32], feedback_hz: f64) {
-    if !has_sdk() {
+    if python_with(&["piper_sdk"]).is_none() {
         return;
     }
     let guest = Guest { limit: Duration::from_secs(180), ..Guest::with(uml::VXCAN) };
@@ -254,20 +253,10 @@ fn what_the_vendors_sdk_changes_of_the_power_is_seen_and_left_alone() {
     interfere("what_the_vendors_sdk_changes_of_the_power_is_seen_and_left_alone", &["power"], &[200], 200.0);
 }
 
-fn has_sdk() -> bool {
-    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
-    let mut import = Command::new(&python);
-    let has = import.args(["-c", "import piper_sdk"]).stderr(Stdio::null()).status().is_ok_and(|s| s.success());
-    if !has {
-        skip_tool("piper_sdk in .venv");
-    }
-    has
-}
-
 /// The vendor's SDK opens its sockets without local loopback: on one interface its commands would not arrive.
 #[test]
 fn the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces() {
-    if !has_sdk() {
+    if python_with(&["piper_sdk"]).is_none() {
         return;
     }
     let name = "the_vendors_sdk_moves_the_emulator_over_a_pair_of_interfaces";

@@ -9,7 +9,7 @@ use dimos::hardware::arms::piper::GripperKind;
 use dimos::hardware::arms::piper::emulator::{PiperEmulator, SimOptions};
 use dimos::hardware::registry::{Emulator, EmulatorAddress};
 
-use crate::support::skip::skip_tool;
+use crate::support::python::python_with;
 
 /// The longest that the SDK's script may take.
 const TIMEOUT: Duration = Duration::from_secs(90);
@@ -19,12 +19,7 @@ const RATE: f64 = 50.0;
 /// Runs `tests/python/NAME` with the SDK; its output, or `None` where the SDK is not installed.
 fn python(name: &str, arguments: &[&str]) -> Option<String> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = root.join(".venv/bin/python");
-    let has = Command::new(&python).args(["-c", "import piper_sdk, serial"]).stderr(Stdio::null()).status();
-    if !has.is_ok_and(|status| status.success()) {
-        skip_tool("piper_sdk in .venv");
-        return None;
-    }
+    let python = python_with(&["piper_sdk", "serial"])?;
     let mut child = Command::new(python)
         .arg(root.join("tests/python").join(name))
         .args(arguments)

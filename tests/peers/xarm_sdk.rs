@@ -12,7 +12,8 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 use serde_json::json;
 
 use crate::support::program;
-use crate::support::skip::{skip_port_502, skip_tool};
+use crate::support::python::python_with;
+use crate::support::skip::skip_port_502;
 
 /// An emulator at the arm's own ports of a loopback address; `None` where port 502 cannot be had.
 fn emulator(last: u8, dof: usize, options: serde_json::Value) -> Option<(XArmEmulator, String)> {
@@ -42,13 +43,7 @@ struct Client {
 /// Runs a scenario of `tests/python/xarm_sdk.py` to its end; `None` where the client is not installed.
 fn client(scenario: &str, host: &str) -> Option<Client> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = root.join(".venv/bin/python");
-    let mut import = Command::new(&python);
-    import.args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null());
-    if !import.status().is_ok_and(|status| status.success()) {
-        skip_tool("xarm-python-sdk");
-        return None;
-    }
+    let python = python_with(&["xarm"])?;
     let home = tempfile::tempdir().unwrap();
     let child = Command::new(python)
         .arg(root.join("tests/python/xarm_sdk.py"))

@@ -18,7 +18,8 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 use rustix::process::Signal;
 
 use crate::support::program::{Home, Started, eventually};
-use crate::support::skip::{skip, skip_port_502, skip_tool};
+use crate::support::python::python_with;
+use crate::support::skip::{skip, skip_port_502};
 
 pub(super) const BLUEPRINT: &str = "
 hardware:
@@ -262,11 +263,7 @@ fn a_slow_sdk_keeps_its_own_pace() {
 
 #[test]
 fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
-    let python = in_tree(".venv/bin/python");
-    let import = Command::new(&python).args(["-c", "import xarm"]).stdout(Stdio::null()).stderr(Stdio::null()).status();
-    if !import.is_ok_and(|status| status.success()) {
-        return skip_tool("xarm-python-sdk");
-    }
+    let Some(python) = python_with(&["xarm"]) else { return };
     let (ip, options) = (IpAddr::V4(Ipv4Addr::new(127, 0, 7, 2)), serde_json::json!({}));
     let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 6, options };
     let emulator = match XArmEmulator::start(&config, &EmulatorAddress::Bind(ip)) {
@@ -279,7 +276,7 @@ fn the_vendors_sdk_in_an_adapter_of_the_guide_runs_an_xarm() {
     let start = emulator.joints().0;
     let home = Home::new();
     let arguments = ["--address", &ip.to_string(), "--dof", "6", "--hz", "20"];
-    let mut command = shim_of(&python, "xarm_guide:XArmAdapter", &home, &socket(&home), &arguments);
+    let mut command = shim_of(python.to_str().unwrap(), "xarm_guide:XArmAdapter", &home, &socket(&home), &arguments);
     let shim = serving(&home, Started::of(&mut command));
     let run = home.run("remote.yaml");
     assert_eq!(home.positions("arm").len(), 6);

@@ -1,21 +1,29 @@
 //! Python tools that tests ask: used where they are installed, else said.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use super::skip::skip_tool;
 
-/// What a script of `tests/readers` says to some JSON; nothing where its Python packages are not installed.
-pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> Option<serde_json::Value> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = root.join(".venv/bin/python");
-    let has = Command::new(&python).args(["-c", &format!("import {module}")]).stderr(Stdio::null()).status();
-    if !has.is_ok_and(|s| s.success()) {
-        skip_tool(&format!("Python's {module}"));
+/// The Python that has these packages; nothing where they are not installed. They are not imported: the vendors' write to
+/// the home folder when they are, and fail when several do at once.
+#[track_caller]
+pub fn python_with(packages: &[&str]) -> Option<PathBuf> {
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");
+    let find = "import importlib.util, sys; sys.exit(any(importlib.util.find_spec(p) is None for p in sys.argv[1:]))";
+    let has = Command::new(&python).args(["-c", find]).args(packages).stderr(Stdio::null()).status();
+    if !has.is_ok_and(|status| status.success()) {
+        skip_tool(&format!("Python's {}", packages.join(", ")));
         return None;
     }
-    let script = root.join("tests/readers").join(script);
+    Some(python)
+}
+
+/// What a script of `tests/readers` says to some JSON; nothing where its Python packages are not installed.
+pub fn ask_python(script: &str, module: &str, question: &serde_json::Value) -> Option<serde_json::Value> {
+    let python = python_with(&[module])?;
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers").join(script);
     let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
     let mut input = child.stdin.take().unwrap();
     let text = question.to_string();
