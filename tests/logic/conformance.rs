@@ -3,7 +3,7 @@
 use dimos::hardware::conformance::{Outcome, Subject, checks, run_all};
 use dimos::hardware::registry::Registry;
 
-use crate::support::counting::allocations;
+use dimos::rt::counting::allocations;
 
 #[test]
 fn every_adapter_conforms() {

@@ -7,8 +7,8 @@ use dimos::hardware::conformance::first_motion::{Motion, refusal, run_first_moti
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::{AdapterConfig, AdapterSpec};
 use dimos::joint::ControlMode;
+use dimos::rt::counting;
 
-use crate::support::counting;
 use crate::support::delegate::delegate;
 
 type Inner = Box<dyn ManipulatorAdapter>;
@@ -43,7 +43,14 @@ const MOVES_WITHOUT_POWER: u8 = 25;
 const ALLOCATES_FOR_NEWS: u8 = 26;
 const GRIPPER_IGNORES_STOP: u8 = 27;
 const STOP_LOCKS_GRIPPER: u8 = 28;
+const ENABLES_AT_OLD_GOAL: u8 = 29;
+const VELOCITIES_SCALED: u8 = 30;
+const TAKES_LATE_ANSWERS: u8 = 31;
+const ENABLED_BY_ONE_MOTOR: u8 = 32;
 const NO_MISTAKE: u8 = 255;
+
+/// The modes of an arm that takes only setpoints.
+const SERVO: &[ControlMode] = &[ControlMode::ServoPosition];
 
 /// An arm with one mistake.
 struct Wrong<const MISTAKE: u8> {
@@ -56,6 +63,12 @@ struct Wrong<const MISTAKE: u8> {
     gripper: f64,
     /// The last reading.
     last: Option<JointReading>,
+    /// The last positions it was sent to [rad].
+    goal: Option<[f64; 6]>,
+    /// A reading failed: from now on each is the one before.
+    late: bool,
+    /// What its motors were ordered.
+    ordered: bool,
     /// The next reading is to be the last once more.
     repeat: bool,
 }
@@ -81,11 +94,23 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
         create: |config: &AdapterConfig| Ok(Box::new(Self::around((xarm::SPEC.create)(config)?))),
         ..xarm::SPEC
     };
+    /// Around an arm with a wire that has no velocity mode.
+    const SERVOS: AdapterSpec = AdapterSpec { modes: SERVO, ..Self::WIRED };
     /// Around an arm that is said to fall without power.
     const FALLING: AdapterSpec = AdapterSpec { holds_when_disabled: false, ..Self::SPEC };
 
     fn around(inner: Inner) -> Self {
-        Self { inner, connections: 0, stopped: false, gripper: 0.0, last: None, repeat: false }
+        Self {
+            inner,
+            connections: 0,
+            stopped: false,
+            gripper: 0.0,
+            last: None,
+            goal: None,
+            late: false,
+            ordered: false,
+            repeat: false,
+        }
     }
 
     fn spoil(values: &mut [f64]) {
@@ -100,8 +125,8 @@ impl<const MISTAKE: u8> Wrong<MISTAKE> {
 
 impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
     delegate!(
-        inner: disconnect, get_info, state_fd, get_dof, get_limits, get_control_mode, read_state, read_enabled,
-        write_joint_velocities, write_enable, write_clear_errors
+        inner: disconnect, state_fd, get_dof, get_limits, get_control_mode, read_state, write_joint_velocities,
+        write_clear_errors
     );
 
     fn connect(&mut self) -> AdapterResult<()> {
@@ -131,12 +156,32 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
 
     fn activate(&mut self) -> AdapterResult<()> {
         self.inner.activate()?;
+        self.ordered = true;
+        if let Some(goal) = self.goal.filter(|_| MISTAKE == ENABLES_AT_OLD_GOAL) {
+            return self.inner.write_joint_positions(&goal, 0.5);
+        }
         if MISTAKE == MOVES_ON_ACTIVATION { self.inner.write_joint_positions(&[0.1; 6], 0.5) } else { Ok(()) }
     }
 
     fn deactivate(&mut self) -> AdapterResult<()> {
         self.inner.deactivate()?;
         if MISTAKE == DROPS_POWER_ON_LEAVING { self.inner.write_enable(false) } else { Ok(()) }
+    }
+
+    fn get_info(&self) -> ManipulatorInfo {
+        let info = self.inner.get_info();
+        if MISTAKE == VELOCITIES_SCALED { ManipulatorInfo { modes: SERVO, ..info } } else { info }
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        let enabled = self.inner.read_enabled()?;
+        Ok(if MISTAKE == ENABLED_BY_ONE_MOTOR { self.ordered } else { enabled })
+    }
+
+    fn write_enable(&mut self, on: bool) -> AdapterResult<()> {
+        self.inner.write_enable(on)?;
+        self.ordered = on;
+        Ok(())
     }
 
     fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
@@ -157,6 +202,15 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         }
         match (self.inner.read_joints(reading), self.last) {
             (Err(_), Some(last)) if MISTAKE == HIDES_SILENCE => *reading = last,
+            (Err(error), _) if MISTAKE == TAKES_LATE_ANSWERS => {
+                self.late = true;
+                return Err(error);
+            }
+            (Ok(()), Some(last)) if self.late => {
+                self.last = Some(*reading);
+                *reading = last;
+                return Ok(());
+            }
             (result, _) => result?,
         }
         Self::spoil(&mut reading.position[..6]);
@@ -168,6 +222,9 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
         }
         if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_IN_DEGREES) {
             *velocity = velocity.map(f64::to_degrees);
+        }
+        if let Some(velocity) = reading.velocity.as_mut().filter(|_| MISTAKE == VELOCITIES_SCALED) {
+            *velocity = velocity.map(|v| -651.0 * v);
         }
         if MISTAKE == RESTAMPS_STATES {
             reading.stamp = Some(MonotonicClock.now());
@@ -197,6 +254,7 @@ impl<const MISTAKE: u8> ManipulatorAdapter for Wrong<MISTAKE> {
             Self::spoil(&mut positions);
             return self.inner.write_joint_positions(&positions, velocity);
         }
+        self.goal = positions.try_into().ok();
         let result = self.inner.write_joint_positions(positions, velocity);
         if MISTAKE == MOVES_WITHOUT_POWER { Ok(()) } else { result }
     }
@@ -291,6 +349,11 @@ fn each_mistake_is_found_by_the_check_for_it() {
         (Wrong::<MOVES_WITHOUT_POWER>::SPEC, "disabled_arms_do_not_move"),
         (Wrong::<MOVES_WITHOUT_POWER>::FALLING, "disabled_arms_do_not_move"),
         (Wrong::<ALLOCATES_FOR_NEWS>::PUSHED, "reads_do_not_allocate"),
+        (Wrong::<ENABLES_AT_OLD_GOAL>::WIRED, "enabling_moves_nothing"),
+        (Wrong::<VELOCITIES_SCALED>::SERVOS, "velocities_are_those_of_motion"),
+        (Wrong::<TAKES_LATE_ANSWERS>::WIRED, "late_answers_are_not_new"),
+        (Wrong::<ENABLED_BY_ONE_MOTOR>::WIRED, "enabled_means_every_motor"),
+        (Wrong::<CONFIRMS_ALWAYS>::WIRED, "stop_without_answer"),
     ];
     std::thread::scope(|scope| {
         for (row, name) in cases {
@@ -310,6 +373,11 @@ fn without_a_mistake_the_same_checks_pass() {
     for (row, name) in [
         (Wrong::<NO_MISTAKE>::FALLING, "disabled_arms_do_not_move"),
         (Wrong::<NO_MISTAKE>::PUSHED, "reads_do_not_allocate"),
+        (Wrong::<NO_MISTAKE>::WIRED, "enabling_moves_nothing"),
+        (Wrong::<NO_MISTAKE>::SERVOS, "velocities_are_those_of_motion"),
+        (Wrong::<NO_MISTAKE>::WIRED, "late_answers_are_not_new"),
+        (Wrong::<NO_MISTAKE>::WIRED, "enabled_means_every_motor"),
+        (Wrong::<NO_MISTAKE>::WIRED, "stop_without_answer"),
     ] {
         let check = checks().find(|check| check.name == name).unwrap();
         assert_eq!(run(&row, check, Some(counting::allocations)), Outcome::Passed, "{name}");

@@ -2,11 +2,11 @@
 //! device thread did because no tick came; other refusals are reported as such.
 
 use std::sync::Arc;
-use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 use dimos::arm::{ArmCommand, ArmState, Interference, Link, Supervision};
-use dimos::clock::{Clock, MonotonicClock};
+use dimos::clock::{Clock, Mono, MonotonicClock};
 use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
@@ -30,6 +30,16 @@ struct Bench {
     mock: MockAdapter,
 }
 
+/// A clock that can jump forward, as it does for a process that was stopped.
+#[derive(Debug, Default)]
+struct JumpingClock(AtomicU64);
+
+impl Clock for JumpingClock {
+    fn now(&self) -> Mono {
+        MonotonicClock.now().after(Duration::from_nanos(self.0.load(Relaxed)))
+    }
+}
+
 fn bench(native_rate: f64) -> Bench {
     let mock = MockAdapter::new(6);
     bench_of(Box::new(mock.clone()), mock, native_rate)
@@ -39,6 +49,7 @@ fn bench(native_rate: f64) -> Bench {
 fn spawn(
     adapter: Box<dyn ManipulatorAdapter>,
     native_rate: f64,
+    clock: Arc<dyn Clock>,
 ) -> (Device, Arc<Heartbeat>, SlotReader<ArmState>, SlotWriter<ArmCommand>) {
     let beat = Arc::new(Heartbeat::default());
     let (state_writer, states) = slot(ArmState::default());
@@ -50,7 +61,7 @@ fn spawn(
         native_rate,
         supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
         beat: beat.clone(),
-        clock: Arc::new(MonotonicClock),
+        clock,
         notes: Box::new(|_| {}),
     };
     let device = Device::spawn(config, adapter, state_writer, command_reader).unwrap();
@@ -59,7 +70,12 @@ fn spawn(
 
 /// A connected and enabled arm with this adapter; `mock` is that adapter, or unused.
 fn bench_of(adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
-    let (device, beat, states, commands) = spawn(adapter, native_rate);
+    bench_on(Arc::new(MonotonicClock), adapter, mock, native_rate)
+}
+
+/// As above, on this clock.
+fn bench_on(clock: Arc<dyn Clock>, adapter: Box<dyn ManipulatorAdapter>, mock: MockAdapter, native_rate: f64) -> Bench {
+    let (device, beat, states, commands) = spawn(adapter, native_rate, clock);
     device.connect().wait(LIMIT).unwrap();
     device.activate().wait(LIMIT).unwrap();
     Bench { device, beat, states, commands, command: ArmCommand::default(), mock }
@@ -156,6 +172,22 @@ fn a_tick_that_was_charged_for_a_pause_of_the_computer_does_not_hang() {
     assert!(held_after >= Duration::from_millis(105), "it waits, and was held after {held_after:?}");
     tick.thread().unpark();
     tick.join().unwrap();
+    bench.end();
+}
+
+#[test]
+fn a_delay_of_the_device_thread_is_not_the_arms_silence() {
+    let (clock, mock) = (Arc::new(JumpingClock::default()), MockAdapter::new(6));
+    let mut bench = bench_on(clock.clone(), Box::new(mock.clone()), mock, 100.0);
+    // A setpoint waits for the acknowledgement of the one before.
+    for _ in 0..1000 {
+        bench.mock.fail("write_joint_velocities", AdapterError::Busy);
+    }
+    bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.03));
+    bench.until("the refusal", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
+    clock.0.fetch_add(65_000_000, Relaxed);
+    std::thread::sleep(Duration::from_millis(15));
+    assert!(!bench.states.read().self_held, "the process was stopped for 65 ms, the arm was not silent");
     bench.end();
 }
 
@@ -260,7 +292,7 @@ fn the_end_of_a_run_reports_an_arm_that_was_lost() {
 fn an_arm_that_was_never_connected_is_released_without_an_error() {
     let mock = MockAdapter::new(6);
     mock.fail("connect", AdapterError::Io("unplugged".into()));
-    let (device, ..) = spawn(Box::new(mock), 100.0);
+    let (device, ..) = spawn(Box::new(mock), 100.0, Arc::new(MonotonicClock));
     assert!(device.connect().wait(LIMIT).is_err());
     device.finish(true).wait(LIMIT).unwrap();
     device.join();

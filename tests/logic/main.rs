@@ -5,7 +5,7 @@
 mod support;
 
 #[global_allocator]
-static ALLOCATOR: support::counting::Counting = support::counting::Counting;
+static ALLOCATOR: dimos::rt::counting::Counting = dimos::rt::counting::Counting;
 
 mod adding_a_task;
 mod arm_phases;

@@ -24,9 +24,9 @@ use dimos::rt::slot::slot;
 use dimos::rt::wake::Wake;
 use dimos::telemetry::{ArmSample, Cause, Event, Phase, Sample, TaskState, TaskView};
 
-use crate::support::counting::{watch, watched_calls};
 use crate::support::delegate::delegate;
 use crate::support::rig::*;
+use dimos::rt::counting::{watch, watched_calls};
 
 #[test]
 fn the_counter_sees_allocation_growth_and_release() {

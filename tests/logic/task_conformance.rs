@@ -9,7 +9,7 @@ use dimos::control::task_spec::{BuildError, TaskSetup, TaskSpec, TaskTable};
 use dimos::control::tasks::{cartesian, velocity};
 use dimos::telemetry::Outcome;
 
-use crate::support::counting::allocations;
+use dimos::rt::counting::allocations;
 
 /// What is wrong with a row, check by check.
 pub fn failures(row: &TaskSpec) -> Vec<(&'static str, String)> {

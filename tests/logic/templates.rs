@@ -14,8 +14,7 @@ mod tcp;
 
 use dimos::hardware::conformance::{Outcome, checks, run};
 use dimos::hardware::registry::AdapterSpec;
-
-use crate::support::counting;
+use dimos::rt::counting;
 
 /// The suite over a row, its checks side by side.
 fn conforms(row: &AdapterSpec) {

@@ -161,6 +161,7 @@ fn stopped_repeatedly(with_emulator: bool, again: Option<Duration>) {
         if report.state != "COMPLETED" {
             let arm = three.home.status()["arms"][0].clone();
             println!("stopped for {time:?} ({took:?}): {:?}, {} {}", report.error, arm["phase"], arm["cause"]);
+            println!("{}", three.run.err());
             held += usize::from(took < LONGEST);
         }
         three.ready();

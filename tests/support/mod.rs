@@ -3,7 +3,6 @@
 #![allow(dead_code, reason = "each test binary uses a part")]
 
 pub mod busy;
-pub mod counting;
 pub mod crates;
 pub mod delegate;
 pub mod fake_arms;

@@ -1,12 +1,19 @@
 //! The conformance suite of dimos over the adapter: each check has an adapter and an emulator of its own.
 
 use dimos::hardware::conformance::{Outcome, checks, run};
+use dimos::rt::counting::{self, Counting};
+
+/// What runs in every cycle must not allocate: the suite counts.
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn the_adapter_conforms() {
     // The checks mostly wait for motion, so they run side by side.
     let outcomes: Vec<_> = std::thread::scope(|scope| {
-        let threads: Vec<_> = checks().map(|check| (check, scope.spawn(|| run(&acme::SPEC, check, None)))).collect();
+        let count = Some(counting::allocations as fn() -> u64);
+        let threads: Vec<_> =
+            checks().map(|check| (check, scope.spawn(move || run(&acme::SPEC, check, count)))).collect();
         threads.into_iter().map(|(check, thread)| (check, thread.join().unwrap())).collect()
     });
     let mut failures = 0;

@@ -177,6 +177,32 @@ impl Context {
         self.row.modes.first().copied().unwrap_or_default()
     }
 
+    /// Returns a mode for joint positions; `None` if it has none.
+    pub fn position_mode(&self) -> Option<ControlMode> {
+        [ControlMode::ServoPosition, ControlMode::Position].into_iter().find(|mode| self.row.modes.contains(mode))
+    }
+
+    /// Moves from `start` to `goal` [rad] in a position mode: by setpoints during half a second, or by one target.
+    pub fn stream(&mut self, start: &[f64], goal: &[f64]) -> Result<(), String> {
+        if self.adapter.get_control_mode() == ControlMode::ServoPosition {
+            for i in 1..=50 {
+                let part = f64::from(i) / 50.0;
+                let point: Vec<f64> = start.iter().zip(goal).map(|(a, b)| a + (b - a) * part).collect();
+                self.command(&point, 1.0)?;
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        } else {
+            self.command(goal, 0.5)?;
+        }
+        self.until("the last setpoint", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))
+    }
+
+    /// Returns the true joint positions of the emulated arm [rad]; `None` if they are unknown.
+    pub fn true_positions(&self) -> Option<Vec<f64>> {
+        let all = self.emulator.as_ref()?.true_positions()?;
+        Some(all.get(..self.config.dof).unwrap_or_default().to_vec())
+    }
+
     /// Returns joint positions [rad] that were measured after this call.
     pub fn positions(&mut self) -> Result<Vec<f64>, String> {
         let reading = self.joints()?;

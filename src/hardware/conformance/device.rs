@@ -1,10 +1,11 @@
 //! Reading the arm, its modes and its optional parts.
 
 use super::Check;
-use super::Needs::{Motion, Nothing};
+use super::Needs::{Faults, Motion, Nothing};
 use super::context::{Context, farthest, require};
 use super::streamed_state;
 use crate::hardware::adapter::{AdapterError, JointReading};
+use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
 
 /// The checks of this file.
@@ -13,6 +14,7 @@ pub const CHECKS: &[Check] = &[
     Check::new(Nothing, "positions_are_plausible", "positions are in rad, inside the limits", plausible),
     Check::new(Nothing, "stamps_are_of_the_past", "stamps increase and are never in the future", stamps),
     Check::new(Motion, "reads_do_not_allocate", "a cycle's reads and writes allocate nothing", no_allocation),
+    Check::new(Faults, "enabled_means_every_motor", "with one motor off it is not enabled", every_motor),
     Check::new(Motion, "modes_are_what_it_says", "its modes work, others are Unsupported", modes),
     Check::new(
         Motion,
@@ -41,6 +43,16 @@ fn reads_agree(context: &mut Context) -> Result<(), String> {
     let efforts = context.adapter.read_joint_efforts(&mut buffer).map_err(|e| e.to_string())?;
     require(efforts == reading.effort.is_some(), || "the two disagree on having torques".into())?;
     context.adapter.read_state().map(|_| ()).map_err(|e| format!("read_state: {e}"))
+}
+
+fn every_motor(context: &mut Context) -> Result<(), String> {
+    let joint = context.config.dof.min(2);
+    if context.emulator.is_none() || !context.prepare(Fault { joint, ..Fault::new(FaultKind::MotorOff) }) {
+        return context.skip("its emulator has no motor per joint");
+    }
+    context.ready(context.first_mode())?;
+    context.trigger_faults()?;
+    context.until("read_enabled to be false with one motor off", |context| Ok(!context.enabled()?))
 }
 
 fn plausible(context: &mut Context) -> Result<(), String> {

@@ -11,11 +11,17 @@ use crate::hardware::sim::faults::{Fault, FaultKind};
 /// Maximum duration of `connect` at an address that does not answer.
 const UNREACHABLE: Duration = Duration::from_secs(3);
 
+/// How far joints are moved by hand [rad].
+const BY_HAND: f64 = 0.1;
+/// Time in which an arm without brakes falls back to its rest.
+const FALL_TIME: Duration = Duration::from_secs(1);
+
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Nothing, "not_connected_is_said", "calls before connect return NotConnected", not_connected_is_said),
     Check::new(Nothing, "connecting_changes_nothing", "connect enables and moves nothing", connecting_changes_nothing),
     Check::new(Motion, "activation_holds", "activate enables and holds within 0.005 rad", activation_holds),
+    Check::new(Faults, "enabling_moves_nothing", "an arm moved by hand while disabled stays there", enabling_displaced),
     Check::new(Motion, "leaving_moves_nothing", "deactivate and disconnect move nothing", leaving_moves_nothing),
     Check::new(Nothing, "connects_twice", "connecting again, or after disconnecting, works", connects_twice),
     Check::new(Faults, "unreachable_is_clear", "an address without arm fails within 3 s", unreachable_is_clear),
@@ -66,6 +72,37 @@ fn activation_holds(context: &mut Context) -> Result<(), String> {
     let start = context.positions()?;
     context.activate()?;
     context.stays(&start, 0.005)
+}
+
+/// A servo goes to its old goal when its motor comes on, unless the goal is set to where the joint is before.
+fn enabling_displaced(context: &mut Context) -> Result<(), String> {
+    let joints = context.config.dof;
+    let by_hand = |joint| Fault { joint, amount: BY_HAND, ..Fault::new(FaultKind::Pushed) };
+    if context.emulator.is_none() || !(1..=joints).all(|joint| context.prepare(by_hand(joint))) {
+        return context.skip("its emulator cannot be moved by hand");
+    }
+    let mode = context.position_mode();
+    context.ready(mode.unwrap_or(context.first_mode()))?;
+    if mode.is_some() {
+        let start = context.positions()?;
+        let goal = context.nearby(&start)?;
+        context.stream(&start, &goal)?;
+    }
+    context.adapter.write_enable(false).map_err(|e| format!("write_enable: {e}"))?;
+    context.until("the motors to go off", |context| Ok(!context.enabled()?))?;
+    let rest = context.standstill()?;
+    for _ in 0..joints {
+        context.trigger_faults()?;
+    }
+    // An arm without brakes may have fallen, and fall back.
+    let begun = Instant::now();
+    context.until("the displacement", |context| {
+        let moved = farthest(&context.positions()?, &rest) > 0.5 * BY_HAND;
+        Ok(moved || (!context.row.holds_when_disabled && begun.elapsed() > FALL_TIME))
+    })?;
+    let displaced = context.standstill()?;
+    context.activate()?;
+    context.stays(&displaced, 0.005)
 }
 
 fn leaving_moves_nothing(context: &mut Context) -> Result<(), String> {

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use super::Check;
 use super::Needs::Motion;
 use super::context::{Context, farthest, require};
+use crate::hardware::adapter::JointReading;
 use crate::joint::ControlMode;
 
 /// The checks of this file.
@@ -12,6 +13,7 @@ pub const CHECKS: &[Check] = &[
     Check::new(Motion, "planned_moves_arrive", "each joint moves to its target, in rad", planned_moves_arrive),
     Check::new(Motion, "set_points_are_followed", "streamed positions are followed", set_points_are_followed),
     Check::new(Motion, "velocities_are_kept", "rad/s written is rad/s moved and read", velocities_are_kept),
+    Check::new(Motion, "velocities_are_those_of_motion", "rad/s read is rad/s moved, in position modes", measured),
     Check::new(Motion, "joints_are_the_arms_own", "values and order match the emulated joints", own_joints),
     Check::new(Motion, "disabled_arms_do_not_move", "commands without power are refused", disabled_arms),
     Check::new(Motion, "nonsense_is_refused", "NaN and wrong lengths are refused, nothing moves", nonsense),
@@ -38,22 +40,12 @@ fn set_points_are_followed(context: &mut Context) -> Result<(), String> {
     context.ready(ControlMode::ServoPosition)?;
     let start = context.positions()?;
     let target = context.nearby(&start)?;
-    for i in 1..=50 {
-        let part = f64::from(i) / 50.0;
-        let point: Vec<f64> = start.iter().zip(&target).map(|(a, b)| a + (b - a) * part).collect();
-        context.command(&point, 1.0)?;
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    context.until("the last setpoint", |context| Ok(farthest(&context.positions()?, &target) < 1e-3))
+    context.stream(&start, &target)
 }
 
 /// An adapter with the same mistake in both directions agrees with itself. The emulator's true positions reveal it.
 fn own_joints(context: &mut Context) -> Result<(), String> {
-    let truth = |context: &Context| {
-        let all = context.emulator.as_ref()?.true_positions()?;
-        Some(all.get(..context.config.dof).unwrap_or_default().to_vec())
-    };
-    if !context.row.modes.contains(&ControlMode::Position) || truth(context).is_none() {
+    if !context.row.modes.contains(&ControlMode::Position) || context.true_positions().is_none() {
         return context.skip("its emulator has no true positions");
     }
     context.ready(ControlMode::Position)?;
@@ -61,11 +53,11 @@ fn own_joints(context: &mut Context) -> Result<(), String> {
     let target = context.nearby(&start)?;
     for goal in [&target, &start] {
         let read = context.positions()?;
-        let found = truth(context).unwrap_or_default();
+        let found = context.true_positions().unwrap_or_default();
         require(farthest(&read, &found) < 1e-3, || format!("read {read:?}, the arm is at {found:?}"))?;
         context.command(goal, 0.5)?;
         context.until("arrival", |context| Ok(farthest(&context.positions()?, goal) < 1e-3))?;
-        let found = truth(context).unwrap_or_default();
+        let found = context.true_positions().unwrap_or_default();
         require(farthest(goal, &found) < 1e-3, || format!("sent to {goal:?}, the arm is at {found:?}"))?;
     }
     Ok(())
@@ -85,6 +77,68 @@ fn velocities_are_kept(context: &mut Context) -> Result<(), String> {
         }
     }
     result
+}
+
+/// Velocities are compared with the differences of positions: an arm may have no velocity mode.
+fn measured(context: &mut Context) -> Result<(), String> {
+    // A planned motion is smooth; between setpoints an arm may slow down.
+    let planned = context.row.modes.contains(&ControlMode::Position).then_some(ControlMode::Position);
+    let Some(mode) = planned.or(context.position_mode()) else { return context.skip("it has no position mode") };
+    context.ready(mode)?;
+    if context.joints()?.velocity.is_none() {
+        return context.skip("it measures no velocities");
+    }
+    let start = context.positions()?;
+    let away = context.nearby(&start)?;
+    // A busy machine may interrupt the stream of setpoints; a wrong adapter fails every time.
+    let mut result = compare_velocities(context, &start, &away);
+    for (from, to) in [(&away, &start), (&start, &away)] {
+        if result.is_err() {
+            let here = context.standstill()?;
+            context.stream(&here, from)?;
+            result = compare_velocities(context, from, to);
+        }
+    }
+    result
+}
+
+/// Moves from one pose to another; compares the distances with the integrals of the velocities read.
+fn compare_velocities(context: &mut Context, from: &[f64], to: &[f64]) -> Result<(), String> {
+    const POINTS: u32 = 60;
+    let servo = context.adapter.get_control_mode() == ControlMode::ServoPosition;
+    let dof = context.config.dof;
+    let mut travelled = vec![0.0; dof];
+    let mut last: Option<(f64, JointReading)> = None;
+    let mut first = None;
+    let began = Instant::now();
+    if !servo {
+        context.command(to, 0.2)?;
+    }
+    for i in 1..=POINTS {
+        if servo {
+            let part = f64::from(i) / f64::from(POINTS);
+            let point: Vec<f64> = from.iter().zip(to).map(|(a, b)| a + (b - a) * part).collect();
+            context.command(&point, 1.0)?;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+        let reading = context.joints()?;
+        let now = reading.stamp.map_or(began.elapsed().as_secs_f64(), |stamp| stamp.0 as f64 * 1e-9);
+        if let Some((then, before)) = last {
+            let ends = before.velocity.iter().flatten().zip(reading.velocity.iter().flatten());
+            for (sum, (a, b)) in travelled.iter_mut().zip(ends) {
+                *sum += 0.5 * (a + b) * (now - then);
+            }
+        }
+        first.get_or_insert(reading.position);
+        last = Some((now, reading));
+    }
+    let (Some(first), Some((_, end))) = (first, last) else { return Ok(()) };
+    for (i, ((a, b), sum)) in first.iter().zip(&end.position).zip(&travelled).enumerate() {
+        let moved = b - a;
+        let close = (moved - sum).abs() < if servo { 0.7 } else { 0.3 } * moved.abs() + 0.005;
+        require(close, || format!("joint {} moved by {moved:.4} rad; its velocities add up to {sum:.4} rad", i + 1))?;
+    }
+    Ok(())
 }
 
 fn stream_velocities(context: &mut Context) -> Result<(), String> {

@@ -15,9 +15,18 @@ use crate::hardware::sim::faults::{Fault, FaultKind};
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Faults, "silence_is_noticed", "readings of a silent arm are not new, and soon errors", silence),
+    Check::new(Faults, "late_answers_are_not_new", "a late answer is not taken for that to the next request", late),
     Check::new(Faults, "frozen_state_is_noticed", "a measurement that is repeated keeps its stamp", frozen),
 ];
 
+/// How late answers are [s]: beyond any adapter's patience with one of them.
+const STALLS: [f64; 5] = [0.02, 0.04, 0.06, 0.12, 0.25];
+/// Readings after each of them.
+const LATE_READINGS: u32 = 25;
+/// The reading whose answer is late.
+const LATE_FROM: u32 = 3;
+/// Tolerance of a position that was measured during the call [rad].
+const LATE_TOLERANCE: f64 = 0.002;
 /// How long an arm stays silent or frozen [s]: longer than any check.
 const FAULT_TIME: f64 = 60.0;
 /// Delayed states arrive within this time. Generous, because the emulator may have to wait for a processor.
@@ -76,6 +85,51 @@ fn silence(context: &mut Context) -> Result<(), String> {
     while MonotonicClock.now() < end {
         let now = look(context)?;
         require(now.is_err(), || "after the error, reading a silent arm succeeds".into())?;
+    }
+    Ok(())
+}
+
+/// While the arm moves, each reading must be of a time within its call. An adapter that takes the answer to an earlier
+/// request lags one reading behind from then on.
+fn late(context: &mut Context) -> Result<(), String> {
+    if !STALLS.iter().all(|seconds| context.prepare(Fault::new(FaultKind::Stall).lasting(*seconds))) {
+        return context.skip("its emulator cannot answer late");
+    }
+    let Some(mode) = context.position_mode() else { return context.skip("it has no position mode") };
+    context.ready(mode)?;
+    if context.adapter.state_fd().is_some() || context.true_positions().is_none() {
+        return context.skip("it has no requests for its state");
+    }
+    let start = context.positions()?;
+    let away = context.nearby(&start)?;
+    for _ in STALLS {
+        let mut answered = true;
+        for i in 0..LATE_READINGS {
+            // Back and forth, so that it moves at every reading.
+            let part = 0.5 - 0.5 * (f64::from(i) * std::f64::consts::TAU / f64::from(LATE_READINGS)).cos();
+            let point: Vec<f64> = start.iter().zip(&away).map(|(a, b)| a + (b - a) * part).collect();
+            if answered {
+                // That it is refused, or late, is no matter of this check.
+                let _ = context.adapter.write_joint_positions(&point, 1.0);
+            }
+            std::thread::sleep(Duration::from_millis(20));
+            if i == LATE_FROM {
+                context.trigger_faults()?;
+            }
+            let before = context.true_positions().unwrap_or_default();
+            let mut reading = JointReading::default();
+            let result = context.adapter.read_joints(&mut reading);
+            let after = context.true_positions().unwrap_or_default();
+            answered = result.is_ok();
+            if answered {
+                for (j, (q, (a, b))) in reading.position.iter().zip(before.iter().zip(&after)).enumerate() {
+                    let off = (a.min(*b) - q).max(q - a.max(*b));
+                    require(off <= LATE_TOLERANCE, || {
+                        format!("joint {}: after a late answer it reads {q:.4} rad, the arm is at {b:.4} rad", j + 1)
+                    })?;
+                }
+            }
+        }
     }
     Ok(())
 }

@@ -6,7 +6,7 @@ use super::Check;
 use super::Needs::{Faults, Motion};
 use super::context::{Context, farthest, require};
 use crate::clock::{Clock, MonotonicClock};
-use crate::hardware::adapter::AdapterError;
+use crate::hardware::adapter::{AdapterError, JointReading, Stop};
 use crate::hardware::device::gripper::GripperStop;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::joint::ControlMode;
@@ -24,9 +24,17 @@ pub const CHECKS: &[Check] = &[
         stop_is_no_fault,
     ),
     Check::new(Motion, "stop_holds_the_gripper", "after a stop a moving gripper can be held", stop_holds_gripper),
+    Check::new(
+        Faults,
+        "stop_without_answer",
+        "no stop is confirmed by an arm that does not answer",
+        stop_without_answer,
+    ),
     Check::new(Faults, "stop_in_error_is_harmless", "write_stop in error clears nothing", stop_in_error),
 ];
 
+/// How long an arm does not answer [s]: longer than any check.
+const SILENCE: f64 = 60.0;
 /// Speed of the planned move that is stopped, as a fraction of the top speed.
 const SLOW: f64 = 0.1;
 /// Speed of the stream that is stopped [rad/s].
@@ -187,6 +195,21 @@ fn gripper_stays(context: &mut Context, stopped: f64) -> Result<(), String> {
     std::thread::sleep(Duration::from_millis(300));
     let now = context.gripper()?.unwrap_or(f64::NAN);
     require((now - stopped).abs() < 0.001, || format!("it moved from {stopped:.4} to {now:.4} m"))
+}
+
+fn stop_without_answer(context: &mut Context) -> Result<(), String> {
+    if !context.prepare(Fault::new(FaultKind::Silent).lasting(SILENCE)) {
+        return context.skip("its emulator cannot be silent");
+    }
+    context.ready(context.first_mode())?;
+    context.trigger_faults()?;
+    // States that were on their way.
+    context.until("the silence", |context| Ok(context.adapter.read_joints(&mut JointReading::default()).is_err()))?;
+    for _ in 0..3 {
+        let result = context.adapter.write_stop();
+        require(result != Ok(Stop::Confirmed), || "a stop is confirmed although the arm is silent".into())?;
+    }
+    Ok(())
 }
 
 fn stop_in_error(context: &mut Context) -> Result<(), String> {

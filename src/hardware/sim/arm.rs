@@ -37,6 +37,8 @@ pub const PLAYABLE: &[FaultKind] = &[
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
+    FaultKind::Pushed,
+    FaultKind::MotorOff,
 ];
 
 /// Why the arm refuses a command.

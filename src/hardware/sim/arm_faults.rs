@@ -14,6 +14,12 @@ impl SimArm {
         if let Some(fault) = self.take_fault(FaultKind::ErrorCode) {
             self.fail(fault.code);
         }
+        if let Some(fault) = self.take_fault(FaultKind::Pushed) {
+            self.plant.push(fault.joint.saturating_sub(1), fault.amount);
+        }
+        if let Some(fault) = self.take_fault(FaultKind::MotorOff) {
+            self.plant.enable_joint(fault.joint.saturating_sub(1), false);
+        }
         let blocked = self.take_fault(FaultKind::Blocked).map(|fault| fault.joint.saturating_sub(1));
         (0..self.dof()).for_each(|joint| self.plant.block(joint, blocked == Some(joint)));
     }

@@ -52,6 +52,10 @@ pub enum FaultKind {
     Sag,
     /// Joint number `joint` does not move for `duration`.
     Blocked,
+    /// Joint number `joint` is moved by `amount` [rad], as by hand. A joint whose motor is on does not give way.
+    Pushed,
+    /// The motor of joint number `joint` loses its power; the other motors keep theirs.
+    MotorOff,
     /// The computer's CAN controller leaves the bus after too many errors.
     BusOff,
     /// The CAN interface has no room for frames to send.
@@ -102,10 +106,10 @@ pub struct Fault {
     #[serde(default = "default_code")]
     #[schemars(range(min = 1))]
     pub code: u16,
-    /// How far the arm sinks, for `sag` [rad].
+    /// How far the arm sinks, for `sag`, or a joint is moved, for `pushed` [rad].
     #[serde(default = "default_amount", deserialize_with = "non_negative")]
     pub amount: f64,
-    /// Number of the joint, from 1, for `blocked`.
+    /// Number of the joint, from 1, for `blocked`, `pushed` and `motor_off`.
     #[serde(default = "default_joint")]
     #[schemars(range(min = 1))]
     pub joint: usize,

@@ -246,6 +246,13 @@ impl Plant {
         }
     }
 
+    /// Moves a joint (index from 0) by `amount` [rad], as by hand: a joint whose motor is on does not give way.
+    pub fn push(&mut self, joint: usize, amount: f64) {
+        if let Some(joint) = self.active_mut().get_mut(joint).filter(|joint| !joint.on) {
+            joint.position = (joint.position + amount).max(joint.lower).min(joint.upper);
+        }
+    }
+
     /// Advances by `dt` [s].
     pub fn advance(&mut self, dt: f64) {
         let mut left = if dt.is_finite() { dt.max(0.0) } else { 0.0 };

@@ -41,6 +41,8 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Truncated,
     FaultKind::Sag,
     FaultKind::Blocked,
+    FaultKind::Pushed,
+    FaultKind::MotorOff,
     FaultKind::Leader,
     // Only on a bus in memory; the last of the list, in that order.
     FaultKind::Disconnect,

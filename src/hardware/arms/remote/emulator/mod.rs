@@ -31,6 +31,8 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
+    FaultKind::Pushed,
+    FaultKind::MotorOff,
 ];
 
 /// Starts an emulator at `place`, with the `sim` part of the arm's options. It ends when it is dropped.

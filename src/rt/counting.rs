@@ -1,9 +1,11 @@
-//! An allocator that counts what each thread asks of it. `logic/main.rs` makes it the binary's.
+//! Counting allocator, for tests: what must not allocate is called between two counts. A test binary installs it with
+//! `#[global_allocator]`.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-/// Counts, and passes every call on to the system's allocator.
+/// Counts the calls of each thread, and passes them on to the system's allocator.
+#[derive(Debug)]
 pub struct Counting;
 
 thread_local! {
@@ -46,17 +48,17 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// How many allocations the calling thread has made.
+/// Returns the number of allocations of the calling thread so far; 0 if the allocator is not installed.
 pub fn allocations() -> u64 {
     ALLOCATIONS.with(Cell::get)
 }
 
-/// Counts every call of the calling thread from now on, releases too; or no more.
+/// Starts or ends a watch over the calling thread, which counts every call, also those that free memory.
 pub fn watch(on: bool) {
     WATCHED.set(on);
 }
 
-/// How many calls [`watch`] saw on the calling thread.
+/// Returns the number of calls of the calling thread while it was watched.
 pub fn watched_calls() -> u64 {
     WATCHED_CALLS.get()
 }
