@@ -72,6 +72,11 @@ pub mod replay;
 pub mod cli;
 pub mod testing;
 
+/// The examples of `docs/kit.md`, as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../docs/kit.md")]
+pub struct KitPage;
+
 /// The examples of `docs/library.md`, as tests.
 #[cfg(doctest)]
 #[doc = include_str!("../docs/library.md")]

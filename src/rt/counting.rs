@@ -29,18 +29,21 @@ unsafe impl GlobalAlloc for Counting {
         unsafe { System.alloc(layout) }
     }
 
+    // SAFETY: as above.
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         count(true);
         // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.
         unsafe { System.alloc_zeroed(layout) }
     }
 
+    // SAFETY: as above.
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         count(true);
         // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.
         unsafe { System.realloc(pointer, layout, size) }
     }
 
+    // SAFETY: as above.
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         count(false);
         // SAFETY: the caller keeps the contract of `GlobalAlloc`, and so of `System`.

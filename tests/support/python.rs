@@ -6,8 +6,8 @@ use std::process::{Command, Stdio};
 
 use super::skip::skip_tool;
 
-/// The Python that has these packages; nothing where they are not installed. They are not imported: the vendors' write to
-/// the home folder when they are, and fail when several do at once.
+/// The Python that has these packages; nothing where they are not installed. They are not imported: that makes some
+/// write to the home folder, and fail where several do so at once.
 #[track_caller]
 pub fn python_with(packages: &[&str]) -> Option<PathBuf> {
     let python = Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python");

@@ -15,11 +15,11 @@ use crate::hardware::sim::faults::{Fault, FaultKind};
 /// The checks of this file.
 pub const CHECKS: &[Check] = &[
     Check::new(Faults, "silence_is_noticed", "readings of a silent arm are not new, and soon errors", silence),
-    Check::new(Faults, "late_answers_are_not_new", "a late answer is not taken for that to the next request", late),
+    Check::new(Faults, "late_answers_are_not_new", "a late answer does not count as the next one", late),
     Check::new(Faults, "frozen_state_is_noticed", "a measurement that is repeated keeps its stamp", frozen),
 ];
 
-/// How late answers are [s]: beyond any adapter's patience with one of them.
+/// How late answers are [s]: later than any adapter waits, at least once.
 const STALLS: [f64; 5] = [0.02, 0.04, 0.06, 0.12, 0.25];
 /// Readings after each of them.
 const LATE_READINGS: u32 = 25;

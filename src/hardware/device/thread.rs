@@ -81,6 +81,8 @@ pub(super) struct Worker {
     ordered_power: Option<bool>,
     /// Consecutive readings that disagree with what was ordered.
     disagreeing: u32,
+    /// How late this thread woke for the present cycle.
+    late: Duration,
     /// The tick, as seen by this thread.
     tick: tick_monitor::Seen,
     last_read: Mono,
@@ -107,6 +109,7 @@ impl Worker {
             ordered_mode: None,
             ordered_power: None,
             disagreeing: 0,
+            late: Duration::ZERO,
             tick: tick_monitor::Seen::default(),
             speed: 0.0,
             config,
@@ -168,7 +171,8 @@ impl Worker {
         };
         self.due.awake();
         let woke = self.config.clock.now();
-        self.see_tick(woke, woke.since(due));
+        self.late = woke.since(due);
+        self.see_tick(woke, self.late);
         loop {
             match orders.try_recv() {
                 Ok(order) => {

@@ -74,8 +74,9 @@ impl Incoming {
         Ok(n)
     }
 
-    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the given time and returns 0 if
-    /// none arrived.
+    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the given time (zero: not at all)
+    /// and returns 0 if none arrived. What has arrived when the time is over counts: in a process that is stopped and
+    /// continued, the wait ends as if interrupted.
     pub(super) fn receive<T>(
         &mut self,
         peer: &str,
@@ -84,17 +85,23 @@ impl Incoming {
         mut read: impl FnMut(&mut [u8], Duration) -> AdapterResult<usize>,
     ) -> AdapterResult<T> {
         let deadline = Instant::now() + timeout;
-        let mut left = timeout;
+        let (mut left, mut over) = (timeout, false);
         loop {
             if let Some(frame) = self.next(&mut scan) {
                 return Ok(frame);
             }
-            if left.is_zero() {
+            if over {
                 return Err(AdapterError::Timeout(format!("{peer} did not answer within {timeout:?}")));
             }
+            over = left.is_zero();
             self.fill(peer, |room| read(room, left))?;
             left = deadline.saturating_duration_since(Instant::now());
         }
+    }
+
+    /// Discards all received bytes.
+    pub(super) fn clear(&mut self) {
+        self.filled = 0..0;
     }
 
     fn used(&mut self, n: usize) {

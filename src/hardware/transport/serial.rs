@@ -128,6 +128,14 @@ impl SerialLink {
     }
 }
 
+impl SerialLink {
+    /// Discards everything received so far.
+    pub fn drain(&mut self) -> AdapterResult<()> {
+        self.incoming.clear();
+        tcflush(&self.line, QueueSelector::IFlush).map_err(|e| broken(&self.peer, e))
+    }
+}
+
 impl AsFd for SerialLink {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.line.as_fd()
@@ -318,6 +326,19 @@ mod tests {
         let mut link = link(&pty, 9600);
         pty.write(b"new\n").unwrap();
         assert_eq!(link.receive(WAIT, scan), Ok(b"new".to_vec()));
+    }
+
+    #[test]
+    fn received_bytes_can_be_discarded() {
+        let pty = Pty::open().unwrap();
+        let mut link = link(&pty, 9600);
+        pty.write(b"one\ntw").unwrap();
+        assert_eq!(link.receive(WAIT, scan), Ok(b"one".to_vec()));
+        pty.write(b"o\nthree\n").unwrap();
+        std::thread::sleep(Duration::from_millis(20));
+        link.drain().unwrap();
+        pty.write(b"four\n").unwrap();
+        assert_eq!(link.receive(WAIT, scan), Ok(b"four".to_vec()));
     }
 
     #[test]

@@ -154,6 +154,9 @@ impl TcpLink {
     pub fn receive<T>(&mut self, timeout: Duration, scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<T> {
         let Self { stream, peer, incoming, timeout: set } = self;
         incoming.receive(peer, timeout, scan, |room, left| {
+            if left.is_zero() {
+                return read_now(stream, peer, room);
+            }
             if *set != left {
                 stream.set_read_timeout(Some(left)).map_err(|e| broken(peer, &e))?;
                 *set = left;
@@ -169,6 +172,18 @@ impl TcpLink {
         })
     }
 
+    /// Discards everything received so far.
+    pub fn drain(&mut self) -> AdapterResult<()> {
+        self.incoming.clear();
+        let mut room = [0; 1024];
+        for _ in 0..MAX_READS {
+            if read_now(&self.stream, &self.peer, &mut room)? == 0 {
+                break;
+            }
+        }
+        Ok(())
+    }
+
     /// Returns the next frame among the received bytes, without waiting; `None` if there is none, or if too much noise
     /// comes before it: the connection is still readable then. `scan` as above.
     pub fn poll<T>(&mut self, mut scan: impl FnMut(&[u8]) -> Scan<T>) -> AdapterResult<Option<T>> {
@@ -177,19 +192,22 @@ impl TcpLink {
             if let Some(frame) = incoming.next(&mut scan) {
                 return Ok(Some(frame));
             }
-            let arrived = incoming.fill(peer, |room| {
-                match rustix::net::recv(&*stream, room, rustix::net::RecvFlags::DONTWAIT) {
-                    Ok((0, _)) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
-                    Ok((n, _)) => Ok(n),
-                    Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
-                    Err(e) => Err(broken(peer, &e.into())),
-                }
-            })?;
+            let arrived = incoming.fill(peer, |room| read_now(stream, peer, room))?;
             if arrived == 0 {
                 return Ok(None);
             }
         }
         Ok(incoming.next(&mut scan))
+    }
+}
+
+/// Reads what has arrived; 0 if nothing has.
+fn read_now(stream: &TcpStream, peer: &str, room: &mut [u8]) -> AdapterResult<usize> {
+    match rustix::net::recv(stream, room, rustix::net::RecvFlags::DONTWAIT) {
+        Ok((0, _)) => Err(AdapterError::Io(format!("{peer} closed the connection"))),
+        Ok((n, _)) => Ok(n),
+        Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
+        Err(e) => Err(broken(peer, &e.into())),
     }
 }
 
@@ -268,6 +286,24 @@ mod tests {
         assert_eq!(link.receive(wait, scan), Ok(b"#cd".to_vec()));
         let late = link.receive(Duration::from_millis(20), scan);
         assert!(matches!(late, Err(AdapterError::Timeout(_))), "{late:?}");
+    }
+
+    #[test]
+    fn what_has_arrived_counts_when_the_time_is_over() {
+        let mut link = TcpLink::connect("test", &peer(vec![b"#ab".to_vec()]), Duration::from_secs(2)).unwrap();
+        std::thread::sleep(Duration::from_millis(100));
+        assert_eq!(link.receive(Duration::ZERO, scan), Ok(b"#ab".to_vec()));
+        assert!(matches!(link.receive(Duration::ZERO, scan), Err(AdapterError::Timeout(_))));
+    }
+
+    #[test]
+    fn received_bytes_can_be_discarded() {
+        let pieces = [&b"#ab#c"[..], b"d#ef"].map(<[u8]>::to_vec).to_vec();
+        let mut link = TcpLink::connect("test", &peer(pieces), Duration::from_secs(2)).unwrap();
+        assert_eq!(link.receive(Duration::from_secs(5), scan), Ok(b"#ab".to_vec()));
+        std::thread::sleep(Duration::from_millis(100));
+        link.drain().unwrap();
+        assert!(matches!(link.receive(Duration::from_millis(20), scan), Err(AdapterError::Timeout(_))));
     }
 
     #[test]

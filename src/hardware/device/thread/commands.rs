@@ -5,6 +5,7 @@ use std::sync::atomic::Ordering::{Relaxed, Release};
 use std::time::Duration;
 
 use super::Worker;
+use super::tick_monitor::MAX_DELAY;
 use crate::arm::{ArmCommand, Interference};
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, Stop};
 use crate::joint::ControlMode;
@@ -177,9 +178,10 @@ impl Worker {
     }
 
     /// Discards setpoints in flight when the arm's state is stale: unacknowledged setpoints must not reach the arm
-    /// later.
+    /// later. While this thread was not run it could not see that the state is fresh.
     pub(super) fn discard_if_stale(&mut self, adapter: &mut dyn ManipulatorAdapter) {
-        let age = self.config.clock.now().since(self.state.stamp.max(self.last_read));
+        let own = if self.late < MAX_DELAY { self.late } else { Duration::ZERO };
+        let age = self.config.clock.now().since(self.state.stamp.max(self.last_read)).saturating_sub(own);
         let stale = age > self.config.state_timeout() && self.state.seq != 0;
         if self.connected && (self.in_flight > 0 || self.resend) && stale {
             self.trouble("setpoints are not acknowledged and no state arrives: pending setpoints discarded");

@@ -7,7 +7,7 @@ use crate::clock::Mono;
 
 /// Longest delay of this thread, or of a tick that got no processor, that is tolerated on top of the heartbeat's
 /// timeout.
-const MAX_DELAY: Duration = Duration::from_millis(100);
+pub(super) const MAX_DELAY: Duration = Duration::from_millis(100);
 /// How long this thread observes the processor time of a silent tick to tell one that hangs from one that waits.
 const OBSERVATION: Duration = Duration::from_millis(5);
 /// This thread woke late if it was later than this: the computer was stalled, including the tick.
