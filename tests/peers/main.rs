@@ -4,6 +4,7 @@
 mod support;
 
 mod can_kernel;
+mod feetech_sdk;
 mod piper_kernel;
 mod piper_sdk;
 mod xarm_sdk;

@@ -74,7 +74,7 @@ impl Incoming {
         Ok(n)
     }
 
-    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for the given time (not at all for 0)
+    /// Waits up to `timeout` for a frame that `scan` takes. `read` waits for bytes for that time (0: not at all)
     /// and returns 0 if none arrived. What has arrived when the time is over counts: in a process that is stopped and
     /// continued, the wait ends as if interrupted.
     pub(super) fn receive<T>(

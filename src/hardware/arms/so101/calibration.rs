@@ -1,0 +1,131 @@
+//! What the servos' counts mean: each joint's range and its zero, from LeRobot's calibration file or the data sheet.
+
+use std::f64::consts::TAU;
+use std::path::Path;
+
+use serde::Deserialize;
+
+use super::protocol::{SERVOS, TURN};
+
+/// The joints and the gripper, as LeRobot calls them.
+pub const NAMES: [&str; SERVOS] =
+    ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"];
+/// Ranges of the joints and the gripper [rad], from the arm's model file.
+const DATA_SHEET: [(f64, f64); SERVOS] =
+    [(-1.920, 1.920), (-1.745, 1.745), (-1.690, 1.690), (-1.658, 1.658), (-2.744, 2.841), (-0.175, 1.745)];
+/// The middle of a turn [counts]: zero of the data sheet.
+const MIDDLE: f64 = 2048.0;
+
+/// A servo in LeRobot's file.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+struct Entry {
+    id: u8,
+    homing_offset: i32,
+    range_min: i32,
+    range_max: i32,
+}
+
+/// Range and zero of a servo.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Range {
+    /// Lowest and highest position [counts].
+    pub low: i32,
+    /// Highest.
+    pub high: i32,
+    /// Position of zero [counts].
+    zero: f64,
+    /// The offset that the servo must have; `None`: any.
+    pub offset: Option<i32>,
+}
+
+impl Range {
+    /// Returns the angle of a position [rad].
+    pub fn angle(&self, counts: i32) -> f64 {
+        (f64::from(counts) - self.zero) * TAU / TURN
+    }
+
+    /// Returns the position inside the range that is closest to an angle [counts].
+    pub fn counts(&self, angle: f64) -> i32 {
+        ((angle * TURN / TAU + self.zero).round() as i32).max(self.low).min(self.high)
+    }
+
+    /// Returns the angles of the ends [rad].
+    pub fn angles(&self) -> (f64, f64) {
+        (self.angle(self.low), self.angle(self.high))
+    }
+}
+
+/// Ranges and zeros of all servos.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Calibration(pub [Range; SERVOS]);
+
+impl Default for Calibration {
+    /// That of the data sheet: zero in the middle of a turn.
+    fn default() -> Self {
+        Self(DATA_SHEET.map(|(low, high)| {
+            let counts = |angle: f64| angle * TURN / TAU + MIDDLE;
+            Range { low: counts(low).ceil() as i32, high: counts(high).floor() as i32, zero: MIDDLE, offset: None }
+        }))
+    }
+}
+
+impl Calibration {
+    /// Reads LeRobot's file; zero is the middle of each range. The error is a sentence without full stop.
+    pub fn load(path: &Path) -> Result<Self, String> {
+        let text = std::fs::read_to_string(path).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
+        Self::parse(&text).map_err(|e| format!("{}: {e}", path.display()))
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let file: std::collections::BTreeMap<String, Entry> =
+            serde_json::from_str(text).map_err(|e| format!("this is no calibration of LeRobot: {e}"))?;
+        let mut ranges = Self::default().0;
+        for ((name, id), range) in NAMES.into_iter().zip(1u8..).zip(&mut ranges) {
+            let entry = file.get(name).ok_or_else(|| format!("{name} is missing"))?;
+            if entry.id != id {
+                return Err(format!("{name} is servo {}, expected {id}", entry.id));
+            }
+            let (low, high) = (entry.range_min, entry.range_max);
+            if !(0 <= low && low < high && high < TURN as i32) {
+                return Err(format!("{name}: {low} to {high} is not a range within 0 to 4095"));
+            }
+            *range = Range { low, high, zero: 0.5 * f64::from(low + high), offset: Some(entry.homing_offset) };
+        }
+        Ok(Self(ranges))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FILE: &str = r#"{
+        "shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -50, "range_min": 758, "range_max": 3420},
+        "shoulder_lift": {"id": 2, "drive_mode": 0, "homing_offset": 12, "range_min": 900, "range_max": 3200},
+        "elbow_flex": {"id": 3, "drive_mode": 0, "homing_offset": 0, "range_min": 900, "range_max": 3100},
+        "wrist_flex": {"id": 4, "drive_mode": 0, "homing_offset": 7, "range_min": 950, "range_max": 3100},
+        "wrist_roll": {"id": 5, "drive_mode": 0, "homing_offset": 1, "range_min": 0, "range_max": 4095},
+        "gripper": {"id": 6, "drive_mode": 0, "homing_offset": 900, "range_min": 2000, "range_max": 3500}
+    }"#;
+
+    #[test]
+    fn zero_is_the_middle_of_the_range_in_lerobots_file() {
+        let Calibration([pan, .., gripper]) = Calibration::parse(FILE).unwrap();
+        assert_eq!((pan.low, pan.high, pan.offset), (758, 3420, Some(-50)));
+        assert!(pan.angle(2089).abs() < 1e-12 && (pan.angle(2089 + 1024) - TAU / 4.0).abs() < 1e-12);
+        assert_eq!(pan.counts(TAU / 8.0), 2089 + 512);
+        assert_eq!((pan.counts(9.0), pan.counts(-9.0)), (3420, 758), "never beyond the range");
+        assert_eq!(gripper.angles().1, 750.0 * TAU / TURN);
+    }
+
+    #[test]
+    fn mistakes_in_the_file_are_named() {
+        let wrong = |from: &str, to: &str| Calibration::parse(&FILE.replace(from, to)).unwrap_err();
+        assert_eq!(wrong("wrist_roll", "wrist"), "wrist_roll is missing");
+        assert_eq!(wrong(r#""id": 3"#, r#""id": 4"#), "elbow_flex is servo 4, expected 3");
+        assert_eq!(wrong("3420", "4096"), "shoulder_pan: 758 to 4096 is not a range within 0 to 4095");
+        assert!(wrong("range_max", "max").starts_with("this is no calibration of LeRobot"));
+        let error = Calibration::load(Path::new("/no/such/file")).unwrap_err();
+        assert!(error.starts_with("cannot read /no/such/file: "), "{error}");
+    }
+}

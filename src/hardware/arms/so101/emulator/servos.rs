@@ -1,0 +1,272 @@
+//! Six servos with their registers, on the joints of a simulated arm.
+
+use std::f64::consts::TAU;
+
+use super::wire::{ALL, packet, status};
+use super::{PLAYABLE, SPEED, SimOptions, limits};
+use crate::clock::Mono;
+use crate::hardware::adapter::AdapterResult;
+use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
+use crate::hardware::sim::faults::FaultKind;
+use crate::hardware::sim::stream::Controller;
+use crate::hardware::transport::Scan;
+
+/// Number of registers, and of servos.
+const REGISTERS: usize = 87;
+const SERVOS: usize = 6;
+/// Registers: EEPROM keeps its values without power; those from `READ_ONLY` on cannot be written.
+const MODEL: usize = 3;
+const LOWEST: usize = 9;
+const RAM: usize = 40;
+const TORQUE: usize = 40;
+const GOAL: usize = 42;
+const GOAL_SPEED: usize = 46;
+const LOCK: usize = 55;
+const READ_ONLY: std::ops::Range<usize> = 56..80;
+/// Speed at which joints without power fall [rad/s].
+const FALLING: f64 = 0.4;
+
+/// The servos of an arm.
+pub struct Servos {
+    arm: SimArm,
+    registers: [[u8; REGISTERS]; SERVOS],
+    /// Writes that wait for the instruction `action`: servo, address, bytes.
+    held: Vec<(usize, usize, Vec<u8>)>,
+    /// Whether the line returns what is sent.
+    echo: bool,
+    /// The fault of a wrong model.
+    wrong_model: bool,
+}
+
+impl Servos {
+    /// Creates servos that were just switched on.
+    pub fn new(options: &SimOptions, now: Mono) -> AdapterResult<Self> {
+        let limits = limits();
+        let arm = SimArm::new("so101", &limits, &options.common(), PLAYABLE, now)?.without_modes();
+        let mut registers = [[0; REGISTERS]; SERVOS];
+        for ((servo, id), (low, high)) in
+            registers.iter_mut().zip(1u8..).zip(limits.position_lower.iter().zip(&limits.position_upper))
+        {
+            let mut set = |address: usize, bytes: &[u8]| {
+                servo.iter_mut().skip(address).zip(bytes).for_each(|(register, byte)| *register = *byte);
+            };
+            set(0, &[3, 10, 0, 0x09, 0x03, id, 0, 0, 1]);
+            set(LOWEST, &(counts(*low).ceil() as u16).to_le_bytes());
+            set(LOWEST + 2, &(counts(*high).floor() as u16).to_le_bytes());
+            set(13, &[70, 140, 40, 0xE8, 0x03, 0x0C]);
+            set(21, &[32, 32, 0]);
+            set(34, &[20, 200, 80]);
+            set(84, &[254, 254, 0]);
+        }
+        let mut servos = Self { arm, registers, held: Vec::new(), echo: options.echo, wrong_model: false };
+        servos.power_up();
+        Ok(servos)
+    }
+
+    /// What is in RAM has its default.
+    fn power_up(&mut self) {
+        self.held.clear();
+        for servo in &mut self.registers {
+            servo.iter_mut().skip(RAM).take(16).for_each(|register| *register = 0);
+            // The torque limit.
+            let limit = [servo.get(16).copied(), servo.get(17).copied()].map(Option::unwrap_or_default);
+            servo.iter_mut().skip(48).zip(limit).for_each(|(register, byte)| *register = byte);
+            servo.iter_mut().skip(LOCK).take(1).for_each(|register| *register = 1);
+        }
+    }
+
+    /// From now on upper arm and forearm fall without power, to the end of their range. At power-up they are supported.
+    fn fall(&mut self) {
+        let limits = limits();
+        let (low, high) = (limits.position_lower.get(1).copied(), limits.position_upper.get(2).copied());
+        self.arm.falls(FALLING, &[None, low, high, None, None, None]);
+    }
+
+    fn byte(&self, servo: usize, address: usize) -> u8 {
+        self.registers.get(servo).and_then(|servo| servo.get(address)).copied().unwrap_or_default()
+    }
+
+    fn word(&self, servo: usize, address: usize) -> u16 {
+        u16::from_le_bytes([self.byte(servo, address), self.byte(servo, address + 1)])
+    }
+
+    /// The error bits of a servo.
+    fn error(&self, servo: usize) -> u8 {
+        if servo == 0 { self.arm.error() as u8 } else { 0 }
+    }
+
+    /// What is read from registers of a servo.
+    fn read(&self, servo: usize, address: usize, length: usize) -> Vec<u8> {
+        let (positions, velocities) = self.arm.joints();
+        let at = |values: &[f64]| values.get(servo).copied().unwrap_or_default();
+        let mut all = self.registers.get(servo).copied().unwrap_or([0; REGISTERS]);
+        let mut set = |address: usize, bytes: &[u8]| {
+            all.iter_mut().skip(address).zip(bytes).for_each(|(register, byte)| *register = *byte);
+        };
+        if self.wrong_model {
+            set(MODEL, &2825u16.to_le_bytes());
+        }
+        set(TORQUE, &[u8::from(self.arm.motor(servo))]);
+        set(56, &with_sign(counts(at(&positions)).round() as i32).to_le_bytes());
+        let speed = at(&velocities) * 4096.0 / TAU;
+        set(58, &with_sign(speed.round() as i32).to_le_bytes());
+        set(60, &[0, 0, 120, 31, u8::from(self.held.iter().any(|(held, ..)| *held == servo)), self.error(servo)]);
+        set(66, &[u8::from(speed.abs() > 3.0)]);
+        (address..address + length).map(|i| all.get(i).copied().unwrap_or_default()).collect()
+    }
+
+    /// Writes registers of a servo, as far as they can be written.
+    fn write(&mut self, servo: usize, address: usize, values: &[u8]) {
+        let Some(registers) = self.registers.get_mut(servo) else { return };
+        for (i, value) in (address..).zip(values) {
+            if let Some(register) = registers.get_mut(i).filter(|_| !READ_ONLY.contains(&i)) {
+                *register = *value;
+            }
+        }
+        let touches = |register: usize| (address..address + values.len()).contains(&register);
+        if touches(TORQUE) {
+            let on = self.byte(servo, TORQUE) == 1;
+            if on != self.arm.motor(servo) {
+                self.arm.enable_joint(servo, on);
+                if !on {
+                    self.fall();
+                }
+            }
+        }
+    }
+
+    /// Sends the joints to the goals in the registers. A servo whose goal is where it is has no overload.
+    fn go(&mut self) {
+        let mut goals = [0.0; SERVOS];
+        let (positions, velocities) = self.arm.joints();
+        for (servo, ((goal, position), velocity)) in goals.iter_mut().zip(&positions).zip(&velocities).enumerate() {
+            let (low, high) = (self.word(servo, LOWEST), self.word(servo, LOWEST + 2));
+            let wanted = self.word(servo, GOAL).max(low).min(high.max(low));
+            *goal = radians(f64::from(wanted));
+            // A joint at rest less than a count away stays.
+            if velocity.abs() < 1e-3 && (*goal - position).abs() < radians(2049.0) {
+                *goal = *position;
+            }
+        }
+        let near = |servo: usize| {
+            let off = goals.get(servo).zip(positions.get(servo)).map_or(0.0, |(goal, position)| goal - position);
+            off.abs() < 0.01
+        };
+        if self.arm.error() != 0 && near(0) {
+            let _ = self.arm.clear_error();
+        }
+        let speed = f64::from(self.word(0, GOAL_SPEED)) * TAU / 4096.0 / SPEED;
+        if self.arm.error() == 0 {
+            self.arm.take_goal(&goals, if speed > 0.0 { speed.min(1.0) } else { 1.0 }, speed == 0.0);
+        }
+    }
+
+    /// Executes an instruction; puts statuses into `answer`.
+    fn execute(&mut self, id: u8, instruction: u8, parameters: &[u8], answer: &mut Vec<u8>) {
+        let listed = |id: u8| (1..=SERVOS as u8).contains(&id).then(|| usize::from(id) - 1);
+        match (instruction, parameters) {
+            (0x01, []) => {
+                let pinged = (1..=SERVOS as u8).filter(|servo| id == ALL || id == *servo);
+                pinged.for_each(|servo| status(answer, servo, self.error(usize::from(servo) - 1), &[]));
+            }
+            (0x02, [address, length]) => {
+                if let Some(servo) = listed(id) {
+                    let data = self.read(servo, (*address).into(), (*length).into());
+                    status(answer, id, self.error(servo), &data);
+                }
+            }
+            (0x03 | 0x04, [address, values @ ..]) => {
+                let chosen: Vec<usize> =
+                    if id == ALL { (0..SERVOS).collect() } else { listed(id).into_iter().collect() };
+                for servo in &chosen {
+                    if instruction == 0x03 {
+                        self.write(*servo, (*address).into(), values);
+                    } else {
+                        self.held.push((*servo, (*address).into(), values.to_vec()));
+                    }
+                }
+                if instruction == 0x03 {
+                    self.go();
+                }
+                if let Some(servo) = listed(id) {
+                    status(answer, id, self.error(servo), &[]);
+                }
+            }
+            (0x05, []) => {
+                for (servo, address, values) in std::mem::take(&mut self.held) {
+                    self.write(servo, address, &values);
+                }
+                self.go();
+            }
+            (0x82, [address, length, ids @ ..]) => {
+                for (id, servo) in ids.iter().filter_map(|id| Some((*id, listed(*id)?))) {
+                    let data = self.read(servo, (*address).into(), (*length).into());
+                    status(answer, id, self.error(servo), &data);
+                }
+            }
+            (0x83, [address, length, values @ ..]) => {
+                for chunk in values.chunks_exact(usize::from(*length) + 1) {
+                    if let [id, values @ ..] = chunk
+                        && let Some(servo) = listed(*id)
+                    {
+                        self.write(servo, (*address).into(), values);
+                    }
+                }
+                self.go();
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Position of an angle [counts], zero in the middle of the turn.
+fn counts(angle: f64) -> f64 {
+    2048.0 + angle * 4096.0 / TAU
+}
+
+/// Angle of a position [rad].
+fn radians(counts: f64) -> f64 {
+    (counts - 2048.0) * TAU / 4096.0
+}
+
+/// A number with its sign in the highest bit.
+fn with_sign(value: i32) -> u16 {
+    let size = value.unsigned_abs().min(0x7FFF) as u16;
+    if value < 0 { size | 0x8000 } else { size }
+}
+
+impl HasArm for Servos {
+    fn arm(&mut self) -> &mut SimArm {
+        &mut self.arm
+    }
+}
+
+impl Controller for Servos {
+    fn serve(&mut self, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
+        let (id, instruction, parameters, length) = match packet(bytes) {
+            Scan::More => return Scan::More,
+            Scan::Skip(n) => return Scan::Skip(n),
+            Scan::Take(n, packet) => (packet.id, packet.instruction, packet.parameters, n),
+        };
+        self.arm.client_came();
+        self.arm.advance(now);
+        if self.arm.take_fault(FaultKind::WrongModel).is_some() {
+            self.wrong_model = true;
+        }
+        self.execute(id, instruction, &parameters, answer);
+        // Only what is answered can be lost.
+        let delivery = if answer.is_empty() { Delivery::Send } else { self.arm.delivery() };
+        if matches!(delivery, Delivery::PowerLoss(_)) {
+            self.power_up();
+        }
+        if self.echo {
+            drop(answer.splice(0..0, bytes.iter().take(length).copied()));
+        }
+        Scan::Take(length, delivery)
+    }
+
+    /// Servos do not know their client.
+    fn client_gone(&mut self, now: Mono) {
+        self.arm.advance(now);
+    }
+}

@@ -1,0 +1,117 @@
+//! SO-101 (and SO-100): five joints and a gripper of Feetech STS3215 servos on one half-duplex serial line.
+//!
+//! `protocol.rs` has the bytes, `calibration.rs` what counts mean, `adapter.rs` the lifecycle, `emulator/` the servos'
+//! side of the line.
+
+pub mod adapter;
+pub mod calibration;
+pub mod emulator;
+pub mod protocol;
+#[cfg(test)]
+mod tests;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::hardware::transport::serial::SerialAddress;
+use crate::joint::{ControlMode, JointLimits};
+use calibration::Calibration;
+use emulator::SimOptions;
+
+/// Number of joints.
+pub const DOF: usize = 5;
+/// The modes: the servos take goals at any time, with a top speed or without.
+const MODES: &[ControlMode] = &[ControlMode::ServoPosition, ControlMode::Position];
+/// Rate at which all servos are read [Hz]: a request for their state takes 2.4 ms of the line.
+const NATIVE_RATE: f64 = 100.0;
+/// Without power the arm falls: its gears do not hold it.
+const HOLDS_WHEN_DISABLED: bool = false;
+/// Opening of the gripper at its tips when it is open [m].
+const GRIPPER_MAX: f64 = 0.1;
+/// Rate of the line, where an address names none [bit/s].
+const BAUD: u32 = 1_000_000;
+/// Top speed [rad/s], acceleration [rad/s²] and jerk [rad/s³] of every joint: less than a servo's 45 rpm without load.
+const TOP_SPEED: f64 = 3.0;
+const ACCELERATION: f64 = 15.0;
+const JERK: f64 = 200.0;
+
+/// The arm's row in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "so101",
+    about: "SO-101 and SO-100, Feetech STS3215 servos",
+    level: Level::Emulated,
+    transport: "serial",
+    dof: (DOF, DOF),
+    modes: MODES,
+    wire_units: "counts",
+    native_rate: NATIVE_RATE,
+    accuracy: 0.03,
+    lag: 0.06,
+    stale_after: Duration::from_millis(100),
+    address: AddressForm {
+        form: "/dev/ttyX[@BAUD]",
+        required: true,
+        check: |address| SerialAddress::parse(address, BAUD).map(|address| address.to_string()),
+    },
+    holds_when_disabled: HOLDS_WHEN_DISABLED,
+    gripper: true,
+    options: OptionsSpec::of::<Options>(),
+    check,
+    create: |config| Ok(Box::new(adapter::So101Adapter::new(config)?)),
+    emulate: Some(|config, place| Ok(Box::new(emulator::start(config, place)?))),
+};
+
+/// Checks the number of joints, the options and the calibration file; returns the joint limits.
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
+    config.check_dof("so101", SPEC.dof)?;
+    let options = config.options::<Options>()?;
+    options.sim.check()?;
+    Ok(Checked { limits: limits(&options.calibration()?) })
+}
+
+/// Returns the joint limits of a calibrated arm in SI units.
+fn limits(calibration: &Calibration) -> JointLimits {
+    let ranges = calibration.0.iter().take(DOF).map(calibration::Range::angles);
+    let (position_lower, position_upper) = ranges.unzip();
+    JointLimits {
+        position_lower,
+        position_upper,
+        velocity_max: vec![TOP_SPEED; DOF],
+        acceleration_max: vec![ACCELERATION; DOF],
+        jerk_max: vec![JERK; DOF],
+    }
+}
+
+/// What a blueprint may set of an SO-101.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// LeRobot's calibration file of this arm, such as `~/.cache/huggingface/lerobot/calibration/robots/…/my_arm.json`.
+    /// Without one, zero of each joint is the middle of its servo's turn.
+    pub calibration: Option<PathBuf>,
+    /// Whether the line returns what is sent on it.
+    pub echo: bool,
+    /// Settings of the emulator.
+    pub sim: SimOptions,
+}
+
+impl Options {
+    /// Reads the calibration file, if there is one.
+    fn calibration(&self) -> Result<Calibration, ConfigError> {
+        let load = |path: &PathBuf| Calibration::load(&expanded(path)).map_err(|e| ConfigError::new("calibration", e));
+        self.calibration.as_ref().map_or(Ok(Calibration::default()), load)
+    }
+}
+
+/// Replaces a leading `~` by the home folder.
+fn expanded(path: &std::path::Path) -> PathBuf {
+    match (path.strip_prefix("~"), std::env::var_os("HOME")) {
+        (Ok(rest), Some(home)) => PathBuf::from(home).join(rest),
+        _ => path.to_owned(),
+    }
+}

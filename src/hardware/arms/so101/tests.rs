@@ -1,0 +1,120 @@
+//! The adapter against the emulated servos.
+
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use super::adapter::So101Adapter;
+use super::emulator::start;
+use super::{DOF, SPEC};
+use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::joint::ControlMode;
+
+/// An adapter and its servos.
+fn arm(options: serde_json::Value) -> (So101Adapter, Box<dyn Emulator>) {
+    let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: DOF, options };
+    let servos = start(&config, &EmulatorAddress::InProcess).unwrap();
+    config.address = servos.address();
+    (So101Adapter::new(&config).unwrap(), Box::new(servos))
+}
+
+fn positions(adapter: &mut So101Adapter) -> [f64; DOF] {
+    let mut positions = [0.0; DOF];
+    adapter.read_joint_positions(&mut positions).unwrap();
+    positions
+}
+
+fn until(mut done: impl FnMut() -> bool) {
+    let began = Instant::now();
+    while !done() {
+        assert!(began.elapsed() < Duration::from_secs(10));
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_lost_a_damaged_and_a_late_answer_cost_no_reading() {
+    let (mut adapter, servos) = arm(json!({}));
+    adapter.connect().unwrap();
+    let start = positions(&mut adapter);
+    for fault in [
+        Fault::new(FaultKind::Silent),
+        Fault::new(FaultKind::Corrupt),
+        Fault::new(FaultKind::Truncated),
+        Fault::new(FaultKind::Garbage),
+        Fault::new(FaultKind::Stall).lasting(0.02),
+    ] {
+        servos.inject(fault).unwrap();
+        assert_eq!(positions(&mut adapter), start, "{:?}", fault.kind);
+    }
+}
+
+#[test]
+fn joints_and_gripper_move_in_radians_and_metres() {
+    for echo in [false, true] {
+        let (mut adapter, servos) = arm(json!({"echo": echo, "sim": {"echo": echo}}));
+        adapter.connect().unwrap();
+        adapter.activate().unwrap();
+        adapter.set_control_mode(ControlMode::Position).unwrap();
+        let goal = [0.2, -0.3, 0.4, -0.1, 0.5];
+        adapter.write_joint_positions(&goal, 1.0).unwrap();
+        let near = |found: &[f64]| found.iter().zip(goal).all(|(a, b)| (a - b).abs() < 2e-3);
+        until(|| near(&positions(&mut adapter)));
+        assert!(near(&servos.true_positions().unwrap()[..DOF]));
+        adapter.write_gripper_position(0.07).unwrap();
+        until(|| (adapter.read_gripper_position().unwrap().unwrap() - 0.07).abs() < 1e-3);
+        assert!(near(&positions(&mut adapter)), "the joints stay");
+        // 0.07 of 0.1 m, between −0.175 and 1.745 rad.
+        assert!((servos.true_positions().unwrap()[DOF] - 1.169).abs() < 0.03);
+        assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+        assert!(adapter.write_gripper_position(0.11).is_err());
+    }
+}
+
+#[test]
+fn a_joint_outside_its_range_is_not_enabled() {
+    // The calibration says that the first joint ends at 2100 counts; it is at 2048 + 326.
+    let home = tempfile::tempdir().unwrap();
+    let path = home.path().join("arm.json");
+    let names = super::calibration::NAMES;
+    let entry =
+        |id: usize| json!({"id": id + 1, "drive_mode": 0, "homing_offset": 0, "range_min": 1000, "range_max": 3100});
+    let mut file: serde_json::Map<_, _> =
+        names.iter().enumerate().map(|(i, name)| ((*name).into(), entry(i))).collect();
+    std::fs::write(&path, serde_json::to_string(&file).unwrap()).unwrap();
+    let (mut adapter, _servos) = arm(json!({"calibration": path}));
+    let error = adapter.connect().unwrap_err().to_string();
+    assert!(error.contains("servo 1 (shoulder_pan) has the range 797 to 3299 and the offset 0"), "{error}");
+    assert!(error.contains("\nhint: "), "{error}");
+    file.remove("gripper");
+    std::fs::write(&path, serde_json::to_string(&file).unwrap()).unwrap();
+    let options = json!({"calibration": path});
+    let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: DOF, options };
+    let error = (SPEC.check)(&config).unwrap_err();
+    assert!(error.what.ends_with("arm.json: gripper is missing"), "{}", error.what);
+}
+
+#[test]
+fn a_servo_that_does_not_answer_is_named() {
+    let (mut adapter, servos) = arm(json!({}));
+    servos.inject(Fault::new(FaultKind::Silent).lasting(20.0)).unwrap();
+    let error = adapter.connect().unwrap_err();
+    assert!(matches!(&error, AdapterError::Timeout(text) if text.contains("servo 1 (shoulder_pan)")), "{error}");
+    assert!(error.to_string().contains("\nhint: is the arm powered"), "{error}");
+}
+
+#[test]
+fn an_overload_is_reported_and_ends_when_the_goal_is_where_the_joint_is() {
+    let (mut adapter, servos) = arm(json!({}));
+    adapter.connect().unwrap();
+    adapter.activate().unwrap();
+    servos.inject(Fault::new(FaultKind::ErrorCode).code(0x20)).unwrap();
+    until(|| adapter.read_error().unwrap() == (0x20, "servo 1 (shoulder_pan): overload".into()));
+    let here = positions(&mut adapter);
+    assert!(matches!(adapter.write_joint_positions(&here, 1.0), Err(AdapterError::Fault { code: 0x20, .. })));
+    adapter.write_clear_errors().unwrap();
+    assert_eq!(adapter.read_error().unwrap(), (0, String::new()));
+    adapter.write_joint_positions(&here, 1.0).unwrap();
+}
