@@ -188,12 +188,14 @@ impl Report {
                 vec![row.outcome.to_owned(), row.name.to_owned(), detail]
             })
             .collect();
-        let more = self.checks.iter().filter(hidden).count();
-        if more > 0 {
-            let name = format!("{more} more");
+        let unchecked: Vec<&str> = self.checks.iter().filter(hidden).map(|row| row.name).collect();
+        let mut notes = Vec::new();
+        if !unchecked.is_empty() {
+            let name = format!("{} more", unchecked.len());
             rows.push(vec!["skipped".to_owned(), name, "they move the arm fast or cut its wire: --address sim".into()]);
+            notes.push(format!("not checked on this arm: {}", unchecked.join(", ")));
         }
-        Part { title: "checks", headings: vec!["", "CHECK", "FOUND"], rows, notes: Vec::new() }
+        Part { title: "checks", headings: vec!["", "CHECK", "FOUND"], rows, notes }
     }
 
     fn limits_part(&self) -> Part {

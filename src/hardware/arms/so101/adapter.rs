@@ -24,11 +24,13 @@ use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 /// Servos may just be starting. With six of them: below 3 s.
 const INTRODUCTION: Retry = Retry { each: Duration::from_millis(40), times: 5 };
 /// Longest wait for the state of all servos. All attempts together stay below `stale_after`.
-const CYCLE: Retry = Retry { each: Duration::from_millis(15), times: 3 };
+const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
 /// Longest wait until the line takes a command.
 const SEND_TIMEOUT: Duration = Duration::from_millis(100);
-/// A state answers further questions for this time.
+/// A state answers further questions for this time, and tells for this time whether a setpoint may be written: it is
+/// read once a cycle.
 const STATE_AGE: Duration = Duration::from_millis(5);
+const WRITABLE: Duration = Duration::from_millis(50);
 /// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
 const WRITES: u32 = 4;
 /// A goal this far from the joint is that joint's position [counts]: encoders flicker.
@@ -128,8 +130,12 @@ impl So101Adapter {
 
     /// Returns the last state, or a new one when that is too old.
     fn recent(&mut self) -> AdapterResult<[Servo; SERVOS]> {
+        self.not_older(STATE_AGE)
+    }
+
+    fn not_older(&mut self, age: Duration) -> AdapterResult<[Servo; SERVOS]> {
         match self.state {
-            Some((servos, at)) if self.line.is_open() && MonotonicClock.now().since(at) <= STATE_AGE => Ok(servos),
+            Some((servos, at)) if self.line.is_open() && MonotonicClock.now().since(at) <= age => Ok(servos),
             _ => self.fetch(),
         }
     }
@@ -179,7 +185,7 @@ impl So101Adapter {
 
     /// Writes goals of the joints with a top speed [counts/s, 0 = none]; the gripper keeps its own.
     fn drive(&mut self, joints: [f64; DOF], speed: u16) -> AdapterResult<()> {
-        let servos = self.recent()?;
+        let servos = self.not_older(WRITABLE)?;
         if let Some(joint) = servos.iter().take(DOF).position(|servo| !servo.on) {
             return Err(AdapterError::Rejected(format!("the motor of joint {} is off", joint + 1)));
         }
