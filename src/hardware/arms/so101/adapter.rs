@@ -39,6 +39,8 @@ const SAME: i32 = 3;
 const DROOP: i32 = 40;
 /// Acceleration of the servos, the highest [100 counts/s²].
 const ACCELERATION: u8 = 254;
+/// Below this the servos answer, but have no force [0.1 V].
+const LOWEST_VOLTAGE: u8 = 55;
 /// Slowest planned motion [counts/s]: zero would be the fastest.
 const SLOWEST: f64 = 10.0;
 
@@ -352,6 +354,12 @@ impl ManipulatorAdapter for So101Adapter {
             if servos.iter().all(|servo| servo.on) {
                 return Ok(());
             }
+            if let Some(servo) = servos.iter().find(|servo| servo.voltage < LOWEST_VOLTAGE) {
+                let volts = f64::from(servo.voltage) * 0.1;
+                return Err(AdapterError::Rejected(format!(
+                    "so101: the servos have {volts:.1} V\nhint: switch the arm's power supply on; USB gives them no force"
+                )));
+            }
             let held = self.hold_goals(&servos)?;
             // A motor that is on keeps its goal.
             let mut goals = servos.map(|servo| servo.goal);
@@ -371,8 +379,14 @@ impl ManipulatorAdapter for So101Adapter {
         if error_of(&servos).is_none() {
             return Ok(());
         }
-        // An overload ends when the goal no longer asks for force.
-        let goals = self.hold_goals(&servos)?;
+        // An overload ends when the goal no longer asks for force. The other servos keep theirs.
+        let held = self.hold_goals(&servos)?;
+        let mut goals = servos.map(|servo| servo.goal);
+        for ((goal, servo), held) in goals.iter_mut().zip(&servos).zip(held) {
+            if servo.error != 0 {
+                *goal = held;
+            }
+        }
         self.write_goals(goals)?;
         match error_of(&self.fetch()?) {
             None => Ok(()),

@@ -151,8 +151,6 @@ pub struct Servo {
     pub velocity: i32,
     /// Supply voltage [0.1 V].
     pub voltage: u8,
-    /// Temperature [°C].
-    pub temperature: u8,
     /// Error bits; 0 = none.
     pub error: u8,
     /// Whether it moves.
@@ -171,7 +169,6 @@ impl Servo {
             position: signed(word(56), 15),
             velocity: signed(word(58), 15),
             voltage: byte(62),
-            temperature: byte(63),
             error: byte(65),
             moving: byte(66) != 0,
         })

@@ -97,6 +97,15 @@ fn a_joint_outside_its_range_is_not_enabled() {
 }
 
 #[test]
+fn servos_without_a_power_supply_are_not_enabled() {
+    let (mut adapter, _servos) = arm(json!({"sim": {"voltage": 5.0}}));
+    adapter.connect().unwrap();
+    let error = adapter.activate().unwrap_err().to_string();
+    assert!(error.starts_with("so101: the servos have 5.0 V\nhint: "), "{error}");
+    assert!(!adapter.read_enabled().unwrap());
+}
+
+#[test]
 fn a_servo_that_does_not_answer_is_named() {
     let (mut adapter, servos) = arm(json!({}));
     servos.inject(Fault::new(FaultKind::Silent).lasting(20.0)).unwrap();

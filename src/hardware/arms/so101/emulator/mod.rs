@@ -23,6 +23,7 @@ use servos::Servos;
 const PLAYABLE: &[FaultKind] = &[
     FaultKind::Stall,
     FaultKind::Silent,
+    FaultKind::Disconnect,
     FaultKind::ErrorCode,
     FaultKind::PowerLoss,
     FaultKind::Garbage,
@@ -54,13 +55,16 @@ pub struct SimOptions {
     pub droop: f64,
     /// Whether the line returns what is sent on it.
     pub echo: bool,
+    /// Supply voltage, 4 to 14 [V].
+    #[schemars(range(min = 4, max = 14))]
+    pub voltage: f64,
     /// Faults, and when they begin (seconds after the first request).
     pub faults: Vec<Fault>,
 }
 
 impl Default for SimOptions {
     fn default() -> Self {
-        Self { initial_positions: Vec::new(), lag: 0.03, droop: 0.0, echo: false, faults: Vec::new() }
+        Self { initial_positions: Vec::new(), lag: 0.03, droop: 0.0, echo: false, voltage: 12.0, faults: Vec::new() }
     }
 }
 
@@ -76,6 +80,9 @@ impl SimOptions {
 
     /// Returns an error for values that the emulator cannot have.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
+        if !(4.0..=14.0).contains(&self.voltage) {
+            return Err(ConfigError::new("sim.voltage", format!("{} is not between 4 and 14 V", self.voltage)));
+        }
         self.common().check("so101", &limits(), PLAYABLE)
     }
 }

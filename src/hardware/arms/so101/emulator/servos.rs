@@ -34,6 +34,8 @@ pub struct Servos {
     held: Vec<(usize, usize, Vec<u8>)>,
     /// Whether the line returns what is sent.
     echo: bool,
+    /// Supply voltage [0.1 V].
+    voltage: u8,
     /// The fault of a wrong model.
     wrong_model: bool,
 }
@@ -58,7 +60,14 @@ impl Servos {
             set(34, &[20, 200, 80]);
             set(84, &[254, 254, 0]);
         }
-        let mut servos = Self { arm, registers, held: Vec::new(), echo: options.echo, wrong_model: false };
+        let mut servos = Self {
+            arm,
+            registers,
+            held: Vec::new(),
+            echo: options.echo,
+            voltage: (options.voltage * 10.0).round() as u8,
+            wrong_model: false,
+        };
         servos.power_up();
         Ok(servos)
     }
@@ -110,7 +119,10 @@ impl Servos {
         set(56, &with_sign(counts(at(&positions)).round() as i32).to_le_bytes());
         let speed = at(&velocities) * 4096.0 / TAU;
         set(58, &with_sign(speed.round() as i32).to_le_bytes());
-        set(60, &[0, 0, 120, 31, u8::from(self.held.iter().any(|(held, ..)| *held == servo)), self.error(servo)]);
+        set(
+            60,
+            &[0, 0, self.voltage, 31, u8::from(self.held.iter().any(|(held, ..)| *held == servo)), self.error(servo)],
+        );
         set(66, &[u8::from(speed.abs() > 3.0)]);
         (address..address + length).map(|i| all.get(i).copied().unwrap_or_default()).collect()
     }
