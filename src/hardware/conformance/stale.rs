@@ -89,8 +89,8 @@ fn silence(context: &mut Context) -> Result<(), String> {
     Ok(())
 }
 
-/// While the arm moves, each reading must be of a time within its call. Where replies carry no number, one late reply may
-/// count once; an adapter that discards nothing lags one reading behind from then on.
+/// While the arm moves, each reading must be of a time within its call. Where replies carry no number, one late reply
+/// may count once; an adapter that discards nothing lags one reading behind from then on.
 fn late(context: &mut Context) -> Result<(), String> {
     if !STALLS.iter().all(|seconds| context.prepare(Fault::new(FaultKind::Stall).lasting(*seconds))) {
         return context.skip("its emulator cannot answer late");

@@ -27,9 +27,9 @@ const INTRODUCTION: Retry = Retry { each: Duration::from_millis(40), times: 5 };
 const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
 /// Longest wait until the line takes a command.
 const SEND_TIMEOUT: Duration = Duration::from_millis(100);
-/// A state answers further questions for this time, and tells for this time whether a setpoint may be written: it is
-/// read once a cycle.
+/// A state answers further questions for this time.
 const STATE_AGE: Duration = Duration::from_millis(5);
+/// A setpoint is written if the motors were on and without error this long ago at most: the state is read once a cycle.
 const WRITABLE: Duration = Duration::from_millis(50);
 /// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
 const WRITES: u32 = 4;
