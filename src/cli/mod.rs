@@ -42,8 +42,9 @@ pub mod world;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
+use std::sync::OnceLock;
 
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{ArgMatches, CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::blueprint::{self, Catalog};
 use crate::control::task_spec::{TaskSpec, TaskTable};
@@ -143,6 +144,21 @@ pub struct Program {
     absent: Vec<Absent>,
     blueprints: Vec<(&'static str, &'static str)>,
     robots: Vec<(&'static str, &'static str)>,
+    verbs: Vec<Verb>,
+}
+
+/// A verb of another crate.
+#[derive(Debug, Clone)]
+struct Verb {
+    command: clap::Command,
+    run: fn(&ArgMatches) -> exit::Result,
+}
+
+/// The verbs of the crate that embeds this one.
+static VERBS: OnceLock<Vec<Verb>> = OnceLock::new();
+
+fn verbs() -> &'static [Verb] {
+    VERBS.get().map(Vec::as_slice).unwrap_or_default()
 }
 
 impl Program {
@@ -181,8 +197,17 @@ impl Program {
         self
     }
 
+    /// Adds a verb, such as `calibrate`: its name, help and arguments, and what it does. A [`exit::Failure`] is printed
+    /// with its hint and ends with its exit code. The name must be none of this program's.
+    pub fn verb(mut self, command: clap::Command, run: fn(&ArgMatches) -> exit::Result) -> Self {
+        self.verbs.push(Verb { command, run });
+        self
+    }
+
     /// Runs the command line: what `main` does.
     pub fn main(self) -> ExitCode {
+        // A second program in the same process keeps the verbs of the first.
+        let _ = VERBS.set(self.verbs);
         blueprint::embed(self.blueprints);
         builtin::embed(self.robots);
         let adapters = Registry::with(&self.adapters).lacking(&self.absent);
@@ -192,7 +217,17 @@ impl Program {
 
 /// The command line: verbs, options, help texts. For man pages, completions and tests.
 pub fn command() -> clap::Command {
-    Cli::command()
+    with_verbs(verbs())
+}
+
+fn with_verbs(verbs: &[Verb]) -> clap::Command {
+    Cli::command().subcommands(verbs.iter().map(|verb| verb.command.clone()))
+}
+
+/// Returns the added verb that the arguments name, and its own arguments.
+fn added<'a>(verbs: &'a [Verb], arguments: &'a ArgMatches) -> Option<(&'a Verb, &'a ArgMatches)> {
+    let (name, own) = arguments.subcommand()?;
+    Some((verbs.iter().find(|verb| verb.command.get_name() == name)?, own))
 }
 
 /// Runs the command line with adapters besides the built-in ones. [`Program`] can add more than that.
@@ -201,10 +236,22 @@ pub fn main_with(adapters: &[AdapterSpec]) -> ExitCode {
 }
 
 fn command_line(catalog: Catalog<'_>) -> ExitCode {
-    let registry = catalog.adapters;
     // Usage errors, `--help` and `--version` end here, with 2 or 0.
-    let cli = Cli::parse_from(std::env::args_os().map(spelled_out));
-    let result = match &cli.command {
+    let arguments = command().get_matches_from(std::env::args_os().map(spelled_out));
+    let result = match added(verbs(), &arguments) {
+        Some((verb, own)) => (verb.run)(own),
+        None => built_in(&Cli::from_arg_matches(&arguments).unwrap_or_else(|error| error.exit()), catalog),
+    };
+    let exit = result.unwrap_or_else(|failure| {
+        output::failure(&failure);
+        failure.exit
+    });
+    ExitCode::from(exit as u8)
+}
+
+fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
+    let registry = catalog.adapters;
+    match &cli.command {
         Command::Run(args) => run::run(args, catalog),
         Command::Status(args) => status::run(args),
         Command::State(args) => state::run(args),
@@ -230,12 +277,7 @@ fn command_line(catalog: Catalog<'_>) -> ExitCode {
         Command::Model(args) => model::run(args, catalog),
         Command::Schema(args) => schema::run(args, catalog),
         Command::Replay(args) => replay::run(args, catalog),
-    };
-    let exit = result.unwrap_or_else(|failure| {
-        output::failure(&failure);
-        failure.exit
-    });
-    ExitCode::from(exit as u8)
+    }
 }
 
 /// Negative numbers in plain decimals: of `-0.5`, `-.5` and `-5e-1` the parser takes only the first for a number.
@@ -265,6 +307,24 @@ mod tests {
     fn the_command_line_is_sound() {
         Cli::command().debug_assert();
         Only::<run::Args>::command().debug_assert();
+    }
+
+    #[test]
+    fn verbs_of_another_crate_are_found_and_hide_no_others() {
+        let calibrate = clap::Command::new("calibrate").arg(clap::Arg::new("arm").required(true));
+        let run = |arguments: &ArgMatches| -> exit::Result {
+            let arm = arguments.get_one::<String>("arm").map_or("", String::as_str);
+            Err(exit::Failure::usage(format!("no arm {arm}")))
+        };
+        let verbs = [Verb { command: calibrate, run }];
+        with_verbs(&verbs).debug_assert();
+        let parse = |line: &str| with_verbs(&verbs).try_get_matches_from(line.split_whitespace());
+        let arguments = parse("so101 calibrate left").unwrap();
+        let (verb, own) = added(&verbs, &arguments).unwrap();
+        assert_eq!((verb.run)(own), Err(exit::Failure::usage("no arm left")));
+        assert_eq!(parse("so101 calibrate").unwrap_err().exit_code(), 2);
+        let arguments = parse("so101 stop left").unwrap();
+        assert!(added(&verbs, &arguments).is_none() && Cli::from_arg_matches(&arguments).is_ok());
     }
 
     #[test]
