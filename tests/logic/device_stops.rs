@@ -30,13 +30,26 @@ struct Bench {
     mock: MockAdapter,
 }
 
-/// A clock that can jump forward, as it does for a process that was stopped.
+/// A clock that jumps forward once while the device thread waits, as it does for a process that was stopped.
 #[derive(Debug, Default)]
-struct JumpingClock(AtomicU64);
+struct JumpingClock {
+    /// The jump to come, and what was jumped so far [ns].
+    jump: AtomicU64,
+    ahead: AtomicU64,
+    /// When the thread last asked for the time [ns].
+    asked: AtomicU64,
+}
+
+/// Between two questions for the time that are further apart than this the thread waited.
+const WAITED: u64 = 3_000_000;
 
 impl Clock for JumpingClock {
     fn now(&self) -> Mono {
-        MonotonicClock.now().after(Duration::from_nanos(self.0.load(Relaxed)))
+        let now = MonotonicClock.now();
+        if now.0.saturating_sub(self.asked.swap(now.0, Relaxed)) > WAITED {
+            self.ahead.fetch_add(self.jump.swap(0, Relaxed), Relaxed);
+        }
+        now.after(Duration::from_nanos(self.ahead.load(Relaxed)))
     }
 }
 
@@ -183,8 +196,19 @@ fn a_delay_of_the_device_thread_is_not_the_arms_silence() {
     bench.mock.fail("write_joint_velocities", AdapterError::Timeout("no answer".into()));
     bench.tick(|c| (c.mode, c.values[0]) = (Some(ControlMode::Velocity), 0.03));
     bench.until("the refusal", |b| b.mock.calls().iter().any(|c| c.name() == "write_joint_velocities"));
-    clock.0.fetch_add(65_000_000, Relaxed);
-    std::thread::sleep(Duration::from_millis(15));
+    clock.jump.store(65_000_000, Relaxed);
+    let beat = |b: &Bench| b.beat.beat(MonotonicClock.now().after(Duration::from_nanos(clock.ahead.load(Relaxed))));
+    bench.until("the jump", |b| {
+        beat(b);
+        clock.ahead.load(Relaxed) > 0
+    });
+    // Until the state is read again.
+    let reads = |b: &Bench| b.mock.calls().iter().filter(|c| c.name() == "read_joint_positions").count();
+    let before = reads(&bench);
+    bench.until("two readings", |b| {
+        beat(b);
+        reads(b) >= before + 2
+    });
     assert!(!bench.states.read().self_held, "the process was stopped for 65 ms, the arm was not silent");
     bench.end();
 }

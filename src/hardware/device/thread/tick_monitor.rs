@@ -20,9 +20,11 @@ pub(super) struct Seen {
     beat: Option<Mono>,
     /// How late this thread has woken in total since then.
     late: Duration,
+    /// Processor time of the tick when this thread first saw the heartbeat.
+    cpu_time: Option<Duration>,
     /// Start of the present observation, and the tick's processor time then.
     observed: Option<(Mono, Duration)>,
-    /// The tick used the processor for most of the latest observation.
+    /// The tick used the processor for most of the latest observation, and nearly all the time since it had to wake.
     hangs: bool,
 }
 
@@ -41,7 +43,7 @@ impl Worker {
     pub(super) fn see_tick(&mut self, now: Mono, late: Duration) {
         let beat = self.config.beat.last();
         if self.tick.beat != beat {
-            self.tick = Seen { beat, ..Seen::default() };
+            self.tick = Seen { beat, cpu_time: self.config.beat.cpu_time(), ..Seen::default() };
         }
         if (LATE..MAX_DELAY).contains(&late) {
             self.tick.late = (self.tick.late + late).min(MAX_DELAY);
@@ -50,8 +52,8 @@ impl Worker {
     }
 
     /// Finds out whether a silent tick hangs in a loop: then it uses processor time all along. One that waits for a
-    /// processor uses none. Linux may charge a pause of a virtual machine to it, but once; a time in which this thread
-    /// was `stalled` itself is not judged.
+    /// processor uses none. Linux may charge a pause of a virtual machine to it, but not all the time since it had to
+    /// wake, and not the latest; a time in which this thread was `stalled` itself is not judged.
     fn observe_tick(&mut self, now: Mono, stalled: bool) {
         let silence = self.config.beat.silence(now).unwrap_or_default();
         if silence <= self.config.tick_period {
@@ -68,7 +70,9 @@ impl Worker {
                 if time < OBSERVATION {
                     return;
                 }
-                self.tick.hangs = used.saturating_sub(before) >= time * 2 / 3;
+                let since_beat = used.saturating_sub(self.tick.cpu_time.unwrap_or_default());
+                let awake = self.config.beat_timeout().saturating_sub(self.config.tick_period);
+                self.tick.hangs = used.saturating_sub(before) >= time * 2 / 3 && since_beat >= awake * 9 / 10;
             }
             _ => {}
         }
