@@ -186,9 +186,7 @@ impl Context {
     pub fn stream(&mut self, start: &[f64], goal: &[f64]) -> Result<(), String> {
         if self.adapter.get_control_mode() == ControlMode::ServoPosition {
             for i in 1..=50 {
-                let part = f64::from(i) / 50.0;
-                let point: Vec<f64> = start.iter().zip(goal).map(|(a, b)| a + (b - a) * part).collect();
-                self.command(&point, 1.0)?;
+                self.command(&between(start, goal, f64::from(i) / 50.0), 1.0)?;
                 std::thread::sleep(Duration::from_millis(10));
             }
         } else {
@@ -349,6 +347,11 @@ impl Context {
         }
         Ok(())
     }
+}
+
+/// Returns the point at a fraction of the way between two.
+pub fn between(from: &[f64], to: &[f64], part: f64) -> Vec<f64> {
+    from.iter().zip(to).map(|(a, b)| a + (b - a) * part).collect()
 }
 
 /// Returns the largest difference of two vectors.

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::Check;
 use super::Needs::Motion;
-use super::context::{Context, farthest, require};
+use super::context::{Context, between, farthest, require};
 use crate::hardware::adapter::JointReading;
 use crate::joint::ControlMode;
 
@@ -116,9 +116,7 @@ fn compare_velocities(context: &mut Context, from: &[f64], to: &[f64]) -> Result
     }
     for i in 1..=POINTS {
         if servo {
-            let part = f64::from(i) / f64::from(POINTS);
-            let point: Vec<f64> = from.iter().zip(to).map(|(a, b)| a + (b - a) * part).collect();
-            context.command(&point, 1.0)?;
+            context.command(&between(from, to, f64::from(i) / f64::from(POINTS)), 1.0)?;
         }
         std::thread::sleep(Duration::from_millis(10));
         let reading = context.joints()?;
