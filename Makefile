@@ -83,9 +83,10 @@ test-tools: .venv/readers-installed $(READERS)/node_modules/.package-lock.json
 	[ -z "$$missing" ] || { apt-get update -q && apt-get install -qy --no-install-recommends $(SYSTEM_PACKAGES); }; \
 	fi
 
-.venv/readers-installed: $(READERS)/requirements.txt
+.venv/readers-installed: $(READERS)/requirements.txt $(READERS)/requirements-no-deps.txt
 	$(PYTHON) -m venv .venv
 	.venv/bin/pip install -q -r $<
+	.venv/bin/pip install -q --no-deps -r $(READERS)/requirements-no-deps.txt
 	touch $@
 
 $(READERS)/node_modules/.package-lock.json: $(READERS)/package-lock.json

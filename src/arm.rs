@@ -1,6 +1,10 @@
 //! Data between an arm's device thread and the tick: the latest state one way, the latest command the other. Plain
 //! data of fixed size, so that neither side ever allocates or waits.
 
+mod io;
+mod joint_status;
+mod load;
+
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
@@ -8,6 +12,10 @@ use serde::{Deserialize, Serialize};
 use crate::clock::Mono;
 use crate::joint::{ControlMode, Joints, MAX_DOF};
 use crate::named::named;
+
+pub use io::{AnalogUnit, IoInfo, IoState, MAX_ANALOG, MAX_DIGITAL, OutputValue, StopInput, channel};
+pub use joint_status::JointStatus;
+pub use load::{Load, UPRIGHT};
 
 /// Figures with which an arm's measurements and its motion are checked: the adapter's row, overridden by the blueprint.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -141,6 +149,10 @@ pub struct ArmState {
     pub interference: Interference,
     /// Part of this state's age during which this host's device thread could not run [ns].
     pub own_delay_ns: u64,
+    /// The arm's stop input is open; false if the blueprint names none.
+    pub stop_input_open: bool,
+    /// The device's own time of the measurement, on its own clock [ns], where it reports one.
+    pub device_ns: Option<u64>,
 }
 
 impl Default for ArmState {
@@ -164,6 +176,8 @@ impl Default for ArmState {
             written: 0,
             interference: Interference::None,
             own_delay_ns: 0,
+            stop_input_open: false,
+            device_ns: None,
         }
     }
 }

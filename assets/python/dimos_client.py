@@ -337,6 +337,22 @@ class Client:
             opening = found["gripper_range"][opening == "open"]
         self.call("gripper", arm=arm, position=opening)
 
+    def io(self, arm: str) -> Dict[str, Any]:
+        """Digital and analogue inputs and outputs of an arm, as docs/rpc.md says."""
+        return self.call("arm_io", arm=arm)
+
+    def set_io(self, arm: str, **outputs: float) -> Dict[str, Any]:
+        """Sets outputs, `do3=1` or `ao0=2.5`; the levels that are read back."""
+        return self.call("arm_io_set", arm=arm, outputs=outputs)
+
+    def payload(self, arm: str) -> Optional[Dict[str, Any]]:
+        """The load at the flange that the controller reports: mass [kg], center [m], inertia [kg·m²]."""
+        return self.call("arm_payload", arm=arm)["payload"]
+
+    def set_payload(self, arm: str, mass: float, center: Sequence[float] = (0, 0, 0)) -> Optional[Dict[str, Any]]:
+        """Sets the load of everything at the flange [kg, m], at rest; what the controller then reports."""
+        return self.call("arm_payload_set", arm=arm, mass=mass, center=list(center))["payload"]
+
     def cancel(self, arm: Optional[str] = None, task: Optional[str] = None) -> Dict[str, str]:
         """Ends motions by decelerating: of an arm, of a task, or all."""
         return self.call("cancel", arm=arm, task=task)["tasks"]

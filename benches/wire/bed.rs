@@ -55,6 +55,7 @@ impl Arm {
             tick_period: period,
             native_rate: 250.0,
             supervision: dimos::arm::Supervision::default(),
+            setup: dimos::hardware::device::Setup::default(),
             beat: beat.clone(),
             clock: Arc::new(MonotonicClock),
             notes: Box::new(|_| {}),

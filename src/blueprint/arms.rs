@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use crate::arm::Supervision;
-use crate::blueprint::limits;
 use crate::blueprint::resolve::{Arm, Checker};
 use crate::blueprint::schema::{HardwareEntry, Joints, OnExit};
+use crate::blueprint::{limits, park, parts};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, SIM};
 use crate::joint::{JointLimits, MAX_DOF, make_joints};
 use crate::yaml::{Diag, Located, NodeId, Tree, did_you_mean, quote};
@@ -105,7 +105,9 @@ fn arm(
         true => limits::resolve(checker, &entry.limits, joints, own.as_ref()),
         false => Vec::new(),
     };
+    let park_pose = park::resolve(checker, entry, joints, joints_known, own.as_ref(), &limits);
     let simulated = address == SIM && row.emulate.is_some();
+    let setup = parts::resolve(checker, entry);
     let default_on_exit = if row.holds_when_disabled { OnExit::Disable } else { OnExit::Hold };
     Arm {
         hardware_id: id.to_owned(),
@@ -118,7 +120,9 @@ fn arm(
         auto_enable: entry.auto_enable,
         on_exit: entry.on_exit.unwrap_or(default_on_exit),
         on_exit_given: entry.on_exit.is_some(),
+        park_pose,
         supervision: supervision(entry, &row, simulated),
+        setup,
         options,
         own_limits: own.unwrap_or_default(),
         limits,

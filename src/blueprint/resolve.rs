@@ -10,8 +10,9 @@ use crate::blueprint::limits::JointOverride;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
-use crate::blueprint::{arms, assets, planner_check, planner_files, planner_models, tasks};
+use crate::blueprint::{arms, assets, park, planner_check, planner_files, planner_models, tasks};
 use crate::control::task_spec::TaskSpec;
+use crate::hardware::device::Setup;
 use crate::hardware::registry::AdapterSpec;
 use crate::joint::JointLimits;
 use crate::planning::config::PlannerConfig;
@@ -92,8 +93,12 @@ pub struct Arm {
     pub on_exit: OnExit,
     /// Whether the blueprint sets `on_exit`; otherwise it is the default.
     pub on_exit_given: bool,
+    /// Where it goes before its motors are disabled, with [`OnExit::Park`] [rad]; empty otherwise.
+    pub park_pose: Vec<f64>,
     /// Figures that its measurements and motion are checked against.
     pub supervision: Supervision,
+    /// What is set of its optional parts.
+    pub setup: Setup,
     /// The adapter's own options: an object.
     pub options: Value,
     /// The arm's own limits, from its adapter.
@@ -199,6 +204,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     }
     let hardware = arms::resolve(&mut checker, &file.hardware);
     let mut tasks = tasks::resolve(&mut checker, &file.tasks, &hardware);
+    park::check_tasks(&mut checker, &file.hardware, &tasks, &hardware);
     checker.assets = Assets::of(file.assets);
     assets::check(&mut checker, &file.tasks, file.planner.as_ref());
     let planner = file.planner.as_ref().map(|planner| {

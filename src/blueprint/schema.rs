@@ -8,6 +8,7 @@ use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Serialize};
 
 use crate::blueprint::limits::LimitsEntry;
+use crate::blueprint::parts::{MountingEntry, PayloadEntry, StopInputEntry};
 use crate::blueprint::planner::{PlannerEntry, ViewConfig};
 use crate::blueprint::size::Size;
 use crate::yaml::range::{self, tick_rate};
@@ -87,6 +88,11 @@ pub struct HardwareEntry {
     /// `disable` if it has brakes.
     #[serde(default)]
     pub on_exit: Option<OnExit>,
+    /// With `on_exit: park`: where the arm goes at the end, one position per joint [rad]. The way there is direct, not
+    /// collision-checked.
+    #[serde(default)]
+    #[schemars(with = "Option<Vec<f64>>")]
+    pub park_pose: Option<Located<Vec<Located<f64>>>>,
     /// Maximum position error of a joint at rest under load [rad]. Default: the adapter's.
     #[serde(default, deserialize_with = "range::maybe_positive")]
     #[schemars(extend("exclusiveMinimum" = 0))]
@@ -109,6 +115,17 @@ pub struct HardwareEntry {
     /// Whether a state with every joint at exactly zero is accepted even if the device does not confirm it.
     #[serde(default)]
     pub accept_zero_pose: bool,
+    /// A digital input of the arm that stops it: while it is open, the arm is held. Default: none.
+    #[serde(default)]
+    pub stop_input: Option<StopInputEntry>,
+    /// The load at the flange: set and read back before the motors are enabled. Default: the controller keeps its own
+    /// setting.
+    #[serde(default)]
+    pub payload: Option<Located<PayloadEntry>>,
+    /// How the base is mounted: set before the motors are enabled, so that the controller compensates gravity.
+    /// Default: the controller keeps its own setting, from the factory upright.
+    #[serde(default)]
+    pub mounting: Option<Located<MountingEntry>>,
     /// The adapter's own options.
     #[serde(default)]
     #[schemars(with = "Option<serde_json::Map<String, serde_json::Value>>")]
@@ -139,6 +156,9 @@ pub enum OnExit {
     Hold,
     /// The motors are disabled; the arm's brakes hold it.
     Disable,
+    /// The arm moves to its `park_pose`, then the motors are disabled: at a controlled end (signal, `dimos down`,
+    /// duration), never after a fault.
+    Park,
 }
 
 impl OnExit {
@@ -147,6 +167,7 @@ impl OnExit {
         match self {
             Self::Hold => "hold",
             Self::Disable => "disable",
+            Self::Park => "park",
         }
     }
 }

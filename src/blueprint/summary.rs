@@ -67,6 +67,9 @@ pub struct ArmSummary {
     pub on_exit: OnExit,
     /// Origin of `on_exit`.
     pub on_exit_from: Origin,
+    /// Where the arm goes before its motors are disabled [rad]; empty if it does not.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub park_pose: Vec<f64>,
     /// Whether the arm keeps its pose when its motors are disabled.
     pub holds_when_disabled: bool,
     /// Its joints.
@@ -148,6 +151,7 @@ fn arm(arm: &Arm) -> ArmSummary {
         auto_enable: arm.auto_enable,
         on_exit: arm.on_exit,
         on_exit_from: if arm.on_exit_given { Origin::Blueprint } else { Origin::Default },
+        park_pose: arm.park_pose.clone(),
         holds_when_disabled: arm.adapter.holds_when_disabled,
         joints: (0..arm.joints.len()).map(|joint| joint_summary(arm, joint)).collect(),
     }

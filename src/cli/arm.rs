@@ -1,11 +1,21 @@
-//! `dimos arm enable|disable|reset|gripper ARM`: motors, latch and gripper of an arm.
+//! `dimos arm enable|disable|reset|gripper|io|payload ARM`: motors, latch, gripper and optional parts of an arm in a
+//! run; `find-port`, `setup-motors`, `calibrate` and `configure`: work on an arm without a run, directly on its bus.
+
+mod bus;
+mod calibrate;
+mod configure;
+mod find_port;
+mod live_table;
+pub(super) mod parts;
+mod setup_motors;
 
 use clap::Subcommand;
 
 use super::arguments::{Target, finite};
 use super::exit::{Exit, Failure, Result};
 use super::output;
-use crate::rpc::api::{ArmDisable, ArmEnable, ArmReset, Gripper, Status};
+use crate::hardware::registry::Registry;
+use crate::rpc::api::{ArmDisable, ArmEnable, ArmReply, ArmReset, Gripper, Method, Status};
 use crate::rpc::client::Client;
 use crate::rpc::report::ArmReport;
 
@@ -39,14 +49,28 @@ enum Action {
         #[arg(value_name = "OPENING", value_parser = opening, allow_negative_numbers = true)]
         opening: Opening,
     },
+    /// List serial ports, and find the arm's by unplugging it or by asking each; no run needed
+    FindPort(find_port::Args),
+    /// Number the motors of a new arm, one after the other; no run needed
+    SetupMotors(setup_motors::Args),
+    /// Record the middle pose and the range of each joint by hand; motors off, no run needed
+    Calibrate(calibrate::Args),
+    /// Compare the motors' stored settings with those the adapter wants, and write them; no run needed
+    Configure(configure::Args),
+    /// Show the digital and analogue inputs and outputs, or set outputs
+    Io(parts::IoArgs),
+    /// Show the load at the flange, or set it: the arm must be at rest
+    Payload(parts::PayloadArgs),
 }
 
+/// Which arm.
 #[derive(Debug, clap::Args)]
-struct ArmArgs {
+pub struct ArmArgs {
     /// Name of the arm (hardware_id)
-    arm: String,
+    pub arm: String,
+    /// Which run
     #[command(flatten)]
-    target_run: Target,
+    pub target_run: Target,
 }
 
 /// Requested opening of a gripper.
@@ -90,26 +114,30 @@ impl Opening {
 }
 
 /// Runs the verb.
-pub fn run(args: &Args) -> Result {
-    let (Action::Enable(which) | Action::Disable { which, .. } | Action::Reset(which) | Action::Gripper { which, .. }) =
-        &args.action;
-    let mut client = which.target_run.connect()?;
-    let arm = which.arm.clone();
-    let reply = match &args.action {
-        Action::Enable(_) => client.call(ArmEnable { arm })?,
-        Action::Disable { now, .. } => client.call(ArmDisable { arm, now: *now })?,
-        Action::Reset(_) => client.call(ArmReset { arm })?,
-        Action::Gripper { opening, .. } => {
-            let position = opening.of(&mut client, &arm)?;
-            let done = client.call(Gripper { arm, position })?;
-            if which.target_run.json {
-                output::json(&done);
-            } else {
-                output::line(format_args!("{}: gripper to {position:.4} m", which.arm));
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    match &args.action {
+        Action::Enable(which) => phase(which, ArmEnable { arm: which.arm.clone() }),
+        Action::Disable { which, now } => phase(which, ArmDisable { arm: which.arm.clone(), now: *now }),
+        Action::Reset(which) => {
+            phase(which, ArmReset { arm: which.arm.clone() })?;
+            if !which.target_run.json {
+                output::note(format_args!("to make it ready for motion: dimos arm enable {}", which.arm));
             }
-            return Ok(Exit::Ok);
+            Ok(Exit::Ok)
         }
-    };
+        Action::Gripper { which, opening } => gripper(which, *opening),
+        Action::Io(args) => parts::io(args),
+        Action::Payload(args) => parts::payload(args),
+        Action::FindPort(args) => find_port::run(args, registry),
+        Action::SetupMotors(args) => setup_motors::run(args, registry),
+        Action::Calibrate(args) => calibrate::run(args, registry),
+        Action::Configure(args) => configure::run(args, registry),
+    }
+}
+
+/// Sends a request that changes the arm's phase, and prints the phase that it has then.
+fn phase(which: &ArmArgs, request: impl Method<Reply = ArmReply>) -> Result {
+    let reply = which.target_run.connect()?.call(request)?;
     if which.target_run.json {
         output::json(&reply);
     } else {
@@ -117,9 +145,18 @@ pub fn run(args: &Args) -> Result {
         if let Some(note) = &reply.note {
             output::note(format_args!("{}: {note}", reply.arm));
         }
-        if matches!(args.action, Action::Reset(_)) {
-            output::note(format_args!("to make it ready for motion: dimos arm enable {}", reply.arm));
-        }
+    }
+    Ok(Exit::Ok)
+}
+
+fn gripper(which: &ArmArgs, opening: Opening) -> Result {
+    let (mut client, arm) = (which.target_run.connect()?, which.arm.clone());
+    let position = opening.of(&mut client, &arm)?;
+    let done = client.call(Gripper { arm, position })?;
+    if which.target_run.json {
+        output::json(&done);
+    } else {
+        output::line(format_args!("{}: gripper to {position:.4} m", which.arm));
     }
     Ok(Exit::Ok)
 }

@@ -200,7 +200,7 @@ impl Attached {
             terminal
                 .note(format_args!("{why}: planner {} ended; run {} continues without it", self.name, self.run.name));
         }
-        record.end(exit, why);
+        record.end(exit, why, Vec::new());
         terminal.flush();
         Ok(exit)
     }

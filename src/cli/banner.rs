@@ -52,16 +52,29 @@ pub fn at_exit(arm: &ArmReport) -> &'static str {
     match (arm.on_exit.as_str(), arm.holds_when_disabled) {
         ("disable", true) => "motors off; it keeps its pose",
         ("disable", false) => "motors off; it FALLS unless supported",
+        ("park", _) => "it moves to its park pose, then motors off",
         _ => "motors stay on and hold the pose",
     }
 }
 
-/// Describes the motors now that the run has ended, from its last report.
-pub fn after_exit(arm: &ArmReport) -> &'static str {
+/// What follows the deceleration where arms park.
+pub const PARKING: &str = "then to the park pose (Ctrl-C or `dimos stop` ends that), then releasing the arms";
+
+/// Returns whether the arm moves to its park pose at the end.
+pub fn parks(arm: &ArmReport) -> bool {
+    arm.on_exit == "park"
+}
+
+/// Describes the motors now that the run has ended, from its last report, and from whether it was parked.
+pub fn after_exit(arm: &ArmReport, parked: bool) -> &'static str {
     match (arm.link.as_str(), arm.enabled, arm.holds_when_disabled) {
         ("down" | "faulted", ..) => "it could not be reached: its motors are unchanged",
         (_, false, true) => "motors are off; it keeps its pose",
         (_, false, false) => "motors are off; it does not hold its pose",
+        (_, true, _) if parked => "parked; motors off",
+        // Not parked: as without parking.
+        (_, true, true) if arm.on_exit == "park" => "motors off; it keeps its pose",
+        (_, true, false) if arm.on_exit == "park" => "motors stay on and hold the pose",
         (_, true, _) => at_exit(arm),
     }
 }
@@ -120,11 +133,15 @@ run coordinator-yourarm  SIMULATED  (pid 42, dimos 0.1.0)
 Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
         assert_eq!(text(&report, Path::new("/run/dimos.sock"), IN_A_TERMINAL).join("\n"), expected);
 
-        assert_eq!(after_exit(&arm("hold", false)), "motors stay on and hold the pose");
-        let off = |holds| after_exit(&ArmReport { enabled: false, ..arm("hold", holds) });
+        assert_eq!(at_exit(&arm("park", false)), "it moves to its park pose, then motors off");
+        assert_eq!(after_exit(&arm("park", false), true), "parked; motors off");
+        assert_eq!(after_exit(&arm("park", false), false), "motors stay on and hold the pose");
+        assert_eq!(after_exit(&arm("park", true), false), "motors off; it keeps its pose");
+        assert_eq!(after_exit(&arm("hold", false), false), "motors stay on and hold the pose");
+        let off = |holds| after_exit(&ArmReport { enabled: false, ..arm("hold", holds) }, false);
         assert_eq!(off(false), "motors are off; it does not hold its pose", "as after its own E-stop");
         assert_eq!(off(true), "motors are off; it keeps its pose");
         let lost = ArmReport { link: "faulted".into(), ..arm("disable", true) };
-        assert_eq!(after_exit(&lost), "it could not be reached: its motors are unchanged");
+        assert_eq!(after_exit(&lost, false), "it could not be reached: its motors are unchanged");
     }
 }

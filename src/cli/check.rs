@@ -104,6 +104,7 @@ fn print(summary: &Summary) {
             OnExit::Hold => "stay on and hold the pose",
             OnExit::Disable if arm.holds_when_disabled => "are disabled, its brakes hold it",
             OnExit::Disable => "are disabled, it FALLS unless supported",
+            OnExit::Park => "move the arm to its park pose, then are disabled",
         };
         output::line(format_args!("  motors: {motors}; at exit they {exit} ({})", arm.on_exit_from.name()));
         let mut table =

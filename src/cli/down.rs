@@ -6,12 +6,13 @@ use super::attach;
 use super::exit::{Exit, Failure, Result};
 use super::output;
 use super::run_record::{RunRecord, RunState};
-use crate::rpc::api::Shutdown;
+use crate::rpc::api::{Shutdown, Status};
 use crate::rpc::client::{self, Client, ClientError};
 use crate::rpc::run_dir::{LiveRun, RunDir};
 
-/// Maximum wait for a controlled stop, with some margin.
+/// Maximum wait for a controlled stop, with some margin; with an arm that parks.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(6);
+const PARKING_TIMEOUT: Duration = Duration::from_secs(32);
 /// Poll period.
 const POLL_PERIOD: Duration = Duration::from_millis(20);
 
@@ -37,13 +38,17 @@ pub fn run(args: &Args) -> Result {
             return planner.map_or(Err(failure), |planner| attach::end(&planner));
         }
     };
-    Client::connect(&found.name, &found.socket)?.call(Shutdown {})?;
+    let mut client = Client::connect(&found.name, &found.socket)?;
+    // A run that cannot report its status can still be ended.
+    let parks = client.call(Status {}).is_ok_and(|status| status.arms.iter().any(|arm| arm.on_exit == "park"));
+    let timeout = if parks { PARKING_TIMEOUT } else { SHUTDOWN_TIMEOUT };
+    client.call(Shutdown {})?;
     let requested = Instant::now();
     // The name is free before the process has written its last lines.
     let recorded = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
     let is_live = || recorded().is_some_and(|record| record.state() == RunState::Live);
     while folder.runs().map_err(ClientError::from)?.contains(&found) || is_live() {
-        if requested.elapsed() > SHUTDOWN_TIMEOUT {
+        if requested.elapsed() > timeout {
             let what = format!("{} is still shutting down: pid {} has not exited", found.name, found.pid);
             return Err(Failure::new(Exit::Failed, what).hint("its terminal or `dimos logs` shows the reason"));
         }
@@ -54,12 +59,14 @@ pub fn run(args: &Args) -> Result {
             let exit = if let RunState::Ended(end) = record.state() { Exit::of(end.exit) } else { Exit::Failed };
             Err(Failure { exit, ..record.failure().unwrap_or_else(|| Failure::new(exit, "it ended abnormally")) })
         }
-        Some(RunRecord { log: Some(log), .. }) => {
-            output::note(format_args!("{} ended; log: {}", found.name, log.display()));
-            Ok(Exit::Ok)
-        }
-        _ => {
-            output::note(format_args!("{} ended", found.name));
+        record => {
+            let end = record.as_ref().and_then(|record| record.end.as_ref());
+            for warning in end.into_iter().flat_map(|end| &end.warnings) {
+                output::note(format_args!("warning: {warning}"));
+            }
+            let log = record.as_ref().and_then(|record| record.log.as_ref());
+            let log = log.map_or_else(String::new, |log| format!("; log: {}", log.display()));
+            output::note(format_args!("{} ended{log}", found.name));
             Ok(Exit::Ok)
         }
     }

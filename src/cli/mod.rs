@@ -3,6 +3,7 @@
 pub mod adapter;
 pub mod arguments;
 pub mod arm;
+mod ask;
 mod attach;
 pub mod banner;
 pub mod cancel;
@@ -93,7 +94,7 @@ enum Command {
     Cancel(cancel::Args),
     /// Hold arms at once and keep them held until `arm reset`: an operational stop
     Stop(stop::Args),
-    /// Enable, disable or reset an arm, or move its gripper
+    /// Enable, disable or reset an arm, move its gripper; find, set up and calibrate one without a run
     Arm(arm::Args),
     /// Drive an arm from the keyboard, in the terminal
     Jog(jog::Args),
@@ -262,7 +263,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::World(args) => world::run(args),
         Command::Cancel(args) => cancel::run(args),
         Command::Stop(args) => stop::run(args),
-        Command::Arm(args) => arm::run(args),
+        Command::Arm(args) => arm::run(args, registry),
         Command::Jog(args) => jog::run(args),
         Command::Task(args) => task::run(args),
         Command::Down(args) => down::run(args),

@@ -92,7 +92,8 @@ pub fn run(args: &Args, catalog: Catalog<'_>) -> Result {
         None => match bring_up(args, catalog)? {
             (Up::Run(run), signals, terminal) => {
                 let record = RunRecord::begin(&run.status(), None);
-                keep_up(*run, signals, &terminal, args.duration, args.json, Some(record))
+                let keep = Keep { duration: args.duration, json: args.json, seen: true };
+                keep_up(*run, signals, &terminal, keep, Some(record))
             }
             (Up::Planner(planner), signals, terminal) => {
                 watch(signals, planner.endings())?;
@@ -129,7 +130,7 @@ fn in_background(args: &Args, catalog: Catalog<'_>, text_log: &Path) -> Result {
         }
     };
     let record = RunRecord::begin(&run.status(), Some(text_log));
-    keep_up(run, signals, &terminal, args.duration, false, Some(record))
+    keep_up(run, signals, &terminal, Keep { duration: args.duration, json: false, seen: notified }, Some(record))
 }
 
 /// What `dimos run` keeps up.
@@ -164,7 +165,7 @@ fn bring_up(args: &Args, catalog: Catalog<'_>) -> Result<(Up, Signals, Terminal)
 /// Keeps a started run up until a signal, its duration, `dimos down` or a fault ends it, and stops it. Reports on the
 /// terminal.
 pub fn until_its_end(run: Run, duration: Option<Duration>, json: bool) -> Result {
-    keep_up(run, signals()?, &terminal()?, duration, json, None)
+    keep_up(run, signals()?, &terminal()?, Keep { duration, json, seen: true }, None)
 }
 
 fn signals() -> Result<Signals> {
@@ -175,25 +176,37 @@ fn terminal() -> Result<Terminal> {
     Ok(Terminal::start().context("cannot start the thread of the terminal")?)
 }
 
-fn keep_up(
-    run: Run,
-    signals: Signals,
-    terminal: &Terminal,
+/// How a run is kept up.
+struct Keep {
     duration: Option<Duration>,
     json: bool,
+    /// Whether somebody learned that the run is up: otherwise nobody expects that its arms move at its end.
+    seen: bool,
+}
+
+fn keep_up(
+    run: Run,
+    mut signals: Signals,
+    terminal: &Terminal,
+    Keep { duration, json, mut seen }: Keep,
     record: Option<RunRecord>,
 ) -> Result {
+    for signal in signals.pending() {
+        seen = false;
+        let _ = run.endings().send(Ending::Signal(signal));
+    }
     watch(signals, run.endings())?;
     let report = run.status();
     let in_terminal = record.as_ref().is_none_or(|record| record.text_log.is_none());
     let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
     banner::print(terminal, &report, run.socket().unwrap_or_else(|| Path::new("none")), how_to_end, json);
     let ending = run.wait_for_end(duration);
+    let parks = seen && !matches!(ending, Ending::Fault(_) | Ending::Log(_)) && report.arms.iter().any(banner::parks);
     if !json {
-        terminal.note(format_args!("{}: decelerating to rest, then releasing the arms", why(&ending)));
+        let then = if parks { banner::PARKING } else { "then releasing the arms" };
+        terminal.note(format_args!("{}: decelerating to rest, {then}", why(&ending)));
     }
-    let report = run.status();
-    let ended = run.stop();
+    let ended = if parks { run.park_and_stop() } else { run.stop() };
     print_summary(terminal, &report, &ending, &ended, json);
     let exit = match &ending {
         Ending::Fault(_) => Exit::Fault,
@@ -204,13 +217,13 @@ fn keep_up(
     };
     if let Some(record) = record {
         let why = ended.log_cut.clone().filter(|_| exit == Exit::Log).unwrap_or_else(|| why(&ending));
-        record.end(exit, why);
+        record.end(exit, why, ended.troubles);
     }
     terminal.flush();
     Ok(exit)
 }
 
-/// Forwards signals for the lifetime of the process: a second signal is logged and changes nothing.
+/// Forwards signals for the lifetime of the process: a second signal ends parking, and changes nothing else.
 fn watch(mut signals: Signals, endings: Sender<Ending>) -> Result<()> {
     let watching = std::thread::Builder::new().name("signals".into()).spawn(move || {
         for signal in signals.forever() {
@@ -244,6 +257,8 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
         run: &'a str,
         why: String,
         troubles: &'a [String],
+        #[serde(skip_serializing_if = "<[String]>::is_empty")]
+        parked: &'a [String],
         log: Option<&'a PathBuf>,
         #[serde(skip_serializing_if = "Option::is_none")]
         log_cut: Option<&'a String>,
@@ -256,6 +271,7 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
             run,
             why: why(ending),
             troubles,
+            parked: &ended.parked,
             log,
             log_cut: ended.log_cut.as_ref(),
         });
@@ -263,8 +279,9 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
     for trouble in &ended.troubles {
         terminal.note(format_args!("warning: {trouble}"));
     }
-    for arm in &report.arms {
-        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
+    for arm in &ended.arms {
+        let parked = ended.parked.contains(&arm.hardware_id);
+        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm, parked)));
     }
     match (&ended.log, &ended.log_cut) {
         (Some(_), Some(cut)) => terminal.note(format_args!("run {} ended; the log is incomplete: {cut}", report.run)),

@@ -46,6 +46,9 @@ pub struct End {
     pub exit: u8,
     /// Reason.
     pub why: String,
+    /// Problems during the shutdown: an arm that was not parked, for example.
+    #[serde(default)]
+    pub warnings: Vec<String>,
 }
 
 /// State of a recorded run.
@@ -78,8 +81,8 @@ impl RunRecord {
     }
 
     /// Records its end.
-    pub fn end(mut self, exit: Exit, why: String) {
-        self.end = Some(End { at: now(), exit: exit as u8, why });
+    pub fn end(mut self, exit: Exit, why: String, warnings: Vec<String>) {
+        self.end = Some(End { at: now(), exit: exit as u8, why, warnings });
         self.keep();
     }
 
@@ -239,7 +242,8 @@ mod tests {
     #[test]
     fn only_abnormal_ends_count_as_failed() {
         let ended = |exit: Exit| {
-            let end = End { at: "1970-01-01T00:00:00.000Z".into(), exit: exit as u8, why: "w".into() };
+            let end =
+                End { at: "1970-01-01T00:00:00.000Z".into(), exit: exit as u8, why: "w".into(), warnings: Vec::new() };
             RunRecord { end: Some(end), ..record(1, 0) }
         };
         assert!(

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::arguments::Target;
+use super::arm::parts::{io_lines, joint_lines, payload_text};
 use super::attach;
 use super::banner::at_exit;
 use super::exit::{Exit, Result};
@@ -246,6 +247,15 @@ fn print_arms(arms: &[ArmReport]) {
         if let Some(codes) = &arm.device_state {
             let (state, mode) = (codes.state, codes.mode);
             output::line(format_args!("  {name}: device state {state}, mode {mode} (the vendor's numbers)"));
+        }
+        for line in joint_lines(&arm.joints) {
+            output::line(format_args!("  {name}: {line}"));
+        }
+        if let Some(load) = &arm.payload {
+            output::line(format_args!("  {name}: payload {}", payload_text(load)));
+        }
+        if let Some(io) = &arm.io {
+            io_lines(io).iter().for_each(|line| output::line(format_args!("  {name}: {line}")));
         }
         if let Some(error) = &arm.error {
             output::line(format_args!("  {name} reports error {}: {}", error.code, error.text));

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use super::arguments::{Target, finite};
+use super::arm::parts::payload_text;
 use super::exit::{Exit, Failure, Result};
 use super::output::{self, Table, fixed};
 use crate::rpc::api::{
@@ -148,6 +149,9 @@ pub struct AttachArgs {
     /// Further links that may touch it
     #[arg(long, value_name = "LINK")]
     pub touch: Vec<String>,
+    /// Its mass [kg]: the arm's controller is set to carry it, and reads it back
+    #[arg(long, value_name = "KG", value_parser = finite, allow_negative_numbers = true)]
+    pub mass: Option<f64>,
     /// Which run
     #[command(flatten)]
     pub target_run: Target,
@@ -197,8 +201,18 @@ pub fn run(args: &Args) -> Result {
         }
         Command::Attach(a) => {
             let (name, robot) = (a.name.clone(), a.robot.clone());
-            a.target_run.connect()?.call(Attach { name, robot, link: a.link.clone(), touch_links: a.touch.clone() })?;
-            done(format_args!("{} is held by {}", a.name, a.robot), a.target_run.json);
+            let (link, touch_links) = (a.link.clone(), a.touch.clone());
+            let reply = a.target_run.connect()?.call(Attach { name, robot, link, touch_links, mass: a.mass })?;
+            if a.target_run.json {
+                output::json(&reply);
+            } else {
+                output::line(format_args!("{} is held by {}", a.name, a.robot));
+                match &reply.payload {
+                    Some(load) => output::line(format_args!("payload {}", payload_text(load))),
+                    None if a.mass.is_some() => output::note("the arm's controller takes no payload: it was not set"),
+                    None => {}
+                }
+            }
         }
         Command::Detach(a) => {
             a.target_run.connect()?.call(Detach { name: a.name.clone() })?;

@@ -41,6 +41,7 @@ pub fn trouble(state: &ArmState, freshness: Freshness) -> Option<Cause> {
         Link::Down | Link::Faulted => Some(Cause::LinkLost),
         Link::Stale => Some(Cause::Stale(freshness.age)),
         Link::Up if !freshness.fresh => Some(Cause::Stale(freshness.age)),
+        Link::Up if state.stop_input_open => Some(Cause::StopInput),
         Link::Up if state.interference == Interference::Mode => Some(Cause::ModeChanged),
         Link::Up if state.interference == Interference::Power => Some(Cause::PowerChanged),
         Link::Up if state.interference == Interference::Stop => Some(Cause::StoppedElsewhere),
@@ -73,6 +74,10 @@ impl Failsafe {
             Phase::Unknown => self.enter(Phase::Disabled, Cause::None, now),
             Phase::Disabled if state.interference == Interference::Power => {
                 self.enter(Phase::Held, Cause::PowerChanged, now);
+            }
+            // It may be about to be enabled.
+            Phase::Disabled if state.link == Link::Up && state.stop_input_open => {
+                self.enter(Phase::Held, Cause::StopInput, now);
             }
             Phase::Disabled | Phase::Held => {}
             Phase::Standby if !state.enabled && fresh.fresh => self.enter(Phase::Disabled, Cause::None, now),
@@ -158,3 +163,7 @@ impl Failsafe {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "failsafe_tests.rs"]
+mod tests;

@@ -129,3 +129,7 @@ impl Feedback {
         Freshness { fresh, age: Age { age_us: us(seen), limit_us: us(self.max_age), own_us: us(own) } }
     }
 }
+
+#[cfg(test)]
+#[path = "feedback_tests.rs"]
+mod tests;

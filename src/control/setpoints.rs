@@ -42,11 +42,6 @@ impl SetpointWindow {
         self.count = 0;
     }
 
-    /// Returns whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.count == 0
-    }
-
     /// Adds the setpoints of a tick [rad or rad/s].
     pub fn push(&mut self, now: Mono, values: &Joints) {
         let grown = self.count > 0
@@ -148,7 +143,7 @@ mod tests {
         let off = points.range(ms(1190 - 60)).unwrap().distance(0, 2.8);
         assert!((off + 0.17).abs() < 1e-12, "{off}");
         points.clear();
-        assert!(points.is_empty() && points.range(ms(0)).is_none());
+        assert!(points.range(ms(0)).is_none());
     }
 
     #[test]

@@ -53,6 +53,11 @@ impl Task {
         }
     }
 
+    /// Returns the joints that it moves now: those of its motion, else all of its joints.
+    pub fn moving_joints(&self) -> &[u16] {
+        self.motion.as_ref().map_or(&self.joints, |motion| &motion.joints)
+    }
+
     /// Returns whether it executes or decelerates.
     pub fn is_active(&self) -> bool {
         matches!(self.state, TaskState::Executing | TaskState::Cancelling)

@@ -131,11 +131,6 @@ impl Tracking {
     pub fn pause(&mut self) {
         self.exceeded = 0.0;
     }
-
-    /// Returns whether there are setpoints to compare with.
-    pub fn has_setpoints(&self) -> bool {
-        !self.setpoints.is_empty()
-    }
 }
 
 /// Returns how far a joint's velocity is from its setpoints, if that exceeds the tolerance [rad/s]; otherwise 0.
@@ -150,3 +145,7 @@ fn velocity_error(range: &Range, state: &ArmState, joint: usize) -> f64 {
 pub(super) fn furthest(values: impl Iterator<Item = f64>) -> Option<(u16, f64)> {
     values.zip(0u16..).map(|(v, j)| (j, v)).max_by(|a, b| a.1.abs().total_cmp(&b.1.abs()))
 }
+
+#[cfg(test)]
+#[path = "tracking_tests.rs"]
+mod tests;

@@ -2,11 +2,16 @@
 //!
 //! All values are in SI units: rad, rad/s, Nm, m, N. A new arm implements the methods without a default body, and
 //! overrides the others if its device has the feature; the defaults report a missing feature. Features that only some
-//! arms have are separate traits: [`Gripper`], [`ForceTorque`], [`Cartesian`].
+//! arms have are separate traits: [`Gripper`], [`ForceTorque`], [`Cartesian`], [`Io`],
+//! [`Payload`], [`JointMonitor`].
 //!
 //! A device is either polled, or streams its state. For the second kind, [`ManipulatorAdapter::state_fd`] returns the
 //! descriptor on which the state arrives: the device thread then reads when data has arrived, so the age of the state
 //! depends on the device only.
+
+mod io;
+mod joint_monitor;
+mod payload;
 
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -14,6 +19,10 @@ use std::time::Duration;
 use crate::arm::Pose;
 use crate::clock::Mono;
 use crate::joint::{ControlMode, JointLimits, Joints, MAX_DOF};
+
+pub use io::Io;
+pub use joint_monitor::JointMonitor;
+pub use payload::Payload;
 
 /// Why an adapter call failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -81,6 +90,8 @@ pub struct ManipulatorInfo {
 pub struct JointReading {
     /// When the device measured, if it reports that (translated to the monotonic clock).
     pub stamp: Option<Mono>,
+    /// The same time on the device's own clock, from its own zero [ns], if it reports that: for the log.
+    pub device_ns: Option<u64>,
     /// Joint positions [rad].
     pub position: Joints,
     /// Joint velocities [rad/s], if the device has them.
@@ -179,7 +190,7 @@ pub trait ManipulatorAdapter: Send {
         let dof = self.get_dof().min(MAX_DOF);
         let mut buffer = [0.0; MAX_DOF];
         let slice = buffer.get_mut(..dof).unwrap_or_default();
-        reading.stamp = None;
+        (reading.stamp, reading.device_ns) = (None, None);
         self.read_joint_positions(slice)?;
         reading.position = buffer;
         let mut buffer = [0.0; MAX_DOF];
@@ -239,6 +250,21 @@ pub trait ManipulatorAdapter: Send {
     }
     /// Returns the device's own kinematics; `None` if it has none. Does not change while the arm is connected.
     fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
+        None
+    }
+    /// Returns the controller's digital and analogue inputs and outputs; `None` if it has none. Does not change while
+    /// the arm is connected.
+    fn io(&mut self) -> Option<&mut dyn Io> {
+        None
+    }
+    /// Returns the load at the flange, as the controller takes it; `None` if it takes none. Does not change while the
+    /// arm is connected.
+    fn payload(&mut self) -> Option<&mut dyn Payload> {
+        None
+    }
+    /// Returns the condition of the joints' drives; `None` if the device reports none. Does not change while the arm is
+    /// connected.
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
         None
     }
 }

@@ -7,5 +7,6 @@ pub mod check;
 pub mod conformance;
 pub mod device;
 pub mod registry;
+pub mod service;
 pub mod sim;
 pub mod transport;

@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::service::OpenService;
 use crate::hardware::sim::faults::Fault;
 use crate::joint::{ControlMode, Joints};
 use crate::named::named;
@@ -150,6 +151,8 @@ pub struct AdapterSpec {
     pub create: fn(&AdapterConfig) -> Result<Box<dyn ManipulatorAdapter>, AdapterError>,
     /// Starts an emulator of the arm, for `address: sim`; `None` if the adapter simulates the arm itself.
     pub emulate: Option<Emulate>,
+    /// Opens the arm's bus for work outside a run, such as calibration; `None` if there is none.
+    pub service: Option<OpenService>,
 }
 
 /// An adapter that this build lacks: of another operating system, or of a disabled cargo feature.

@@ -1,7 +1,7 @@
 //! Samples of one arm as messages.
 
-use super::messages::{ArmInput, ArmOutput, ArmStatus, Header};
-use crate::arm::{ArmCommand, ArmState};
+use super::messages::{self, ArmInput, ArmIo, ArmOutput, ArmStatus, Header, Inertia, InertiaStamped, Vector3};
+use crate::arm::{AnalogUnit, ArmCommand, ArmState, IoInfo, IoState, JointStatus, Load};
 use crate::joint::ControlMode;
 use crate::telemetry::describe::cause_text;
 use crate::telemetry::{ArmSample, TickSample};
@@ -11,7 +11,7 @@ use crate::telemetry::{ArmSample, TickSample};
 pub(super) fn input_differs(a: &ArmState, b: &ArmState) -> bool {
     let values = |s: &ArmState| (s.gripper, s.pose, s.wrench, s.effort.is_some(), s.velocity_source);
     let flags = |s: &ArmState| (s.seq, s.stamp, s.mode, s.enabled, s.error, s.link, s.self_held, s.written);
-    let more = |s: &ArmState| (s.interference, s.own_delay_ns);
+    let more = |s: &ArmState| (s.interference, s.own_delay_ns, s.stop_input_open, s.device_ns);
     values(a) != values(b) || flags(a) != flags(b) || more(a) != more(b)
 }
 
@@ -41,6 +41,8 @@ pub(super) fn input(header: &Header, tick: u64, s: &ArmState) -> ArmInput {
         written: s.written,
         interference: s.interference.name().into(),
         own_delay_ns: s.own_delay_ns,
+        stop_input_open: s.stop_input_open,
+        device_ns: s.device_ns.into_iter().collect(),
     }
 }
 
@@ -57,6 +59,47 @@ pub(super) fn output(header: &Header, tick: u64, c: &ArmCommand) -> ArmOutput {
         next_tick_ns: c.next_tick.0,
         start_seq: c.start_seq,
     }
+}
+
+/// Returns the levels of inputs and outputs.
+pub(super) fn io(header: Header, info: &IoInfo, state: &IoState) -> ArmIo {
+    let levels = |bits: u32, count: u8| (0..count).map(move |i| (bits.checked_shr(i.into()).unwrap_or(0) & 1) as u8);
+    let units = |units: &[AnalogUnit]| units.iter().map(|unit| unit.name().to_owned()).collect();
+    let values = |values: &[f64], count: usize| values.iter().take(count).copied().collect();
+    ArmIo {
+        header,
+        digital_inputs: levels(state.digital_inputs, info.digital_inputs).collect(),
+        digital_outputs: levels(state.digital_outputs, info.digital_outputs).collect(),
+        analog_inputs: values(&state.analog_inputs, info.analog_inputs.len()),
+        analog_outputs: values(&state.analog_outputs, info.analog_outputs.len()),
+        analog_input_units: units(info.analog_inputs),
+        analog_output_units: units(info.analog_outputs),
+    }
+}
+
+/// Returns the condition of joints with these names.
+pub(super) fn joint_status(header: Header, names: &[String], joints: &[JointStatus]) -> messages::JointStatus {
+    let joints = joints.get(..names.len()).unwrap_or_default();
+    let column = |value: fn(&JointStatus) -> Option<f64>| -> Vec<f64> {
+        let any = joints.iter().any(|joint| value(joint).is_some());
+        joints.iter().filter(|_| any).map(|joint| value(joint).unwrap_or(f64::NAN)).collect()
+    };
+    messages::JointStatus {
+        header,
+        name: names.to_vec(),
+        temperature: column(|joint| joint.temperature),
+        current: column(|joint| joint.current),
+        voltage: column(|joint| joint.voltage),
+        load: column(|joint| joint.load),
+        error: joints.iter().map(|joint| joint.error).collect::<Option<_>>().unwrap_or_default(),
+    }
+}
+
+/// Returns a load at the flange.
+pub(super) fn payload(header: Header, load: &Load) -> InertiaStamped {
+    let ([x, y, z], [ixx, ixy, ixz, iyy, iyz, izz]) = (load.center, load.inertia);
+    let inertia = Inertia { m: load.mass, com: Vector3 { x, y, z }, ixx, ixy, ixz, iyy, iyz, izz };
+    InertiaStamped { header, inertia }
 }
 
 /// Returns the status of an arm.

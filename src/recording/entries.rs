@@ -6,7 +6,10 @@ use mcap::parse_record;
 use mcap::records::{Channel, MessageHeader, Record, op};
 use serde::Serialize;
 
-use super::messages::{ArmInput, ArmOutput, ArmStatus, Event, JointState, Log, Text, Tick, WrenchStamped};
+use super::messages::{
+    ArmInput, ArmIo, ArmOutput, ArmStatus, Event, InertiaStamped, JointState, JointStatus, Log, Text, Tick,
+    WrenchStamped,
+};
 use super::replay::Selection;
 use super::wire::Message;
 
@@ -67,7 +70,7 @@ macro_rules! payloads {
         }
     };
 }
-payloads! { JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput }
+payloads! { JointState Text WrenchStamped Log Tick Event ArmStatus ArmInput ArmOutput ArmIo InertiaStamped JointStatus }
 
 /// Returns the header and bytes of a message record; `None` for other records.
 pub(super) fn message(opcode: u8, body: &[u8]) -> Option<(MessageHeader, &[u8])> {

@@ -89,6 +89,38 @@ message! {
 }
 
 message! {
+    /// Mass, centre and inertia of a body.
+    "geometry_msgs/msg/Inertia" "geometry_msgs/Inertia" Inertia {
+        /// Mass [kg].
+        m: f64,
+        /// Centre of mass [m].
+        com: Vector3,
+        /// Inertia about the centre of mass [kg·m²].
+        ixx: f64,
+        /// [kg·m²].
+        ixy: f64,
+        /// [kg·m²].
+        ixz: f64,
+        /// [kg·m²].
+        iyy: f64,
+        /// [kg·m²].
+        iyz: f64,
+        /// [kg·m²].
+        izz: f64,
+    }
+}
+
+message! {
+    /// Mass, centre and inertia of a body at a time.
+    "geometry_msgs/msg/InertiaStamped" "geometry_msgs/InertiaStamped" InertiaStamped {
+        /// Time.
+        header: Header,
+        /// The body, in the flange frame.
+        inertia: Inertia,
+    }
+}
+
+message! {
     /// A line of the text log.
     "rcl_interfaces/msg/Log" "rcl_interfaces/Log" Log {
         /// Time.
@@ -231,6 +263,50 @@ message! {
         interference: String,
         /// Part of the state's age during which the device thread could not run [ns].
         own_delay_ns: u64,
+        /// The arm's stop input is open.
+        stop_input_open: bool,
+        /// The device's own time of the measurement, on its own clock [ns]; empty if not reported.
+        device_ns: Vec<u64>,
+    }
+}
+
+message! {
+    /// Levels of an arm's digital and analogue inputs and outputs, in the order of their numbers. On changes.
+    "dimos_msgs/msg/ArmIo" "dimos_msgs/ArmIo" ArmIo {
+        /// When they were read.
+        header: Header,
+        /// Digital inputs di0, di1, …: 0 low, 1 high.
+        digital_inputs: Vec<u8>,
+        /// Digital outputs do0, do1, …: 0 low, 1 high.
+        digital_outputs: Vec<u8>,
+        /// Analogue inputs ai0, ai1, …, in their units.
+        analog_inputs: Vec<f64>,
+        /// Analogue outputs ao0, ao1, …, in their units.
+        analog_outputs: Vec<f64>,
+        /// Units of the analogue inputs: V or A.
+        analog_input_units: Vec<String>,
+        /// Units of the analogue outputs: V or A.
+        analog_output_units: Vec<String>,
+    }
+}
+
+message! {
+    /// Condition of an arm's joints. About twice a second, where the device reports any.
+    "dimos_msgs/msg/JointStatus" "dimos_msgs/JointStatus" JointStatus {
+        /// When it was read.
+        header: Header,
+        /// Joint names. Each list below has one value per name, NaN if it is unknown, or is empty.
+        name: Vec<String>,
+        /// Temperature of the motor or its driver [°C].
+        temperature: Vec<f64>,
+        /// Motor current [A].
+        current: Vec<f64>,
+        /// Supply voltage [V].
+        voltage: Vec<f64>,
+        /// Load as a fraction of the rated torque, signed.
+        load: Vec<f64>,
+        /// Error codes of the drives, 0 for none; empty unless every joint reports one.
+        error: Vec<i32>,
     }
 }
 

@@ -5,7 +5,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender};
 
+use crate::arm::{IoInfo, IoState, JointStatus, Load};
 use crate::clock::Mono;
+use crate::joint::MAX_DOF;
 use crate::telemetry::describe::Severity;
 use crate::trajectory::JointTrajectory;
 
@@ -49,6 +51,35 @@ pub enum Note {
         /// The line.
         text: String,
     },
+    /// Levels of an arm's inputs and outputs.
+    Io {
+        /// Index of the arm.
+        arm: u16,
+        /// When they were read.
+        stamp: Mono,
+        /// The channels.
+        info: IoInfo,
+        /// Their levels.
+        state: IoState,
+    },
+    /// Condition of an arm's joints.
+    JointStatus {
+        /// Index of the arm.
+        arm: u16,
+        /// When it was read.
+        stamp: Mono,
+        /// One entry per joint.
+        joints: Box<[JointStatus; MAX_DOF]>,
+    },
+    /// Load at an arm's flange that its controller calculates with.
+    Payload {
+        /// Index of the arm.
+        arm: u16,
+        /// When it was read.
+        stamp: Mono,
+        /// The load.
+        load: Load,
+    },
     /// An arm's text for its current error.
     ArmText {
         /// Index of the arm.
@@ -64,6 +95,9 @@ impl Note {
         NOTE_OVERHEAD
             + match self {
                 Self::Request { json: text, .. } | Self::Log { text, .. } | Self::ArmText { text, .. } => text.len(),
+                Self::Io { .. } => size_of::<IoState>(),
+                Self::Payload { .. } => size_of::<Load>(),
+                Self::JointStatus { joints, .. } => size_of_val(&**joints),
                 Self::Execute { trajectory, .. } => {
                     let values = trajectory
                         .points

@@ -11,6 +11,7 @@ use super::log_writer::LogWriter;
 use super::messages::{
     ArmInput, ArmOutput, ArmStatus, Event, Header, JointState, Log, Text, Tick, Time, Vector3, Wrench, WrenchStamped,
 };
+use super::wire::Message;
 use crate::arm::{ArmCommand, ArmState, VelocitySource};
 use crate::clock::{Mono, WallOffset};
 use crate::joint::{ControlMode, Joints};
@@ -118,6 +119,21 @@ impl TickLog {
         if let Some(arm) = self.arms.get_mut(usize::from(arm)) {
             arm.error_text = text;
         }
+    }
+
+    /// Logs a message of an arm's optional part on `/<topic>/<arm>`; `message` gets the names of its joints.
+    pub fn part<M: Message, W: Write + Seek>(
+        &self,
+        log: &mut LogWriter<W>,
+        arm: u16,
+        topic: &str,
+        stamp: Mono,
+        message: impl FnOnce(Header, &[String]) -> M,
+    ) -> McapResult<()> {
+        let time = self.wall.wall(stamp);
+        let header = Header { stamp: Time::of(time), frame_id: self.frame_id.clone() };
+        let joints = self.names.arms.get(usize::from(arm)).map_or(&[][..], |arm| &arm.joints);
+        log.publish(&format!("/{topic}/{}", self.names.arm(arm)), time, &message(header, joints))
     }
 
     /// Logs a request as passed to the tick.

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use mcap::{McapError, McapResult};
 
+use super::arm_messages::{io, joint_status, payload};
 use super::disk_space;
 use super::disk_sync::DiskSync;
 use super::log_writer::LogWriter;
@@ -177,6 +178,15 @@ impl<W: Write + Seek, F: FnMut(Notice<'_>)> Worker<W, F> {
                 }
             }
             Note::Log { severity, stamp, text } => self.ticks.line(log, severity, stamp, &text),
+            Note::Io { arm, stamp, info, state } => {
+                self.ticks.part(log, arm, "io", stamp, |header, _| io(header, &info, &state))
+            }
+            Note::JointStatus { arm, stamp, joints } => {
+                self.ticks.part(log, arm, "joint_status", stamp, |header, names| joint_status(header, names, &*joints))
+            }
+            Note::Payload { arm, stamp, load } => {
+                self.ticks.part(log, arm, "payload", stamp, |header, _| payload(header, &load))
+            }
             Note::ArmText { arm, text } => {
                 self.ticks.arm_text(arm, text);
                 Ok(())

@@ -271,6 +271,7 @@ fn read_input(input: &ArmInput, state: &mut ArmState) -> Result<(), String> {
         written: input.written,
         interference: interference(&input.interference)?,
         own_delay_ns: input.own_delay_ns,
+        stop_input_open: input.stop_input_open,
         ..ArmState::default()
     };
     Ok(())

@@ -24,6 +24,7 @@ robots!(
     "lite6_gripper",
     "piper",
     "piper_gripper",
+    "ur5e",
     "xarm5",
     "xarm5_gripper",
     "xarm6",

@@ -17,6 +17,7 @@ pub use super::cartesian_api::*;
 use super::error::{Code, RpcError};
 use super::lease::Subject;
 pub use super::motion_api::*;
+pub use super::parts_api::*;
 pub use super::planner_api::*;
 use super::planner_proxy::PlannerProxy;
 use super::report::{MotionReport, StateReport, StatusReport};
@@ -173,6 +174,14 @@ methods! {
     "arm_disable" ArmDisable -> ArmReply;
     /// Commands a gripper.
     "gripper" Gripper -> Done, check Gripper::valid;
+    /// Levels of an arm's digital and analogue inputs and outputs.
+    "arm_io" ArmIo -> IoReport;
+    /// Sets digital and analogue outputs of an arm, and reads them back.
+    "arm_io_set" ArmIoSet -> IoReport, check ArmIoSet::valid;
+    /// The load at an arm's flange that its controller calculates with.
+    "arm_payload" ArmPayload -> PayloadReply;
+    /// Sets the load at an arm's flange, and reads it back. The arm must be at rest.
+    "arm_payload_set" ArmPayloadSet -> PayloadReply, check ArmPayloadSet::valid;
     /// Next target of a servo task; repeat it within the task's timeout.
     "servo" Servo -> Done, check Servo::valid;
     /// Next target of a velocity task; repeat it within the task's timeout.
@@ -200,7 +209,7 @@ methods! {
     /// Removes an object of the world, or all.
     "world_remove" WorldRemove -> Done;
     /// Attaches an object to a robot at its current pose.
-    "attach" Attach -> Done;
+    "attach" Attach -> AttachReply, check Attach::valid;
     /// Detaches an object; it stays at its current pose.
     "detach" Detach -> Done;
     /// Shuts the run down like SIGTERM. Replies before it begins.

@@ -24,6 +24,7 @@ pub mod error;
 mod lease;
 mod line_reader;
 mod motion_api;
+mod parts_api;
 mod planner_api;
 pub mod planner_proxy;
 pub mod planner_stub;

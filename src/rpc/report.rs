@@ -6,6 +6,8 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::api::{IoReport, LoadReport};
+
 /// Reply to `status`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct StatusReport {
@@ -157,6 +159,15 @@ pub struct ArmReport {
     /// Closed and open position of its gripper [m]; absent without a gripper, or if the adapter does not report it.
     #[serde(default)]
     pub gripper_range: Option<[f64; 2]>,
+    /// Its digital and analogue inputs and outputs, as read last; absent without any.
+    #[serde(default)]
+    pub io: Option<IoReport>,
+    /// Condition of its joints, as read last; empty if the device reports none.
+    #[serde(default)]
+    pub joints: Vec<JointStatusReport>,
+    /// The load at the flange that its controller reports, or that was set; absent if it takes none.
+    #[serde(default)]
+    pub payload: Option<LoadReport>,
     /// Lower and upper position limits of its joints [rad], in their order.
     #[serde(default)]
     pub position_limits: Vec<[f64; 2]>,
@@ -166,6 +177,25 @@ pub struct ArmReport {
     pub holds_when_disabled: bool,
     /// Counters of the device thread: `reads`, `read_errors`, `writes`, …
     pub counters: BTreeMap<String, u64>,
+}
+
+/// Condition of one joint in `status`; null: the device does not report it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct JointStatusReport {
+    /// Its name.
+    pub name: String,
+    /// Temperature of the motor or its driver [°C].
+    pub temperature: Option<f64>,
+    /// Motor current [A].
+    pub current: Option<f64>,
+    /// Supply voltage [V].
+    pub voltage: Option<f64>,
+    /// Load as a fraction of the rated torque, signed.
+    pub load: Option<f64>,
+    /// Error code of the drive; 0 = none.
+    pub error: Option<i32>,
+    /// Offset that the device's calibration subtracts from its encoder [rad].
+    pub calibration_offset: Option<f64>,
 }
 
 /// The lease holder of an arm.

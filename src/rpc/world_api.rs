@@ -3,6 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::parts_api::LoadReport;
 use super::planner_api::PoseSpec;
 
 /// Shape of an obstacle. Its frame is at its centre; the axis of a cylinder is z.
@@ -147,6 +148,32 @@ pub struct Attach {
     /// Further links that may touch it.
     #[serde(default)]
     pub touch_links: Vec<String>,
+    /// Its mass [kg]: the arm's controller is set to carry it, if it takes a payload. The centre of mass and the
+    /// inertia are those of a solid body of the object's shape; of a mesh or cloud, a point mass at its origin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mass: Option<f64>,
+}
+
+impl Attach {
+    pub(super) fn valid(&self) -> Result<(), String> {
+        match self.mass {
+            Some(mass) if !(mass > 0.0 && mass <= 1000.0) => {
+                Err(format!("mass is {mass} kg, must be above 0, at most 1000"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Reply to `attach`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct AttachReply {
+    /// The object as a load in the flange frame (that of the robot's end-effector link); absent without a mass.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub load: Option<LoadReport>,
+    /// The load that the arm's controller now reports; absent without a mass, or if it takes no payload.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub payload: Option<LoadReport>,
 }
 
 /// Parameters of `detach`.

@@ -175,7 +175,7 @@ impl Service {
     }
 
     /// Waits until an arm is at rest; an error if it still moves at the timeout.
-    async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
+    pub(super) async fn wait_for_rest(&self, id: &str, arm: u16, limit: Instant) -> Result<(), RpcError> {
         let device = self.device(arm)?;
         let late = || Instant::now() >= limit;
         // Without a command the arm is being stopped, or this run did not move it. The motors stay on until that stop.
@@ -231,7 +231,7 @@ impl Service {
     }
 
     /// Returns the time for an arm to brake: twice what its fastest joint needs at its acceleration limit.
-    fn braking_limit(&self, arm: u16) -> Duration {
+    pub(super) fn braking_limit(&self, arm: u16) -> Duration {
         let config = self.parts.config.arms.get(arm as usize);
         let view = self.arm_view(arm as usize);
         let joints = view.iter().zip(config).flat_map(|(view, config)| {
@@ -245,7 +245,7 @@ impl Service {
     }
 
     /// Returns the velocity of an arm's fastest joint [rad/s]; 0 without a state.
-    fn speed(&self, arm: u16) -> f64 {
+    pub(super) fn speed(&self, arm: u16) -> f64 {
         let view = self.arm_view(arm as usize).filter(|view| view.state.link == Link::Up);
         let joints = view.iter().flat_map(|view| view.state.velocity.iter().take(view.state.dof));
         joints.map(|v| v.abs()).fold(0.0, f64::max)
@@ -271,12 +271,12 @@ fn still_moves(arm: &str, speed: f64) -> RpcError {
 }
 
 /// Waits for a device without blocking other clients of the run.
-async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
+pub(super) async fn order<T: Send + 'static>(answer: Answer<T>) -> AdapterResult<T> {
     let waited = tokio::task::spawn_blocking(move || answer.wait(ORDER_LIMIT)).await;
     waited.unwrap_or_else(|e| Err(AdapterError::Io(e.to_string())))
 }
 
-fn refused(arm: &str, what: &str, error: &AdapterError) -> RpcError {
+pub(super) fn refused(arm: &str, what: &str, error: &AdapterError) -> RpcError {
     let general = "see the arm's own panel or manual; `dimos status` shows its link and error";
     let (what, hint) = Message::of(format!("{arm} {what}: {error}")).or_hint(general);
     RpcError::new(Code::DeviceRefused, what).hint(hint)

@@ -73,13 +73,16 @@ pub fn bring_up(
             tick_period: period,
             native_rate: arm.adapter.native_rate,
             supervision: arm.supervision,
+            setup: arm.setup,
             beat: beat.clone(),
             clock: Arc::new(MonotonicClock),
             notes: Box::new(move |what| note(index, what)),
         };
         let thread = |e| StartError::other(format!("no device thread for {}: {e}", arm.hardware_id), "see ulimit -u");
         arms.devices.push(Arc::new(Device::spawn(device, adapter, state_writer, command_reader).map_err(thread)?));
-        arms.disable.push(arm.on_exit == OnExit::Disable);
+        // An arm that is not parked is left as one without `on_exit` is.
+        let unparked = arm.on_exit == OnExit::Park && arm.adapter.holds_when_disabled;
+        arms.disable.push(arm.on_exit == OnExit::Disable || unparked);
         slots.states.push(state_reader);
         slots.commands.push(command_writer);
     }
@@ -218,14 +221,21 @@ impl Arms {
         Ok(())
     }
 
-    /// Ends commanded motion, disables arms with `on_exit: disable`, disconnects. Returns the problems.
-    pub fn release(&mut self) -> Vec<String> {
+    /// Disables this arm when it is released: it is parked.
+    pub fn disable_at_release(&mut self, arm: usize) {
+        self.disable.iter_mut().skip(arm).take(1).for_each(|disable| *disable = true);
+    }
+
+    /// Ends commanded motion, disables arms with `on_exit: disable` and those that are parked, disconnects. Returns the
+    /// problems, each with the name of its arm.
+    pub fn release(&mut self) -> Vec<(String, String)> {
         let answers: Vec<_> = self.devices.iter().zip(&self.disable).map(|(d, disable)| d.finish(*disable)).collect();
         let limit = Instant::now() + RELEASE_LIMIT;
         let mut troubles = Vec::new();
         for (device, answer) in self.devices.iter().zip(answers) {
             if let Err(e) = answer.wait(limit.saturating_duration_since(Instant::now())) {
-                troubles.push(format!("{}: could not be released as planned: {e}", device.hardware_id()));
+                let name = device.hardware_id();
+                troubles.push((name.to_owned(), format!("{name}: could not be released as planned: {e}")));
             }
         }
         self.devices.clear();
@@ -235,7 +245,7 @@ impl Arms {
 
 impl Drop for Arms {
     fn drop(&mut self) {
-        for trouble in self.release() {
+        for (_, trouble) in self.release() {
             tracing::warn!("{trouble}");
         }
     }

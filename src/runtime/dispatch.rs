@@ -110,6 +110,12 @@ impl Dispatcher {
         let _ = self.notes.send(Note::Log { severity, stamp: MonotonicClock.now(), text });
     }
 
+    /// Sends a note to the recorder.
+    pub fn note(&self, note: Note) {
+        // The recorder counts notes that do not fit; without a recorder the run is shutting down.
+        let _ = self.notes.send(note);
+    }
+
     fn answered(&self, id: u64, outcome: Outcome) {
         if let Some(sender) = lock(&self.waiting).remove(&id) {
             // The client may have disconnected.

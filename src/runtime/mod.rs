@@ -3,7 +3,7 @@
 //!
 //! ```text
 //! start: claim the name ─▶ lock the devices ─▶ emulators ─▶ connect all ─▶ tick, recorder ─▶ enable ─▶ rpc
-//! stop:  decelerate ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
+//! stop:  park, where asked ─▶ decelerate ─▶ end the tick ─▶ release the arms ─▶ close rpc ─▶ close the log
 //! ```
 
 mod arm_requests;
@@ -20,6 +20,9 @@ mod log_file;
 mod log_throttle;
 mod motion_requests;
 mod motions;
+mod park;
+mod part_requests;
+mod payloads;
 mod plan_requests;
 mod planner_link;
 mod planner_port;
@@ -38,7 +41,7 @@ mod world_requests;
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::time::{Duration, Instant};
 
@@ -54,6 +57,7 @@ use crate::control::request::Request;
 use crate::control::tick_loop::{Probe, Pulse};
 use crate::planning::planner_thread::Solver;
 use crate::recording::recorder::Recorder;
+use crate::rpc::report::ArmReport;
 use crate::rpc::run_dir::RunDir;
 use crate::rpc::server::Server;
 use crate::rt::host::LatencyHold;
@@ -171,10 +175,14 @@ pub enum Ending {
 }
 
 /// Result of a run that has ended.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Ended {
     /// Problems during the shutdown.
     pub troubles: Vec<String>,
+    /// The arms that were parked ([`Run::park_and_stop`]).
+    pub parked: Vec<String>,
+    /// The arms at rest, before they were released.
+    pub arms: Vec<ArmReport>,
     /// The log, if one was written.
     pub log: Option<PathBuf>,
     /// Why the log ended before the run, if so.
@@ -204,6 +212,8 @@ pub struct Run {
     server: Option<Server>,
     handle: Handle,
     endings: (Sender<Ending>, Receiver<Ending>),
+    /// Whether it ends by a fault, or because of its log: then nothing is parked.
+    faulted: AtomicBool,
     manager: Option<ServiceManager>,
     _latency: Option<LatencyHold>,
 }
@@ -218,7 +228,7 @@ impl std::ops::Deref for Run {
 
 impl Drop for Run {
     fn drop(&mut self) {
-        for trouble in self.stop_in_order().troubles {
+        for trouble in self.stop_in_order(false).troubles {
             tracing::warn!("{trouble}");
         }
     }
@@ -252,15 +262,26 @@ impl Run {
             Some(limit) => self.endings.1.recv_timeout(limit),
             None => self.endings.1.recv().map_err(|_| RecvTimeoutError::Disconnected),
         };
-        received.unwrap_or(Ending::Duration)
+        let ending = received.unwrap_or(Ending::Duration);
+        if matches!(ending, Ending::Fault(_) | Ending::Log(_)) {
+            self.faulted.store(true, Ordering::Release);
+        }
+        ending
     }
 
-    /// Shuts the run down in order. Continues after errors. Dropping a run does the same.
+    /// Shuts the run down in order. Continues after errors. Moves nothing: arms with `on_exit: park` are left as those
+    /// without `on_exit`. Dropping a run does the same.
     pub fn stop(mut self) -> Ended {
-        self.stop_in_order()
+        self.stop_in_order(false)
     }
 
-    fn stop_in_order(&mut self) -> Ended {
+    /// Moves arms with `on_exit: park` to their park pose, unless there was a fault, and shuts the run down. Until they
+    /// have arrived, stop and cancel are accepted, and another ending ([`endings`](Self::endings)) ends the motion.
+    pub fn park_and_stop(mut self) -> Ended {
+        self.stop_in_order(true)
+    }
+
+    fn stop_in_order(&mut self, park: bool) -> Ended {
         // The remaining fields are dropped with the run, the arms before the server: when the run has disappeared, its
         // log is closed and its devices are free.
         let Some(recorder) = self.recorder.take() else { return Ended::default() };
@@ -268,13 +289,22 @@ impl Run {
         if let Some(manager) = &self.manager {
             manager.stopping();
         }
+        // Before the run is closed: no stop is refused that comes before the motion.
+        self.handle.service.set_parking(park);
         self.handle.service.close();
+        if park {
+            self.park(&mut ended);
+            self.handle.service.set_parking(false);
+        }
         self.come_to_rest(&mut ended);
+        ended.arms = self.status().arms;
         self.watchdog.stand_down();
         if !self.tick.end() {
             ended.troubles.push("the tick thread does not end; it is left behind".to_owned());
         }
-        ended.troubles.extend(self.arms.release());
+        let unreleased = self.arms.release();
+        ended.parked.retain(|arm| !unreleased.iter().any(|(name, _)| name == arm));
+        ended.troubles.extend(unreleased.into_iter().map(|(_, trouble)| trouble));
         self.outcomes = None;
         if let Err(e) = recorder.finish() {
             ended.log_cut = e.to_string().lines().next().map(str::to_owned);
@@ -285,20 +315,24 @@ impl Run {
     fn come_to_rest(&self, ended: &mut Ended) {
         let sent = self.dispatcher.send(Request::Shutdown, log_of(&Request::Shutdown));
         let Ok(mut answer) = sent else { return ended.troubles.push("the coordinator accepts no requests".to_owned()) };
+        if !self.rests(|| answer.try_recv().is_ok()) && self.tick.is_alive() {
+            ended.troubles.push(format!("the arms were not at rest after {} s", REST_LIMIT.as_secs()));
+        }
+    }
+
+    /// Waits until all arms are at rest, after `is_taken` returned true once. Returns whether they are.
+    fn rests(&self, mut is_taken: impl FnMut() -> bool + Send) -> bool {
         let (service, tick, pulse) = (&self.handle.service, &self.tick, &self.pulse);
         let (mut taken, mut still_since) = (false, Instant::now());
         let look = || {
-            taken = taken || answer.try_recv().is_ok();
+            taken = taken || is_taken();
             // Commands at rest are not enough: an arm that lags, or whose motors are off, may still move.
             if !(taken && pulse.at_rest.load(Ordering::Acquire) && service.at_standstill()) {
                 still_since = Instant::now();
             }
             let rests = still_since.elapsed() >= STILL_FOR.max(2 * service.period());
-            (rests || !tick.is_alive()).then_some(())
+            (rests || !tick.is_alive()).then_some(rests)
         };
-        let rested = in_process::wait_for(service.until(Instant::now() + REST_LIMIT, look)).flatten();
-        if rested.is_none() && tick.is_alive() {
-            ended.troubles.push(format!("the arms were not at rest after {} s", REST_LIMIT.as_secs()));
-        }
+        in_process::wait_for(service.until(Instant::now() + REST_LIMIT, look)).flatten() == Some(true)
     }
 }

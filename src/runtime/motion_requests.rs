@@ -1,6 +1,7 @@
 //! Requests for motions: finds the task, checks every limit, passes the motion to the tick.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use serde_json::json;
 
@@ -25,13 +26,13 @@ const REST: f64 = 1e-3;
 pub(super) type Carries = (u64, Option<Option<api::Presence>>);
 
 impl Service {
-    /// Returns a trajectory task that covers these joints.
+    /// Returns the trajectory task that covers these joints and the fewest others.
     pub(super) fn trajectory_task(&self, joints: &[u16]) -> Result<u16, RpcError> {
         let tasks = self.parts.blueprint.tasks.iter().enumerate();
         let fitting = |(_, t): &(usize, &crate::blueprint::Task)| {
             t.spec.takes(TargetKind::Trajectory) && joints.iter().all(|&j| t.joints.contains(&j.into()))
         };
-        match { tasks }.find(fitting) {
+        match tasks.filter(fitting).min_by_key(|(_, t)| t.joints.len()) {
             Some((i, _)) => Ok(i as u16),
             None => Err(RpcError::new(Code::NoTrajectoryTask, "no trajectory task covers these joints")
                 .hint("add one to the blueprint: `tasks: [{name: traj_arm, type: trajectory, …}]`")),
@@ -39,6 +40,11 @@ impl Service {
     }
 
     pub(super) async fn move_arm(&self, call: api::Move) -> Result<Reply, RpcError> {
+        self.move_within(call, Duration::MAX).await
+    }
+
+    /// Moves an arm, if that takes at most `longest`.
+    pub(super) async fn move_within(&self, call: api::Move, longest: Duration) -> Result<Reply, RpcError> {
         let arm = self.arm_index(&call.arm)?;
         let joints: Vec<u16> = self.joints_of_arm(arm).collect();
         let config = &self.parts.config.arms[arm as usize];
@@ -67,6 +73,10 @@ impl Service {
             }
         })?;
         let duration = motion.duration();
+        if duration > longest.as_secs_f64() {
+            let what = format!("the motion would take {duration:.1} s (limit {} s)", longest.as_secs());
+            return Err(RpcError::new(Code::OutOfLimits, what));
+        }
         let number = self.begin(task, joints, motion, None).await?;
         Ok(Reply::Move(api::MoveReply {
             motion: number,

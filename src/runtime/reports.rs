@@ -6,9 +6,9 @@ use std::time::Instant;
 use super::motions::{End, Next};
 use super::service::Service;
 use crate::arm::{ArmState, VelocitySource};
-use crate::blueprint::OnExit;
 use crate::clock::WallOffset;
 use crate::hardware::device::Connected;
+use crate::rpc::api::LoadReport;
 use crate::rpc::report::*;
 use crate::rpc::streams::{EventReport, JointState, Level};
 use crate::rpc::{Code, RpcError};
@@ -62,7 +62,7 @@ impl Service {
     fn arm_report(&self, index: usize) -> Option<ArmReport> {
         let (arm, device) = (self.parts.blueprint.arms.get(index)?, self.parts.devices.get(index)?);
         let (view, health, now) = (self.arm_view(index)?, device.health(), self.now());
-        let Connected { info, gripper_range, .. } = self.parts.connected.get(index)?;
+        let Connected { info, gripper_range, io, .. } = self.parts.connected.get(index)?;
         let faults = health.episodes().into_iter().map(|e| FaultReport {
             since: now.seconds_since(e.since),
             over: e.until.is_some(),
@@ -97,11 +97,11 @@ impl Service {
             faults: faults.collect(),
             commander: None, // filled in by the connection
             gripper_range: gripper_range.map(|(closed, open)| [closed, open]),
+            io: io.zip(health.details().io).map(|(info, state)| self.io_report(index, &info, &state)),
+            joints: self.joint_status(index, &health.details()),
+            payload: health.details().payload.map(LoadReport::from),
             position_limits: self.position_limits(index),
-            on_exit: match arm.on_exit {
-                OnExit::Hold => "hold".to_owned(),
-                OnExit::Disable => "disable".to_owned(),
-            },
+            on_exit: arm.on_exit.name().to_owned(),
             holds_when_disabled: info.holds_when_disabled,
             counters: counters.into_iter().map(|(name, n)| (name.to_owned(), n.load(Relaxed))).collect(),
         })

@@ -12,6 +12,7 @@ use super::dispatch::{Dispatcher, SendError, log_of};
 use super::late_stops::LateStops;
 use super::log_throttle::LogThrottle;
 use super::motions::Motions;
+use super::payloads::HeldLoads;
 use super::planner_link::Attached;
 use super::planner_port::PlannerPort;
 use super::waiting::Progress;
@@ -21,7 +22,7 @@ use crate::clock::{Mono, WallOffset};
 use crate::control::config::CoordinatorConfig;
 use crate::control::request::Request;
 use crate::control::tick_loop::Pulse;
-use crate::hardware::device::{Connected, Device};
+use crate::hardware::device::{Connected, Details, Device};
 use crate::joint::STANDSTILL;
 use crate::recording::recorder::{Notice, RecorderStats};
 use crate::rpc::api::{self, Backend, BoxFuture, Done, RegisterPlanner, Registered, Reply, Request as Call};
@@ -67,6 +68,10 @@ pub struct Service {
     pub(super) progress: Progress,
     /// One gripper order per arm at a time, so that each gets its own answer.
     pub(super) grippers: Vec<tokio::sync::Mutex<()>>,
+    /// Per arm, the numbers of the slowly changing values that were logged last.
+    pub(super) details_logged: Mutex<Vec<Details>>,
+    /// Per arm, the objects that it holds and whose mass is known. Locked while a load is set.
+    pub(super) held_loads: Vec<tokio::sync::Mutex<HeldLoads>>,
     /// Number of ticks when the joint state was last published.
     pub(super) published: AtomicU64,
     /// The attached planner, also after it disconnected.
@@ -77,6 +82,8 @@ pub struct Service {
     pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
     pub(super) me: Weak<Self>,
     closed: AtomicBool,
+    /// Whether arms move to their park pose: stops are accepted although it is closed.
+    parking: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
 
@@ -85,6 +92,8 @@ impl Service {
         Self {
             progress: Progress::default(),
             grippers: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
+            details_logged: Mutex::new(vec![Details::default(); parts.devices.len()]),
+            held_loads: parts.devices.iter().map(|_| tokio::sync::Mutex::default()).collect(),
             parts,
             started: Instant::now(),
             motions: Mutex::default(),
@@ -97,6 +106,7 @@ impl Service {
             plan_requests: Mutex::default(),
             me,
             closed: AtomicBool::new(false),
+            parking: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
     }
@@ -114,6 +124,11 @@ impl Service {
     /// Rejects new requests from now on.
     pub fn close(&self) {
         self.closed.store(true, Ordering::Release);
+    }
+
+    /// Accepts stops while arms move to their park pose, although the run is closed.
+    pub fn set_parking(&self, parking: bool) {
+        self.parking.store(parking, Ordering::Release);
     }
 
     /// Returns whether the run is shutting down.
@@ -254,7 +269,8 @@ impl Service {
 
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
         let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
-        if changes && self.closed.load(Ordering::Acquire) {
+        let stops = matches!(call, Call::Stop(_) | Call::Cancel(_)) && self.parking.load(Ordering::Acquire);
+        if changes && !stops && self.closed.load(Ordering::Acquire) {
             return self.refusal(&Outcome::ShuttingDown).map_or_else(|| Err(internal()), Err);
         }
         match call {
@@ -274,15 +290,19 @@ impl Service {
             | Call::World(_)
             | Call::WorldAdd(_)
             | Call::WorldMove(_)
-            | Call::WorldRemove(_)
-            | Call::Attach(_)
-            | Call::Detach(_) => self.planner_call(call).await,
+            | Call::WorldRemove(_) => self.planner_call(call).await,
+            Call::Attach(attach) => self.attach(attach).await,
+            Call::Detach(detach) => self.detach(detach).await,
             Call::Cancel(c) => self.cancel(c).await,
             Call::Stop(s) => self.stop(s).await,
             Call::ArmReset(a) => self.reset(a.arm).await,
             Call::ArmEnable(a) => self.enable(a.arm).await,
             Call::ArmDisable(a) => self.disable(a.arm, a.now).await,
             Call::Gripper(g) => self.gripper(g).await,
+            Call::ArmPayload(p) => self.payload(&p.arm).await.map(Reply::ArmPayload),
+            Call::ArmPayloadSet(p) => self.set_payload(p).await,
+            Call::ArmIo(io) => self.io(&io.arm).await.map(Reply::ArmIo),
+            Call::ArmIoSet(io) => self.set_io(io).await,
             Call::Servo(s) => self.stream(s.task, s.positions, true).await.map(|()| Reply::Servo(Done {})),
             Call::Velocity(v) => self.stream(v.task, v.velocities, false).await.map(|()| Reply::Velocity(Done {})),
             Call::Twist(twist) => self.twist(&twist).await.map(Reply::Twist),

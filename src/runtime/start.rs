@@ -7,8 +7,10 @@
 //! ```
 
 use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{Sender, channel};
 use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
 
 use super::arms::{self, Arms, BroughtUp, Slots};
 use super::control_config::{coordinator_config, names_of, tasks};
@@ -39,6 +41,9 @@ use crate::rpc::streams::Streams;
 use crate::rt::host::{self, Grant, LatencyHold};
 use crate::telemetry::Sample;
 use crate::telemetry::describe::Names;
+
+/// Minimum time between two looks for values of an arm that change slowly.
+const DETAILS_PERIOD: Duration = Duration::from_millis(50);
 
 impl Run {
     /// Starts a run. On failure everything is stopped again, and nothing has moved.
@@ -162,6 +167,7 @@ impl Connected<'_> {
         let service = Arc::new_cyclic(|me| Service::new(parts, me.clone()));
         let recorder = start_recorder(&prepared, &config, ends.samples, noted, &service)?;
         let publish = publisher(service.clone(), prepared.wall);
+        service.log_calibration();
         let outcomes = OutcomeThread::start(dispatcher.clone(), ends.reply_wake, ends.replies, ends.retired, publish);
         let outcomes = outcomes.map_err(no_thread("outcomes"))?;
         let Options { probe, service_manager: manager, .. } = prepared.options;
@@ -178,6 +184,7 @@ impl Connected<'_> {
             server: None,
             handle: Handle { service },
             endings: (endings, ended),
+            faulted: AtomicBool::new(false),
             manager,
             _latency: prepared.latency,
         };
@@ -213,9 +220,14 @@ fn start_recorder(
 
 /// Returns the work of the outcome thread at each wake-up.
 fn publisher(service: Arc<Service>, wall: WallOffset) -> impl FnMut(bool) + Send + 'static {
+    let mut details_due = Instant::now();
     move |woken| {
         service.progress.made();
         service.publish(woken);
+        if Instant::now() >= details_due {
+            service.log_details();
+            details_due = Instant::now() + DETAILS_PERIOD;
+        }
         service.report_late_stops(wall);
     }
 }

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Matrix3, Vector3};
 
 use super::planner_port::{PlannerPort, isometry, positions_of, robot_index, run_blocking, spec};
 use super::service::internal;
@@ -13,7 +13,7 @@ use crate::collision::world::{Attached, Obstacle, World};
 use crate::planning::config::{ObjectConfig, ObjectShape};
 use crate::planning::planning_scene::{PlannedRobot, obstacle};
 use crate::robot::kinematics::{frame, pose};
-use crate::rpc::api::{self, Done, Moment, ShapeSpec, WorldObject};
+use crate::rpc::api::{self, AttachReply, Done, LoadReport, Moment, ShapeSpec, WorldObject};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
 
@@ -21,7 +21,7 @@ use crate::sync::lock;
 type Objects = BTreeMap<String, WorldObject>;
 
 impl PlannerPort {
-    pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<Done, RpcError> {
+    pub(super) fn attach(&self, call: &api::Attach, moment: &Moment) -> Result<AttachReply, RpcError> {
         self.measured(moment);
         let setup = &*self.thread.now();
         let index = robot_index(setup, &call.robot)?;
@@ -51,10 +51,13 @@ impl PlannerPort {
             taken
         };
         self.thread.world(held).map_err(|e| wrong(e.to_string()))?;
+        let flange = link_pose(robot, &robot.config.end_effector_link, moment)?;
+        let in_flange = flange.inverse() * link_pose(robot, &link, moment)? * at;
+        let load = call.mass.map(|mass| load_of(&object.shape, mass, &in_flange));
         object.pose = spec(&at);
         object.held_by = Some([call.robot.clone(), link]);
         objects.insert(call.name.clone(), object);
-        Ok(Done {})
+        Ok(AttachReply { load, payload: None })
     }
 
     pub(super) fn detach(&self, name: &str, moment: &Moment) -> Result<Done, RpcError> {
@@ -126,6 +129,24 @@ fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isomet
     let joints = positions_of(&robot.config.name, &robot.config.coordinator_joints, moment)?;
     kinematics.forward_from(&robot.body.base, &joints, &mut frames);
     Ok(pose(&kinematics.link_frame(index, &frames)))
+}
+
+/// Returns a solid body of this shape and mass [kg] as a load; a mesh or a cloud is a point mass at its origin. `at`:
+/// its pose in the flange frame.
+fn load_of(shape: &ShapeSpec, mass: f64, at: &Isometry3<f64>) -> LoadReport {
+    let principal = match shape {
+        ShapeSpec::Box([x, y, z]) => [y * y + z * z, x * x + z * z, x * x + y * y].map(|v| v / 12.0),
+        ShapeSpec::Sphere(r) => [0.4 * r * r; 3],
+        ShapeSpec::Cylinder([r, length]) => {
+            let across = (3.0 * r * r + length * length) / 12.0;
+            [across, across, 0.5 * r * r]
+        }
+        ShapeSpec::Mesh(_) | ShapeSpec::Cloud(_) => [0.0; 3],
+    };
+    let rotation = at.rotation.to_rotation_matrix();
+    let inertia = rotation * Matrix3::from_diagonal(&(mass * Vector3::from(principal))) * rotation.inverse();
+    let [xx, xy, xz, yy, yz, zz] = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].map(|at| inertia[at]);
+    LoadReport { mass, center: at.translation.vector.into(), inertia: [xx, xy, xz, yy, yz, zz] }
 }
 
 fn wrong(what: impl Into<String>) -> RpcError {
@@ -223,7 +244,8 @@ mod tests {
         let (port, moment) = with_a_ball(before);
         let to =
             api::WorldMove { name: "ball".into(), pose: spec(&Isometry3::translation(after[0], after[1], after[2])) };
-        let attach = api::Attach { name: "ball".into(), robot: "arm".into(), link: None, touch_links: Vec::new() };
+        let attach =
+            api::Attach { name: "ball".into(), robot: "arm".into(), link: None, touch_links: Vec::new(), mass: None };
         let moved = std::thread::scope(|scope| {
             // Both requests wait for the world, the move first.
             let moved = port.thread.world(|_| {

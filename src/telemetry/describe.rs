@@ -192,7 +192,7 @@ pub fn outcome_text(outcome: &Outcome, names: &Names) -> String {
 fn task_changed(task: u16, state: TaskState, reason: Reason, names: &Names) -> Described {
     let severity = match (state, reason) {
         (_, Reason::None | Reason::Cancelled | Reason::StreamEnded) => Severity::Info,
-        (_, Reason::ArmHeld(_, Cause::Operator | Cause::Shutdown)) => Severity::Warn,
+        (_, Reason::ArmHeld(_, Cause::Operator | Cause::StopInput | Cause::Shutdown)) => Severity::Warn,
         (TaskState::Aborted | TaskState::Fault, _) => Severity::Error,
         _ => Severity::Warn,
     };
@@ -251,7 +251,7 @@ pub fn bound_text(bound: Bound, names: &Names) -> String {
 
 fn arm_changed(arm: u16, phase: Phase, cause: Cause, names: &Names) -> Described {
     let severity = match (phase, cause) {
-        (Phase::Held, Cause::Operator | Cause::Shutdown) => Severity::Warn,
+        (Phase::Held, Cause::Operator | Cause::StopInput | Cause::Shutdown) => Severity::Warn,
         (Phase::Held, _) => Severity::Error,
         (_, Cause::None | Cause::Operator | Cause::Shutdown) => Severity::Info,
         _ => Severity::Warn,
@@ -288,6 +288,7 @@ pub fn cause_text(cause: Cause) -> String {
         Cause::ModeChanged => "the panel, hand guiding or another program changed the control mode".into(),
         Cause::StoppedElsewhere => "the panel or another program stopped the arm".into(),
         Cause::PowerChanged => "the panel or another program enabled the motors".into(),
+        Cause::StopInput => "the stop input is open".into(),
         Cause::Shutdown => "the run is shutting down".into(),
     }
 }

@@ -124,6 +124,8 @@ pub enum Cause {
     PowerChanged,
     /// The arm was stopped, paused or reset, and not by this run.
     StoppedElsewhere,
+    /// The arm's stop input is open.
+    StopInput,
     /// The run is shutting down.
     Shutdown,
 }
@@ -154,6 +156,7 @@ impl Cause {
             Self::ModeChanged => "mode_changed",
             Self::PowerChanged => "power_changed",
             Self::StoppedElsewhere => "stopped_elsewhere",
+            Self::StopInput => "stop_input",
             Self::Shutdown => "shutdown",
         }
     }

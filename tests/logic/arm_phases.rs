@@ -93,6 +93,39 @@ fn a_stop_while_an_arm_is_being_enabled_is_not_lost() {
 }
 
 #[test]
+fn an_open_stop_input_latches_a_hold_in_every_phase_and_is_reset_only_when_closed() {
+    for (enabled, moving) in [(true, true), (true, false), (false, false)] {
+        let mut rig = Rig::new(100.0, vec![arm("arm", 6)], one(trajectory()));
+        rig.arms[0].enabled = enabled;
+        if enabled {
+            rig.make_ready();
+        }
+        rig.run_for(0.5);
+        if moving {
+            let q = rig.commanded(0)[0];
+            rig.execute(0, sweep(1, 0..6, q, 1.0, 2.0));
+            rig.run_for(0.8);
+        }
+        rig.arms[0].state.stop_input_open = true;
+        rig.run(2);
+        assert_eq!((rig.phase(0), rig.samples[0].cause), (Phase::Held, Cause::StopInput), "{enabled} {moving}");
+        assert!(rig.reported(Event::Arm(0, Phase::Held, Cause::StopInput)));
+        rig.run_for(2.0);
+        assert_eq!((rig.commands[0].mode, rig.arms[0].stops), (None, u32::from(enabled)));
+        let rest = rig.arms[0].q[0];
+        assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::StillFaulted(0, Cause::StopInput));
+        assert_eq!(rig.ask(Request::Enabled { arm: 0 }), Outcome::ArmLatched(0, Cause::StopInput));
+        rig.arms[0].state.stop_input_open = false;
+        rig.run_for(0.5);
+        assert_eq!((rig.phase(0), rig.commands[0].mode), (Phase::Held, None), "closing it moves nothing");
+        assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+        rig.run_for(0.5);
+        assert_eq!(rig.phase(0), if enabled { Phase::Standby } else { Phase::Disabled });
+        assert_eq!(rig.arms[0].q[0], rest);
+    }
+}
+
+#[test]
 fn activating_again_and_again_does_not_sink() {
     let mut sagging = arm("arm", 6);
     sagging.supervision.accuracy = 0.02;

@@ -6,7 +6,10 @@ use std::path::Path;
 
 use dimos::blueprint::planner::{GripperJointEntry, ObjectEntry, PlannerEntry, PoseEntry, RobotEntry, ViewConfig};
 use dimos::blueprint::schema::{AssetEntry, BlueprintFile, CountedJoints, HardwareEntry, TaskEntry};
-use dimos::blueprint::{Catalog, CoordinatorConfig, LimitsEntry, RecordingConfig, RpcConfig, full_schema, json_schema};
+use dimos::blueprint::{
+    Catalog, CoordinatorConfig, LimitsEntry, MountingEntry, PayloadEntry, RecordingConfig, RpcConfig, StopInputEntry,
+    full_schema, json_schema,
+};
 use dimos::control::task_spec::{TaskSpec, TaskTable};
 use dimos::hardware::registry::Registry;
 use dimos::yaml::keys;
@@ -48,12 +51,15 @@ const fn section(title: &'static str, first: &'static str, pointer: &'static str
 const ARMS: &str = "A list of arms, merged by `hardware_id` when blueprints are included.";
 const TASKS: &str = "A list of tasks, merged by `name` when blueprints are included.";
 
-const SECTIONS: [Section; 6] = [
+const SECTIONS: [Section; 9] = [
     section("Top level", "", "", keys::<BlueprintFile>),
     section("`coordinator`", "", "/$defs/CoordinatorConfig", keys::<CoordinatorConfig>),
     section("`hardware[]`", ARMS, "/$defs/HardwareEntry", keys::<HardwareEntry>),
     section("`hardware[].joints`, short form", "", "/$defs/CountedJoints", keys::<CountedJoints>),
     section("`hardware[].limits`", "", "/$defs/LimitsEntry", keys::<LimitsEntry>),
+    section("`hardware[].stop_input`", "", "/$defs/StopInputEntry", keys::<StopInputEntry>),
+    section("`hardware[].payload`", "", "/$defs/PayloadEntry", keys::<PayloadEntry>),
+    section("`hardware[].mounting`", "", "/$defs/MountingEntry", keys::<MountingEntry>),
     section("`tasks[]`", TASKS, "/$defs/TaskEntry", keys::<TaskEntry>),
 ];
 /// Those behind the parameters of the task types.

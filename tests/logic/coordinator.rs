@@ -195,6 +195,24 @@ fn a_start_up_to_the_tolerance_away_is_faded_out_within_limits() {
 }
 
 #[test]
+fn a_fade_takes_a_quarter_of_a_joints_speed() {
+    let mut slow = arm("arm", 6);
+    slow.limits.velocity_max = vec![0.1; 6];
+    let mut rig = Rig::new(100.0, vec![slow], one(trajectory()));
+    rig.make_ready();
+    // Exactly the start tolerance away.
+    assert_eq!(rig.execute(0, sweep(1, 0..6, 0.05, 0.05, 5.0)), Outcome::Accepted);
+    let mut fastest = 0.0f64;
+    let took = rig.run_until(6.0, |rig| {
+        fastest = fastest.max(rig.speed(0));
+        (rig.commanded(0)[0] - 0.05).abs() < 1e-9
+    });
+    // A quintic step is 1.875 times as fast as its mean.
+    assert!((0.0249..=0.02501).contains(&fastest), "{fastest} rad/s");
+    assert!((took - 1.875 * 0.05 / 0.025).abs() < 0.1, "{took} s");
+}
+
+#[test]
 fn a_trajectory_shorter_than_its_fade_still_arrives() {
     let mut rig = Rig::one_arm(one(trajectory()));
     assert_eq!(rig.execute(0, sweep(1, 0..6, 0.04, 0.041, 0.02)), Outcome::Accepted);
@@ -269,6 +287,8 @@ fn grippers_open_on_request_and_only_where_there_is_one() {
     rig.make_ready();
     assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }), Outcome::Accepted);
     assert_eq!((rig.arms[0].gripper, rig.commands[0].gripper_seq), (0.04, 1));
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.0 }), Outcome::Accepted, "closed");
+    assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: 0.04 }), Outcome::Accepted);
     assert_eq!(rig.ask(Request::Gripper { arm: 1, opening: 0.04 }), Outcome::NoGripper(1));
     for unfit in [f64::NAN, f64::INFINITY, -0.1] {
         assert_eq!(rig.ask(Request::Gripper { arm: 0, opening: unfit }).name(), "OUT_OF_LIMITS");
@@ -277,6 +297,16 @@ fn grippers_open_on_request_and_only_where_there_is_one() {
     let negative = rig.ask(Request::Gripper { arm: 0, opening: -0.1 });
     assert_eq!(negative, Outcome::GripperOutOfLimits(0, -0.1));
     assert_eq!(rig.arms[0].gripper, 0.04);
+}
+
+#[test]
+fn a_motion_needs_only_the_arms_that_it_moves() {
+    let mut rig = Rig::two_arms(vec![task("both", trajectory(), 0..13, 10)]);
+    assert_eq!(rig.ask(Request::Stop { arm: Some(1) }), Outcome::Accepted);
+    assert_eq!(rig.phase(1), Phase::Held);
+    assert_eq!(rig.execute(0, sweep(1, 0..7, 0.0, 0.3, 1.0)), Outcome::Accepted);
+    rig.run_until(3.0, |rig| rig.tasks[0].state == TaskState::Completed);
+    assert_eq!(rig.execute(0, sweep(2, 5..9, 0.0, 0.3, 1.0)), Outcome::ArmLatched(1, Cause::Operator));
 }
 
 #[test]

@@ -73,6 +73,7 @@ fn spawn(
         tick_period: Duration::from_millis(10),
         native_rate,
         supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
+        setup: dimos::hardware::device::Setup::default(),
         beat: beat.clone(),
         clock,
         notes: Box::new(|_| {}),

@@ -167,6 +167,75 @@ fn a_blocked_joint_holds_the_arm_and_does_not_lunge_when_it_comes_free() {
 }
 
 #[test]
+fn a_blocked_joint_has_its_setpoint_drawn_to_it_at_the_same_pace_at_every_hold() {
+    let mut rig = ready(figured(0.05, 0.005), one(servo()));
+    let mut steps = Vec::new();
+    for _ in 0..2 {
+        let at = rig.arms[0].q[0];
+        rig.arms[0].blocked = true;
+        for k in 1..=16 {
+            rig.servo(0, &[at + 0.004 * k as f64, 0.0, 0.0, 0.0, 0.0, 0.0]);
+            rig.tick();
+        }
+        assert_eq!(rig.ask(Request::Stop { arm: None }), Outcome::Accepted);
+        let mut step = 0.0f64;
+        for _ in 0..50 {
+            let before = rig.commanded(0)[0];
+            rig.tick();
+            step = step.max((rig.commanded(0)[0] - before).abs());
+        }
+        steps.push(step);
+        rig.arms[0].blocked = false;
+        assert_eq!(rig.ask(Request::Reset { arm: 0 }), Outcome::Accepted);
+        rig.make_ready();
+    }
+    assert!((steps[0] - steps[1]).abs() < 0.2 * steps[0], "{steps:?}");
+}
+
+#[test]
+fn an_arm_that_does_not_come_to_rest_is_stopped_after_half_a_second() {
+    // A period of 2^-7 s adds up without rounding.
+    let mut config = figured(0.05, 0.005);
+    config.read_period = Duration::from_nanos(7_812_500);
+    let mut rig = Rig::new(128.0, vec![config], one(servo()));
+    rig.make_ready();
+    let stops = rig.arms[0].stops;
+    // Each tick finds its joints in motion, by less than anything that is supervised.
+    let ticks = (0..200).find(|k| {
+        rig.arms[0].sag = 0.0005 * (k % 2) as f64;
+        if *k == 10 {
+            rig.send(Request::Stop { arm: Some(0) });
+        }
+        rig.tick();
+        rig.arms[0].stops > stops
+    });
+    assert_eq!(ticks, Some(10 + 64), "64 ticks are 0.5 s");
+}
+
+#[test]
+fn a_reading_that_is_not_believed_restarts_the_time_of_a_tracking_error() {
+    let held_after = |wrong_reading: Option<u64>| {
+        let mut rig = ready(figured(0.05, 0.005), one(servo()));
+        rig.arms[0].blocked = true;
+        (1..100)
+            .find(|k| {
+                rig.servo(0, &[0.01 * *k as f64; 6]);
+                if wrong_reading == Some(*k) {
+                    rig.arms[0].q[0] += 1.0;
+                }
+                rig.tick();
+                if wrong_reading == Some(*k) {
+                    rig.arms[0].q[0] -= 1.0;
+                }
+                rig.phase(0) == Phase::Held
+            })
+            .expect("held at last")
+    };
+    let usual = held_after(None);
+    assert_eq!(held_after(Some(usual - 2)), usual - 2 + 11, "0.1 s from the next good reading");
+}
+
+#[test]
 fn an_idle_arm_that_is_pushed_is_held() {
     let mut rig = ready(figured(0.05, 0.005), one(servo()));
     rig.arms[0].sag = 0.0;

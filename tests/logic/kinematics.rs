@@ -140,3 +140,29 @@ fn a_position_alone_is_enough_when_asked() {
         assert!(ik.pose(q).translation.distance(target.translation) < 2e-6);
     }
 }
+
+/// The description and the emulated controller have the same flange.
+#[test]
+fn a_ur5e_has_the_controllers_kinematics() {
+    use dimos::hardware::arms::ur::model::Model;
+    use dimos::robot::builtin;
+
+    let model = from_text("ur5e", builtin::text("ur5e").unwrap()).unwrap();
+    let kinematics = Kinematics::whole(&model).unwrap();
+    let tool = model.link_index("tool0").unwrap();
+    let (mut random, mut frames) = (Random::new(5), kinematics.frames());
+    for _ in 0..20 {
+        let q = random_q(&kinematics, &mut random);
+        kinematics.forward(&q, &mut frames);
+        let found = kinematics.link_frame(tool, &frames);
+        let links = q.iter().enumerate().map(|(joint, position)| Model::Ur5e.link(joint, *position).unwrap());
+        let expected = links.reduce(|pose, link| pose * link).unwrap();
+        let turn = expected.rotation.to_rotation_matrix();
+        for r in 0..3 {
+            assert!((found.translation[r] - expected.translation.vector[r]).abs() < 1e-9);
+            for c in 0..3 {
+                assert!((found.matrix3.col(c)[r] - turn[(r, c)]).abs() < 1e-9);
+            }
+        }
+    }
+}

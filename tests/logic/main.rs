@@ -40,6 +40,7 @@ mod surface;
 mod task_conformance;
 mod templates;
 mod test_support;
+mod tick_rules;
 mod verify;
 mod xacro;
 mod yaml_reader;

@@ -271,6 +271,7 @@ fn a_healthy_device_thread_does_not_allocate() {
         tick_period: Duration::from_millis(2),
         native_rate: 500.0,
         supervision: dimos::arm::Supervision::default(),
+        setup: dimos::hardware::device::Setup::default(),
         beat: beat.clone(),
         clock: Arc::new(MonotonicClock),
         notes: Box::new(|_| {}),

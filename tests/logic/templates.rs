@@ -1,7 +1,5 @@
 //! The templates of `dimos adapter new`, as they stand: their unit tests, and the conformance suite over each.
 
-#![allow(clippy::duplicate_mod, reason = "a TCP port and a serial line share all but `wire.rs`")]
-
 #[allow(dead_code, reason = "a library's public parts")]
 #[path = "../../assets/templates/can/mod.rs"]
 mod can;

@@ -103,6 +103,19 @@ fn eventful(folder: &Path) -> (PathBuf, u64) {
     run.states[0].error = 31;
     steps(&mut run, 40);
     run.ask(Request::Reset { arm: 0 }); // refused: the fault persists
+    run.states[0].error = 0;
+    run.states[0].stop_input_open = true;
+    steps(&mut run, 2);
+    run.ask(Request::Reset { arm: 0 }); // refused: the stop input is open
+    steps(&mut run, 2);
+    run.states[0].stop_input_open = false;
+    for request in [Request::Reset { arm: 0 }, Request::Enabled { arm: 0 }] {
+        run.ask(request);
+        steps(&mut run, 40);
+    }
+    run.states[0].stop_input_open = true;
+    steps(&mut run, 10);
+    run.states[0].stop_input_open = false;
     run.states[0].position[2] = f64::NAN;
     run.step();
     run.states[0].position[2] = 0.1;

@@ -5,6 +5,8 @@ mod support;
 
 mod can_kernel;
 mod feetech_sdk;
+mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;
+mod ur_rtde;
 mod xarm_sdk;

@@ -193,7 +193,11 @@ fn arms_in_the_tree_build_and_conform() {
             added,
             ["tree/src/hardware/arms/mod.rs", "tree/src/hardware/arms/mod.rs", "tree/src/robot/builtin.rs"]
         );
-        let files = if transport == "can" { 8 } else { 9 };
+        let files = match transport {
+            "can" => 8,
+            "tcp" => 9,
+            _ => 10,
+        };
         assert_eq!(report["written"].as_array().unwrap().len(), files, "{report}");
         let blueprint = fs::read_to_string(tree.join(format!("blueprints/coordinator-{name}.yaml"))).unwrap();
         assert!(blueprint.contains(&format!("count: {dof}}}")), "{blueprint}");

@@ -49,8 +49,16 @@ def check(what, holds):
         sys.exit(f"wrong: {what}")
 
 
+class Patient(sdk.PortHandler):
+    """The SDK waits 34 ms for an answer; the emulator's thread may have to wait longer for a busy processor."""
+
+    def setPacketTimeout(self, length):
+        super().setPacketTimeout(length)
+        self.packet_timeout += 1000
+
+
 def use(path):
-    port, packets = sdk.PortHandler(path), sdk.PacketHandler(0)
+    port, packets = Patient(path), sdk.PacketHandler(0)
     check("open", port.openPort() and port.setBaudRate(1_000_000))
     for servo in IDS:
         model, result, error = packets.ping(port, servo)

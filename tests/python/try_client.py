@@ -117,6 +117,14 @@ def moves_the_end_effector(robot):
     robot.cancel()
 
 
+def sets_outputs_and_payload(robot):
+    assert robot.set_io("arm", do3=1, ao0=2.5)["digital_outputs"][3] is True
+    assert robot.io("arm")["analog_inputs"][0] == {"value": 2.5, "unit": "V"}
+    refused(dimos.Refused, "INVALID_PARAMS", lambda: robot.set_io("arm", di0=1))
+    assert robot.set_payload("arm", 0.5, (0, 0, 0.05)) == robot.payload("arm")
+    assert robot.payload("arm")["mass"] == 0.5
+
+
 def grips_and_stops(robot):
     robot.gripper("arm", "open")
     while abs(robot.state("arm").gripper - 0.08) > 1e-3:
@@ -140,6 +148,7 @@ with Client.connect() as robot, Client.connect("scripts") as watcher:
     moves(robot)
     follows_a_policy(robot, watcher)
     moves_the_end_effector(robot)
+    sets_outputs_and_payload(robot)
     grips_and_stops(robot)
     assert robot.call("release")["arms"] == ["arm"]
     watcher.move("arm", READY)

@@ -4,7 +4,7 @@
 mod support;
 
 #[allow(dead_code, reason = "a library's public parts")]
-#[path = "../../assets/templates/serial/mod.rs"]
+#[path = "../support/serial_line/mod.rs"]
 mod serial;
 
 mod faults;

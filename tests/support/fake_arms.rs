@@ -63,6 +63,7 @@ pub const YOURARM: AdapterSpec = AdapterSpec {
     check: |config| Ok(Checked { limits: JointLimits::uniform(config.dof, 3.0, 2.0) }),
     create: |_| Err(AdapterError::Rejected(NOT_HERE.to_owned())),
     emulate: Some(|_, _| Err(AdapterError::Rejected(NOT_HERE.to_owned()))),
+    service: None,
 };
 
 /// An arm in memory that needs no address.
@@ -74,6 +75,7 @@ pub const MOCK: AdapterSpec = AdapterSpec {
     address: AddressForm { form: "none", required: false, check: |address| Ok(address.to_owned()) },
     options: OptionsSpec::of::<NoOptions>(),
     emulate: None,
+    service: None,
     ..YOURARM
 };
 
@@ -95,6 +97,7 @@ pub const SERVOBOT: AdapterSpec = AdapterSpec {
     holds_when_disabled: false,
     options: OptionsSpec::of::<NoOptions>(),
     emulate: None,
+    service: None,
     ..YOURARM
 };
 

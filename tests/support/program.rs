@@ -249,6 +249,13 @@ impl Ended {
         self
     }
 
+    /// stdout contains all of these.
+    #[track_caller]
+    pub fn shows(self, parts: &[&str]) -> Self {
+        parts.iter().for_each(|part| assert!(self.out.contains(part), "no {part:?} in\n{}", self.out));
+        self
+    }
+
     /// stderr contains all of these.
     #[track_caller]
     pub fn says(self, parts: &[&str]) -> Self {

@@ -314,6 +314,7 @@ impl ManipulatorAdapter for AcmeAdapter {
         let state = self.recent()?;
         *reading = JointReading {
             stamp: Some(self.state_at), // the arm has no clock: when the round was complete
+            device_ns: None,
             position: from_wire(&state.positions),
             velocity: Some(from_wire(&state.velocities)),
             effort: None, // YOUR ARM: its torques [Nm], if it measures them; then write `read_joint_efforts` too

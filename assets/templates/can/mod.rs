@@ -54,6 +54,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::AcmeAdapter::new(config)?)),
     emulate: Some(emulator::start),
+    service: None,
 };
 
 /// Checks the number of joints and the options, and returns the joint limits; `dimos check` calls it.

@@ -1,1 +1,380 @@
-../stream/adapter.rs
+//! The Acme adapter: the adapter protocol on one side, the servos' line on the other.
+//!
+//! Wire: counts, counts/s. Here: rad, rad/s, m. One request reads the state of all servos;
+//! [`ManipulatorAdapter::read_joints`] makes it, and what is read right after is answered from it, so that a cycle
+//! costs one round trip. Requests to all servos have no reply: where it matters, their effect is read back.
+
+use std::f64::consts::TAU;
+use std::time::Duration;
+
+use dimos::clock::{Clock, Mono, MonotonicClock};
+use dimos::hardware::adapter::{
+    AdapterError, AdapterResult, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
+use dimos::hardware::adapter_util::{fault, fill, finite};
+use dimos::hardware::registry::AdapterConfig;
+use dimos::hardware::transport::request_reply::{RequestReply, Retry};
+use dimos::joint::{ControlMode, JointLimits, Joints, joints_of};
+
+use super::calibration::{Calibration, TURN};
+use super::protocol::{self, MAX_REQUEST, MODEL, Request, Servo};
+use super::wire::{self, Address, Link};
+use super::{DOF, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, OPEN, Options, SERVOS, TOP_SPEED, check, limits};
+
+/// HELLO is retried, as the servos may just be starting. With all of them: below 3 s.
+const HELLO: Retry = Retry { each: Duration::from_millis(30), times: 5 };
+/// Longest wait for the state of all servos. YOUR ARM: all tries together stay below `stale_after`, so that a lost, a
+/// damaged or a late reply does not hold the arm.
+const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
+/// A state answers further questions for this time.
+const STATE_AGE: Duration = Duration::from_millis(5);
+/// A setpoint is written if the motors were on and without error this long ago at most.
+const WRITABLE: Duration = Duration::from_millis(50);
+/// How often a request without a reply is sent until the servos show its effect.
+const WRITES: u32 = 4;
+/// A servo at rest this close to its goal has arrived [counts]: it droops under load. YOUR ARM.
+const ARRIVED: i32 = 40;
+
+/// The state of all servos.
+type Servos = [Servo; SERVOS];
+
+/// An arm of servos on a line.
+pub struct AcmeAdapter {
+    address: Address,
+    calibration: Calibration,
+    line: RequestReply<Link>,
+    firmware: Option<(u8, u8)>,
+    mode: ControlMode,
+    /// The last state, and when it was asked for.
+    state: Option<(Servos, Mono)>,
+}
+
+impl AcmeAdapter {
+    /// An adapter for the servos at `config.address`. Does not connect.
+    pub fn new(config: &AdapterConfig) -> AdapterResult<Self> {
+        config.check(check)?;
+        let options: Options = config.options()?;
+        Ok(Self {
+            address: config.parse_address(wire::address)?,
+            calibration: Calibration::of(&options.calibration).map_err(AdapterError::Rejected)?,
+            line: RequestReply::half_duplex(options.echo),
+            firmware: None,
+            mode: ControlMode::default(),
+            state: None,
+        })
+    }
+
+    /// Asks a servo for its model and firmware.
+    fn hello(&mut self, servo: u8) -> AdapterResult<()> {
+        let mut frame = [0; MAX_REQUEST];
+        let frame = protocol::encode(Request::Hello(servo), &mut frame);
+        let reply = self.line.request(frame, HELLO, |bytes| {
+            protocol::scan(bytes, protocol::HELLO).map(|reply| reply.data.first_chunk().copied().unwrap_or([0; 4]))
+        });
+        let silent = |_| AdapterError::Timeout(format!("servo {servo} at {} does not answer", self.address));
+        let [m0, m1, major, minor] = match reply {
+            Err(AdapterError::Timeout(text)) => return Err(silent(text)),
+            other => other?,
+        };
+        self.firmware = Some((major, minor));
+        match u16::from_be_bytes([m0, m1]) {
+            MODEL => Ok(()),
+            model => {
+                let what = format!("acme at {}: servo {servo} is model {model}, expected {MODEL}", self.address);
+                Err(AdapterError::Rejected(what))
+            }
+        }
+    }
+
+    /// Asks for the state of all servos.
+    fn fetch(&mut self) -> AdapterResult<Servos> {
+        self.state = None;
+        let asked = MonotonicClock.now();
+        let mut frame = [0; MAX_REQUEST];
+        let frame = protocol::encode(Request::State, &mut frame);
+        let mut found: [Option<Servo>; SERVOS] = [None; SERVOS];
+        let scan = |bytes: &[u8]| {
+            protocol::scan(bytes, protocol::STATE).map(|reply| (reply.servo, Servo::decode(&reply).unwrap_or_default()))
+        };
+        self.line.gather(frame, CYCLE, SERVOS, scan, |(servo, state)| {
+            // One that answers twice, because it was asked again, counts once.
+            let slot = usize::from(servo).checked_sub(1).and_then(|servo| found.get_mut(servo));
+            slot.is_some_and(|slot| slot.replace(state).is_none())
+        })?;
+        let servos = found.map(Option::unwrap_or_default);
+        self.state = Some((servos, asked));
+        Ok(servos)
+    }
+
+    /// The last state, or a new one when that is older.
+    fn not_older(&mut self, age: Duration) -> AdapterResult<Servos> {
+        match self.state {
+            Some((servos, at)) if self.line.is_open() && MonotonicClock.now().since(at) <= age => Ok(servos),
+            _ => self.fetch(),
+        }
+    }
+
+    /// Sends a request that no servo answers. That it arrived is not known.
+    fn tell(&mut self, request: Request<'_>) -> AdapterResult<()> {
+        let mut frame = [0; MAX_REQUEST];
+        self.line.tell(protocol::encode(request, &mut frame))
+    }
+
+    /// Sends a request that no servo answers until all of them show its effect.
+    fn confirmed(&mut self, request: Request<'_>, shown: impl Fn(usize, &Servo) -> bool) -> AdapterResult<()> {
+        for _ in 0..WRITES {
+            self.tell(request)?;
+            if self.fetch()?.iter().enumerate().all(|(i, servo)| shown(i, servo)) {
+                return Ok(());
+            }
+        }
+        Err(AdapterError::Protocol(format!("acme: the servos do not execute {request:?}")))
+    }
+
+    fn write_goals(&mut self, goals: [i32; SERVOS]) -> AdapterResult<()> {
+        self.confirmed(Request::Goals(&goals, 0), |i, servo| goals.get(i) == Some(&servo.goal))
+    }
+
+    /// One value per joint.
+    fn of_joints(&self, servos: &Servos, value: impl Fn(&Servo, &super::Range) -> f64) -> Joints {
+        let mut values = [0.0; DOF];
+        let each = values.iter_mut().zip(servos).zip(self.calibration.joints());
+        each.for_each(|((to, servo), range)| *to = value(servo, range));
+        joints_of(&values)
+    }
+}
+
+/// Velocity of a servo [rad/s].
+fn velocity(servo: &Servo) -> f64 {
+    f64::from(servo.velocity) * TAU / TURN
+}
+
+/// Code and text of the first servo in error.
+fn error_of(servos: &Servos) -> Option<u8> {
+    servos.iter().map(|servo| servo.error).find(|error| *error != 0)
+}
+
+impl ManipulatorAdapter for AcmeAdapter {
+    // --- Lifecycle ---
+
+    fn connect(&mut self) -> AdapterResult<()> {
+        self.disconnect();
+        self.line.open(wire::connect(&self.address)?);
+        let introduced = (1..=SERVOS as u8).try_for_each(|servo| self.hello(servo)).and_then(|()| self.fetch());
+        if introduced.is_err() {
+            self.disconnect();
+        }
+        introduced.map(drop)
+    }
+
+    fn disconnect(&mut self) {
+        self.line.close();
+        self.state = None;
+    }
+
+    fn is_connected(&self) -> bool {
+        self.line.is_open()
+    }
+
+    // --- Identity ---
+
+    fn get_info(&self) -> ManipulatorInfo {
+        ManipulatorInfo {
+            vendor: "Acme".into(), // YOUR ARM
+            model: "Acme".into(),  // YOUR ARM
+            dof: DOF,
+            firmware_version: self.firmware.map(|(major, minor)| format!("{major}.{minor}")),
+            serial_number: None,
+            native_rate: NATIVE_RATE,
+            modes: MODES,
+            holds_when_disabled: HOLDS_WHEN_DISABLED,
+            whole_state_at_once: true,
+        }
+    }
+
+    fn get_dof(&self) -> usize {
+        DOF
+    }
+
+    fn get_limits(&mut self) -> AdapterResult<JointLimits> {
+        Ok(limits(&self.calibration))
+    }
+
+    // --- Mode: goals with a top speed, or without ---
+
+    fn set_control_mode(&mut self, mode: ControlMode) -> AdapterResult<()> {
+        match mode {
+            _ if !self.is_connected() => Err(AdapterError::NotConnected),
+            mode if MODES.contains(&mode) => {
+                self.mode = mode;
+                Ok(())
+            }
+            _ => Err(AdapterError::Unsupported),
+        }
+    }
+
+    fn get_control_mode(&self) -> ControlMode {
+        self.mode
+    }
+
+    // --- State ---
+
+    fn read_joint_positions(&mut self, positions: &mut [f64]) -> AdapterResult<()> {
+        let servos = self.fetch()?;
+        fill(positions, &self.of_joints(&servos, |servo, range| range.angle(servo.position)));
+        Ok(())
+    }
+
+    fn read_joint_velocities(&mut self, velocities: &mut [f64]) -> AdapterResult<bool> {
+        let servos = self.not_older(STATE_AGE)?;
+        fill(velocities, &self.of_joints(&servos, |servo, _| velocity(servo)));
+        Ok(true) // YOUR ARM: leave the method out if they do not measure them; never fill in zeros
+    }
+
+    fn read_joints(&mut self, reading: &mut JointReading) -> AdapterResult<()> {
+        let servos = self.fetch()?;
+        *reading = JointReading {
+            stamp: None,
+            device_ns: None,
+            position: self.of_joints(&servos, |servo, range| range.angle(servo.position)),
+            velocity: Some(self.of_joints(&servos, |servo, _| velocity(servo))),
+            effort: None,
+            valid: Some(true),
+        };
+        Ok(())
+    }
+
+    fn read_state(&mut self) -> AdapterResult<RobotState> {
+        let servos = self.not_older(STATE_AGE)?;
+        let (on, moving) = (servos.iter().all(|servo| servo.on), servos.iter().any(|servo| servo.moving));
+        Ok(RobotState { state: i32::from(on) + 2 * i32::from(moving), mode: 0 })
+    }
+
+    fn read_error(&mut self) -> AdapterResult<(i32, String)> {
+        let error = error_of(&self.not_older(STATE_AGE)?).unwrap_or_default();
+        Ok((error.into(), protocol::error_text(error).into())) // an empty text allocates nothing
+    }
+
+    fn read_enabled(&mut self) -> AdapterResult<bool> {
+        Ok(self.not_older(STATE_AGE)?.iter().take(DOF).all(|servo| servo.on))
+    }
+
+    // --- Motion ---
+
+    fn write_joint_positions(&mut self, positions: &[f64], velocity: f64) -> AdapterResult<()> {
+        let angles = finite::<DOF>(positions)?;
+        let servos = self.not_older(WRITABLE)?;
+        if let Some(joint) = servos.iter().take(DOF).position(|servo| !servo.on) {
+            return Err(AdapterError::Rejected(format!("the motor of joint {} is off", joint + 1)));
+        }
+        if let Some(error) = error_of(&servos) {
+            return Err(fault(error.into(), protocol::error_text(error)));
+        }
+        let mut goals = servos.map(|servo| servo.goal); // the gripper keeps its own
+        let joints = goals.iter_mut().zip(self.calibration.joints()).zip(angles);
+        joints.for_each(|((goal, range), angle)| *goal = range.counts(angle));
+        let speed = match self.mode {
+            ControlMode::Position => (velocity * TOP_SPEED * TURN / TAU).max(1.0) as u16,
+            _ => 0,
+        };
+        self.tell(Request::Goals(&goals, speed))
+    }
+
+    /// Makes the position of each servo that moves its goal; one at rest keeps its goal, above which it droops.
+    fn write_stop(&mut self) -> AdapterResult<Stop> {
+        let servos = self.fetch()?;
+        let moves = |servo: &Servo| servo.moving || !servo.on || (servo.goal - servo.position).abs() > ARRIVED;
+        if servos.iter().any(|servo| servo.on && moves(servo)) {
+            let here = self.calibration.inside(servos.map(|servo| servo.position));
+            let mut goals = servos.map(|servo| servo.goal);
+            let stopped = goals.iter_mut().zip(here).zip(&servos).filter(|(_, servo)| moves(servo));
+            stopped.for_each(|((goal, here), _)| *goal = here);
+            self.write_goals(goals)?;
+        }
+        Ok(Stop::Confirmed)
+    }
+
+    /// A servo goes to its goal when its motor comes on: so the goal is first set to where it is, and read back.
+    fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
+        let servos = self.fetch()?;
+        if enable && !servos.iter().all(|servo| servo.on) {
+            let here = self.calibration.inside(servos.map(|servo| servo.position));
+            let mut goals = servos.map(|servo| servo.goal);
+            let off = goals.iter_mut().zip(here).zip(&servos).filter(|(_, servo)| !servo.on);
+            off.for_each(|((goal, here), _)| *goal = here);
+            self.write_goals(goals)?;
+        }
+        self.confirmed(Request::Motors(enable), |_, servo| servo.on == enable)
+    }
+
+    fn write_clear_errors(&mut self) -> AdapterResult<()> {
+        match error_of(&self.fetch()?) {
+            None => Ok(()),
+            Some(_) => self.confirmed(Request::Clear, |_, servo| servo.error == 0),
+        }
+    }
+
+    fn discard_pending(&mut self) {
+        self.line.abort(); // what the servos did not get must not reach them later
+        self.disconnect();
+    }
+
+    // --- Optional parts. YOUR ARM: remove `gripper` if it has none ---
+
+    fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        Some(self)
+    }
+}
+
+impl Gripper for AcmeAdapter {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        let servos = self.not_older(STATE_AGE)?;
+        Ok(Some(self.calibration.opening(servos[DOF].position)))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        if !(0.0..=OPEN).contains(&position) {
+            return Err(AdapterError::Rejected(format!("the gripper opens 0 to {OPEN} m, not {position} m")));
+        }
+        let servos = self.not_older(STATE_AGE)?;
+        if !servos[DOF].on {
+            return Err(AdapterError::Rejected("the motor of the gripper is off".into()));
+        }
+        let mut goals = servos.map(|servo| servo.goal);
+        goals[DOF] = self.calibration.of_opening(position);
+        self.write_goals(goals)
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        Some((0.0, OPEN))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dimos::hardware::registry::EmulatorAddress;
+    use dimos::hardware::sim::faults::{Fault, FaultKind};
+
+    #[test]
+    fn a_lost_a_damaged_and_a_late_reply_cost_no_reading() {
+        let (hardware_id, options) = ("arm".into(), Default::default());
+        let mut config = AdapterConfig { hardware_id, address: String::new(), dof: DOF, options };
+        let servos = super::super::emulator::start(&config, &EmulatorAddress::InProcess).unwrap();
+        config.address = servos.address();
+        let mut adapter = AcmeAdapter::new(&config).unwrap();
+        adapter.connect().unwrap();
+        let mut read = || {
+            let mut positions = [0.0; DOF];
+            adapter.read_joint_positions(&mut positions).map(|()| positions)
+        };
+        let start = read();
+        assert!(start.is_ok());
+        for kind in [FaultKind::Silent, FaultKind::Corrupt, FaultKind::Truncated, FaultKind::Garbage] {
+            servos.inject(Fault::new(kind)).unwrap();
+            assert_eq!(read(), start, "{kind:?}");
+        }
+        servos.inject(Fault::new(FaultKind::Stall).lasting(0.04)).unwrap();
+        assert_eq!(read(), start, "late");
+    }
+}

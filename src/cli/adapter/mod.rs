@@ -1,6 +1,6 @@
 //! `dimos adapter new|test|emulate`: the integration kit.
 
-mod choice;
+pub(super) mod choice;
 pub mod emulate;
 pub mod new;
 mod report;

@@ -71,7 +71,7 @@ pub enum Transport {
     Tcp,
     /// A CAN bus; the arm streams its state
     Can,
-    /// A serial line; the arm is asked and answers
+    /// A serial line of servos, with a gripper; they are asked and answer
     Serial,
 }
 

@@ -1,15 +1,14 @@
 //! `dimos adapter test NAME`: an adapter against its arm. On a real one nothing is enabled and nothing moves, unless
 //! that is asked for; on the emulator the whole suite runs.
 
-use std::io::{self, BufRead, IsTerminal};
+use std::io::{self, IsTerminal};
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::io::Errno;
 
+use super::super::ask;
 use super::super::exit::{Exit, Failure, Result};
 use super::super::follow::Signals;
 use super::super::output;
@@ -287,31 +286,13 @@ fn confirm(signals: &Signals) -> Result<()> {
         return Err(Failure::usage("the motion cannot be confirmed: stdin is not a terminal").hint("add --yes"));
     }
     output::note("Type yes to continue:");
-    if answered_yes(signals) {
+    if ask::line(signals).as_deref() == Some("yes") {
         return Ok(());
     }
     Err(match signals.last() {
         Some(signal) => Failure::new(Exit::by_signal(signal), "not moved: interrupted"),
         None => Failure::new(Exit::Failed, "not moved: the answer was not yes"),
     })
-}
-
-/// Waits for a line, and for a signal: reading alone would continue after Ctrl-C.
-fn answered_yes(signals: &Signals) -> bool {
-    let stdin = io::stdin();
-    let moment = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
-    while signals.last().is_none() {
-        match poll(&mut [PollFd::new(&stdin, PollFlags::IN)], Some(&moment)) {
-            Ok(0) | Err(Errno::INTR) => continue,
-            Ok(_) => {
-                let mut answer = String::new();
-                let read = stdin.lock().read_line(&mut answer);
-                return read.is_ok() && answer.trim() == "yes" && signals.last().is_none();
-            }
-            Err(_) => return false,
-        }
-    }
-    false
 }
 
 fn arm(row: &AdapterSpec, info: ManipulatorInfo) -> Arm {

@@ -55,12 +55,15 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Cata
     let show = Show { bars: !args.json && io::stderr().is_terminal(), quiet: args.json };
     let driver = Driver { run: &run, blueprint: &blueprint, plan: &plan, signals: &signals, show, rate: args.rate };
     let result = driver.drive(&wanted);
-    let report = run.status();
     let ended = run.stop();
     terminal.flush();
     print_summary(&result, &ended, args.json);
-    for arm in report.arms.iter().filter(|_| !args.json) {
-        output::note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm)));
+    for arm in ended.arms.iter().filter(|_| !args.json) {
+        output::note(format_args!(
+            "{}: {}",
+            arm.hardware_id,
+            banner::after_exit(arm, ended.parked.contains(&arm.hardware_id))
+        ));
     }
     result.map(|_| Exit::Ok).or_else(|end| match end {
         End::Failed(failure) => Err(failure),

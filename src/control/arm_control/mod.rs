@@ -174,10 +174,10 @@ impl ArmControl {
 
     /// Returns the cause for a hold if the arm moves without a command.
     fn unexpected_motion(&mut self, dt: f64) -> Option<Cause> {
-        let (state, usable) = (self.feedback.state(), self.feedback.is_usable());
-        let supervised = usable && self.command.mode == Some(state.mode) && self.tracking.has_setpoints();
+        let state = self.feedback.state();
+        let supervised = self.feedback.is_usable() && self.command.mode == Some(state.mode);
         match self.failsafe.phase() {
-            Phase::Activating if usable => {
+            Phase::Activating => {
                 let limit = ENABLING_TOLERANCE.max(2.0 * self.config.supervision.accuracy);
                 let moved = state.position.iter().zip(&self.enabled_at).take(self.config.dof);
                 let (joint, by) = furthest(moved.map(|(q, before)| q - before))?;

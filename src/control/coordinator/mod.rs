@@ -179,7 +179,7 @@ impl Coordinator {
     fn end_tasks_of_held_arms(&mut self) {
         for t in 0..self.tasks.len() {
             let Some(task) = self.tasks.get(t).filter(|t| t.is_active()) else { continue };
-            let held = task.joints.iter().find_map(|&joint| {
+            let held = task.moving_joints().iter().find_map(|&joint| {
                 let arm = self.arm_of.get(joint as usize).copied()?;
                 let failsafe = &self.arms.get(arm as usize)?.failsafe;
                 (failsafe.phase() != Phase::Ready).then_some((arm, failsafe.cause()))
@@ -253,7 +253,7 @@ impl Coordinator {
             }
             if let Some(at) = arm.gap() {
                 for task in self.tasks.iter_mut().filter(|t| t.is_active()) {
-                    if task.joints.iter().any(|&joint| (first..first + dof).contains(&usize::from(joint))) {
+                    if task.moving_joints().iter().any(|&joint| (first..first + dof).contains(&usize::from(joint))) {
                         task.rewind(at, time.now);
                     }
                 }

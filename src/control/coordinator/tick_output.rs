@@ -59,3 +59,18 @@ impl TickOutput {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_that_do_not_fit_are_counted_and_nothing_is_allocated() {
+        let mut output = TickOutput::new(1, 1, 3, 1);
+        let room = output.events.capacity();
+        for k in 0..room as u32 + 2 {
+            output.report(Event::Overrun(k, 0));
+        }
+        assert_eq!((output.events.len(), output.events.capacity(), output.events_lost), (room, room, 2));
+    }
+}

@@ -6,11 +6,13 @@ pub mod mock;
 pub mod piper;
 pub mod remote;
 pub mod so101;
+pub mod ur;
 pub mod xarm;
 pub mod yourarm;
 
 /// The compile-time adapter table.
-pub const TABLE: &[AdapterSpec] = &[mock::SPEC, yourarm::SPEC, xarm::SPEC, piper::SPEC, so101::SPEC, remote::SPEC];
+pub const TABLE: &[AdapterSpec] =
+    &[mock::SPEC, yourarm::SPEC, xarm::SPEC, piper::SPEC, so101::SPEC, ur::SPEC, remote::SPEC];
 
 /// Adapters that this build lacks because their cargo feature is off. No built-in adapter has one.
 pub const ABSENT: &[Absent] = &[];

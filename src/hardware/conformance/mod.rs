@@ -13,6 +13,7 @@ mod identity;
 pub mod lag;
 mod lifecycle;
 mod motion;
+mod parts;
 mod stale;
 mod stops;
 mod streamed_state;
@@ -78,6 +79,7 @@ pub fn checks() -> impl Iterator<Item = &'static Check> {
         identity::CHECKS,
         lifecycle::CHECKS,
         device::CHECKS,
+        parts::CHECKS,
         streamed_state::CHECKS,
         motion::CHECKS,
         stops::CHECKS,

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, OnceLock};
 
+use super::Details;
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult, RobotState};
 use crate::rt::wake::Wake;
@@ -63,6 +64,7 @@ pub struct Health {
     interval_ns: AtomicU64,
     text: Mutex<Text>,
     codes: Mutex<Option<RobotState>>,
+    details: Mutex<Details>,
     /// `ArmCommand::gripper_seq` of the last gripper command that was answered, and the answer.
     gripper: Mutex<Option<(u32, AdapterResult<()>)>>,
     /// Raised when a stop or a gripper command is answered.
@@ -142,6 +144,19 @@ impl Health {
 
     pub(super) fn set_codes(&self, codes: RobotState) {
         *lock(&self.codes) = Some(codes);
+    }
+
+    /// Returns the latest values that change slowly.
+    pub fn details(&self) -> Details {
+        *lock(&self.details)
+    }
+
+    /// Publishes values that change slowly. Never waits for a reader: `false` if one holds them now.
+    pub(super) fn publish_details(&self, details: &Details) -> bool {
+        self.details.try_lock().is_ok_and(|mut published| {
+            *published = *details;
+            true
+        })
     }
 
     /// Returns recent episodes, the newest last.

@@ -7,6 +7,7 @@
 //! rpc  ──orders─────────▶└───────────────┘   monitors the tick's heartbeat; holds the arm without it
 //! ```
 
+mod details;
 pub mod gripper;
 mod health;
 mod plausible;
@@ -18,12 +19,13 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, channel, sync_chan
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+pub use details::Details;
 pub use health::{Episode, Health, Note};
 
-use crate::arm::{ArmCommand, ArmState, Supervision};
+use crate::arm::{ArmCommand, ArmState, IoInfo, IoState, Load, OutputValue, StopInput, Supervision};
 use crate::clock::Clock;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter, ManipulatorInfo};
-use crate::joint::JointLimits;
+use crate::joint::{JointLimits, Joints};
 use crate::rt::due::Due;
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter};
@@ -46,12 +48,26 @@ pub struct DeviceConfig {
     pub native_rate: f64,
     /// Limits for checking the arm's measurements and motion.
     pub supervision: Supervision,
+    /// What the blueprint sets of the arm's optional parts.
+    pub setup: Setup,
     /// The tick's heartbeat.
     pub beat: Arc<Heartbeat>,
     /// The clock.
     pub clock: Arc<dyn Clock>,
     /// Receives a note at the beginning and at the end of each episode of trouble.
     pub notes: Box<dyn Fn(Note) + Send>,
+}
+
+/// What a blueprint sets of an arm's optional parts.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Setup {
+    /// The digital input that stops the arm: read in every cycle.
+    pub stop_input: Option<StopInput>,
+    /// Load at the flange: set before the motors are enabled.
+    pub payload: Option<Load>,
+    /// Direction of gravity in the base frame, a unit vector: set before the motors are enabled. `None`: the
+    /// controller keeps its own setting.
+    pub gravity: Option<[f64; 3]>,
 }
 
 impl DeviceConfig {
@@ -87,6 +103,14 @@ pub struct Connected {
     pub limits: JointLimits,
     /// Opening of its gripper when closed and when open [m], if known.
     pub gripper_range: Option<(f64, f64)>,
+    /// Its digital and analogue inputs and outputs, if it has any.
+    pub io: Option<IoInfo>,
+    /// Calibration offsets of its joints [rad], if it reports them.
+    pub calibration_offsets: Option<Joints>,
+    /// Whether its controller takes the load at the flange.
+    pub has_payload: bool,
+    /// Whether setting that load resets the controller, so that the arm must be enabled again.
+    pub payload_resets: bool,
     /// Period of reads.
     pub read_period: Duration,
     /// Period of setpoints: the longer of the tick's and the arm's own.
@@ -99,6 +123,10 @@ enum Order {
     Disable(SyncSender<AdapterResult<()>>),
     ClearErrors(SyncSender<AdapterResult<()>>),
     SetLimits(JointLimits, SyncSender<AdapterResult<()>>),
+    ReadIo(SyncSender<AdapterResult<IoState>>),
+    SetOutput(OutputValue, SyncSender<AdapterResult<()>>),
+    ReadPayload(SyncSender<AdapterResult<Option<Load>>>),
+    SetPayload(Load, SyncSender<AdapterResult<Option<Load>>>),
     Finish { disable: bool, reply: SyncSender<AdapterResult<()>> },
 }
 
@@ -172,6 +200,27 @@ impl Device {
     /// Sets the limits of commands: the arm's own, narrowed by the blueprint.
     pub fn set_limits(&self, limits: JointLimits) -> Answer<()> {
         self.order(|reply| Order::SetLimits(limits, reply))
+    }
+
+    /// Reads the levels of all inputs and outputs. `Unsupported` for an arm without any.
+    pub fn read_io(&self) -> Answer<IoState> {
+        self.order(Order::ReadIo)
+    }
+
+    /// Sets an output. `Unsupported` for an arm without any.
+    pub fn set_output(&self, value: OutputValue) -> Answer<()> {
+        self.order(|reply| Order::SetOutput(value, reply))
+    }
+
+    /// Reads the load that the controller calculates with. `Unsupported` for an arm that takes none.
+    pub fn read_payload(&self) -> Answer<Option<Load>> {
+        self.order(Order::ReadPayload)
+    }
+
+    /// Sets the load at the flange, and returns what the controller then reports. `Rejected` while the arm moves, and
+    /// if the controller reports another load. Repeated whenever the motors are enabled.
+    pub fn set_payload(&self, load: Load) -> Answer<Option<Load>> {
+        self.order(|reply| Order::SetPayload(load, reply))
     }
 
     /// Returns the thread's wake deadline.

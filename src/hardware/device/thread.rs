@@ -2,7 +2,9 @@
 
 mod commands;
 mod connection;
+mod payload;
 mod readings;
+mod slow_readings;
 mod tick_monitor;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -14,7 +16,7 @@ use super::gripper::GripperStop;
 use super::plausible::Plausible;
 use super::wire_guard::WireGuard;
 use super::{DeviceConfig, Health, Note, Order};
-use crate::arm::{ArmCommand, ArmState, Link};
+use crate::arm::{ArmCommand, ArmState, Link, Load};
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult, JointReading, ManipulatorAdapter, RobotState};
 use crate::joint::ControlMode;
@@ -85,6 +87,9 @@ pub(super) struct Worker {
     late: Duration,
     /// The tick, as seen by this thread.
     tick: tick_monitor::Seen,
+    slow: slow_readings::Slow,
+    /// The load to set whenever the motors are enabled.
+    payload: Option<Load>,
     last_read: Mono,
     next_read: Mono,
     read_time: f64,
@@ -99,6 +104,7 @@ impl Worker {
         commands: SlotReader<ArmCommand>,
         shared: Shared,
     ) -> Self {
+        let payload = config.setup.payload;
         let state = ArmState { dof: config.dof, ..ArmState::default() };
         let Shared { wake, health, due } = shared;
         Self {
@@ -132,6 +138,8 @@ impl Worker {
             read_errors: 0,
             write_errors: 0,
             plausible: Plausible::default(),
+            slow: slow_readings::Slow::default(),
+            payload,
             last_read: Mono::ZERO,
             next_read: Mono::ZERO,
             read_time: 0.0,
@@ -235,6 +243,20 @@ impl Worker {
             Order::SetLimits(limits, reply) => {
                 self.set_limits(&limits);
                 let _ = reply.send(Ok(()));
+            }
+            Order::ReadIo(reply) => {
+                let _ = reply.send(self.while_connected(adapter, slow_readings::read_io));
+            }
+            Order::SetOutput(value, reply) => {
+                let result = self.while_connected(adapter, |a| slow_readings::set_output(a, value));
+                self.slow.read_io_next();
+                let _ = reply.send(result);
+            }
+            Order::ReadPayload(reply) => {
+                let _ = reply.send(self.while_connected(adapter, payload::read));
+            }
+            Order::SetPayload(load, reply) => {
+                let _ = reply.send(self.set_payload(adapter, &load));
             }
             Order::Finish { disable, reply } => {
                 let _ = reply.send(self.finish(adapter, disable));

@@ -170,4 +170,52 @@ mod tests {
         g.wrote(&command(100, 1.0, 1), velocity);
         assert!(admits(&g, 110, 1.1) && !admits(&g, 110, 1.11));
     }
+
+    /// Of rad or rad/s: more than the rounding of a sum, less than any resolution of an arm.
+    #[test]
+    fn rounding_is_no_reason_to_skip_a_setpoint() {
+        let (mut g, servo) = (guard(), ControlMode::ServoPosition);
+        g.wrote(&command(100, 0.0, 1), servo);
+        let admits = |g: &WireGuard, q| g.admits(&command(110, q, 1), servo, &state(0.0), Duration::ZERO, P);
+        assert!(admits(&g, 0.02 * (1.0 + 1e-6) + 0.9e-6) && !admits(&g, 0.02 * (1.0 + 1e-6) + 1.1e-6));
+        let velocity = ControlMode::Velocity;
+        let starts = |v| guard().admits(&command(110, v, 1), velocity, &state(0.0), Duration::ZERO, P);
+        assert!(starts(0.2 + 0.9e-6) && !starts(0.2 + 1.1e-6));
+    }
+
+    #[test]
+    fn a_reading_of_two_periods_ago_is_still_one_to_start_from() {
+        let admits = |age| guard().admits(&command(1, 0.0, 1), ControlMode::ServoPosition, &state(0.0), age, P);
+        assert!(admits(2 * P) && !admits(2 * P + Duration::from_nanos(1)));
+    }
+
+    #[test]
+    fn a_new_start_or_another_mode_is_not_compared_with_the_last_setpoint() {
+        let (mut g, servo, velocity) = (guard(), ControlMode::ServoPosition, ControlMode::Velocity);
+        g.wrote(&command(100, 0.0, 1), servo);
+        let admits = |value, start, mode| g.admits(&command(110, value, start), mode, &state(0.5), Duration::ZERO, P);
+        assert!(admits(0.0, 1, servo) && !admits(0.5, 1, servo), "it continues");
+        assert!(admits(0.5, 2, servo), "it starts again, where the arm is now");
+        assert!(admits(0.15, 1, velocity) && !admits(0.25, 1, velocity), "velocities start at 0");
+    }
+
+    #[test]
+    fn an_arm_that_sags_starts_at_its_last_setpoint_and_no_other() {
+        let supervision = Supervision { accuracy: 0.02, ..Supervision::default() };
+        let mut g = WireGuard::new(1, P, supervision);
+        g.wrote(&command(90, 0.5, 1), ControlMode::ServoPosition);
+        let admits = |value, q| g.admits(&command(100, value, 2), ControlMode::ServoPosition, &state(q), P, P);
+        // Twice its accuracy, and the step that the tick allows.
+        assert!(admits(0.5, 0.421) && !admits(0.5, 0.419));
+        assert!(admits(0.51, 0.4701) && !admits(0.51, 0.4699), "not the last setpoint");
+    }
+
+    #[test]
+    fn a_longer_period_allows_longer_steps() {
+        let (mut g, servo) = (guard(), ControlMode::ServoPosition);
+        g.set_period(3 * P);
+        g.wrote(&command(100, 0.0, 1), servo);
+        let admits = |q| g.admits(&command(900, q, 1), servo, &state(0.0), Duration::ZERO, P);
+        assert!(admits(0.12) && !admits(0.121));
+    }
 }

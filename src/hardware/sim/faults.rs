@@ -56,6 +56,8 @@ pub enum FaultKind {
     Pushed,
     /// The motor of joint number `joint` loses its power; the other motors keep theirs.
     MotorOff,
+    /// Digital input number `input` is low for `duration`; without a duration it stays low.
+    InputLow,
     /// The computer's CAN controller leaves the bus after too many errors.
     BusOff,
     /// The CAN interface has no room for frames to send.
@@ -113,6 +115,10 @@ pub struct Fault {
     #[serde(default = "default_joint")]
     #[schemars(range(min = 1))]
     pub joint: usize,
+    /// Number of the digital input, from 0, for `input_low`.
+    #[serde(default)]
+    #[schemars(range(max = 31))]
+    pub input: u8,
 }
 
 fn default_code() -> u16 {
@@ -153,6 +159,7 @@ impl Fault {
             code: default_code(),
             amount: default_amount(),
             joint: default_joint(),
+            input: 0,
         }
     }
 

@@ -6,10 +6,11 @@
 //! | [`arm`] | [`SimArm`](arm::SimArm): joints with a motor each, modes, error, E-stop line, uptime; its options `sim` |
 //! | [`plant`] | how the joints move: limits, lag, droop under load, falling without power, blocked and sagging joints |
 //! | [`gripper`] | a gripper with a finite speed |
+//! | [`io`] | digital and analogue inputs and outputs |
 //! | [`reach`] | end-effector poses and inverse kinematics |
 //! | [`faults`] | fault script: what goes wrong, when, how often, for how long |
 //! | [`delivery`] | delivery of responses and reports: late, lost, damaged, cut off, without power |
-//! | [`tcp_server`] | one port for requests, or several ports with requests or reports |
+//! | [`tcp_server`] | one port for requests, or several ports with requests, reports or both |
 //! | [`serial_server`] | a pseudo-terminal; requests as over TCP ([`stream`]) |
 //! | [`can_server`] | a bus in memory, a CAN interface, or a serial CAN adapter; the arm streams its state |
 //! | [`trace`] | received bytes, for tests |
@@ -29,6 +30,7 @@ pub mod delivery;
 pub mod events;
 pub mod faults;
 pub mod gripper;
+pub mod io;
 pub mod options;
 pub mod plant;
 mod plant_joint;
@@ -38,4 +40,5 @@ pub mod serial_server;
 pub mod stream;
 mod tcp_listener;
 pub mod tcp_server;
+mod tcp_session;
 pub mod trace;

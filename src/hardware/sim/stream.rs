@@ -40,9 +40,35 @@ pub trait Controller: Send + 'static {
         self.serve(bytes, now, answer)
     }
 
+    /// As [`Controller::serve_port`], for a controller that keeps a state per connection. `client` is the number of the
+    /// connection.
+    fn serve_client(
+        &mut self,
+        port: usize,
+        _client: u64,
+        bytes: &[u8],
+        now: Mono,
+        answer: &mut Vec<u8>,
+    ) -> Scan<Delivery> {
+        self.serve_port(port, bytes, now, answer)
+    }
+
     /// Puts the periodic report for clients of `port` into the empty `packet`; `None` closes the connection.
     fn report(&mut self, _port: usize, _now: Mono, _packet: &mut Vec<u8>) -> Option<Delivery> {
         None
+    }
+
+    /// A client has connected to a port with sessions. What is put into `greeting` is sent first.
+    fn session_began(&mut self, _port: usize, _client: u64, _now: Mono, _greeting: &mut Vec<u8>) {}
+
+    /// As [`Controller::report`], for one client of a port with sessions. Nothing is sent if `packet` stays empty.
+    fn session_report(&mut self, _port: usize, _client: u64, _now: Mono, _packet: &mut Vec<u8>) -> Option<Delivery> {
+        Some(Delivery::Send)
+    }
+
+    /// A client of a port with sessions has disconnected.
+    fn session_ended(&mut self, _port: usize, _client: u64, now: Mono) {
+        self.client_gone(now);
     }
 }
 
@@ -107,32 +133,41 @@ impl<C: Controller, Client> Shared<C, Client> {
         let mut buffer = [0; 4096];
         while let Ok(n @ 1..) = stream.read(&mut buffer) {
             arrived.extend_from_slice(buffer.get(..n).unwrap_or_default());
-            let mut used = 0;
-            while let Some(bytes @ [_, ..]) = arrived.get(used..) {
-                answer.clear();
-                match self.with(|controller, now| controller.serve_port(port, bytes, now, &mut answer)) {
-                    Scan::More => break,
-                    Scan::Skip(n) => used += n.max(1),
-                    Scan::Take(n, delivery) => {
-                        used += n.max(1);
-                        match self.play(delivery, &mut answer) {
-                            // A client that is gone gets no response; its earlier requests still count.
-                            Ok(true) => drop(stream.write_all(&answer)),
-                            Ok(false) => {}
-                            Err(ending) => return ending,
-                        }
-                        if delivery == Delivery::HangUp {
-                            return Ending::Closed;
-                        }
-                    }
-                }
-            }
-            arrived.drain(..used.min(arrived.len()));
-            if arrived.len() > MAX_PENDING {
-                break;
+            if let Err(ending) = self.answer((port, 0), &mut arrived, &mut answer, stream) {
+                return ending;
             }
         }
         Ending::Closed
+    }
+
+    /// Answers the requests that have arrived from a client of a port, and removes them.
+    pub fn answer(
+        &self,
+        (port, client): (usize, u64),
+        arrived: &mut Vec<u8>,
+        answer: &mut Vec<u8>,
+        stream: &mut impl Write,
+    ) -> Result<(), Ending> {
+        let mut used = 0;
+        while let Some(bytes @ [_, ..]) = arrived.get(used..) {
+            answer.clear();
+            match self.with(|controller, now| controller.serve_client(port, client, bytes, now, answer)) {
+                Scan::More => break,
+                Scan::Skip(n) => used += n.max(1),
+                Scan::Take(n, delivery) => {
+                    used += n.max(1);
+                    // A client that is gone gets no response; its earlier requests still count.
+                    if self.play(delivery, answer)? {
+                        let _ = stream.write_all(answer);
+                    }
+                    if delivery == Delivery::HangUp {
+                        return Err(Ending::Closed);
+                    }
+                }
+            }
+        }
+        arrived.drain(..used.min(arrived.len()));
+        if arrived.len() > MAX_PENDING { Err(Ending::Closed) } else { Ok(()) }
     }
 
     /// Applies faults to a response or report. Returns whether the rest of it is to be sent.

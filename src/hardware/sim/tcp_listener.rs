@@ -101,7 +101,7 @@ impl<C: Controller> ListenerThread<C> {
     fn add_client(&mut self, stream: TcpStream, port: usize) {
         let _ = stream.set_nodelay(true);
         match self.inner.ports.get(port) {
-            Some((_, Port::Requests)) => {
+            Some((_, Port::Requests | Port::Sessions(_))) => {
                 self.sessions.retain(|session| !session.is_finished());
                 let inner = self.inner.clone();
                 let builder = std::thread::Builder::new().name(format!("{}-sim-client", inner.name));

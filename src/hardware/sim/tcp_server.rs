@@ -1,9 +1,9 @@
-//! An emulated controller on TCP ports of this computer: ports for requests, and ports on which it sends periodic
-//! reports.
+//! An emulated controller on TCP ports of this computer: ports for requests, ports on which it sends periodic reports,
+//! and ports for both.
 //!
 //! ```text
 //!  listening thread ── accepts clients, sends reports, listens again after a loss of power
-//!   └─▶ one thread per client of a request port: reads, calls the controller, responds
+//!   └─▶ one thread per client with requests: reads, calls the controller, responds, sends a session's reports
 //! ```
 //!
 //! All threads block in the kernel while nothing happens.
@@ -38,6 +38,15 @@ pub enum Port {
     Requests,
     /// The controller sends a report to every client, with this period.
     Reports(Duration),
+    /// Both at once, with a state per connection: requests, and reports with this period.
+    Sessions(Duration),
+}
+
+impl Port {
+    /// Returns the period of a port with sessions.
+    fn session(self) -> Option<Duration> {
+        if let Self::Sessions(period) = self { Some(period) } else { None }
+    }
 }
 
 /// A running emulator on TCP. It ends when it is dropped.
@@ -163,13 +172,20 @@ impl<C: Controller> Inner<C> {
             return self.turn_away(stream);
         };
         events::note(SimEvent::Connected);
-        let ending = self.shared.serve(port, &mut stream);
+        let session = self.ports.get(port).and_then(|(_, kind)| kind.session());
+        let ending = match session {
+            Some(period) => self.shared.converse((port, number), &mut stream, period),
+            None => self.shared.serve(port, &mut stream),
+        };
         events::note(SimEvent::Disconnected);
         if let Ending::Cut(dark) = ending {
             self.cut(dark);
         }
         let _ = stream.shutdown(Shutdown::Both);
-        self.shared.with(|controller, now| controller.client_gone(now));
+        self.shared.with(|controller, now| match session {
+            Some(_) => controller.session_ended(port, number, now),
+            None => controller.client_gone(now),
+        });
         lock(&self.shared.line).clients.retain(|(client, _)| *client != number);
         self.shared.changed.notify_all();
     }

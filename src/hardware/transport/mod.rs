@@ -6,6 +6,7 @@ mod incoming;
 pub mod pty;
 pub mod request_reply;
 pub mod serial;
+pub mod serial_ports;
 pub mod tcp;
 
 pub use incoming::Scan;

@@ -18,12 +18,11 @@ use rustix::termios::{
 use super::incoming::Incoming;
 pub use super::incoming::Scan;
 pub use super::pty::Pty;
+use super::serial_ports;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 
 /// Maximum error of the hardware's rate [%]; a character of 10 bits tolerates about twice that.
 const RATE_TOLERANCE: u32 = 2;
-/// Names of serial devices that may be arms.
-const NAMES: [&str; 5] = ["ttyUSB", "ttyACM", "ttyAMA", "ttyTHS", "ttymxc"];
 
 /// Address of a controller on a serial line: `/dev/ttyUSB0`, `/dev/ttyUSB0@115200`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -220,16 +219,10 @@ fn open_error(error: Errno) -> String {
 
 /// Lists the serial devices of this computer.
 fn list_devices() -> String {
-    let entries = std::fs::read_dir("/dev").into_iter().flatten().flatten();
-    let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
-    let mut found: Vec<_> = names.filter(|name| NAMES.iter().any(|known| name.starts_with(known))).collect();
-    found.sort();
+    let found: Vec<String> = serial_ports::list().into_iter().map(|port| port.path).collect();
     match found.as_slice() {
         [] => "this computer has no serial device; check that the adapter is plugged in".to_owned(),
-        found => format!(
-            "available serial devices: {}",
-            found.iter().map(|n| format!("/dev/{n}")).collect::<Vec<_>>().join(", ")
-        ),
+        found => format!("available serial devices: {}", found.join(", ")),
     }
 }
 

@@ -73,6 +73,8 @@ fn state(arm: u16, tick: u64) -> ArmState {
         written: tick.saturating_sub(1),
         interference: if tick == 9 { Interference::Mode } else { Interference::None },
         own_delay_ns: tick % 2,
+        stop_input_open: tick % 5 == 3,
+        device_ns: tick.is_multiple_of(2).then_some(tick * 1000),
     }
 }
 
@@ -178,6 +180,8 @@ fn with_values(input: &ArmInput, states: Option<&JointState>, skip: usize, dof: 
         written: input.written,
         interference: if input.interference == "mode" { Interference::Mode } else { Interference::None },
         own_delay_ns: input.own_delay_ns,
+        stop_input_open: input.stop_input_open,
+        device_ns: input.device_ns.first().copied(),
     }
 }
 

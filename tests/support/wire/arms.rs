@@ -68,7 +68,7 @@ pub const REMOTE: Arm = Arm {
     time_limit: Some(0.5),
 };
 
-/// An arm on a serial line: the template of `dimos adapter new --transport serial`.
+/// An arm on a serial line (`tests/support/serial_line`).
 pub fn serial(row: &'static AdapterSpec) -> Arm {
     Arm {
         name: "acme",

@@ -136,7 +136,7 @@ pub fn remote() -> NewDecoder {
     })
 }
 
-/// The template of an arm on a stream of bytes (the sheet in `assets/templates/stream/protocol.rs`): big-endian floats
+/// The template of an arm on a stream of bytes (the sheet in `assets/templates/tcp/protocol.rs`): big-endian floats
 /// in degrees, a sum at the end.
 pub fn template() -> NewDecoder {
     by(|bytes| {

@@ -8,21 +8,21 @@ use super::description;
 use super::name::Name;
 
 macro_rules! arm {
-    ($folder:literal $($more:literal)?) => {
+    ($folder:literal $($more:literal)*) => {
         [
             ("mod.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/mod.rs"))),
             ("adapter.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/adapter.rs"))),
             ("protocol.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/protocol.rs"))),
             ("golden.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/golden.rs"))),
             ("emulator.rs", include_str!(concat!("../../../../assets/templates/", $folder, "/emulator.rs"))),
-            $(($more, include_str!(concat!("../../../../assets/templates/", $folder, "/", $more))),)?
+            $(($more, include_str!(concat!("../../../../assets/templates/", $folder, "/", $more))),)*
         ]
     };
 }
 
 const TCP: &[(&str, &str)] = &arm!("tcp" "wire.rs");
 const CAN: &[(&str, &str)] = &arm!("can");
-const SERIAL: &[(&str, &str)] = &arm!("serial" "wire.rs");
+const SERIAL: &[(&str, &str)] = &arm!("serial" "wire.rs" "calibration.rs");
 
 const BLUEPRINT: &str = include_str!("../../../../assets/templates/blueprint.yaml");
 const PLANNER: &str = include_str!("../../../../assets/templates/planner.yaml");
@@ -213,7 +213,12 @@ mod tests {
     fn in_the_tree_nothing_is_of_another_crate() {
         for transport in [Transport::Tcp, Transport::Can, Transport::Serial] {
             let files = arm("otto", 7, transport).in_tree();
-            assert_eq!(files.len(), if transport == Transport::Can { 8 } else { 9 });
+            let count = match transport {
+                Transport::Can => 8,
+                Transport::Tcp => 9,
+                Transport::Serial => 10,
+            };
+            assert_eq!(files.len(), count);
             let left = |text: &str| text.contains("dimos::") || text.to_lowercase().contains("acme");
             assert!(files.iter().all(|(_, text)| !left(text)), "{transport:?}");
         }

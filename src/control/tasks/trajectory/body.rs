@@ -67,7 +67,7 @@ impl TrajectoryTask {
         (self.slowing, self.begun, self.at_end, self.settling) = (false, false, false, 0.0);
         self.samples.clear();
         self.samples.resize(motion.joints.len(), Sample::default());
-        self.last = TaskView { motion: motion.id, remaining: motion.spline.duration(), ..TaskView::default() };
+        self.last = TaskView { motion: motion.id, ..TaskView::default() };
         self.set_out(cx, motion);
     }
 

@@ -5,14 +5,16 @@ use std::sync::Arc;
 use super::device::{Device, GRIPPER_MAX};
 use super::options::Options;
 use super::{MODES, NATIVE_RATE, check, limits};
+use crate::arm::{IoInfo, IoState, JointStatus, Load};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
-    Stop,
+    AdapterError, AdapterResult, ForceTorque, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
+    ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
 use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::io::{MAX_VOLTAGE, SimIo};
 use crate::joint::{ControlMode, JointLimits, MAX_DOF};
 
 /// An ideal arm in memory.
@@ -133,6 +135,7 @@ impl ManipulatorAdapter for MockArm {
         reading.velocity = self.options.velocity_feedback.then(|| self.device.arm.joints().1);
         reading.effort = self.options.effort_feedback.then(|| self.device.arm.efforts());
         reading.stamp = Some(self.device.arm.now());
+        reading.device_ns = Some(self.device.arm.uptime().as_nanos() as u64);
         reading.valid = Some(position == self.device.arm.joints().0);
         self.measured = Some(*reading);
         Ok(())
@@ -200,6 +203,18 @@ impl ManipulatorAdapter for MockArm {
     fn force_torque(&mut self) -> Option<&mut dyn ForceTorque> {
         if self.options.force_torque { Some(self) } else { None }
     }
+
+    fn io(&mut self) -> Option<&mut dyn Io> {
+        Some(self)
+    }
+
+    fn payload(&mut self) -> Option<&mut dyn Payload> {
+        Some(self)
+    }
+
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
+        Some(self)
+    }
 }
 
 impl Gripper for MockArm {
@@ -221,6 +236,63 @@ impl Gripper for MockArm {
             )));
         }
         self.device.gripper.move_to(position);
+        Ok(())
+    }
+}
+
+impl Io for MockArm {
+    fn get_io(&self) -> IoInfo {
+        SimIo::INFO
+    }
+
+    fn read_io(&mut self, state: &mut IoState) -> AdapterResult<()> {
+        self.device.answer()?;
+        *state = self.device.io.state();
+        Ok(())
+    }
+
+    fn write_digital_output(&mut self, output: u8, high: bool) -> AdapterResult<()> {
+        self.device.write()?;
+        let there = self.device.io.set_output(output, high);
+        there.then_some(()).ok_or_else(|| AdapterError::Rejected(format!("there is no digital output {output}")))
+    }
+
+    fn write_analog_output(&mut self, output: u8, value: f64) -> AdapterResult<()> {
+        self.device.write()?;
+        let set = self.device.io.set_voltage(output, value);
+        let refused = || format!("analogue output {output} cannot be {value} V: there are two, 0 to {MAX_VOLTAGE} V");
+        set.then_some(()).ok_or_else(|| AdapterError::Rejected(refused()))
+    }
+}
+
+impl JointMonitor for MockArm {
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        self.device.answer()?;
+        joints.fill(JointStatus { temperature: Some(25.0), error: Some(0), ..JointStatus::default() });
+        Ok(())
+    }
+}
+
+impl Payload for MockArm {
+    fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
+        self.device.answer()?;
+        Ok(Some(self.device.load))
+    }
+
+    fn write_payload(&mut self, load: &Load) -> AdapterResult<()> {
+        self.device.write()?;
+        self.device.load = *load;
+        Ok(())
+    }
+
+    fn read_mounting(&mut self) -> AdapterResult<Option<[f64; 3]>> {
+        self.device.answer()?;
+        Ok(Some(self.device.gravity))
+    }
+
+    fn write_mounting(&mut self, gravity: [f64; 3]) -> AdapterResult<()> {
+        self.device.write()?;
+        self.device.gravity = gravity;
         Ok(())
     }
 }

@@ -5,11 +5,13 @@ use std::time::Duration;
 
 use super::limits;
 use super::options::{Options, PLAYABLE};
+use crate::arm::{Load, UPRIGHT};
 use crate::clock::{Clock, Mono};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::sim::arm::{Delivery, SimArm};
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::gripper::Gripper;
+use crate::hardware::sim::io::SimIo;
 use crate::hardware::sim::plant::{Plant, Tracking};
 use crate::joint::Joints;
 
@@ -24,6 +26,9 @@ const FALL_SPEED: f64 = 0.2;
 pub struct Device {
     pub arm: SimArm,
     pub gripper: Gripper,
+    pub io: SimIo,
+    pub load: Load,
+    pub gravity: [f64; 3],
     pub connected: bool,
     clock: Arc<dyn Clock>,
     latency: Duration,
@@ -42,6 +47,9 @@ impl Device {
             // Targets outside the limits are accepted; the joints stop at the limits.
             arm: arm.with_plant(plant).with_tolerance(f64::INFINITY),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
+            io: SimIo::default(),
+            load: Load::default(),
+            gravity: UPRIGHT,
             connected: false,
             clock,
             latency: Duration::from_secs_f64(options.latency_ms * 1e-3),
@@ -146,6 +154,7 @@ impl Device {
             panic!("scripted fault: the adapter panics");
         }
         self.arm.apply_faults();
+        self.io.play(&mut self.arm);
         Ok(())
     }
 }

@@ -42,6 +42,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(MockArm::new(config)?)),
     emulate: None,
+    service: None,
 };
 
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {

@@ -24,6 +24,7 @@ pub(super) const PLAYABLE: &[FaultKind] = &[
     FaultKind::Frozen,
     FaultKind::Sag,
     FaultKind::Blocked,
+    FaultKind::InputLow,
 ];
 
 /// Options of a mock arm.

@@ -18,11 +18,11 @@ use super::protocol::{self, DOF, WireJoints, millidegrees, radians};
 use super::session::{ESTOP, Session};
 use super::wire::{Wire, WireCounts};
 use super::{Follow, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check};
-use crate::arm::Pose;
+use crate::arm::{JointStatus, Pose};
 use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
-    Stop,
+    AdapterError, AdapterResult, Cartesian, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo,
+    RobotState, Stop,
 };
 use crate::hardware::adapter_util::fill;
 use crate::hardware::registry::AdapterConfig;
@@ -41,6 +41,9 @@ const MARGIN: f64 = 0.1;
 const TORQUE: [f64; DOF] = [1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844];
 /// Up to this firmware the arm reports a quarter of the current of its first three joints.
 const QUARTER_CURRENT: (u8, u8, u8) = (1, 8, 2);
+
+/// Bit of a driver's status that is no error: the motor is on.
+const ENABLED: u8 = 0x40;
 
 const MICRO: f64 = 1e-6;
 const MILLI: f64 = 1e-3;
@@ -198,6 +201,7 @@ impl ManipulatorAdapter for PiperAdapter {
         self.arm.whole()?;
         *reading = JointReading {
             stamp: Some(self.arm.feedback.joints_at),
+            device_ns: None,
             position: joints_of(&self.arm.feedback.joints.map(radians)),
             velocity: self.velocities(),
             effort: self.efforts(),
@@ -332,6 +336,30 @@ impl ManipulatorAdapter for PiperAdapter {
 
     fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
         Some(self)
+    }
+
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
+        Some(self)
+    }
+}
+
+impl JointMonitor for PiperAdapter {
+    /// From feedback that has arrived. A motor's current is absent while it is not reported, or its unit is unknown.
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        let drivers = self.arm.known()?.drivers;
+        let efforts = self.efforts();
+        for (i, (joint, driver)) in joints.iter_mut().zip(&drivers).enumerate() {
+            let temperature = driver.driver_temperature.max(driver.motor_temperature.into());
+            let torque = efforts.as_ref().and_then(|efforts| efforts.get(i)).zip(TORQUE.get(i));
+            *joint = JointStatus {
+                temperature: Some(temperature.into()),
+                current: torque.map(|(effort, per_ampere)| effort / per_ampere),
+                voltage: Some(f64::from(driver.voltage) * 0.1),
+                load: None,
+                error: Some((driver.status & !ENABLED).into()),
+            };
+        }
+        Ok(())
     }
 }
 

@@ -63,6 +63,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::PiperAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::PiperEmulator::start(config, place)?))),
+    service: None,
 };
 
 /// Lowest and highest position of each joint [rad].

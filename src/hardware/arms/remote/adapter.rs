@@ -209,6 +209,7 @@ impl ManipulatorAdapter for RemoteAdapter {
         }
         *reading = JointReading {
             stamp: Some(stamp),
+            device_ns: None,
             position: state.position.joints,
             velocity: state.velocity.map(|values| values.joints),
             effort: state.effort.map(|values| values.joints),

@@ -55,6 +55,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::RemoteAdapter::new(config)?)),
     emulate: Some(emulator::start),
+    service: None,
 };
 
 fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {

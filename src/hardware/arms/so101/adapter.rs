@@ -6,27 +6,26 @@
 use std::f64::consts::TAU;
 use std::time::Duration;
 
+use super::bus::{Bus, servo};
 use super::calibration::{Calibration, NAMES, Range};
 use super::protocol::{
     self, Instruction, MAX_DATA, MAX_INSTRUCTION, MODEL, SERVOS, STATE, Servo, TURN, register, signed,
 };
-use super::{BAUD, DOF, GRIPPER_MAX, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
+use super::settings;
+use super::{DOF, GRIPPER_MAX, HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, TOP_SPEED, check, limits};
+use crate::arm::JointStatus;
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+    AdapterError, AdapterResult, Gripper, JointMonitor, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
+    Stop,
 };
 use crate::hardware::adapter_util::{fill, finite};
 use crate::hardware::registry::AdapterConfig;
-use crate::hardware::transport::request_reply::{RequestReply, Retry};
-use crate::hardware::transport::serial::{SerialAddress, SerialLink};
+use crate::hardware::transport::request_reply::Retry;
 use crate::joint::{ControlMode, JointLimits, Joints, joints_of};
 
-/// Servos may just be starting. With six of them: below 3 s.
-const INTRODUCTION: Retry = Retry { each: Duration::from_millis(40), times: 5 };
 /// Longest wait for the state of all servos. All attempts together stay below `stale_after`.
 const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
-/// Longest wait until the line takes a command.
-const SEND_TIMEOUT: Duration = Duration::from_millis(100);
 /// A state answers further questions for this time.
 const STATE_AGE: Duration = Duration::from_millis(5);
 /// A setpoint is written if the motors were on and without error this long ago at most: the state is read once a cycle.
@@ -41,20 +40,25 @@ const DROOP: i32 = 40;
 const ACCELERATION: u8 = 254;
 /// Below this the servos answer, but have no force [0.1 V].
 const LOWEST_VOLTAGE: u8 = 55;
+/// Unit of the servos' currents [A].
+const AMPERE: f64 = 6.5e-3;
 /// Slowest planned motion [counts/s]: zero would be the fastest.
 const SLOWEST: f64 = 10.0;
 
 /// An SO-101.
 pub struct So101Adapter {
-    address: SerialAddress,
+    bus: Bus,
     calibration: Calibration,
-    line: RequestReply<SerialLink>,
+    /// Whether settings with other values than wanted are written when connecting.
+    write_settings: bool,
     firmware: (u8, u8),
     mode: ControlMode,
     /// The last state of all servos, and when it was asked for.
     state: Option<([Servo; SERVOS], Mono)>,
     /// The last goal of the gripper [counts]; `None`: where it is.
     gripper_goal: Option<i32>,
+    /// The servos' homing offsets, read when connecting [counts].
+    offsets: [i32; SERVOS],
 }
 
 impl So101Adapter {
@@ -63,13 +67,14 @@ impl So101Adapter {
         config.check(check)?;
         let options = config.options::<Options>()?;
         Ok(Self {
-            address: config.parse_address(|address| SerialAddress::parse(address, BAUD))?,
+            bus: Bus::new(config)?,
             calibration: options.calibration().map_err(|e| AdapterError::Rejected(e.what))?,
-            line: RequestReply::half_duplex(options.echo),
+            write_settings: options.write_settings,
             firmware: (0, 0),
             mode: MODES.first().copied().unwrap_or_default(),
             state: None,
             gripper_goal: None,
+            offsets: [0; SERVOS],
         })
     }
 
@@ -77,29 +82,12 @@ impl So101Adapter {
         self.calibration.0.get(servo).copied().unwrap_or(Calibration::default().0[0])
     }
 
-    /// Reads registers of one servo.
-    fn read<const N: usize>(&mut self, id: u8, address: u8) -> AdapterResult<[u8; N]> {
-        let mut frame = [0; MAX_INSTRUCTION];
-        let frame = protocol::encode(Instruction::Read(id, address, N as u8), &mut frame);
-        let name = usize::from(id).checked_sub(1).and_then(|servo| NAMES.get(servo)).copied().unwrap_or_default();
-        let reply = self.line.request(frame, INTRODUCTION, |bytes| {
-            protocol::scan(bytes, id..=id, N).map(|status| status.data.first_chunk::<N>().copied().unwrap_or([0; N]))
-        });
-        reply.map_err(|error| match error {
-            AdapterError::Timeout(_) => AdapterError::Timeout(format!(
-                "servo {id} ({name}) at {} does not answer\nhint: is the arm powered, and is each cable plugged in?",
-                self.address
-            )),
-            error => error,
-        })
-    }
-
     /// Writes the same registers of all servos.
     fn write<const N: usize>(&mut self, address: u8, values: [[u8; N]; SERVOS]) -> AdapterResult<()> {
         let mut frame = [0; MAX_INSTRUCTION];
         let values = values.as_flattened();
         self.state = None;
-        self.line.tell(protocol::encode(Instruction::WriteAll(address, N as u8, values), &mut frame))
+        self.bus.line.tell(protocol::encode(Instruction::WriteAll(address, N as u8, values), &mut frame))
     }
 
     /// Asks for the state of all servos.
@@ -116,7 +104,7 @@ impl So101Adapter {
                 (status.id, data)
             })
         };
-        let result = self.line.gather(frame, CYCLE, SERVOS, scan, |(id, data)| {
+        let result = self.bus.line.gather(frame, CYCLE, SERVOS, scan, |(id, data)| {
             let slot = usize::from(id).checked_sub(1).and_then(|servo| servos.get_mut(servo));
             slot.is_some_and(|slot| slot.replace(Servo::decode(&data).unwrap_or_default()).is_none())
         });
@@ -137,7 +125,7 @@ impl So101Adapter {
 
     fn not_older(&mut self, age: Duration) -> AdapterResult<[Servo; SERVOS]> {
         match self.state {
-            Some((servos, at)) if self.line.is_open() && MonotonicClock.now().since(at) <= age => Ok(servos),
+            Some((servos, at)) if self.bus.line.is_open() && MonotonicClock.now().since(at) <= age => Ok(servos),
             _ => self.fetch(),
         }
     }
@@ -228,8 +216,7 @@ fn error_of(servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
 impl ManipulatorAdapter for So101Adapter {
     fn connect(&mut self) -> AdapterResult<()> {
         self.disconnect();
-        let link = SerialLink::connect("so101", &self.address.path, self.address.baud, SEND_TIMEOUT)?;
-        self.line.open(link);
+        self.bus.open()?;
         let introduced = self.introduce();
         if introduced.is_err() {
             self.disconnect();
@@ -238,12 +225,12 @@ impl ManipulatorAdapter for So101Adapter {
     }
 
     fn disconnect(&mut self) {
-        self.line.close();
+        self.bus.line.close();
         (self.state, self.gripper_goal) = (None, None);
     }
 
     fn is_connected(&self) -> bool {
-        self.line.is_open()
+        self.bus.line.is_open()
     }
 
     fn get_info(&self) -> ManipulatorInfo {
@@ -299,6 +286,7 @@ impl ManipulatorAdapter for So101Adapter {
         let servos = self.fetch()?;
         *reading = JointReading {
             stamp: None,
+            device_ns: None,
             position: self.angles(|j, range| range.angle(servos.get(j).map_or(0, |servo| servo.position))),
             velocity: Some(self.angles(|j, _| velocity(servos.get(j)))),
             effort: None,
@@ -397,11 +385,15 @@ impl ManipulatorAdapter for So101Adapter {
     }
 
     fn discard_pending(&mut self) {
-        self.line.abort();
+        self.bus.line.abort();
         self.disconnect();
     }
 
     fn gripper(&mut self) -> Option<&mut dyn Gripper> {
+        Some(self)
+    }
+
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
         Some(self)
     }
 }
@@ -414,30 +406,82 @@ fn velocity(servo: Option<&Servo>) -> f64 {
 impl So101Adapter {
     /// Checks that the servos are those of this arm, calibrated as the blueprint says.
     fn introduce(&mut self) -> AdapterResult<()> {
-        let at = self.address.to_string();
+        let at = self.bus.address().to_string();
         for (i, id) in (1..=SERVOS as u8).enumerate() {
-            let name = NAMES.get(i).copied().unwrap_or_default();
-            let [firmware @ .., _, m0, m1] = self.read::<5>(id, 0)?;
+            let [firmware @ .., _, m0, m1] = self.bus.read::<5>(id, 0)?;
             let model = u16::from_le_bytes([m0, m1]);
             if model != MODEL {
-                let what = format!("so101 at {at}: servo {id} ({name}) is model {model}, expected {MODEL} (STS3215)");
+                let what = format!("so101 at {at}: {} is model {model}, expected {MODEL} (STS3215)", servo(id));
                 return Err(AdapterError::Rejected(what));
             }
             self.firmware = (firmware[0], firmware[1]);
-            let [low0, low1, high0, high1] = self.read::<4>(id, register::RANGE)?;
+            let [low0, low1, high0, high1] = self.bus.read::<4>(id, register::RANGE)?;
             let found = (u16::from_le_bytes([low0, low1]), u16::from_le_bytes([high0, high1]));
-            let offset = signed(u16::from_le_bytes(self.read::<2>(id, register::OFFSET)?), 11);
+            let offset = signed(u16::from_le_bytes(self.bus.read::<2>(id, register::OFFSET)?), 11);
+            self.offsets.get_mut(i).into_iter().for_each(|to| *to = offset);
             let range = self.range(i);
             let same = found == (range.low as u16, range.high as u16);
             if range.offset.is_some_and(|expected| !same || offset != expected) {
                 return Err(AdapterError::Rejected(format!(
-                    "so101 at {at}: servo {id} ({name}) has the range {} to {} and the offset {offset}, not those of the \
-                     calibration file\nhint: write the file to the servos with LeRobot, or name another file",
-                    found.0, found.1
+                    "so101 at {at}: {} has the range {} to {} and the offset {offset}, not those of the calibration \
+                     file\nhint: write the file to the servos (dimos arm calibrate so101 --restore FILE), or name another",
+                    servo(id),
+                    found.0,
+                    found.1
                 )));
             }
         }
+        self.settle()?;
         self.fetch().map(drop)
+    }
+
+    /// Checks the settings that the servos keep, and writes them if the blueprint says so.
+    fn settle(&mut self) -> AdapterResult<()> {
+        let at = self.bus.address().to_string();
+        let found = settings::check(&mut self.bus)?;
+        if found.is_empty() {
+            return Ok(());
+        }
+        if self.write_settings {
+            if self.fetch()?.iter().any(|servo| servo.on) {
+                let what = format!("so101 at {at}: settings cannot be written while motors are on");
+                return Err(AdapterError::Rejected(format!(
+                    "{what}\nhint: support the arm and switch its power off and on"
+                )));
+            }
+            tracing::warn!("so101 at {at}: {} settings are written to the servos", found.len());
+            return settings::write(&mut self.bus);
+        }
+        let hint = "dimos arm configure so101";
+        if let Some(mode) = found.iter().find(|setting| setting.name == settings::MODE) {
+            let what = format!("so101 at {at}: {} is in control mode {}, not 0 (position)", mode.motor, mode.found);
+            return Err(AdapterError::Rejected(format!("{what}\nhint: {hint}")));
+        }
+        let list = found.iter().map(|s| format!("{}: {} is {}, not {}", s.motor, s.name, s.found, s.wanted));
+        let list = list.collect::<Vec<_>>().join("; ");
+        tracing::warn!("so101 at {at}: the servos have other settings ({hint} writes them): {list}");
+        Ok(())
+    }
+}
+
+impl JointMonitor for So101Adapter {
+    /// The load is the duty cycle of the motor: the servos measure no torque.
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        for (joint, servo) in joints.iter_mut().zip(&self.recent()?) {
+            *joint = JointStatus {
+                temperature: Some(servo.temperature.into()),
+                current: Some(f64::from(servo.current) * AMPERE),
+                voltage: Some(f64::from(servo.voltage) * 0.1),
+                load: Some(f64::from(servo.load) * 1e-3),
+                error: Some(servo.error.into()),
+            };
+        }
+        Ok(())
+    }
+
+    fn read_calibration_offsets(&mut self, offsets: &mut [f64]) -> AdapterResult<bool> {
+        fill(offsets, &self.offsets.map(|offset| f64::from(offset) * TAU / TURN));
+        Ok(true)
     }
 }
 

@@ -17,12 +17,37 @@ const DATA_SHEET: [(f64, f64); SERVOS] =
 const MIDDLE: f64 = 2048.0;
 
 /// A servo in LeRobot's file.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-struct Entry {
-    id: u8,
-    homing_offset: i32,
-    range_min: i32,
-    range_max: i32,
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+pub struct Servo {
+    /// Its number on the line.
+    pub id: u8,
+    /// Direction for LeRobot's percentages; always 0 for this arm.
+    #[serde(default)]
+    pub drive_mode: u8,
+    /// Homing offset: what the servo subtracts from its encoder [counts].
+    pub homing_offset: i32,
+    /// Lowest position [counts].
+    pub range_min: i32,
+    /// Highest position [counts].
+    pub range_max: i32,
+}
+
+/// Returns the text of LeRobot's file, as LeRobot writes it.
+pub fn file(servos: &[Servo; SERVOS]) -> String {
+    let entry = |(name, servo): (&str, &Servo)| {
+        let Servo { id, drive_mode, homing_offset, range_min, range_max } = servo;
+        let values = [
+            ("id", i32::from(*id)),
+            ("drive_mode", i32::from(*drive_mode)),
+            ("homing_offset", *homing_offset),
+            ("range_min", *range_min),
+            ("range_max", *range_max),
+        ];
+        let lines = values.map(|(key, value)| format!("        \"{key}\": {value}"));
+        format!("    \"{name}\": {{\n{}\n    }}", lines.join(",\n"))
+    };
+    let entries: Vec<String> = NAMES.into_iter().zip(servos).map(entry).collect();
+    format!("{{\n{}\n}}", entries.join(",\n"))
 }
 
 /// Range and zero of a servo.
@@ -72,27 +97,49 @@ impl Default for Calibration {
 impl Calibration {
     /// Reads LeRobot's file; zero is the middle of each range. The error is a sentence without full stop.
     pub fn load(path: &Path) -> Result<Self, String> {
-        let text = std::fs::read_to_string(path).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
-        Self::parse(&text).map_err(|e| format!("{}: {e}", path.display()))
+        Self::read(path).map(|servos| Self::of(&servos))
     }
 
-    fn parse(text: &str) -> Result<Self, String> {
-        let file: std::collections::BTreeMap<String, Entry> =
-            serde_json::from_str(text).map_err(|e| format!("this is no calibration of LeRobot: {e}"))?;
-        let mut ranges = Self::default().0;
-        for ((name, id), range) in NAMES.into_iter().zip(1u8..).zip(&mut ranges) {
-            let entry = file.get(name).ok_or_else(|| format!("{name} is missing"))?;
-            if entry.id != id {
-                return Err(format!("{name} is servo {}, expected {id}", entry.id));
-            }
-            let (low, high) = (entry.range_min, entry.range_max);
-            if !(0 <= low && low < high && high < TURN as i32) {
-                return Err(format!("{name}: {low} to {high} is not a range within 0 to 4095"));
-            }
-            *range = Range { low, high, zero: 0.5 * f64::from(low + high), offset: Some(entry.homing_offset) };
-        }
-        Ok(Self(ranges))
+    /// Reads LeRobot's file as it is.
+    pub fn read(path: &Path) -> Result<[Servo; SERVOS], String> {
+        let text = std::fs::read_to_string(path).map_err(|e| format!("cannot read {}: {e}", path.display()))?;
+        entries(&text).map_err(|e| format!("{}: {e}", path.display()))
     }
+
+    /// Reads the text of LeRobot's file.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        entries(text).map(|servos| Self::of(&servos))
+    }
+
+    fn of(servos: &[Servo; SERVOS]) -> Self {
+        Self(servos.map(|servo| Range {
+            low: servo.range_min,
+            high: servo.range_max,
+            zero: 0.5 * f64::from(servo.range_min + servo.range_max),
+            offset: Some(servo.homing_offset),
+        }))
+    }
+}
+
+fn entries(text: &str) -> Result<[Servo; SERVOS], String> {
+    let file: std::collections::BTreeMap<String, Servo> =
+        serde_json::from_str(text).map_err(|e| format!("this is no calibration of LeRobot: {e}"))?;
+    let mut servos = [Servo::default(); SERVOS];
+    for ((name, id), servo) in NAMES.into_iter().zip(1u8..).zip(&mut servos) {
+        let entry = file.get(name).ok_or_else(|| format!("{name} is missing"))?;
+        if entry.id != id {
+            return Err(format!("{name} is servo {}, expected {id}", entry.id));
+        }
+        let (low, high, offset) = (entry.range_min, entry.range_max, entry.homing_offset);
+        if !(0 <= low && low < high && high < TURN as i32) {
+            return Err(format!("{name}: {low} to {high} is not a range within 0 to 4095"));
+        }
+        if !(-2047..=2047).contains(&offset) {
+            return Err(format!("{name}: {offset} is not an offset within -2047 to 2047"));
+        }
+        *servo = *entry;
+    }
+    Ok(servos)
 }
 
 #[cfg(test)]
@@ -119,10 +166,20 @@ mod tests {
     }
 
     #[test]
+    fn a_file_that_was_written_is_read_as_it_was() {
+        let servos = entries(FILE).unwrap();
+        let text = file(&servos);
+        assert_eq!(entries(&text), Ok(servos));
+        let begin = "{\n    \"shoulder_pan\": {\n        \"id\": 1,\n        \"drive_mode\": 0,\n        \"homing_offset\": -50,";
+        assert!(text.starts_with(begin) && text.ends_with("\"range_max\": 3500\n    }\n}"), "{text}");
+    }
+
+    #[test]
     fn mistakes_in_the_file_are_named() {
         let wrong = |from: &str, to: &str| Calibration::parse(&FILE.replace(from, to)).unwrap_err();
         assert_eq!(wrong("wrist_roll", "wrist"), "wrist_roll is missing");
         assert_eq!(wrong(r#""id": 3"#, r#""id": 4"#), "elbow_flex is servo 4, expected 3");
+        assert_eq!(wrong("-50", "2048"), "shoulder_pan: 2048 is not an offset within -2047 to 2047");
         assert_eq!(wrong("3420", "4096"), "shoulder_pan: 758 to 4096 is not a range within 0 to 4095");
         assert!(wrong("range_max", "max").starts_with("this is no calibration of LeRobot"));
         let error = Calibration::load(Path::new("/no/such/file")).unwrap_err();

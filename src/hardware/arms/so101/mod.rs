@@ -1,14 +1,19 @@
 //! SO-101 (and SO-100): five joints and a gripper of Feetech STS3215 servos on one half-duplex serial line.
 //!
-//! `protocol.rs` has the bytes, `calibration.rs` what counts mean, `adapter.rs` the lifecycle, `emulator/` the servos'
-//! side of the line.
+//! `protocol.rs` has the bytes, `bus.rs` the line, `calibration.rs` what counts mean, `adapter.rs` the lifecycle,
+//! `service.rs` and `settings.rs` the work outside a run, `emulator/` the servos' side of the line.
 
 pub mod adapter;
+mod bus;
 pub mod calibration;
 pub mod emulator;
 pub mod protocol;
+mod service;
+mod settings;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_service;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -64,6 +69,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::So101Adapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::start(config, place)?))),
+    service: Some(service::open),
 };
 
 /// Checks the number of joints, the options and the calibration file; returns the joint limits.
@@ -96,6 +102,9 @@ pub struct Options {
     pub calibration: Option<PathBuf>,
     /// Whether the line returns what is sent on it.
     pub echo: bool,
+    /// Whether settings of the servos that differ from LeRobot's (gains, the gripper's torque limits, return delay) are
+    /// written when connecting. Otherwise a warning lists them. EEPROM wears: `dimos arm configure` once is enough.
+    pub write_settings: bool,
     /// Settings of the emulator.
     pub sim: SimOptions,
 }

@@ -16,8 +16,8 @@ pub const SERVOS: usize = 6;
 pub const TURN: f64 = 4096.0;
 /// The model that servos report: STS3215.
 pub const MODEL: u16 = 777;
-/// Number of all servos at once; none of them answers.
-const BROADCAST: u8 = 0xFE;
+/// Number of all servos at once; they answer to a ping only.
+pub const BROADCAST: u8 = 0xFE;
 /// Longest instruction: seven registers of each servo, or a list of them.
 pub const MAX_INSTRUCTION: usize = 8 + SERVOS * 8;
 /// Most data of a status.
@@ -25,8 +25,10 @@ pub const MAX_DATA: usize = 32;
 
 /// Registers.
 pub mod register {
-    /// Model, two bytes.
-    pub const MODEL: u8 = 3;
+    /// Number of the servo.
+    pub const ID: u8 = 5;
+    /// Rate of the line: 0 is 1 Mbit/s.
+    pub const RATE: u8 = 6;
     /// Lowest position, two bytes; the highest follows it.
     pub const RANGE: u8 = 9;
     /// Homing offset, two bytes with the sign in bit 11.
@@ -37,6 +39,10 @@ pub mod register {
     pub const ACCELERATION: u8 = 41;
     /// Goal position, two bytes.
     pub const GOAL: u8 = 42;
+    /// Lock: while it is 1, writes to the EEPROM are lost at power-off.
+    pub const LOCK: u8 = 55;
+    /// Position, two bytes.
+    pub const POSITION: u8 = 56;
 }
 
 /// Registers 40 to 70: all of a servo's state.
@@ -49,6 +55,8 @@ pub enum Instruction<'a> {
     Ping(u8),
     /// Reads registers of a servo: address, length.
     Read(u8, u8, u8),
+    /// Writes registers of a servo: address, bytes.
+    Write(u8, u8, &'a [u8]),
     /// Reads the same registers of the servos 1 to `SERVOS`; each answers, in order.
     ReadAll(u8, u8),
     /// Writes the same registers of the servos 1 to `SERVOS`: address, bytes of one servo, those of all. No answer.
@@ -71,6 +79,10 @@ pub fn encode<'a>(instruction: Instruction<'_>, frame: &'a mut [u8; MAX_INSTRUCT
         }
         Instruction::Read(id, address, length) => {
             [0x02, address, length].into_iter().for_each(put);
+            id
+        }
+        Instruction::Write(id, address, values) => {
+            [0x03, address].iter().chain(values).copied().for_each(put);
             id
         }
         Instruction::ReadAll(address, length) => {
@@ -131,6 +143,12 @@ pub fn scan(bytes: &[u8], ids: std::ops::RangeInclusive<u8>, data: usize) -> Sca
     }
 }
 
+/// The word of a number with its sign in bit `bit`.
+pub fn with_sign(value: i32, bit: u32) -> u16 {
+    let size = value.unsigned_abs() as u16 & ((1 << bit) - 1);
+    if value < 0 { size | 1 << bit } else { size }
+}
+
 /// A number with its sign in bit `bit`.
 pub fn signed(word: u16, bit: u32) -> i32 {
     let sign = 1u16 << bit;
@@ -155,6 +173,12 @@ pub struct Servo {
     pub error: u8,
     /// Whether it moves.
     pub moving: bool,
+    /// Duty cycle of the motor [0.1 %], signed.
+    pub load: i32,
+    /// Temperature [°C].
+    pub temperature: u8,
+    /// Motor current [6.5 mA].
+    pub current: u16,
 }
 
 impl Servo {
@@ -171,6 +195,9 @@ impl Servo {
             voltage: byte(62),
             error: byte(65),
             moving: byte(66) != 0,
+            load: signed(word(60), 10),
+            temperature: byte(63),
+            current: word(69),
         })
     }
 }
@@ -202,6 +229,8 @@ mod tests {
         assert_eq!(bytes(Instruction::Read(1, 3, 2)), [0xFF, 0xFF, 0x01, 0x04, 0x02, 0x03, 0x02, 0xF3]);
         let all = [0xFF, 0xFF, 0xFE, 0x0A, 0x82, 0x38, 0x02, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x26];
         assert_eq!(bytes(Instruction::ReadAll(56, 2)), all);
+        let goal = [0xFF, 0xFF, 0x01, 0x05, 0x03, 0x2A, 0x00, 0x08, 0xC4];
+        assert_eq!(bytes(Instruction::Write(1, 42, &[0x00, 0x08])), goal);
         // The SDK writes two servos where this writes as many as there are values.
         let two = [0xFF, 0xFF, 0xFE, 0x0A, 0x83, 0x2A, 0x02, 0x01, 0x00, 0x08, 0x02, 0x00, 0x04, 0x39];
         assert_eq!(bytes(Instruction::WriteAll(42, 2, &[0x00, 0x08, 0x00, 0x04])), two);
@@ -227,5 +256,6 @@ mod tests {
     #[test]
     fn signs_are_a_bit() {
         assert_eq!((signed(0x8005, 15), signed(5, 15), signed(0x864, 11)), (-5, 5, -100));
+        assert_eq!((with_sign(-5, 15), with_sign(5, 15), with_sign(-100, 11)), (0x8005, 5, 0x864));
     }
 }

@@ -15,10 +15,10 @@ use super::protocol::gripper::GripperKind;
 use super::report_validity::measured;
 use super::session::Session;
 use super::{HOLDS_WHEN_DISABLED, MODES, MODES_WITHOUT_VELOCITY, Options, check, model_of};
-use crate::arm::Pose;
+use crate::arm::{JointStatus, Load, Pose};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo,
-    RobotState, Stop,
+    AdapterError, AdapterResult, Cartesian, ForceTorque, Gripper, JointMonitor, JointReading, ManipulatorAdapter,
+    ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::registry::AdapterConfig;
 use crate::joint::{ControlMode, JointLimits, joints_of};
@@ -249,6 +249,7 @@ impl ManipulatorAdapter for XArmAdapter {
         let (motion, stamp) = session.motion();
         *reading = JointReading {
             stamp: Some(stamp),
+            device_ns: motion.time_us.map(|us| us.saturating_mul(1000)),
             position: self.only(&motion.position),
             velocity: motion.velocity.map(|velocity| self.only(&velocity)),
             effort: session.device.torques.then(|| self.only(&motion.torque)),
@@ -337,6 +338,56 @@ impl ManipulatorAdapter for XArmAdapter {
 
     fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
         Some(self)
+    }
+
+    fn payload(&mut self) -> Option<&mut dyn Payload> {
+        Some(self)
+    }
+
+    /// Older firmware reports neither temperatures nor errors of the joints.
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
+        let known = self.session.as_ref().is_some_and(|session| session.condition().motors.is_some());
+        if known { Some(self) } else { None }
+    }
+}
+
+impl JointMonitor for XArmAdapter {
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        let condition = self.recent()?.condition();
+        let motors = condition.motors.unwrap_or_default();
+        for (i, joint) in joints.iter_mut().enumerate() {
+            let at = |values: Option<[f64; 7]>| values.and_then(|values| values.get(i).copied());
+            *joint = JointStatus {
+                temperature: motors.temperature.get(i).map(|celsius| f64::from(*celsius)),
+                current: at(motors.current),
+                voltage: at(motors.voltage),
+                load: None,
+                error: condition.servos.get(i).map(|code| i32::from(*code)),
+            };
+        }
+        Ok(())
+    }
+}
+
+impl Payload for XArmAdapter {
+    /// The controller keeps no inertia.
+    fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
+        let [mass, x, y, z] = self.recent()?.condition().load;
+        Ok(Some(Load { mass, center: [x, y, z].map(|v| v / MM_PER_M), inertia: [0.0; 6] }))
+    }
+
+    fn write_payload(&mut self, load: &Load) -> AdapterResult<()> {
+        let [x, y, z] = load.center.map(|v| v * MM_PER_M);
+        self.target = None;
+        self.with(|session| session.set_load([load.mass, x, y, z]))
+    }
+
+    fn resets_controller(&self) -> bool {
+        true
+    }
+
+    fn read_mounting(&mut self) -> AdapterResult<Option<[f64; 3]>> {
+        Ok(self.recent()?.condition().gravity)
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::errors::{error_text, servo_text};
 use super::protocol::commands::Command;
 use super::protocol::frame::{Response, Status};
-use super::protocol::report::Health;
+use super::protocol::report::{Health, Motors};
 use crate::clock::Mono;
 
 /// Maximum time between two requests, which also shows that the controller still answers.
@@ -29,8 +29,14 @@ pub struct Condition {
     pub enabled: u8,
     /// Position of the tool relative to the flange: x, y, z [mm].
     pub tool: [f64; 3],
+    /// Load at the flange: mass [kg], centre x, y, z [mm].
+    pub load: [f64; 4],
+    /// Direction of gravity in the base frame, if reported.
+    pub gravity: Option<[f64; 3]>,
+    /// Condition of the joints' motors, if reported.
+    pub motors: Option<Motors>,
     /// Error codes of the joints' servos.
-    servos: [u8; 7],
+    pub servos: [u8; 7],
     /// Whether something has changed, so that register 15 must be read.
     pub changed: bool,
     /// When a change was seen that only a later request explains.
@@ -60,6 +66,7 @@ impl Condition {
     /// Checks a report.
     pub fn report(&mut self, health: Health) {
         (self.enabled, self.tool) = (health.enabled, health.tool);
+        (self.load, self.gravity, self.motors) = (health.load, health.gravity, health.motors);
         self.changed |= health.error != self.error || health.warning != self.warning;
     }
 

@@ -54,7 +54,7 @@ pub fn connect(address: &Address, model: Model, options: &Options) -> AdapterRes
     let serial = decode_serial(serial.data()).unwrap_or_else(|| identity.serial.clone());
 
     let (motion, first) = reports(address, firmware, until)?;
-    let mut normal = Stream::connect(address, Kind::Normal, Health::decode, left(until, CONNECT))?;
+    let mut normal = Stream::connect(address, Kind::Rich, Health::decode, left(until, CONNECT))?;
     let mut condition = Condition::default();
     condition.report(normal.wait(left(until, FIRST_REPORT)).map_err(no_report)?);
     // Register 70 turns the torques of every report but the full one into currents.

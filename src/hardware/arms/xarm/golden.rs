@@ -59,6 +59,8 @@ pub const GRIPPER_GO: &str = "00090003000d7c090810070000020400000352";
 pub const GRIPPER_READ: &str = "000a000300087c09080307020002";
 /// The baud rate of the tool.
 pub const TOOL_BAUD: &str = "000b0003000480090a0b";
+/// A load of 1.5 kg at 0, −10, 80 mm.
+pub const SET_LOAD: &str = "000c00030011240000c03f00000000000020c10000a042";
 /// Error and warning, the last transaction before 1.
 pub const GET_ERROR: &str = "ffff000300010f";
 /// The telegram that sends a G2 to 0 pulses at 100 mm/s with half its force.

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!  adapter ──▶ session ──▶ control   port 502: requests, responses matched by number; port 503: the gripper
-//!   (SI)       (state)  ◀── stream    ports 30000 or 30003: joints; 30001: motors, error
+//!   (SI)       (state)  ◀── stream    ports 30000 or 30003: joints; 30002: motors, error
 //!                 ├── motion_commands, state_commands (motors, mode, stop), other_clients
 //!                 └── mode, condition, gripper: state machines that never wait
 //! ```
@@ -84,6 +84,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::XArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::XArmEmulator::start(config, place)?))),
+    service: None,
 };
 
 /// What a blueprint may set of an xArm.

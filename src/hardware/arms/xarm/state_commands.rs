@@ -17,6 +17,8 @@ const MODE_SLICE: Duration = Duration::from_millis(15);
 const MOTORS_LIMIT: Duration = Duration::from_secs(2);
 /// How long an activation may take for the mode: three steps, each answered within its timeout.
 const ACTIVATION_LIMIT: Duration = Duration::from_secs(6);
+/// Rounding of the load in reports [kg, mm].
+const LOAD_TOLERANCE: f64 = 1e-3;
 /// How long a stop waits for its confirmation: not as long as reports may be silent, after which the connection ends.
 const STOP_LIMIT: Duration = Duration::from_millis(400);
 
@@ -83,6 +85,23 @@ impl Session {
             return Err(AdapterError::Timeout(format!("the arm is not ready within {ACTIVATION_LIMIT:?}")));
         }
         Ok(())
+    }
+
+    /// Sets the load at the flange, mass [kg] and centre [mm], and waits until a report shows it. The controller drops
+    /// to mode 0: the arm must be activated again.
+    pub fn set_load(&mut self, load: [f64; 4]) -> AdapterResult<()> {
+        self.update(Duration::ZERO)?;
+        self.check_error()?;
+        if self.moves() {
+            return Err(AdapterError::Rejected("the arm is moving".into()));
+        }
+        (self.change, self.ready, self.foreign) = (None, None, None);
+        if self.ask(&Command::SetLoad(load))?.status.error() {
+            self.check_error()?;
+        }
+        let differs = |shown: [f64; 4]| shown.iter().zip(load).any(|(a, b)| (a - b).abs() > LOAD_TOLERANCE);
+        self.wait(MOTORS_LIMIT, |session| Ok((!differs(session.condition().load)).then_some(())))?;
+        Ok(()) // a load that does not show is read back
     }
 
     /// Brings the arm into a mode. `Rejected` while it moves, and while the change is under way: ask again.

@@ -11,11 +11,11 @@ use std::time::Duration;
 use super::frame::{self, MAX_FRAME, Reply, Status};
 use super::protocol::{self, Command, DOF, Hello, Mode, WireJoints};
 use super::{HOLDS_WHEN_DISABLED, MODES, NATIVE_RATE, Options, check, limits};
-use crate::arm::Pose;
+use crate::arm::{AnalogUnit, IoInfo, IoState, JointStatus, Load, Pose};
 use crate::clock::{Clock, Mono, MonotonicClock};
 use crate::hardware::adapter::{
-    AdapterError, AdapterResult, Cartesian, Gripper, JointReading, ManipulatorAdapter, ManipulatorInfo, RobotState,
-    Stop,
+    AdapterError, AdapterResult, Cartesian, Gripper, Io, JointMonitor, JointReading, ManipulatorAdapter,
+    ManipulatorInfo, Payload, RobotState, Stop,
 };
 use crate::hardware::adapter_util::{fault, fill, finite};
 use crate::hardware::registry::AdapterConfig;
@@ -264,6 +264,7 @@ impl ManipulatorAdapter for YourArmAdapter {
         self.fetch()?;
         *reading = JointReading {
             stamp: Some(self.device_time.translate(self.state.time_us.saturating_mul(1000), self.state_at)),
+            device_ns: Some(self.state.time_us.saturating_mul(1000)),
             position: from_degrees(&self.state.positions),
             velocity: Some(from_degrees(&self.state.velocities)),
             effort: Some(joints_of(&self.state.torques)),
@@ -329,6 +330,18 @@ impl ManipulatorAdapter for YourArmAdapter {
     fn cartesian(&mut self) -> Option<&mut dyn Cartesian> {
         Some(self)
     }
+
+    fn io(&mut self) -> Option<&mut dyn Io> {
+        Some(self)
+    }
+
+    fn payload(&mut self) -> Option<&mut dyn Payload> {
+        Some(self)
+    }
+
+    fn joint_monitor(&mut self) -> Option<&mut dyn JointMonitor> {
+        Some(self)
+    }
 }
 
 impl Gripper for YourArmAdapter {
@@ -347,6 +360,72 @@ impl Gripper for YourArmAdapter {
             return Err(AdapterError::Rejected(format!("gripper opening {position} m is not within 0 to {max} m")));
         }
         self.command(&Command::Gripper(position * MM_PER_M))
+    }
+}
+
+impl JointMonitor for YourArmAdapter {
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        let drives = self.request(&Command::GetJointStatus, CYCLE, protocol::decode_drives)?;
+        for (joint, drive) in joints.iter_mut().zip(&drives) {
+            *joint = JointStatus {
+                temperature: Some(drive.temperature),
+                current: Some(drive.current),
+                voltage: Some(drive.voltage),
+                load: Some(drive.load / 100.0),
+                error: Some(drive.error.into()),
+            };
+        }
+        Ok(())
+    }
+
+    fn read_calibration_offsets(&mut self, offsets: &mut [f64]) -> AdapterResult<bool> {
+        fill(offsets, &self.request(&Command::GetOffsets, REPLY, protocol::decode_floats::<DOF>)?.map(f64::to_radians));
+        Ok(true)
+    }
+}
+
+impl Payload for YourArmAdapter {
+    fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
+        let [mass, x, y, z, inertia @ ..] = self.request(&Command::GetPayload, REPLY, protocol::decode_floats::<10>)?;
+        Ok(Some(Load { mass, center: [x, y, z].map(|v| v / MM_PER_M), inertia }))
+    }
+
+    fn write_payload(&mut self, load: &Load) -> AdapterResult<()> {
+        let ([x, y, z], [xx, xy, xz, yy, yz, zz]) = (load.center.map(|v| v * MM_PER_M), load.inertia);
+        self.command(&Command::SetPayload([load.mass, x, y, z, xx, xy, xz, yy, yz, zz]))
+    }
+
+    fn read_mounting(&mut self) -> AdapterResult<Option<[f64; 3]>> {
+        self.request(&Command::GetMounting, REPLY, protocol::decode_floats).map(Some)
+    }
+
+    fn write_mounting(&mut self, gravity: [f64; 3]) -> AdapterResult<()> {
+        self.command(&Command::SetMounting(gravity))
+    }
+}
+
+impl Io for YourArmAdapter {
+    fn get_io(&self) -> IoInfo {
+        const VOLTS: &[AnalogUnit] = &[AnalogUnit::Volt; protocol::ANALOG];
+        let digital = protocol::DIGITAL;
+        IoInfo { digital_inputs: digital, digital_outputs: digital, analog_inputs: VOLTS, analog_outputs: VOLTS }
+    }
+
+    fn read_io(&mut self, state: &mut IoState) -> AdapterResult<()> {
+        let io = self.request(&Command::GetIo, CYCLE, protocol::Io::decode)?;
+        *state = IoState::default();
+        (state.digital_inputs, state.digital_outputs) = (io.digital_inputs.into(), io.digital_outputs.into());
+        fill(&mut state.analog_inputs, &io.analog_inputs);
+        fill(&mut state.analog_outputs, &io.analog_outputs);
+        Ok(())
+    }
+
+    fn write_digital_output(&mut self, output: u8, high: bool) -> AdapterResult<()> {
+        self.request(&Command::SetDigital(output, high), REPLY, |_| Some(()))
+    }
+
+    fn write_analog_output(&mut self, output: u8, value: f64) -> AdapterResult<()> {
+        self.request(&Command::SetAnalog(output, value), REPLY, |_| Some(()))
     }
 }
 

@@ -33,6 +33,27 @@ pub const VELOCITY_JOINTS: &str = "59410112090018000000c03f000000000000000000000
 pub const MOVE_CARTESIAN: &str = "594101130a001c0000004842000096430000c8c200807a4300003443000000000000b4c22398";
 /// GRIPPER to 42.5 mm, sequence 11.
 pub const GRIPPER: &str = "594101200b00040000002a42b473";
+/// Load of the samples: 1.5 kg at 0, −10, 80 mm; inertia 0.01, 0, 0.001, 0.02, 0, 0.03 kg·m².
+pub const LOAD: [f64; 10] = [1.5, 0.0, -10.0, 80.0, 0.01, 0.0, 0.001, 0.02, 0.0, 0.03];
+/// SET_PAYLOAD to [`LOAD`], sequence 15.
+pub const SET_PAYLOAD: &str =
+    "594101210f0028000000c03f00000000000020c10000a0420ad7233c000000006f12833a0ad7a33c000000008fc2f53cc9fd";
+/// GET_PAYLOAD, sequence 16.
+pub const GET_PAYLOAD: &str = "5941012210000000eed4";
+/// SET_MOUNTING 0, 0, 1: the base hangs from a ceiling; sequence 17.
+pub const SET_MOUNTING: &str = "5941012311000c0000000000000000000000803f360b";
+/// GET_MOUNTING, sequence 18.
+pub const GET_MOUNTING: &str = "594101241200000003f4";
+/// GET_JOINT_STATUS, sequence 19.
+pub const GET_JOINT_STATUS: &str = "59410140130000006d12";
+/// GET_OFFSETS, sequence 20.
+pub const GET_OFFSETS: &str = "594101411400000011e9";
+/// GET_IO, sequence 12.
+pub const GET_IO: &str = "594101300c000000a2c0";
+/// SET_DIGITAL output 3 high, sequence 13.
+pub const SET_DIGITAL: &str = "594101310d000200030127d6";
+/// SET_ANALOG output 1 to 2.5 V, sequence 14.
+pub const SET_ANALOG: &str = "594101320e00050001000020409fb1";
 
 /// Reply to [`HELLO`]: YOURARM-6, 6 joints, firmware 2.1.3, serial number YA6-00042.
 pub const HELLO_REPLY: &str = "594101810100250000594f555241524d2d3600000000000000060201035941362d303030343200000000\
@@ -46,13 +67,47 @@ pub const STATE_REPLY: &str = "59410182020073000015cd5b0700000000020103060000000
 pub const MOVING_REPLY: &str = "594101830300030006000058f8";
 /// Refusal of [`SERVO_JOINTS`]: in error 2.
 pub const IN_ERROR_REPLY: &str = "5941019108000300080200067c";
+/// Reply to [`GET_JOINT_STATUS`]: 30.5 to 35.5 °C, 0 to 1.25 A in steps of 0.25 A, 48 V, 5 % (joint 3: −12.5 %), no
+/// error but 7 of joint 6.
+pub const JOINT_STATUS_REPLY: &str = "594101c013006d00000000f44100000000000040420000a04000000000fc410000803e000040\
+    420000a0400000000002420000003f00004042000048c10000000006420000403f000040420000a040000000000a420000803f00004042\
+    0000a040000000000e420000a03f000040420000a0400700831d";
+/// Offsets of the samples [deg].
+pub const OFFSETS: [f64; 6] = [1.5, -2.0, 0.0, 0.25, 10.0, -0.5];
+/// Reply to [`GET_OFFSETS`]: [`OFFSETS`].
+pub const OFFSETS_REPLY: &str = "594101c114001900000000c03f000000c0000000000000803e00002041000000bfaa97";
+/// Reply to [`GET_PAYLOAD`]: [`LOAD`].
+pub const PAYLOAD_REPLY: &str =
+    "594101a210002900000000c03f00000000000020c10000a0420ad7233c000000006f12833a0ad7a33c000000008fc2f53c1e95";
+/// Reply to [`GET_MOUNTING`]: 0, 0, −1.
+pub const MOUNTING_REPLY: &str = "594101a412000d00000000000000000000000080bf266c";
+/// Reply to [`GET_IO`]: all inputs but di1 high, do3 high, 1.5 V and −0.25 V at the inputs, 0 V and 2.5 V at the
+/// outputs.
+pub const IO_REPLY: &str = "594101b00c00150000fd0008000000c03f000080be000000000000204036f0";
+/// Refusal of [`SET_DIGITAL`]: there is no such channel; no error.
+pub const NO_CHANNEL_REPLY: &str = "594101b10d0003000a0000cb76";
 /// Good reply to [`STOP`].
 pub const STOP_REPLY: &str = "59410186feff010000470a";
 
 #[test]
 fn the_samples_of_the_sheet_are_these() {
     let sheet = include_str!("../../../../docs/yourarm-protocol.md").replace(' ', "");
-    for frame in [HELLO, GET_STATE, SET_MODE, MOVING_REPLY, SERVO_JOINTS, GRIPPER] {
+    for frame in [
+        HELLO,
+        GET_STATE,
+        SET_MODE,
+        MOVING_REPLY,
+        SERVO_JOINTS,
+        GRIPPER,
+        GET_IO,
+        SET_DIGITAL,
+        SET_ANALOG,
+        IO_REPLY,
+        SET_PAYLOAD,
+        SET_MOUNTING,
+        GET_JOINT_STATUS,
+        OFFSETS_REPLY,
+    ] {
         assert!(sheet.contains(&format!("`{frame}`")), "{frame}");
     }
 }

@@ -21,7 +21,8 @@ use serde::{Deserialize, Serialize};
 use crate::hardware::adapter_util::fraction;
 use crate::hardware::check::{Checked, ConfigError};
 use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
-use crate::hardware::sim::arm::{PLAYABLE, SimOptions};
+use crate::hardware::sim::arm::SimOptions;
+use crate::hardware::sim::io::PLAYABLE;
 use crate::hardware::transport::tcp::Endpoint;
 use crate::joint::{ControlMode, JointLimits};
 
@@ -61,6 +62,7 @@ pub const SPEC: AdapterSpec = AdapterSpec {
     check,
     create: |config| Ok(Box::new(adapter::YourArmAdapter::new(config)?)),
     emulate: Some(|config, place| Ok(Box::new(emulator::YourArmEmulator::start(config, place)?))),
+    service: None,
 };
 
 /// The data sheet's joint limits: minimum and maximum position [deg], maximum speed [deg/s].

@@ -50,6 +50,24 @@ pub enum Command {
     },
     /// Gripper opening [mm].
     Gripper(f64),
+    /// Load at the flange: mass [kg], centre x, y, z [mm], inertia xx, xy, xz, yy, yz, zz [kg·m²].
+    SetPayload([f64; 10]),
+    /// That load.
+    GetPayload,
+    /// Direction of gravity in the base frame.
+    SetMounting([f64; 3]),
+    /// That direction.
+    GetMounting,
+    /// Condition of the joints' drives.
+    GetJointStatus,
+    /// Encoder offsets of the factory calibration [deg].
+    GetOffsets,
+    /// Levels of all inputs and outputs.
+    GetIo,
+    /// Level of a digital output.
+    SetDigital(u8, bool),
+    /// Voltage of an analogue output [V].
+    SetAnalog(u8, f64),
 }
 
 impl Command {
@@ -67,6 +85,15 @@ impl Command {
             Self::VelocityJoints(_) => 0x12,
             Self::MoveCartesian { .. } => 0x13,
             Self::Gripper(_) => 0x20,
+            Self::SetPayload(_) => 0x21,
+            Self::GetPayload => 0x22,
+            Self::SetMounting(_) => 0x23,
+            Self::GetMounting => 0x24,
+            Self::GetJointStatus => 0x40,
+            Self::GetOffsets => 0x41,
+            Self::GetIo => 0x30,
+            Self::SetDigital(..) => 0x31,
+            Self::SetAnalog(..) => 0x32,
         }
     }
 
@@ -84,6 +111,15 @@ impl Command {
             Self::VelocityJoints(_) => "VELOCITY_JOINTS",
             Self::MoveCartesian { .. } => "MOVE_CARTESIAN",
             Self::Gripper(_) => "GRIPPER",
+            Self::SetPayload(_) => "SET_PAYLOAD",
+            Self::GetPayload => "GET_PAYLOAD",
+            Self::SetMounting(_) => "SET_MOUNTING",
+            Self::GetMounting => "GET_MOUNTING",
+            Self::GetJointStatus => "GET_JOINT_STATUS",
+            Self::GetOffsets => "GET_OFFSETS",
+            Self::GetIo => "GET_IO",
+            Self::SetDigital(..) => "SET_DIGITAL",
+            Self::SetAnalog(..) => "SET_ANALOG",
         }
     }
 }
@@ -117,6 +153,10 @@ pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAM
     let mut out = Writer::new(frame);
     match command {
         Command::Hello | Command::GetState | Command::ClearError | Command::Stop => {}
+        Command::GetIo | Command::GetPayload | Command::GetMounting => {}
+        Command::GetJointStatus | Command::GetOffsets => {}
+        Command::SetPayload(load) => out.floats(load),
+        Command::SetMounting(gravity) => out.floats(gravity),
         Command::SetMode(mode) => out.put(&[*mode as u8]),
         Command::Enable(on) => out.put(&[u8::from(*on)]),
         Command::MoveJoints { speed, joints } => {
@@ -129,6 +169,11 @@ pub fn encode<'a>(command: &Command, sequence: u16, frame: &'a mut [u8; MAX_FRAM
             out.floats(pose);
         }
         Command::Gripper(opening) => out.floats(&[*opening]),
+        Command::SetDigital(output, high) => out.put(&[*output, u8::from(*high)]),
+        Command::SetAnalog(output, volts) => {
+            out.put(&[*output]);
+            out.floats(&[*volts]);
+        }
     }
     out.finish(command.opcode(), sequence)
 }
@@ -150,6 +195,7 @@ pub fn status_text(status: u8) -> &'static str {
         7 => "the target is outside the arm's limits or out of reach",
         IN_ERROR => "it is in error",
         9 => "there is no gripper",
+        10 => "there is no such channel",
         _ => "it gives a reason that the sheet does not list",
     }
 }
@@ -245,6 +291,72 @@ impl State {
         };
         data.is_empty().then_some(decoded)
     }
+}
+
+/// Number of digital inputs, and of digital outputs.
+pub const DIGITAL: u8 = 8;
+/// Number of analogue inputs, and of analogue outputs.
+pub const ANALOG: usize = 2;
+
+/// The reply to [`Command::GetIo`]. All numbers are finite.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Io {
+    /// Levels of the digital inputs: bit i is input i.
+    pub digital_inputs: u16,
+    /// Levels of the digital outputs: bit i is output i.
+    pub digital_outputs: u16,
+    /// Voltages of the analogue inputs [V].
+    pub analog_inputs: [f64; ANALOG],
+    /// Voltages of the analogue outputs [V].
+    pub analog_outputs: [f64; ANALOG],
+}
+
+impl Io {
+    /// Decodes the data of a good reply.
+    pub fn decode(data: &[u8]) -> Option<Self> {
+        let mut data = Reader::new(data);
+        let decoded = Self {
+            digital_inputs: u16::from_le_bytes(data.take()?),
+            digital_outputs: u16::from_le_bytes(data.take()?),
+            analog_inputs: data.floats()?,
+            analog_outputs: data.floats()?,
+        };
+        data.is_empty().then_some(decoded)
+    }
+}
+
+/// Condition of a joint's drive. All numbers are finite.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Drive {
+    /// Temperature of the motor [°C].
+    pub temperature: f64,
+    /// Motor current [A].
+    pub current: f64,
+    /// Supply voltage [V].
+    pub voltage: f64,
+    /// Load [% of the rated torque], signed.
+    pub load: f64,
+    /// The drive's error code; 0 = none.
+    pub error: u16,
+}
+
+/// Decodes the data of a good reply to [`Command::GetJointStatus`].
+pub fn decode_drives(data: &[u8]) -> Option<[Drive; DOF]> {
+    let mut data = Reader::new(data);
+    let mut drives = [Drive::default(); DOF];
+    for drive in &mut drives {
+        let [temperature, current, voltage, load] = data.floats()?;
+        *drive = Drive { temperature, current, voltage, load, error: u16::from_le_bytes(data.take()?) };
+    }
+    data.is_empty().then_some(drives)
+}
+
+/// Decodes the data of a good reply that consists of N numbers: of [`Command::GetPayload`] (10),
+/// [`Command::GetMounting`] (3) and [`Command::GetOffsets`] (6).
+pub fn decode_floats<const N: usize>(data: &[u8]) -> Option<[f64; N]> {
+    let mut data = Reader::new(data);
+    let values = data.floats()?;
+    data.is_empty().then_some(values)
 }
 
 /// The controller's error code in the data of a refusal.

@@ -19,6 +19,15 @@ fn commands_are_the_golden_bytes() {
         (Command::VelocityJoints([1.5, 0.0, 0.0, 0.0, 0.0, -90.0]), 9, golden::VELOCITY_JOINTS),
         (Command::MoveCartesian { speed: 50.0, pose: POSE }, 10, golden::MOVE_CARTESIAN),
         (Command::Gripper(42.5), 11, golden::GRIPPER),
+        (Command::SetPayload(golden::LOAD), 15, golden::SET_PAYLOAD),
+        (Command::GetPayload, 16, golden::GET_PAYLOAD),
+        (Command::SetMounting([0.0, 0.0, 1.0]), 17, golden::SET_MOUNTING),
+        (Command::GetMounting, 18, golden::GET_MOUNTING),
+        (Command::GetJointStatus, 19, golden::GET_JOINT_STATUS),
+        (Command::GetOffsets, 20, golden::GET_OFFSETS),
+        (Command::GetIo, 12, golden::GET_IO),
+        (Command::SetDigital(3, true), 13, golden::SET_DIGITAL),
+        (Command::SetAnalog(1, 2.5), 14, golden::SET_ANALOG),
     ] {
         assert_eq!(encode(&command, sequence, &mut frame), bytes(golden), "{}", command.name());
     }
@@ -52,6 +61,38 @@ fn replies_are_read_from_the_golden_bytes() {
     let reply = bytes(golden::IN_ERROR_REPLY);
     let Scan::Take(_, refusal) = scan(&reply, 0x11, 8) else { panic!("no reply") };
     assert_eq!((refusal.status, decode_refusal(refusal.data)), (Status::Refused(IN_ERROR), Some(2)));
+    let reply = bytes(golden::IO_REPLY);
+    let Scan::Take(_, io) = scan(&reply, 0x30, 12) else { panic!("no reply") };
+    let expected =
+        Io { digital_inputs: 0xFD, digital_outputs: 8, analog_inputs: [1.5, -0.25], analog_outputs: [0.0, 2.5] };
+    assert_eq!((Io::decode(io.data), Io::decode(&io.data[1..])), (Some(expected), None));
+    let reply = bytes(golden::PAYLOAD_REPLY);
+    let Scan::Take(_, load) = scan(&reply, 0x22, 16) else { panic!("no reply") };
+    let decoded = decode_floats::<10>(load.data).unwrap();
+    assert!(decoded.iter().zip(golden::LOAD).all(|(a, b)| (a - b).abs() < 1e-8), "{decoded:?}");
+    assert_eq!(decode_floats::<9>(load.data), None);
+    let reply = bytes(golden::MOUNTING_REPLY);
+    let Scan::Take(_, gravity) = scan(&reply, 0x24, 18) else { panic!("no reply") };
+    assert_eq!(decode_floats(gravity.data), Some([0.0, 0.0, -1.0]));
+    let reply = bytes(golden::JOINT_STATUS_REPLY);
+    let Scan::Take(_, drives) = scan(&reply, 0x40, 19) else { panic!("no reply") };
+    let expected: Vec<Drive> = (0..6)
+        .map(|i| Drive {
+            temperature: 30.5 + f64::from(i),
+            current: 0.25 * f64::from(i),
+            voltage: 48.0,
+            load: if i == 2 { -12.5 } else { 5.0 },
+            error: if i == 5 { 7 } else { 0 },
+        })
+        .collect();
+    assert_eq!(decode_drives(drives.data).unwrap().to_vec(), expected);
+    assert_eq!(decode_drives(&drives.data[1..]), None);
+    let reply = bytes(golden::OFFSETS_REPLY);
+    let Scan::Take(_, offsets) = scan(&reply, 0x41, 20) else { panic!("no reply") };
+    assert_eq!(decode_floats(offsets.data), Some(golden::OFFSETS));
+    let reply = bytes(golden::NO_CHANNEL_REPLY);
+    let Scan::Take(_, refusal) = scan(&reply, 0x31, 13) else { panic!("no reply") };
+    assert_eq!((refusal.status, status_text(10)), (Status::Refused(10), "there is no such channel"));
     let reply = bytes(golden::STOP_REPLY);
     assert_eq!(scan(&reply, 0x06, 0xFFFE), Scan::Take(11, Reply { status: Status::Ok, data: &[] }));
 }
@@ -92,6 +133,6 @@ proptest! {
             Scan::More => prop_assert!(data.is_empty() || data[0] == b'Y'),
             Scan::Skip(n) | Scan::Take(n, _) => prop_assert!(n >= 1 && n <= data.len()),
         }
-        let _ = (Hello::decode(&data), State::decode(&data), decode_refusal(&data));
+        let _ = (Hello::decode(&data), State::decode(&data), Io::decode(&data), decode_drives(&data), decode_refusal(&data));
     }
 }

@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use std::time::Duration;
 
 use super::commands::MAX_IN_FLIGHT;
-use super::{BACK_OFF, MAX_FAILURES, TURNS, Worker};
+use super::{BACK_OFF, MAX_FAILURES, TURNS, Worker, slow_readings};
 use crate::arm::{Interference, Link};
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
 use crate::hardware::device::Connected;
@@ -28,6 +28,7 @@ impl Worker {
             return Err(AdapterError::Rejected(what));
         }
         let limits = adapter.get_limits().inspect_err(|_| adapter.disconnect())?;
+        self.check_parts(adapter).inspect_err(|_| adapter.disconnect())?;
         self.whole_state_at_once = info.whole_state_at_once;
         // An older controller may deliver less often than its kind.
         self.config.native_rate = self.config.native_rate.min(info.native_rate);
@@ -48,7 +49,21 @@ impl Worker {
         self.guard.set_period(write_period);
         let read_period = self.config.read_period();
         let gripper_range = adapter.gripper().and_then(|gripper| gripper.get_gripper_range());
-        Ok(Connected { info, limits, gripper_range, read_period, write_period })
+        let io = adapter.io().map(|io| io.get_io());
+        let calibration_offsets = slow_readings::calibration_offsets(adapter, self.config.dof)?;
+        let has_payload = adapter.payload().is_some();
+        let payload_resets = adapter.payload().is_some_and(|payload| payload.resets_controller());
+        Ok(Connected {
+            info,
+            limits,
+            gripper_range,
+            io,
+            calibration_offsets,
+            has_payload,
+            payload_resets,
+            read_period,
+            write_period,
+        })
     }
 
     pub(super) fn set_limits(&mut self, limits: &JointLimits) {
@@ -99,6 +114,11 @@ impl Worker {
                 return Err(AdapterError::NotConnected);
             }
         }
+        if let Some(stop) = self.config.setup.stop_input.filter(|_| self.state.stop_input_open) {
+            let what = format!("the stop input di{} is open\nhint: close it, then enable the arm again", stop.input);
+            return Err(AdapterError::Rejected(what));
+        }
+        self.configure(adapter)?;
         self.expect_nothing(None);
         adapter.activate()?;
         let limit = self.config.clock.now().after(ACTIVATION_TIMEOUT);

@@ -54,6 +54,7 @@ impl Worker {
 
     pub(super) fn read_all(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {
         adapter.read_joints(&mut self.reading)?;
+        self.read_stop_input(adapter)?;
         let all = self.whole_state_at_once;
         let turn = self.turn;
         self.turn = (turn + 1) % TURNS;
@@ -83,6 +84,7 @@ impl Worker {
         if all || turn == 5 {
             self.read_codes(adapter)?;
         }
+        self.read_slowly(adapter)?;
         self.state.mode = adapter.get_control_mode();
         self.compare_with_orders();
         self.take_foreign_change(adapter.foreign_change());
@@ -134,6 +136,7 @@ impl Worker {
         self.last_read = began;
         self.state.seq += 1;
         self.state.stamp = stamp;
+        self.state.device_ns = self.reading.device_ns;
         self.state.position = self.reading.position;
         self.state.effort = self.reading.effort;
         self.state.velocity = self.reading.velocity.unwrap_or_default();

@@ -17,7 +17,7 @@ use crate::hardware::sim::arm;
 use crate::hardware::sim::faults::{Fault, FaultKind};
 use crate::hardware::sim::serial_server::SerialServer;
 use crate::joint::JointLimits;
-use servos::Servos;
+pub use servos::Servos;
 
 /// The faults that the servos can play.
 const PLAYABLE: &[FaultKind] = &[
@@ -55,6 +55,10 @@ pub struct SimOptions {
     pub droop: f64,
     /// Whether the line returns what is sent on it.
     pub echo: bool,
+    /// Numbers of the servos, from the base; 0 for one that is not on the line. Empty: 1 to 6. New servos all have 1.
+    pub ids: Vec<u8>,
+    /// Whether the servos have the settings of the factory instead of those of an arm that is set up.
+    pub factory: bool,
     /// Supply voltage, 4 to 14 [V].
     #[schemars(range(min = 4, max = 14))]
     pub voltage: f64,
@@ -64,7 +68,16 @@ pub struct SimOptions {
 
 impl Default for SimOptions {
     fn default() -> Self {
-        Self { initial_positions: Vec::new(), lag: 0.03, droop: 0.0, echo: false, voltage: 12.0, faults: Vec::new() }
+        Self {
+            initial_positions: Vec::new(),
+            lag: 0.03,
+            droop: 0.0,
+            echo: false,
+            ids: Vec::new(),
+            factory: false,
+            voltage: 12.0,
+            faults: Vec::new(),
+        }
     }
 }
 
@@ -82,6 +95,9 @@ impl SimOptions {
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         if !(4.0..=14.0).contains(&self.voltage) {
             return Err(ConfigError::new("sim.voltage", format!("{} is not between 4 and 14 V", self.voltage)));
+        }
+        if self.ids.len() > RANGES.len() || self.ids.iter().any(|id| *id > 252) {
+            return Err(ConfigError::new("sim.ids", "at most six servos have a number, 0 to 252"));
         }
         self.common().check("so101", &limits(), PLAYABLE)
     }

@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 
 use super::wire::{ALL, packet, status};
-use super::{PLAYABLE, SPEED, SimOptions, limits};
+use super::{PLAYABLE, RANGES, SPEED, SimOptions, limits};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::arm::{Delivery, HasArm, SimArm};
@@ -16,13 +16,23 @@ const REGISTERS: usize = 87;
 const SERVOS: usize = 6;
 /// Registers: EEPROM keeps its values without power; those from `READ_ONLY` on cannot be written.
 const MODEL: usize = 3;
+const ID: usize = 5;
 const LOWEST: usize = 9;
+const PHASE: usize = 18;
+const OFFSET: usize = 31;
 const RAM: usize = 40;
 const TORQUE: usize = 40;
 const GOAL: usize = 42;
 const GOAL_SPEED: usize = 46;
 const LOCK: usize = 55;
 const READ_ONLY: std::ops::Range<usize> = 56..80;
+/// Phase bit: positions count turns instead of beginning again after one.
+const ALL_TURNS: u8 = 0x10;
+/// Torque value that makes the present position the middle of the turn.
+const MAKE_MIDDLE: u8 = 128;
+/// Counts of a turn, and the largest homing offset.
+const TURN: i32 = 4096;
+const MAX_OFFSET: i32 = 2047;
 /// Speed at which joints without power fall [rad/s].
 const FALLING: f64 = 0.4;
 
@@ -30,6 +40,10 @@ const FALLING: f64 = 0.4;
 pub struct Servos {
     arm: SimArm,
     registers: [[u8; REGISTERS]; SERVOS],
+    /// What the registers come back with after a power loss: writes while the lock is set are not stored.
+    stored: [[u8; REGISTERS]; SERVOS],
+    /// Which servos are on the line.
+    plugged: [bool; SERVOS],
     /// Writes that wait for the instruction `action`: servo, address, bytes.
     held: Vec<(usize, usize, Vec<u8>)>,
     /// Whether the line returns what is sent.
@@ -59,22 +73,49 @@ impl Servos {
             set(21, &[32, 32, 0]);
             set(34, &[20, 200, 80]);
             set(84, &[254, 254, 0]);
+            if !options.factory {
+                set(21, &[16]);
+            }
+            if !options.factory && id == SERVOS as u8 {
+                set(16, &500u16.to_le_bytes());
+                set(28, &250u16.to_le_bytes());
+                set(36, &[25]);
+            }
         }
         let mut servos = Self {
             arm,
             registers,
+            stored: registers,
+            plugged: [true; SERVOS],
             held: Vec::new(),
             echo: options.echo,
             voltage: (options.voltage * 10.0).round() as u8,
             wrong_model: false,
         };
+        for (servo, id) in options.ids.iter().take(SERVOS).enumerate() {
+            servos.plug(servo, *id);
+        }
         servos.power_up();
         Ok(servos)
+    }
+
+    /// Puts a servo (index from 0) with this number on the line; 0 takes it off.
+    pub fn plug(&mut self, servo: usize, id: u8) {
+        self.plugged.iter_mut().skip(servo).take(1).for_each(|plugged| *plugged = id != 0);
+        for bank in [&mut self.registers, &mut self.stored] {
+            bank.iter_mut().skip(servo).take(1).for_each(|registers| registers[ID] = id.max(1));
+        }
+    }
+
+    /// Returns a register of a servo (index from 0) as it is after the next power loss.
+    pub fn stored(&self, servo: usize, address: usize) -> u8 {
+        self.stored.get(servo).and_then(|servo| servo.get(address)).copied().unwrap_or_default()
     }
 
     /// What is in RAM has its default.
     fn power_up(&mut self) {
         self.held.clear();
+        self.registers = self.stored;
         for servo in &mut self.registers {
             servo.iter_mut().skip(RAM).take(16).for_each(|register| *register = 0);
             // The torque limit.
@@ -91,12 +132,29 @@ impl Servos {
         self.arm.falls(FALLING, &[None, low, high, None, None, None]);
     }
 
-    fn byte(&self, servo: usize, address: usize) -> u8 {
+    /// Returns a register of a servo (index from 0).
+    pub fn byte(&self, servo: usize, address: usize) -> u8 {
         self.registers.get(servo).and_then(|servo| servo.get(address)).copied().unwrap_or_default()
     }
 
     fn word(&self, servo: usize, address: usize) -> u16 {
         u16::from_le_bytes([self.byte(servo, address), self.byte(servo, address + 1)])
+    }
+
+    /// The homing offset of a servo [counts].
+    fn offset(&self, servo: usize) -> i32 {
+        let word = i32::from(self.word(servo, OFFSET));
+        if word & 0x800 == 0 { word & 0x7FF } else { -(word & 0x7FF) }
+    }
+
+    /// Position of a servo by its own offset [counts], and the turns that are not in it.
+    fn position(&self, servo: usize) -> (i32, i32) {
+        let angle = self.arm.joints().0.get(servo).copied().unwrap_or_default();
+        let counted = counts(angle).round() as i32 - self.offset(servo);
+        match self.byte(servo, PHASE) & ALL_TURNS {
+            0 => (counted.rem_euclid(TURN), counted.div_euclid(TURN)),
+            _ => (counted, 0),
+        }
     }
 
     /// The error bits of a servo.
@@ -106,8 +164,7 @@ impl Servos {
 
     /// What is read from registers of a servo.
     fn read(&self, servo: usize, address: usize, length: usize) -> Vec<u8> {
-        let (positions, velocities) = self.arm.joints();
-        let at = |values: &[f64]| values.get(servo).copied().unwrap_or_default();
+        let velocity = self.arm.joints().1.get(servo).copied().unwrap_or_default();
         let mut all = self.registers.get(servo).copied().unwrap_or([0; REGISTERS]);
         let mut set = |address: usize, bytes: &[u8]| {
             all.iter_mut().skip(address).zip(bytes).for_each(|(register, byte)| *register = *byte);
@@ -116,8 +173,8 @@ impl Servos {
             set(MODEL, &2825u16.to_le_bytes());
         }
         set(TORQUE, &[u8::from(self.arm.motor(servo))]);
-        set(56, &with_sign(counts(at(&positions)).round() as i32).to_le_bytes());
-        let speed = at(&velocities) * 4096.0 / TAU;
+        set(56, &with_sign(self.position(servo).0).to_le_bytes());
+        let speed = velocity * f64::from(TURN) / TAU;
         set(58, &with_sign(speed.round() as i32).to_le_bytes());
         set(
             60,
@@ -129,11 +186,28 @@ impl Servos {
 
     /// Writes registers of a servo, as far as they can be written.
     fn write(&mut self, servo: usize, address: usize, values: &[u8]) {
-        let Some(registers) = self.registers.get_mut(servo) else { return };
-        for (i, value) in (address..).zip(values) {
-            if let Some(register) = registers.get_mut(i).filter(|_| !READ_ONLY.contains(&i)) {
+        let (Some(registers), Some(stored)) = (self.registers.get_mut(servo), self.stored.get_mut(servo)) else {
+            return;
+        };
+        let makes_middle = address == TORQUE && values.first() == Some(&MAKE_MIDDLE);
+        for (i, value) in (address..).zip(values).filter(|(i, _)| !READ_ONLY.contains(i)) {
+            if let Some(register) = registers.get_mut(i).filter(|_| !(makes_middle && i == TORQUE)) {
                 *register = *value;
             }
+        }
+        if registers.get(LOCK) == Some(&0) {
+            stored
+                .iter_mut()
+                .zip(registers.iter())
+                .enumerate()
+                .filter(|(i, _)| !(RAM..READ_ONLY.end).contains(i))
+                .for_each(|(_, (stored, register))| *stored = *register);
+        }
+        if makes_middle {
+            let (position, turns) = self.position(servo);
+            let offset = (position + turns * TURN + self.offset(servo) - TURN / 2).clamp(-MAX_OFFSET, MAX_OFFSET);
+            let word = offset.unsigned_abs() as u16 | if offset < 0 { 0x800 } else { 0 };
+            return self.write(servo, OFFSET, &word.to_le_bytes());
         }
         let touches = |register: usize| (address..address + values.len()).contains(&register);
         if touches(TORQUE) {
@@ -154,7 +228,11 @@ impl Servos {
         for (servo, ((goal, position), velocity)) in goals.iter_mut().zip(&positions).zip(&velocities).enumerate() {
             let (low, high) = (self.word(servo, LOWEST), self.word(servo, LOWEST + 2));
             let wanted = self.word(servo, GOAL).max(low).min(high.max(low));
-            *goal = radians(f64::from(wanted));
+            // The way there never leads over the end of the turn.
+            let turns = self.position(servo).1 * TURN;
+            *goal = radians(f64::from(i32::from(wanted) + self.offset(servo) + turns));
+            let stop = RANGES.get(servo).copied().unwrap_or_default();
+            *goal = goal.max(stop.0).min(stop.1);
             // A joint at rest less than a count away stays.
             if velocity.abs() < 1e-3 && (*goal - position).abs() < radians(2049.0) {
                 *goal = *position;
@@ -174,12 +252,14 @@ impl Servos {
     }
 
     /// Executes an instruction; puts statuses into `answer`.
-    fn execute(&mut self, id: u8, instruction: u8, parameters: &[u8], answer: &mut Vec<u8>) {
-        let listed = |id: u8| (1..=SERVOS as u8).contains(&id).then(|| usize::from(id) - 1);
+    pub fn execute(&mut self, id: u8, instruction: u8, parameters: &[u8], answer: &mut Vec<u8>) {
+        let (ids, plugged) = (self.registers.map(|registers| registers[ID]), self.plugged);
+        let on_line = (0..SERVOS).zip(ids).filter(|(servo, _)| plugged.get(*servo) == Some(&true));
+        let listed = |id: u8| { on_line.clone() }.find(|(_, own)| *own == id).map(|(servo, _)| servo);
         match (instruction, parameters) {
             (0x01, []) => {
-                let pinged = (1..=SERVOS as u8).filter(|servo| id == ALL || id == *servo);
-                pinged.for_each(|servo| status(answer, servo, self.error(usize::from(servo) - 1), &[]));
+                let pinged = { on_line }.filter(|(_, own)| id == ALL || id == *own);
+                pinged.for_each(|(servo, own)| status(answer, own, self.error(servo), &[]));
             }
             (0x02, [address, length]) => {
                 if let Some(servo) = listed(id) {
@@ -188,8 +268,9 @@ impl Servos {
                 }
             }
             (0x03 | 0x04, [address, values @ ..]) => {
+                let answers = listed(id);
                 let chosen: Vec<usize> =
-                    if id == ALL { (0..SERVOS).collect() } else { listed(id).into_iter().collect() };
+                    { on_line }.filter(|(_, own)| [ALL, *own].contains(&id)).map(|(s, _)| s).collect();
                 for servo in &chosen {
                     if instruction == 0x03 {
                         self.write(*servo, (*address).into(), values);
@@ -200,7 +281,8 @@ impl Servos {
                 if instruction == 0x03 {
                     self.go();
                 }
-                if let Some(servo) = listed(id) {
+                // With the number that the request had, also if it was changed.
+                if let Some(servo) = answers {
                     status(answer, id, self.error(servo), &[]);
                 }
             }

@@ -192,7 +192,7 @@ impl XArmEmulator {
         self.server.with(|controller, _| controller.keeps_mode = keep);
     }
 
-    /// Mutes port 30001 while its connections stay open and all other ports continue, or unmutes it.
+    /// Mutes ports 30001 and 30002 while their connections stay open and all other ports continue, or unmutes it.
     pub fn mute_condition(&self, mute: bool) {
         self.server.with(|controller, _| controller.condition_muted = mute);
     }

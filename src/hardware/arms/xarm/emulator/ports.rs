@@ -125,7 +125,7 @@ impl stream::Controller for Controller {
     fn report(&mut self, port: usize, now: Mono, packet: &mut Vec<u8>) -> Option<Delivery> {
         let kind = *Kind::ALL.get(port)?;
         match (kind, self.withhold) {
-            (Kind::Normal, _) if self.condition_muted => return Some(Delivery::Silent),
+            (Kind::Normal | Kind::Rich, _) if self.condition_muted => return Some(Delivery::Silent),
             // Older firmware has no such report.
             (Kind::Full, Withhold::Close) => return None,
             (Kind::Full, _) if self.firmware < [2, 1, 0] => return None,

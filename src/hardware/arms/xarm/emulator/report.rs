@@ -159,6 +159,8 @@ fn rich(s: &Snapshot, out: &mut Vec<u8>) {
     packet.floats(201, &[20.0, 0.01, 20.0, 1e-4, std::f32::consts::PI]);
     packet.floats(221, &[100.0, 40.0]);
     packet.bytes(245, &[30; 7]);
+    (0..7).for_each(|joint| packet.bytes(341 + 2 * joint, &4800_u16.to_be_bytes()));
+    packet.floats(355, &s.torque.map(|torque| torque / 10.0));
     packet.floats(256, &s.velocity);
     packet.bytes(284, &s.counter.to_be_bytes());
     packet.floats(433, &s.wrench);

@@ -86,6 +86,8 @@ pub enum Command {
     Tool(Rtu),
     /// A register of the tool board.
     ReadToolBoard(u16),
+    /// Load at the flange: mass [kg], centre x, y, z [mm]. Resets the controller: mode 0, not ready.
+    SetLoad([f64; 4]),
     /// The force/torque sensor on or off.
     EnableForceTorque(bool),
 }
@@ -107,6 +109,7 @@ impl Command {
             Self::MoveLine { .. } => 21,
             Self::MoveJoints { .. } => 23,
             Self::Servo(_) => 29,
+            Self::SetLoad(_) => 36,
             Self::Velocity { .. } => 81,
             Self::ServoErrors => 106,
             Self::Tool(_) => 124,
@@ -120,7 +123,7 @@ impl Command {
         match self {
             Self::Enable(_) => MOTORS,
             Self::SetState(_) | Self::SetMode { .. } | Self::ClearError | Self::ClearWarning => SLOW,
-            Self::Tool(_) | Self::ReadToolBoard(_) | Self::EnableForceTorque(_) => SLOW,
+            Self::Tool(_) | Self::ReadToolBoard(_) | Self::EnableForceTorque(_) | Self::SetLoad(_) => SLOW,
             _ => QUICK,
         }
     }
@@ -162,6 +165,7 @@ impl Command {
                 out.put(&[TOOL]);
                 out.put(&address.to_be_bytes());
             }
+            Self::SetLoad(load) => out.floats(load),
             Self::EnableForceTorque(on) => out.put(&[u8::from(*on)]),
         }
         out.finish(self.register(), transaction, protocol)

@@ -14,8 +14,9 @@ pub enum Kind {
     Full,
     /// Port 30003, every firmware, 100 Hz: positions and torques.
     Real,
-    /// Port 30001, 5 Hz: which motors are on, error and warning.
-    Normal,
+    /// Port 30002, 5 Hz: which motors are on, error and warning, the load; on newer firmware the joints' temperatures,
+    /// voltages and currents.
+    Rich,
 }
 
 impl Kind {
@@ -23,7 +24,7 @@ impl Kind {
     pub fn offset(self) -> u16 {
         match self {
             Self::Full => 0,
-            Self::Normal => 1,
+            Self::Rich => 2,
             Self::Real => 3,
         }
     }
@@ -33,7 +34,7 @@ impl Kind {
         match self {
             Self::Full => 250.0,
             Self::Real => 100.0,
-            Self::Normal => 5.0,
+            Self::Rich => 5.0,
         }
     }
 
@@ -43,7 +44,7 @@ impl Kind {
         match self {
             Self::Full => (736..=2048).contains(&length),
             Self::Real => (87..=512).contains(&length),
-            Self::Normal => (133..=512).contains(&length),
+            Self::Rich => (133..=1024).contains(&length),
         }
     }
 }
@@ -118,17 +119,51 @@ pub struct Health {
     pub warning: u8,
     /// Where the tool is from the flange: x, y, z [mm].
     pub tool: [f64; 3],
+    /// Load at the flange: mass [kg], centre x, y, z [mm].
+    pub load: [f64; 4],
+    /// Direction of gravity in the base frame, if reported.
+    pub gravity: Option<[f64; 3]>,
+    /// The joints' motors, if reported.
+    pub motors: Option<Motors>,
+}
+
+/// Condition of the joints' motors.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Motors {
+    /// Temperatures [°C].
+    pub temperature: [i8; 7],
+    /// Supply voltages [V], if reported.
+    pub voltage: Option<[f64; 7]>,
+    /// Currents [A], if reported.
+    pub current: Option<[f64; 7]>,
+}
+
+impl Motors {
+    fn decode(packet: &[u8]) -> Option<Self> {
+        let temperature = take::bytes::<7>(packet, 245)?.map(|byte| byte as i8);
+        let mut voltage = Some([0.0; 7]);
+        for i in 0..7 {
+            let value = take::bytes(packet, 341 + 2 * i).map(|bytes| f64::from(u16::from_be_bytes(bytes)) / 100.0);
+            voltage = voltage.zip(value).map(|(mut all, value)| {
+                all.iter_mut().skip(i).take(1).for_each(|to| *to = value);
+                all
+            });
+        }
+        Some(Self { temperature, voltage, current: take::floats(packet, 355) })
+    }
 }
 
 impl Health {
-    /// Decodes a report of port 30001.
+    /// Decodes a report of port 30002, or of port 30001, which has its first part.
     pub fn decode(packet: &[u8]) -> Option<Self> {
         let [enabled, error, warning] = take::bytes(packet, 88)?;
         // What the vendor's own client asks of a report before it believes it.
         let [collision, teach] = take::bytes(packet, 131)?;
         let [state_mode] = take::bytes(packet, 4)?;
-        let tool = take::floats(packet, 91)?;
-        (collision <= 5 && teach <= 5 && state_mode & 0x0F <= 9).then_some(Self { enabled, error, warning, tool })
+        let (tool, load) = (take::floats(packet, 91)?, take::floats(packet, 115)?);
+        let (gravity, motors) = (take::floats(packet, 133), Motors::decode(packet));
+        let valid = collision <= 5 && teach <= 5 && state_mode & 0x0F <= 9;
+        valid.then_some(Self { enabled, error, warning, tool, load, gravity, motors })
     }
 }
 

@@ -4,7 +4,7 @@ use super::commands::Command;
 use super::frame::{Arrived, PRIVATE, Response, Status, WATCHED, scan};
 use super::gripper::{GripperKind, Rtu, decode_position};
 use super::identity::{Firmware, decode_version};
-use super::report::{self, Health, Kind, Motion};
+use super::report::{self, Health, Kind, Motion, Motors};
 use crate::hardware::arms::xarm::golden::{self, DEGREES, POSE, TORQUES, VELOCITIES, WRENCH, bytes};
 use crate::hardware::transport::tcp::Scan;
 
@@ -29,6 +29,7 @@ fn requests_are_the_golden_bytes() {
         (Command::Tool(Rtu::go(GripperKind::Xarm, 850)), 9, WATCHED, golden::GRIPPER_GO),
         (Command::Tool(Rtu::read_position()), 10, WATCHED, golden::GRIPPER_READ),
         (Command::ReadToolBoard(0x0A0B), 11, WATCHED, golden::TOOL_BAUD),
+        (Command::SetLoad([1.5, 0.0, -10.0, 80.0]), 12, WATCHED, golden::SET_LOAD),
         (Command::GetError, 65535, WATCHED, golden::GET_ERROR),
     ] {
         assert_eq!(command.encode(transaction, protocol, &mut [0; 64]), bytes(golden), "{command:?}");
@@ -91,6 +92,27 @@ fn reports_are_read_from_the_golden_bytes() {
     assert_eq!(Motion::decode_real(&golden::real()[..87]).unwrap().wrench, None, "an old firmware");
     let health = Health::decode(&golden::normal()).unwrap();
     assert_eq!(health, Health { enabled: 0x3F, error: 31, warning: 11, ..health });
+}
+
+#[test]
+fn a_rich_report_adds_the_motors_as_far_as_the_firmware_has_them() {
+    let mut rich = golden::normal();
+    assert_eq!(Health::decode(&rich).unwrap().motors, None);
+    rich.resize(252, 0);
+    rich[115..119].copy_from_slice(&1.5_f32.to_le_bytes());
+    rich[127..131].copy_from_slice(&80.0_f32.to_le_bytes());
+    rich[245..252].copy_from_slice(&[31, 32, 33, 34, 35, 36, 0xF6]);
+    let health = Health::decode(&rich).unwrap();
+    let temperature = [31, 32, 33, 34, 35, 36, -10];
+    assert_eq!((health.load[0], health.load[3]), (1.5, 80.0));
+    assert_eq!(health.motors, Some(Motors { temperature, voltage: None, current: None }), "an older firmware");
+    rich.resize(587, 0);
+    rich[341..343].copy_from_slice(&4812_u16.to_be_bytes());
+    rich[353..355].copy_from_slice(&4790_u16.to_be_bytes());
+    rich[355..359].copy_from_slice(&(-0.5_f32).to_le_bytes());
+    let motors = Health::decode(&rich).unwrap().motors.unwrap();
+    assert_eq!(motors.voltage, Some([48.12, 0.0, 0.0, 0.0, 0.0, 0.0, 47.9]));
+    assert_eq!(motors.current.map(|current| current[0]), Some(-0.5));
 }
 
 #[test]

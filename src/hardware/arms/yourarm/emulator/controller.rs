@@ -1,14 +1,15 @@
 //! The emulated controller: executes requests. It consists of a [`SimArm`], a gripper and the arm's kinematics. Time is
 //! passed in, and there is no I/O.
 
-use super::super::{GRIPPER_MAX, limits, protocol::DOF};
+use super::super::{GRIPPER_MAX, PLAYABLE, limits, protocol::DOF};
 use super::kinematics::Links;
-use super::wire::{self, Frame, Report, Request, put_hello, put_report, reply, status};
+use super::wire::{self, Frame, Report, Request, put_drives, put_floats, put_hello, put_io, put_report, reply, status};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
-use crate::hardware::sim::arm::{Delivery, HasArm, PLAYABLE, Refusal, SimArm, SimOptions};
+use crate::hardware::sim::arm::{Delivery, HasArm, Refusal, SimArm, SimOptions};
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::gripper::Gripper;
+use crate::hardware::sim::io::SimIo;
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::stream;
 use crate::hardware::sim::trace::Trace;
@@ -22,6 +23,18 @@ const INITIAL: [f64; DOF] = [0.0, -0.3, 0.6, 0.0, 0.8, 0.0];
 const VELOCITY_TIMEOUT: f64 = 0.2;
 /// Speed of the gripper [m/s].
 const GRIPPER_SPEED: f64 = 0.1;
+/// Largest load at the flange [kg].
+const MAX_LOAD: f32 = 5.0;
+/// Rated torque of each joint [Nm], and torque per motor current [Nm/A].
+const RATED_TORQUE: [f64; DOF] = [60.0, 60.0, 40.0, 15.0, 15.0, 10.0];
+const TORQUE_PER_AMPERE: f64 = 10.0;
+/// Supply voltage [V], and temperature of a motor without load [°C].
+const SUPPLY: f64 = 48.0;
+const AMBIENT: f64 = 30.0;
+/// Encoder offsets of this arm's factory calibration [deg].
+const OFFSETS: [f32; DOF] = [1.5, -2.0, 0.0, 0.25, 10.0, -0.5];
+/// Error of a drive whose motor has lost its power.
+const DRIVE_OFF: u16 = 7;
 /// The modes, by their numbers on the wire.
 const MODES: [ControlMode; 3] = [ControlMode::Position, ControlMode::ServoPosition, ControlMode::Velocity];
 
@@ -40,6 +53,10 @@ pub struct Received {
 pub struct Controller {
     pub(super) arm: SimArm,
     gripper: Gripper,
+    pub(super) io: SimIo,
+    /// Load at the flange [kg, mm, kg·m²], and direction of gravity in the base frame.
+    pub(super) load: [f32; 10],
+    pub(super) gravity: [f32; 3],
     /// Requests that came over the wire.
     pub trace: Trace<Received>,
     /// The last report, for the fault `frozen`.
@@ -54,6 +71,9 @@ impl Controller {
         Ok(Self {
             arm: arm.with_velocity_timeout(VELOCITY_TIMEOUT),
             gripper: Gripper::new(GRIPPER_MAX, GRIPPER_SPEED),
+            io: SimIo::default(),
+            load: [0.0; 10],
+            gravity: [0.0, 0.0, -1.0],
             trace: Trace::default(),
             reported: None,
         })
@@ -65,7 +85,7 @@ impl Controller {
         if frame.request == Ok(Request::Hello) {
             self.arm.client_came();
         }
-        let outcome = frame.request.and_then(|request| self.execute(&request).map_err(status_of));
+        let outcome = frame.request.and_then(|request| self.execute(&request));
         let status = outcome.err().unwrap_or(status::OK);
         if let Ok(request) = frame.request {
             self.trace.push(|| Received { at: now, request, status });
@@ -81,16 +101,52 @@ impl Controller {
                 let report = self.report();
                 reply(out, frame, status, |out| put_report(out, &report));
             }
+            (Ok(()), Ok(Request::GetPayload)) => reply(out, frame, status, |out| put_floats(out, &self.load)),
+            (Ok(()), Ok(Request::GetMounting)) => reply(out, frame, status, |out| put_floats(out, &self.gravity)),
+            (Ok(()), Ok(Request::GetOffsets)) => reply(out, frame, status, |out| put_floats(out, &OFFSETS)),
+            (Ok(()), Ok(Request::GetJointStatus)) => {
+                let drives = self.drives();
+                reply(out, frame, status, |out| put_drives(out, drives));
+            }
+            (Ok(()), Ok(Request::GetIo)) => {
+                let io = self.io.state();
+                let volts = [io.analog_inputs, io.analog_outputs].map(|[a, b, ..]| [a as f32, b as f32]);
+                let [inputs, outputs] = [io.digital_inputs, io.digital_outputs].map(|bits| bits as u16);
+                reply(out, frame, status, |out| put_io(out, inputs, outputs, volts));
+            }
             (Ok(()), _) => reply(out, frame, status, |_| ()),
             (Err(_), _) => reply(out, frame, status, |out| out.extend(self.arm.error().to_le_bytes())),
         }
         self.arm.delivery()
     }
 
-    fn execute(&mut self, request: &Request) -> Result<(), Refusal> {
+    /// Executes a request; the error is the status of the reply.
+    fn execute(&mut self, request: &Request) -> Result<(), u8> {
+        let channel = |there: bool| if there { Ok(()) } else { Err(status::NO_CHANNEL) };
+        match *request {
+            Request::SetDigital(output, high) => channel(self.io.set_output(output, high)),
+            Request::SetAnalog(_, volts) if !(0.0..=10.0).contains(&volts) => Err(status::OUT_OF_RANGE),
+            Request::SetAnalog(output, volts) => channel(self.io.set_voltage(output, volts.into())),
+            Request::SetPayload(_) | Request::SetMounting(_) if self.arm.moving() => Err(status::MOVING),
+            Request::SetPayload([mass, ..]) if !(0.0..=MAX_LOAD).contains(&mass) => Err(status::OUT_OF_RANGE),
+            Request::SetPayload(load) => {
+                self.load = load;
+                Ok(())
+            }
+            Request::SetMounting(gravity) if (gravity.iter().map(|v| v * v).sum::<f32>() - 1.0).abs() > 0.01 => {
+                Err(status::MALFORMED)
+            }
+            Request::SetMounting(gravity) => {
+                self.gravity = gravity;
+                Ok(())
+            }
+            _ => self.execute_motion(request).map_err(status_of),
+        }
+    }
+
+    fn execute_motion(&mut self, request: &Request) -> Result<(), Refusal> {
         let arm = &mut self.arm;
         match *request {
-            Request::Hello | Request::GetState => Ok(()),
             Request::SetMode(mode) => arm.set_mode(MODES.get(usize::from(mode)).copied().ok_or(Refusal::WrongMode)?),
             Request::Enable(on) => arm.enable(on),
             Request::ClearError => arm.clear_error(),
@@ -119,7 +175,23 @@ impl Controller {
                 self.gripper.move_to(opening);
                 Ok(())
             }
+            // Read only, or handled by `execute`.
+            _ => Ok(()),
         }
+    }
+
+    /// Condition of the drives: temperature [°C], current [A], voltage [V], load [%], and error.
+    fn drives(&self) -> [([f32; 4], u16); DOF] {
+        let any_on = (0..DOF).any(|joint| self.arm.motor(joint));
+        let (mut drives, torques) = ([Default::default(); DOF], first(&self.arm.efforts()));
+        for (i, (drive, (torque, rated))) in drives.iter_mut().zip(torques.into_iter().zip(RATED_TORQUE)).enumerate() {
+            let load = torque / rated;
+            let values = [AMBIENT + i as f64 + 20.0 * load.abs(), torque / TORQUE_PER_AMPERE, SUPPLY, 100.0 * load];
+            // With all motors off none has lost its power.
+            let error = if any_on && !self.arm.motor(i) { DRIVE_OFF } else { 0 };
+            *drive = (values.map(|v| v as f32), error);
+        }
+        drives
     }
 
     fn report(&mut self) -> Report {
@@ -178,6 +250,7 @@ impl HasArm for Controller {
     fn advance(&mut self, now: Mono) {
         let before = self.arm.now();
         self.arm.advance(now);
+        self.io.play(&mut self.arm);
         self.gripper.advance(self.arm.now().seconds_since(before));
         if self.arm.estop_open() {
             self.gripper.stop();

@@ -55,6 +55,26 @@ impl YourArmEmulator {
         self.server.with(|controller, _| controller.arm.release_estop());
     }
 
+    /// Sets the level of a digital input, as the device wired to it does. All are high at power-up.
+    pub fn set_input(&self, input: u8, high: bool) {
+        self.server.with(|controller, _| controller.io.set_input(input, high));
+    }
+
+    /// Load at the flange that was set: mass [kg], centre x, y, z [mm], inertia xx, xy, xz, yy, yz, zz [kg·m²].
+    pub fn load(&self) -> [f32; 10] {
+        self.server.with(|controller, _| controller.load)
+    }
+
+    /// Forgets the load, as at power-up.
+    pub fn forget_load(&self) {
+        self.server.with(|controller, _| controller.load = [0.0; 10]);
+    }
+
+    /// Levels of the digital outputs: bit i is output i.
+    pub fn digital_outputs(&self) -> u32 {
+        self.server.with(|controller, _| controller.io.state().digital_outputs)
+    }
+
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
         self.server.with(Controller::joints_at)

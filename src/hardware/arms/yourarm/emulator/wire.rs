@@ -15,6 +15,7 @@ pub mod status {
     pub const MOVING: u8 = 6;
     pub const OUT_OF_RANGE: u8 = 7;
     pub const IN_ERROR: u8 = 8;
+    pub const NO_CHANNEL: u8 = 10;
 }
 
 /// What a client asked, in wire units (deg, deg/s, mm, %).
@@ -42,6 +43,24 @@ pub enum Request {
     MoveCartesian(f32, [f32; 6]),
     /// 0x20: opening [mm].
     Gripper(f32),
+    /// 0x21: mass [kg], centre [mm], inertia [kg·m²].
+    SetPayload([f32; 10]),
+    /// 0x22
+    GetPayload,
+    /// 0x23: direction of gravity.
+    SetMounting([f32; 3]),
+    /// 0x24
+    GetMounting,
+    /// 0x40
+    GetJointStatus,
+    /// 0x41
+    GetOffsets,
+    /// 0x30
+    GetIo,
+    /// 0x31: digital output, level.
+    SetDigital(u8, bool),
+    /// 0x32: analogue output, voltage [V].
+    SetAnalog(u8, f32),
 }
 
 impl Request {
@@ -110,6 +129,21 @@ fn understand(opcode: u8, payload: &[u8]) -> Result<Request, u8> {
         0x11 => floats(payload).map(Request::ServoJoints),
         0x12 => floats(payload).map(Request::VelocityJoints),
         0x20 => floats::<1>(payload).map(|[opening]| Request::Gripper(opening)),
+        0x21 => floats(payload).map(Request::SetPayload),
+        0x22 => empty(Request::GetPayload),
+        0x23 => floats(payload).map(Request::SetMounting),
+        0x24 => empty(Request::GetMounting),
+        0x40 => empty(Request::GetJointStatus),
+        0x41 => empty(Request::GetOffsets),
+        0x30 => empty(Request::GetIo),
+        0x31 => match *payload {
+            [output, level @ 0..=1] => Ok(Request::SetDigital(output, level == 1)),
+            _ => Err(status::MALFORMED),
+        },
+        0x32 => {
+            let (output, volts) = payload.split_first().ok_or(status::MALFORMED)?;
+            floats::<1>(volts).map(|[volts]| Request::SetAnalog(*output, volts))
+        }
         _ => Err(status::UNKNOWN_COMMAND),
     }
 }
@@ -208,6 +242,26 @@ pub fn put_report(out: &mut Vec<u8>, report: &Report) {
     }
 }
 
+/// Adds the data of a reply that consists of numbers.
+pub fn put_floats(out: &mut Vec<u8>, values: &[f32]) {
+    out.extend(values.iter().flat_map(|v| v.to_bits().to_le_bytes()));
+}
+
+/// Adds the data of a GET_JOINT_STATUS reply: per joint temperature [°C], current [A], voltage [V], load [%], error.
+pub fn put_drives(out: &mut Vec<u8>, drives: impl IntoIterator<Item = ([f32; 4], u16)>) {
+    for (values, error) in drives {
+        put_floats(out, &values);
+        out.extend(error.to_le_bytes());
+    }
+}
+
+/// Adds the data of a GET_IO reply.
+pub fn put_io(out: &mut Vec<u8>, inputs: u16, outputs: u16, volts: [[f32; 2]; 2]) {
+    out.extend(inputs.to_le_bytes());
+    out.extend(outputs.to_le_bytes());
+    out.extend(volts.as_flattened().iter().flat_map(|v| v.to_bits().to_le_bytes()));
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::super::golden::{self, JOINTS, POSE, bytes};
@@ -228,6 +282,15 @@ mod tests {
             (golden::VELOCITY_JOINTS, 0x12, 9, Request::VelocityJoints([1.5, 0.0, 0.0, 0.0, 0.0, -90.0])),
             (golden::MOVE_CARTESIAN, 0x13, 10, Request::MoveCartesian(50.0, pose)),
             (golden::GRIPPER, 0x20, 11, Request::Gripper(42.5)),
+            (golden::SET_PAYLOAD, 0x21, 15, Request::SetPayload(golden::LOAD.map(|v| v as f32))),
+            (golden::GET_PAYLOAD, 0x22, 16, Request::GetPayload),
+            (golden::SET_MOUNTING, 0x23, 17, Request::SetMounting([0.0, 0.0, 1.0])),
+            (golden::GET_MOUNTING, 0x24, 18, Request::GetMounting),
+            (golden::GET_JOINT_STATUS, 0x40, 19, Request::GetJointStatus),
+            (golden::GET_OFFSETS, 0x41, 20, Request::GetOffsets),
+            (golden::GET_IO, 0x30, 12, Request::GetIo),
+            (golden::SET_DIGITAL, 0x31, 13, Request::SetDigital(3, true)),
+            (golden::SET_ANALOG, 0x32, 14, Request::SetAnalog(1, 2.5)),
         ] {
             let frame = bytes(golden);
             let expected = Frame { opcode, sequence, request: Ok(request) };
@@ -259,6 +322,22 @@ mod tests {
         assert_eq!(out, bytes(golden::MOVING_REPLY));
         reply(&mut out, &frame(0x11, 8), status::IN_ERROR, |out| out.extend([2, 0]));
         assert_eq!(out, bytes(golden::IN_ERROR_REPLY));
+        reply(&mut out, &frame(0x30, 12), 0, |out| put_io(out, 0xFD, 8, [[1.5, -0.25], [0.0, 2.5]]));
+        assert_eq!(out, bytes(golden::IO_REPLY));
+        reply(&mut out, &frame(0x22, 16), 0, |out| put_floats(out, &golden::LOAD.map(|v| v as f32)));
+        assert_eq!(out, bytes(golden::PAYLOAD_REPLY));
+        reply(&mut out, &frame(0x24, 18), 0, |out| put_floats(out, &[0.0, 0.0, -1.0]));
+        assert_eq!(out, bytes(golden::MOUNTING_REPLY));
+        let drive = |i: u8| {
+            let load = if i == 2 { -12.5 } else { 5.0 };
+            ([30.5 + f32::from(i), 0.25 * f32::from(i), 48.0, load], if i == 5 { 7 } else { 0 })
+        };
+        reply(&mut out, &frame(0x40, 19), 0, |out| put_drives(out, (0..6).map(drive)));
+        assert_eq!(out, bytes(golden::JOINT_STATUS_REPLY));
+        reply(&mut out, &frame(0x41, 20), 0, |out| put_floats(out, &golden::OFFSETS.map(|v| v as f32)));
+        assert_eq!(out, bytes(golden::OFFSETS_REPLY));
+        reply(&mut out, &frame(0x31, 13), status::NO_CHANNEL, |out| out.extend([0, 0]));
+        assert_eq!(out, bytes(golden::NO_CHANNEL_REPLY));
         reply(&mut out, &frame(6, 0xFFFE), 0, |_| ());
         assert_eq!(out, bytes(golden::STOP_REPLY));
     }
@@ -268,6 +347,8 @@ mod tests {
         assert_eq!(understand(0x77, &[]), Err(status::UNKNOWN_COMMAND));
         assert_eq!(understand(0x03, &[3]), Err(status::MALFORMED));
         assert_eq!(understand(0x06, &[0]), Err(status::MALFORMED));
+        assert_eq!(understand(0x31, &[0, 2]), Err(status::MALFORMED));
+        assert_eq!(understand(0x32, &[]), Err(status::MALFORMED));
         assert_eq!(understand(0x11, &[0; 20]), Err(status::MALFORMED));
         assert_eq!(understand(0x20, &f32::NAN.to_le_bytes()), Err(status::MALFORMED));
         assert_eq!(scan(b"xYA"), Scan::Skip(1));

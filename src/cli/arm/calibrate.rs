@@ -1,0 +1,161 @@
+//! `dimos arm calibrate ADAPTER`: the middle pose and the range of each joint, led by hand with the motors off.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+
+use super::super::ask::{self, Typed};
+use super::super::exit::{Exit, Failure, Result};
+use super::super::follow::Signals;
+use super::super::output;
+use super::bus::{self, failure};
+use super::live_table::{Place, Seen, lines};
+use crate::hardware::registry::Registry;
+use crate::hardware::service::{Motor, Service};
+
+/// How often positions are read and shown.
+const PERIOD: Duration = Duration::from_millis(50);
+/// A smaller range was not recorded: the joint was not moved [counts].
+const SMALLEST: i32 = 100;
+/// A joint cannot turn this far between two readings: it passed the end of its turn [counts].
+const JUMP: i32 = 2048;
+
+/// Arguments of `arm calibrate`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "\
+The motors are off and nothing moves the arm: you do. Nothing is written before the ranges are complete; Ctrl-C changes nothing.
+Then offsets and ranges are written to the motors, read back, and written to the file, in LeRobot's format.
+A run uses the file with the adapter's option `calibration`.")]
+pub struct Args {
+    #[command(flatten)]
+    bus: bus::BusArgs,
+    /// Calibration file to write
+    #[arg(long, value_name = "FILE", required_unless_present = "restore")]
+    file: Option<PathBuf>,
+    /// Write the calibration of this file to the motors instead, as after the exchange of one
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "force"])]
+    restore: Option<PathBuf>,
+    /// Overwrite the calibration file
+    #[arg(long)]
+    force: bool,
+    /// Ask nothing: the arm is in its middle pose now, its motors may be switched off, and ranges are recorded for the
+    /// time of --record-for
+    #[arg(long)]
+    yes: bool,
+    /// With --yes: record ranges for this time: 30s, 2m
+    #[arg(long, value_name = "TIME", default_value = "30s", requires = "yes", value_parser = super::super::arguments::duration)]
+    record_for: Duration,
+}
+
+/// Runs the verb.
+pub fn run(args: &Args, registry: &Registry) -> Result {
+    if let Some(file) = args.file.as_ref().filter(|file| file.exists() && !args.force) {
+        let what = format!("{} exists", file.display());
+        return Err(Failure::usage(what).hint("--force overwrites it; --restore writes it to the motors"));
+    }
+    if !args.yes {
+        ask::needs_terminal("--yes asks nothing; see `dimos arm calibrate --help`")?;
+    }
+    let signals = Signals::watch_with_hangup();
+    let mut bus = args.bus.open(registry)?;
+    bus.identify()?;
+    bus.release(&signals, args.yes)?;
+    match (&args.restore, &args.file) {
+        (Some(file), _) => restore(&mut *bus.service, file),
+        (None, Some(file)) => args.calibrate(&mut *bus.service, file, &signals),
+        (None, None) => Err(Failure::usage("no file is given").hint("--file FILE")),
+    }
+}
+
+fn restore(arm: &mut dyn Service, file: &Path) -> Result {
+    let changed = arm.restore(file).map_err(failure)?;
+    match changed.as_slice() {
+        [] => output::note(format_args!("the motors have the calibration of {} already", file.display())),
+        changed => output::note(format_args!("written and read back: {}", changed.join(", "))),
+    }
+    Ok(Exit::Ok)
+}
+
+impl Args {
+    fn calibrate(&self, arm: &mut dyn Service, file: &Path, signals: &Signals) -> Result {
+        if !self.yes {
+            ask::enter(signals, "Bring every joint to the middle of its range")?;
+        }
+        arm.take_middle().map_err(failure)?;
+        let by_hand = |motor: &&Motor| motor.range.is_none();
+        let names: Vec<_> = arm.motors().iter().filter(by_hand).map(|motor| motor.name).collect();
+        output::note(format_args!(
+            "Move these joints through their whole range, one after the other: {}{}",
+            names.join(", "),
+            if self.yes { String::new() } else { "; then press Enter (Ctrl-C ends this)".to_owned() }
+        ));
+        let seen = self.record(arm, signals)?;
+        let mut ranges = Vec::new();
+        for (motor, seen) in arm.motors().iter().zip(&seen) {
+            let (low, high) = motor.range.unwrap_or((seen.low, seen.high));
+            if high - low < SMALLEST {
+                let what = format!("{} was not moved: its range is {} counts", motor.name, high - low);
+                return Err(Failure::new(Exit::Failed, what).hint("nothing was written; calibrate again"));
+            }
+            ranges.push((low, high));
+        }
+        let text = arm.write_calibration(&ranges).map_err(failure)?;
+        if let Err(error) = write(file, &text) {
+            // The motors have it: it must not be lost.
+            output::line(text);
+            return Err(error.hint("the motors are calibrated; the file is above"));
+        }
+        lines(arm.motors(), &seen).iter().for_each(output::line);
+        output::note(format_args!("written to the motors, read back, and saved: {}", file.display()));
+        output::note(format_args!("in a blueprint: options: {{calibration: {}}}", absolute(file).display()));
+        Ok(Exit::Ok)
+    }
+
+    /// Records positions until Enter, or for a time.
+    fn record(&self, arm: &mut dyn Service, signals: &Signals) -> Result<Vec<Seen>> {
+        let mut seen: Vec<Seen> = arm.positions().map_err(failure)?.into_iter().map(Seen::at).collect();
+        let (began, mut place) = (Instant::now(), Place::default());
+        loop {
+            for ((motor, seen), position) in arm.motors().iter().zip(&mut seen).zip(arm.positions().map_err(failure)?) {
+                if seen.take(position) > JUMP && motor.range.is_none() {
+                    let what = format!("{} passed the end of its turn: its middle was not where it began", motor.name);
+                    return Err(
+                        Failure::new(Exit::Failed, what).hint("nothing was written; begin again in the middle pose")
+                    );
+                }
+            }
+            place.draw(&lines(arm.motors(), &seen));
+            if signals.last().is_some() {
+                return Err(ask::interrupted(signals));
+            }
+            if self.yes {
+                if began.elapsed() >= self.record_for {
+                    return Ok(seen);
+                }
+                std::thread::sleep(PERIOD);
+                continue;
+            }
+            match ask::typed(PERIOD) {
+                Typed::Line(_) => return Ok(seen),
+                Typed::Nothing => {}
+                Typed::End => return Err(ask::interrupted(signals)),
+            }
+        }
+    }
+}
+
+/// Writes the file as a whole, or not at all.
+fn write(file: &Path, text: &str) -> Result<()> {
+    let part = file.with_extension("json.part");
+    let wrong = || file.display().to_string();
+    if let Some(folder) = file.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).with_context(wrong)?;
+    }
+    std::fs::write(&part, text).with_context(wrong)?;
+    Ok(std::fs::rename(&part, file).with_context(wrong)?)
+}
+
+fn absolute(file: &Path) -> PathBuf {
+    file.canonicalize().unwrap_or_else(|_| file.to_owned())
+}

@@ -1,0 +1,102 @@
+//! The servos' settings that survive a power loss, as the follower arm needs them: gentle gains, a gripper that does
+//! not crush, answers without delay. The values are those that LeRobot writes.
+
+use super::bus::Bus;
+use super::calibration::NAMES;
+use super::protocol::SERVOS;
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::service;
+
+/// The gripper's number.
+const GRIPPER: u8 = 6;
+/// Control mode: 0 is position. With another value goals have another meaning.
+pub const MODE: &str = "control mode";
+
+/// A setting.
+struct Setting {
+    name: &'static str,
+    address: u8,
+    /// Two bytes instead of one.
+    wide: bool,
+    /// The bits that it has of the register.
+    mask: u16,
+    value: u16,
+    /// For the gripper only.
+    gripper: bool,
+}
+
+impl Setting {
+    const fn of_all(name: &'static str, address: u8, value: u16) -> Self {
+        Self { name, address, wide: false, mask: 0xFF, value, gripper: false }
+    }
+
+    const fn of_gripper(name: &'static str, address: u8, wide: bool, value: u16) -> Self {
+        Self { name, address, wide, mask: 0xFFFF, value, gripper: true }
+    }
+}
+
+/// All settings.
+const SETTINGS: [Setting; 10] = [
+    Setting::of_all("return delay [2 µs]", 7, 0),
+    Setting { mask: 0x10, ..Setting::of_all("positions over several turns", 18, 0) },
+    Setting::of_all("P coefficient", 21, 16),
+    Setting::of_all("D coefficient", 22, 32),
+    Setting::of_all("I coefficient", 23, 0),
+    Setting::of_all(MODE, 33, 0),
+    Setting::of_all("maximum acceleration [100 counts/s²]", 85, 254),
+    Setting::of_gripper("maximum torque [0.1 %]", 16, true, 500),
+    Setting::of_gripper("protection current [6.5 mA]", 28, true, 250),
+    Setting::of_gripper("overload torque [%]", 36, false, 25),
+];
+
+/// Reads a setting of a servo: the register.
+fn read(bus: &mut Bus, id: u8, setting: &Setting) -> AdapterResult<u16> {
+    Ok(match setting.wide {
+        true => u16::from_le_bytes(bus.read(id, setting.address)?),
+        false => u16::from(bus.read::<1>(id, setting.address)?[0]),
+    })
+}
+
+/// Calls `each` for every setting of every servo that has another value than wanted: the servo, the setting, its
+/// register.
+fn differing(
+    bus: &mut Bus,
+    mut each: impl FnMut(&mut Bus, u8, &Setting, u16) -> AdapterResult<()>,
+) -> AdapterResult<()> {
+    for id in 1..=SERVOS as u8 {
+        for setting in SETTINGS.iter().filter(|setting| !setting.gripper || id == GRIPPER) {
+            let register = read(bus, id, setting)?;
+            if register & setting.mask != setting.value {
+                each(bus, id, setting, register)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Returns the settings with other values than wanted.
+pub fn check(bus: &mut Bus) -> AdapterResult<Vec<service::Setting>> {
+    let mut found = Vec::new();
+    differing(bus, |_, id, setting, register| {
+        let motor = usize::from(id).checked_sub(1).and_then(|i| NAMES.get(i)).copied().unwrap_or_default();
+        let (name, wanted) = (setting.name, setting.value);
+        found.push(service::Setting { motor, name, found: register & setting.mask, wanted });
+        Ok(())
+    })?;
+    Ok(found)
+}
+
+/// Writes the settings with other values than wanted, and reads them back. The motors must be off.
+pub fn write(bus: &mut Bus) -> AdapterResult<()> {
+    differing(bus, |bus, id, setting, register| {
+        let [low, high] = (register & !setting.mask | setting.value).to_le_bytes();
+        bus.unlocked(id, |bus| match setting.wide {
+            true => bus.set(id, setting.address, [low, high]).map(drop),
+            false => bus.set(id, setting.address, [low]).map(drop),
+        })
+    })?;
+    match check(bus)?.as_slice() {
+        [] => Ok(()),
+        [first, ..] => Err(AdapterError::Protocol(format!("{}: {} is {} again", first.motor, first.name, first.found))),
+    }
+}

@@ -1,0 +1,107 @@
+//! Connecting: identifies the arm and compares it with the blueprint. Enables and moves nothing.
+
+use std::time::Duration;
+
+use super::Options;
+use super::address::Address;
+use super::dashboard::Dashboard;
+use super::model::Model;
+use super::primary::Primary;
+use super::protocol::primary::Configuration;
+use super::rtde::Rtde;
+use super::session::{Device, Session};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::joint::JointLimits;
+
+/// Timeout of the whole connection.
+const TOTAL_TIMEOUT: Duration = Duration::from_millis(2800);
+/// Timeouts of the first state and of the dashboard.
+const FIRST_STATE: Duration = Duration::from_millis(1000);
+const DASHBOARD: Duration = Duration::from_millis(800);
+
+/// Connects to the arm at `address`.
+pub fn connect(address: &Address, options: &Options) -> AdapterResult<Session> {
+    let limit = MonotonicClock.now().after(TOTAL_TIMEOUT);
+    let named = |error| name(error, address);
+    let mut rtde = Rtde::connect(address, limit).map_err(named)?;
+    let (primary, major, configuration) = Primary::connect(address, limit).map_err(named)?;
+    verify(address, options.model, configuration.kind, major)?;
+    let left = limit.since(MonotonicClock.now());
+    let mut dashboard = Dashboard::connect(address, left.min(DASHBOARD)).map_err(named)?;
+    let serial = dashboard.ask("get serial number").map_err(named)?;
+    let serial = Some(serial).filter(|serial| !serial.is_empty() && serial.bytes().all(|byte| byte.is_ascii_digit()));
+    let left = limit.since(MonotonicClock.now());
+    let first = rtde.next(left.min(FIRST_STATE)).map_err(named)?;
+    let [major, minor, bugfix] = rtde.software;
+    let device = Device {
+        model: options.model,
+        software: format!("{major}.{minor}.{bugfix}"),
+        serial,
+        limits: narrowed(options.model.limits(), &configuration),
+    };
+    Ok(Session::new(device, address.clone(), rtde, primary, first))
+}
+
+/// Adds the address to an error.
+fn name(error: AdapterError, address: &Address) -> AdapterError {
+    match error {
+        AdapterError::Io(text) => AdapterError::Io(format!("ur at {address}: {text}")),
+        AdapterError::Timeout(text) => AdapterError::Timeout(format!("ur at {address}: {text}")),
+        AdapterError::Protocol(text) => AdapterError::Protocol(format!("ur at {address}: {text}")),
+        other => other,
+    }
+}
+
+/// Checks that the arm is the expected one.
+fn verify(address: &Address, model: Model, kind: u32, major: u8) -> AdapterResult<()> {
+    let found = Model::of(kind, major);
+    if found == Some(model) {
+        return Ok(());
+    }
+    let (what, hint) = match found {
+        Some(other) => {
+            (format!("a {}", other.name()), format!(" Else set the arm's options to {{model: {}}}", other.option()))
+        }
+        None => (format!("an arm of type {kind} with software {major}"), String::new()),
+    };
+    Err(AdapterError::Rejected(format!(
+        "ur at {address}: expected the model {}, found {what}\nhint: is the address right?{hint}",
+        model.name()
+    )))
+}
+
+/// Returns the limits of the model, narrowed by those of the arm's safety configuration where they make sense.
+fn narrowed(mut limits: JointLimits, found: &Configuration) -> JointLimits {
+    let ranges = limits.position_lower.iter_mut().zip(&mut limits.position_upper).zip(found.ranges);
+    for ((lower, upper), (low, high)) in ranges {
+        if low.max(*lower) < high.min(*upper) {
+            (*lower, *upper) = (low.max(*lower), high.min(*upper));
+        }
+    }
+    for (top, speed) in limits.velocity_max.iter_mut().zip(found.speeds) {
+        if speed > 0.01 {
+            *top = top.min(speed);
+        }
+    }
+    limits
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_safety_configuration_narrows_the_limits() {
+        let model = Model::Ur5e.limits();
+        let mut found = Configuration::default();
+        assert_eq!(narrowed(model.clone(), &found), model, "zeros are no limits");
+        found.ranges[2] = (-2.5, 2.0);
+        found.ranges[0] = (-9.0, 9.0);
+        found.speeds = [1.0, 9.0, 0.0, 3.0, 3.0, 3.0];
+        let limits = narrowed(model.clone(), &found);
+        assert_eq!((limits.position_lower[2], limits.position_upper[2]), (-2.5, 2.0));
+        assert_eq!(limits.position_upper[0], model.position_upper[0]);
+        assert_eq!((limits.velocity_max[0], limits.velocity_max[1]), (1.0, model.velocity_max[1]));
+    }
+}

@@ -1,0 +1,76 @@
+//! The dashboard: power, brakes, safety, programs. A connection for each occasion: an order is rare, and an idle
+//! connection would hide that the controller has restarted.
+
+use std::time::Duration;
+
+use super::address::{Address, Service};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::transport::Scan;
+use crate::hardware::transport::tcp::TcpLink;
+
+/// Timeouts of the greeting and of an answer.
+const GREETING: Duration = Duration::from_millis(1000);
+const ANSWER: Duration = Duration::from_millis(1000);
+/// Longest line.
+const LONGEST: usize = 1024;
+
+/// A connection to the dashboard.
+pub struct Dashboard {
+    link: TcpLink,
+}
+
+/// Scans for a line, without its end.
+fn line(bytes: &[u8]) -> Scan<String> {
+    match bytes.iter().position(|byte| *byte == b'\n') {
+        Some(end) => Scan::Take(end + 1, String::from_utf8_lossy(bytes.get(..end).unwrap_or_default()).trim().into()),
+        None if bytes.len() > LONGEST => Scan::Skip(bytes.len()),
+        None => Scan::More,
+    }
+}
+
+impl Dashboard {
+    /// Connects and waits for the greeting.
+    pub fn connect(address: &Address, timeout: Duration) -> AdapterResult<Self> {
+        let mut link = TcpLink::connect("the dashboard of ur", &address.port(Service::Dashboard), timeout)?;
+        let greeting = link.receive(GREETING.min(timeout), line)?;
+        if !greeting.contains("Dashboard Server") {
+            let what = format!("{} is not a dashboard: {greeting:?}", link.peer());
+            return Err(AdapterError::Protocol(what));
+        }
+        Ok(Self { link })
+    }
+
+    /// Sends a request and returns the answer.
+    pub fn ask(&mut self, request: &str) -> AdapterResult<String> {
+        self.link.send(format!("{request}\n").as_bytes())?;
+        self.link.receive(ANSWER, line)
+    }
+
+    /// Sends an order; `Rejected` unless the answer begins as expected.
+    pub fn order(&mut self, request: &str, expected: &str) -> AdapterResult<()> {
+        let answer = self.ask(request)?;
+        if answer.to_ascii_lowercase().starts_with(&expected.to_ascii_lowercase()) {
+            return Ok(());
+        }
+        let hint = if answer.contains("not allowed") { "\nhint: select remote control at the pendant" } else { "" };
+        Err(AdapterError::Rejected(format!("ur refuses {request:?}: {answer}{hint}")))
+    }
+
+    /// Returns whether the controller takes orders and programs: not in local control. Series before e have no such
+    /// switch.
+    pub fn is_in_remote_control(&mut self, cb3: bool) -> AdapterResult<bool> {
+        Ok(cb3 || self.ask("is in remote control")? != "false")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines() {
+        assert_eq!(line(b"Robotmode: RUNNING\nmore"), Scan::Take(19, "Robotmode: RUNNING".into()));
+        assert_eq!(line(b"Robotm"), Scan::More);
+        assert_eq!(line(&[b'x'; 2000]), Scan::Skip(2000));
+    }
+}

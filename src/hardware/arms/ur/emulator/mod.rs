@@ -1,0 +1,238 @@
+//! The emulator of a controller with its arm, for `address: sim`, for tests, and for other clients such as `ur_rtde`.
+//!
+//! Written from the protocol, and shares no code with the adapter besides the models' dimensions: two sides that share
+//! an encoder share its mistakes. Programs are not interpreted: the adapter's own and `ur_rtde`'s are recognized by
+//! their names and carried out here, and any other one starts and ends.
+
+mod controller;
+mod dashboard;
+mod fields;
+mod ports;
+mod primary;
+mod programs;
+mod rtde;
+mod scripts;
+#[cfg(test)]
+mod tests;
+
+use std::net::{IpAddr, SocketAddr, TcpListener};
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::address::{FIRST_PORT, PORTS, Service};
+use super::model::Model;
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::check::ConfigError;
+use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use crate::hardware::sim::arm;
+use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
+use crate::joint::{JointLimits, Joints};
+use controller::Controller;
+
+/// The faults that the controller can play. Its joints have one supply, so no single motor goes off.
+const PLAYABLE: &[FaultKind] = &[
+    FaultKind::Stall,
+    FaultKind::Silent,
+    FaultKind::Disconnect,
+    FaultKind::ErrorCode,
+    FaultKind::Estop,
+    FaultKind::PowerLoss,
+    FaultKind::Nan,
+    FaultKind::ZeroState,
+    FaultKind::Garbage,
+    FaultKind::Corrupt,
+    FaultKind::Truncated,
+    FaultKind::WrongModel,
+    FaultKind::Frozen,
+    FaultKind::Sag,
+    FaultKind::Blocked,
+    FaultKind::Pushed,
+];
+/// The ports, in the order of their numbers here.
+const SERVICES: [Service; 5] =
+    [Service::Dashboard, Service::Primary, Service::Secondary, Service::RealTime, Service::Rtde];
+/// Most connections at once.
+const CLIENTS: usize = 32;
+/// Attempts to find consecutive free ports.
+const ATTEMPTS: u32 = 200;
+/// Time between two looks for messages at the script's ports.
+const MESSAGES: Duration = Duration::from_millis(10);
+/// The dashboard sends nothing that is not asked for.
+const NEVER: Duration = Duration::from_secs(3600);
+
+/// Settings of the emulator.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimOptions {
+    /// Joint positions at power-up [rad], one per joint; an upright pose when empty.
+    pub initial_positions: Vec<f64>,
+    /// Lag of the joints behind the servo setpoints of a program, 0 to 0.5 [s].
+    #[schemars(range(min = 0, max = 0.5))]
+    pub lag: f64,
+    /// How far below its target a joint rests under load, 0 to 0.1 [rad].
+    #[schemars(range(min = 0, max = 0.1))]
+    pub droop: f64,
+    /// How long power-on and the release of the brakes take, each, 0 to 60 [s].
+    #[schemars(range(min = 0, max = 60))]
+    pub power_time: f64,
+    /// Whether the pendant is in remote control, which an e-Series controller needs for programs.
+    pub remote_control: bool,
+    /// Position of the pendant's speed slider, 0 to 1.
+    #[schemars(range(min = 0, max = 1))]
+    pub speed_slider: f64,
+    /// Faults, and when they begin (seconds after the first connection).
+    pub faults: Vec<Fault>,
+}
+
+impl Default for SimOptions {
+    fn default() -> Self {
+        Self {
+            initial_positions: Vec::new(),
+            lag: 0.05,
+            droop: 0.0,
+            power_time: 0.05,
+            remote_control: true,
+            speed_slider: 1.0,
+            faults: Vec::new(),
+        }
+    }
+}
+
+impl SimOptions {
+    /// Returns an error for values that the emulator cannot have.
+    pub(super) fn check(&self, limits: &JointLimits) -> Result<(), ConfigError> {
+        let range = |name: &str, value: f64, most: f64| {
+            let what = || format!("{name} must be 0 to {most}, not {value}");
+            if (0.0..=most).contains(&value) { Ok(()) } else { Err(ConfigError::new(format!("sim.{name}"), what())) }
+        };
+        range("power_time", self.power_time, 60.0)?;
+        range("speed_slider", self.speed_slider, 1.0)?;
+        self.common().check("ur", limits, PLAYABLE)
+    }
+
+    fn common(&self) -> arm::SimOptions {
+        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults }
+    }
+}
+
+/// A running emulator. Ends when it is dropped.
+pub struct UrEmulator {
+    server: TcpServer<Controller>,
+    address: SocketAddr,
+}
+
+impl UrEmulator {
+    /// Starts an emulator at `place` of the arm that a configuration describes.
+    pub fn start(config: &AdapterConfig, place: &EmulatorAddress) -> AdapterResult<Self> {
+        config.check(super::check)?;
+        let options: super::Options = config.options()?;
+        let ip = place.tcp(FIRST_PORT)?.ip();
+        let (first, listeners) = match place {
+            EmulatorAddress::InProcess => (0..ATTEMPTS)
+                .find_map(|_| listen(ip, 0).ok())
+                .ok_or_else(|| AdapterError::Io(format!("ur emulator: no {PORTS} consecutive free ports at {ip}")))?,
+            _ => {
+                listen(ip, FIRST_PORT).map_err(|e| cannot_listen("ur emulator", SocketAddr::new(ip, FIRST_PORT), &e))?
+            }
+        };
+        let controller = Controller::new(options.model, &options.sim, MonotonicClock.now())?;
+        let period = Duration::from_secs_f64(1.0 / options.model.rate());
+        let ports = listeners.into_iter().zip(SERVICES).map(|(listener, service)| {
+            let period = match service {
+                Service::Dashboard => NEVER,
+                Service::Rtde => period,
+                _ => MESSAGES,
+            };
+            (listener, Port::Sessions(period))
+        });
+        let server = TcpServer::with_ports("ur", controller, ports.collect(), CLIENTS);
+        let server = server.map_err(|e| AdapterError::Io(format!("ur emulator: cannot serve: {e}")))?;
+        Ok(Self { server, address: SocketAddr::new(ip, first) })
+    }
+
+    /// Calls `act` with the controller, advanced to the present.
+    fn with<T>(&self, act: impl FnOnce(&mut Controller) -> T) -> T {
+        self.server.with(|controller, now| {
+            controller.advance_to(now);
+            act(controller)
+        })
+    }
+
+    /// Sets the safety mode, as safety inputs and faults do; `None`: normal.
+    pub fn set_safety(&self, mode: Option<i32>) {
+        self.with(|controller| controller.set_safety(mode));
+    }
+
+    /// Moves the pendant's speed slider, 0 to 1.
+    pub fn set_slider(&self, fraction: f64) {
+        self.with(|controller| controller.slider = fraction);
+    }
+
+    /// Changes between remote control and the pendant.
+    pub fn set_remote_control(&self, remote: bool) {
+        self.with(|controller| controller.remote = remote);
+    }
+
+    /// Stops the running program, as the pendant's button does.
+    pub fn press_stop(&self) {
+        self.with(Controller::stop_program);
+    }
+
+    /// Lets programs fail in their first line, or run again.
+    pub fn refuse_programs(&self, refuse: bool) {
+        self.with(|controller| controller.refuses_programs = refuse);
+    }
+
+    /// Ends the program's answers: it runs, and ignores every order.
+    pub fn hang_program(&self, hang: bool) {
+        self.with(|controller| controller.hangs = hang);
+    }
+
+    /// Returns the name of the running program.
+    pub fn program(&self) -> Option<String> {
+        self.with(|controller| controller.program_name().map(str::to_owned))
+    }
+
+    /// Returns how many connections there are.
+    pub fn clients(&self) -> usize {
+        self.with(|controller| controller.sessions.len())
+    }
+
+    /// Returns the digital outputs, bits as in RTDE, and the analog ones [V or A].
+    pub fn outputs(&self) -> (u64, [f64; 2]) {
+        self.with(|controller| (controller.outputs.digital, controller.outputs.analog))
+    }
+}
+
+/// Listens at the ports of all services from `first`; from any free port if that is 0.
+fn listen(ip: IpAddr, first: u16) -> std::io::Result<(u16, Vec<TcpListener>)> {
+    let all = ports_in_a_row(ip, first, PORTS)?;
+    let first = all.first().map_or(Ok(0), |listener| listener.local_addr().map(|at| at.port()))?;
+    let used = SERVICES.map(|service| service as usize);
+    let served = all.into_iter().enumerate().filter(|(i, _)| used.contains(i)).map(|(_, listener)| listener);
+    Ok((first, served.collect()))
+}
+
+impl Emulator for UrEmulator {
+    fn address(&self) -> String {
+        self.address.to_string()
+    }
+
+    fn inject(&self, fault: Fault) -> Result<(), String> {
+        self.server.inject(fault)
+    }
+
+    fn true_positions(&self) -> Option<Joints> {
+        self.server.true_positions()
+    }
+}
+
+/// Returns the limits within which the emulated joints move.
+fn limits(model: Model) -> JointLimits {
+    JointLimits { acceleration_max: vec![20.0; super::DOF], ..model.limits() }
+}

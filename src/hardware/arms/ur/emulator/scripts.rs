@@ -1,0 +1,84 @@
+//! Text on the script's ports: programs, programs that run beside them, and single commands.
+
+use super::controller::Controller;
+use super::programs::{Ours, Program, RtdeControl};
+
+impl Controller {
+    /// Takes the line of a connection that has arrived. A program ends with a line `end` at its margin.
+    pub(super) fn script_line(&mut self, who: (usize, u64), line: &str) {
+        let Some(session) = self.sessions.get_mut(&who) else { return };
+        let begins = line.starts_with("def ") || line.starts_with("sec ");
+        if session.text.is_empty() && !begins {
+            return self.command(line.trim());
+        }
+        session.text.push_str(line);
+        session.text.push('\n');
+        if line.trim_end() == "end" {
+            let text = std::mem::take(&mut session.text);
+            self.take_program(&text);
+        }
+    }
+
+    fn refused_in_local_control(&mut self) -> bool {
+        let local = !self.remote && !self.model.is_cb3();
+        if local {
+            self.report_error(210, 2);
+        }
+        local
+    }
+
+    fn take_program(&mut self, text: &str) {
+        if self.refused_in_local_control() {
+            return;
+        }
+        let (kind, head) = text.split_once(' ').unwrap_or_default();
+        let name = head.split('(').next().unwrap_or_default().to_owned();
+        match (kind, name.as_str()) {
+            ("sec", _) => text.lines().for_each(|line| self.statement(line.trim())),
+            (_, "dimos_control") => {
+                let number = text.lines().find_map(|line| line.trim().strip_prefix("number = ")?.parse().ok());
+                self.run(Program::Ours(Ours::new(number.unwrap_or_default())));
+            }
+            (_, "rtde_control") => {
+                // The registers keep what an earlier program has left.
+                self.registers.int_out[0] = 0;
+                self.run(Program::Rtde(RtdeControl::default()));
+            }
+            _ => self.run(Program::Other(name)),
+        }
+    }
+
+    /// Executes a statement of a program that runs beside the main one, if it is known.
+    fn statement(&mut self, line: &str) {
+        let Some((name, arguments)) = line.strip_suffix(')').and_then(|line| line.split_once('(')) else { return };
+        let values: Vec<f64> = arguments
+            .split([',', '[', ']', ' '])
+            .filter(|word| !word.is_empty())
+            .filter_map(|word| word.parse().ok())
+            .collect();
+        match (name, &values[..]) {
+            ("set_payload", [mass, x, y, z]) => (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]),
+            ("set_target_payload", [mass, x, y, z, inertia @ ..]) => {
+                (self.payload.0, self.payload.1) = (*mass, [*x, *y, *z]);
+                self.payload.2.iter_mut().zip(inertia).for_each(|(to, value)| *to = *value);
+            }
+            ("set_tool_voltage", [volts]) => self.outputs.tool_voltage = *volts as i32,
+            _ => {}
+        }
+    }
+
+    /// Executes a command outside of a program.
+    fn command(&mut self, line: &str) {
+        if line.is_empty() || self.refused_in_local_control() {
+            return;
+        }
+        match line {
+            "power on" => self.power_on(false),
+            "power off" => self.power_off(),
+            "set robotmode run" => self.power_on(true),
+            "set unlock protective stop" => drop(self.unlock()),
+            "stop program" => self.stop_program(),
+            _ => {}
+        }
+    }
+}

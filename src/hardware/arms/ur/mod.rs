@@ -1,0 +1,124 @@
+//! Universal Robots: CB3, e-Series, UR20 and UR30.
+//!
+//! `protocol/` has the bytes, `rtde`, `primary` and `dashboard` the connections, `control.script` the program that runs
+//! on the controller, `session` and `safety` the state of the arm, `power` and `motion` what is ordered of it,
+//! `adapter` the adapter trait, `emulator/` the controller's side.
+
+pub mod adapter;
+pub mod address;
+mod connect;
+mod dashboard;
+pub mod emulator;
+#[cfg(test)]
+mod golden;
+mod io;
+pub mod model;
+mod motion;
+mod power;
+mod primary;
+mod program;
+pub mod protocol;
+mod rtde;
+mod safety;
+mod session;
+#[cfg(test)]
+mod tests;
+
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::hardware::check::{Checked, ConfigError};
+use crate::hardware::registry::{AdapterConfig, AdapterSpec, AddressForm, Level, OptionsSpec};
+use crate::joint::ControlMode;
+use address::Address;
+use model::Model;
+
+/// Number of joints.
+pub const DOF: usize = 6;
+/// The modes. There is none in which the controller plans: its program ends when orders no longer come.
+const MODES: &[ControlMode] = &[ControlMode::ServoPosition, ControlMode::Velocity];
+/// Rate of the state of an e-Series controller [Hz]; a CB3 controller has 125 Hz.
+const NATIVE_RATE: f64 = 500.0;
+/// Whether the arm keeps its pose when its motors are off: it has brakes.
+const HOLDS_WHEN_DISABLED: bool = true;
+
+/// The row in the adapter table.
+pub const SPEC: AdapterSpec = AdapterSpec {
+    name: "ur",
+    about: "Universal Robots UR3 to UR30: CB3, e-Series",
+    level: Level::Emulated,
+    transport: "tcp",
+    dof: (DOF, DOF),
+    modes: MODES,
+    wire_units: "rad, m",
+    native_rate: NATIVE_RATE,
+    accuracy: 0.002,
+    lag: 0.07,
+    stale_after: Duration::from_millis(50),
+    address: AddressForm {
+        form: "HOST[:FIRST_PORT]",
+        required: true,
+        check: |address| Address::parse(address).map(|address| address.to_string()),
+    },
+    holds_when_disabled: HOLDS_WHEN_DISABLED,
+    gripper: false,
+    options: OptionsSpec::of::<Options>(),
+    check,
+    create: |config| Ok(Box::new(adapter::UrAdapter::new(config)?)),
+    service: None,
+    emulate: Some(|config, place| Ok(Box::new(emulator::UrEmulator::start(config, place)?))),
+};
+
+/// What a blueprint may set of a Universal Robots arm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Options {
+    /// Which arm it is: `ur3`, `ur3e`, `ur5`, `ur5e`, `ur10`, `ur10e`, `ur16e`, `ur20` or `ur30`. An arm that is
+    /// another model is refused.
+    pub model: Model,
+    /// Time over which the controller smooths setpoints, 0.03 to 0.2 [s]: longer is smoother and later.
+    #[schemars(range(min = 0.03, max = 0.2))]
+    pub lookahead_time: f64,
+    /// Gain with which the controller follows setpoints, 100 to 2000: higher is stiffer, and may vibrate.
+    #[schemars(range(min = 100, max = 2000))]
+    pub gain: f64,
+    /// Deceleration of a stop, 1 to 40 [rad/s²].
+    #[schemars(range(min = 1, max = 40))]
+    pub stop_deceleration: f64,
+    /// Whether to read force and torque at the TCP. An e-Series arm measures them; a CB3 arm estimates them from its
+    /// currents.
+    pub force_torque: bool,
+    /// Settings of the emulator.
+    pub sim: emulator::SimOptions,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            model: Model::default(),
+            lookahead_time: 0.05,
+            gain: 500.0,
+            stop_deceleration: 8.0,
+            force_torque: false,
+            sim: emulator::SimOptions::default(),
+        }
+    }
+}
+
+/// Returns the limits of the configured model.
+fn check(config: &AdapterConfig) -> Result<Checked, ConfigError> {
+    config.check_dof("ur", SPEC.dof)?;
+    let options: Options = config.options()?;
+    let within = |name: &str, value: f64, (least, most): (f64, f64)| match value {
+        value if (least..=most).contains(&value) => Ok(()),
+        value => Err(ConfigError::new(name, format!("{name} is {least} to {most}, not {value}"))),
+    };
+    within("lookahead_time", options.lookahead_time, (0.03, 0.2))?;
+    within("gain", options.gain, (100.0, 2000.0))?;
+    within("stop_deceleration", options.stop_deceleration, (1.0, 40.0))?;
+    let limits = options.model.limits();
+    options.sim.check(&limits)?;
+    Ok(Checked { limits })
+}

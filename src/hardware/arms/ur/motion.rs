@@ -1,0 +1,79 @@
+//! Motion commands of a session: setpoints and stops.
+
+use std::time::Duration;
+
+use super::protocol::inputs::Order;
+use super::protocol::status::program;
+use super::session::Session;
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult, Stop};
+
+/// Setpoints are not sent while none of the last ones was answered for this time.
+const MAX_UNANSWERED: Duration = Duration::from_millis(60);
+/// How long a stop waits for the program's answer, and for what the dashboard does after that.
+const STOP_LIMIT: Duration = Duration::from_millis(300);
+const DASHBOARD_LIMIT: Duration = Duration::from_millis(700);
+
+impl Session {
+    /// Refuses motion unless our program takes orders.
+    fn may_be_commanded(&self) -> AdapterResult<()> {
+        self.fault()?;
+        if !self.enabled() {
+            return Err(AdapterError::Rejected("the motors are disabled".into()));
+        }
+        if self.ready.is_none() {
+            let why = self.ended.unwrap_or("the arm was stopped");
+            return Err(AdapterError::Rejected(format!("{why}: enable it again")));
+        }
+        Ok(())
+    }
+
+    /// Sends a setpoint. It replaces an earlier one that the program has not read yet. `Busy` while the program does
+    /// not answer: a late setpoint must not follow a silence.
+    pub fn stream(&mut self, order: Order) -> AdapterResult<()> {
+        self.update(Duration::ZERO)?;
+        self.may_be_commanded()?;
+        if self.unanswered.is_some_and(|since| MonotonicClock.now().since(since) > MAX_UNANSWERED) {
+            return Err(AdapterError::Busy);
+        }
+        self.setpoint(order)
+    }
+
+    /// Ends a stream of setpoints in another mode: the arm holds.
+    pub fn hold(&mut self) -> AdapterResult<()> {
+        if self.ready.is_some() && self.last != Order::Hold { self.order(Order::Hold) } else { Ok(()) }
+    }
+
+    /// Stops all motion, and ends the program. The arm stays stopped until it is activated. Confirmed by the program,
+    /// which echoes the order in its registers, or by a later state with the joints at rest and no program that moves
+    /// them.
+    pub fn stop(&mut self) -> AdapterResult<Stop> {
+        (self.ready, self.ended) = (None, None);
+        let sent = MonotonicClock.now();
+        if self.rtde.takes_orders() {
+            self.order(Order::Stop)?;
+        }
+        (self.unanswered, self.last) = (None, Order::Hold);
+        let count = self.count;
+        let done = |session: &mut Self| {
+            let (state, measured) = session.state();
+            let echoed = state.count == count && state.program >= program::STOPPED;
+            let still = session.at_rest() && (!session.program_runs() || session.stopped.is_some());
+            Ok((echoed || (still && measured > sent)).then_some(()))
+        };
+        if self.wait(STOP_LIMIT, done)?.is_some() {
+            return Ok(Stop::Confirmed);
+        }
+        // Another program, or ours does not run as it should.
+        let asked = self.dashboard().and_then(|mut dashboard| dashboard.order("stop", "stopped"));
+        let sent = MonotonicClock.now();
+        let done = |session: &mut Self| {
+            let still = session.at_rest() && !session.program_runs() && session.state().1 > sent;
+            Ok(still.then_some(()))
+        };
+        match self.wait(DASHBOARD_LIMIT, done)? {
+            Some(()) => Ok(Stop::Confirmed),
+            None => asked.map(|()| Stop::Sent),
+        }
+    }
+}

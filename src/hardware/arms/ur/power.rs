@@ -1,0 +1,181 @@
+//! What this run orders of a controller besides motion: power and brakes, the program, the end of a protective stop.
+//! Nothing here is done without an order.
+
+use std::time::Duration;
+
+use super::Options;
+use super::program;
+use super::protocol::inputs::Order;
+use super::protocol::status::{self, moves, robot, robot_name, safety, safety_text};
+use super::rtde::in_use;
+use super::session::{FULL_SPEED, Session};
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+
+/// How long enabling may take: power and brakes of a real arm take longer, and enabling again continues.
+const POWER_LIMIT: Duration = Duration::from_millis(6000);
+/// How long the motors may take to go off.
+const OFF_LIMIT: Duration = Duration::from_secs(3);
+/// How long the program may take to start.
+const START_LIMIT: Duration = Duration::from_millis(1500);
+/// A protective stop is released this long after it was seen at the earliest, as the controller demands, too.
+const PROTECTED: Duration = Duration::from_millis(5100);
+/// How long the end of a protective stop may take to show, and that of a fault of the safety system.
+const RELEASE_LIMIT: Duration = Duration::from_secs(1);
+const RESTART_LIMIT: Duration = Duration::from_secs(5);
+
+impl Session {
+    /// Switches power on, releases the brakes, and starts the program. Nothing moves.
+    pub fn activate(&mut self, options: &Options) -> AdapterResult<()> {
+        self.update(Duration::ZERO)?;
+        self.fault()?;
+        if !self.rtde.takes_orders() {
+            return Err(in_use());
+        }
+        if self.state.slider < FULL_SPEED {
+            return Err(AdapterError::Rejected(format!(
+                "the pendant's speed slider is at {:.0} %: the arm would follow its setpoints late\nhint: set the slider to \
+                 100 %, and limits.velocity in the blueprint",
+                100.0 * self.state.slider
+            )));
+        }
+        if self.ready.is_none() && self.program_runs() && !self.at_rest() {
+            return Err(AdapterError::Rejected("the arm is moving: another program commands it".into()));
+        }
+        self.power_on(MonotonicClock.now().after(POWER_LIMIT))?;
+        self.start(options)
+    }
+
+    fn power_on(&mut self, limit: Mono) -> AdapterResult<()> {
+        let mut dashboard = self.dashboard()?;
+        if !dashboard.is_in_remote_control(self.device.model.is_cb3())? {
+            return Err(AdapterError::Rejected(
+                "the controller is in local control\nhint: select remote control at the pendant".into(),
+            ));
+        }
+        if self.enabled() {
+            return Ok(());
+        }
+        if self.state.robot_mode < robot::POWER_OFF || self.state.robot_mode > robot::RUNNING {
+            let name = robot_name(self.state.robot_mode);
+            return Err(AdapterError::Rejected(format!("the controller is not ready: its robot mode is {name}")));
+        }
+        let _ = dashboard.ask("close safety popup");
+        for (request, answer, mode) in
+            [("power on", "powering on", robot::IDLE), ("brake release", "brake releasing", robot::RUNNING)]
+        {
+            if self.state.robot_mode >= mode {
+                continue;
+            }
+            dashboard.order(request, answer)?;
+            let left = limit.since(MonotonicClock.now());
+            let reached = self.wait(left, |session| {
+                session.fault()?;
+                Ok((session.state.robot_mode >= mode).then_some(()))
+            })?;
+            if reached.is_none() {
+                let name = robot_name(self.state.robot_mode);
+                return Err(AdapterError::Rejected(format!(
+                    "the arm is still being switched on ({name}) after {POWER_LIMIT:?}\nhint: enable it again when the pendant \
+                     shows it on"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Starts the program, which replaces a running one.
+    fn start(&mut self, options: &Options) -> AdapterResult<()> {
+        (self.ready, self.ended) = (None, None);
+        // Any number that differs from that of the program before.
+        let number = (MonotonicClock.now().0 >> 10) as i32 & i32::MAX;
+        // What the registers hold from before is not an order for the new program.
+        self.order(Order::Hold)?;
+        self.primary.run(&program::control(number, options))?;
+        let started = self.wait(START_LIMIT, |session| {
+            session.fault()?;
+            session.primary.check()?;
+            let holds = session.state.number == number && session.state.program == status::program::HOLDING;
+            Ok((holds && session.program_runs() && session.state.count == session.count).then_some(()))
+        })?;
+        self.unanswered = None;
+        if started.is_none() {
+            return Err(AdapterError::Timeout(format!(
+                "ur at {}: the program did not start within {START_LIMIT:?}\nhint: the pendant's log may say why",
+                self.address
+            )));
+        }
+        self.ready = Some(number);
+        Ok(())
+    }
+
+    /// Stops, and switches power off: the brakes hold.
+    pub fn disable(&mut self) -> AdapterResult<()> {
+        if self.program_runs() {
+            self.stop()?;
+        }
+        (self.ready, self.ended) = (None, None);
+        self.dashboard()?.order("power off", "powering off")?;
+        let off = self.wait(OFF_LIMIT, |session| Ok((session.state.robot_mode <= robot::POWER_OFF).then_some(())))?;
+        off.ok_or_else(|| AdapterError::Timeout(format!("the motors do not go off within {OFF_LIMIT:?}")))
+    }
+
+    /// Ends a protective stop or a fault of the safety system. Only for an operator who has found its cause. A paused
+    /// program is ended first: it would continue.
+    pub fn clear_errors(&mut self) -> AdapterResult<()> {
+        self.update(Duration::ZERO)?;
+        (self.ready, self.ended) = (None, None);
+        let Some(stopped) = self.stopped else { return Ok(()) };
+        match stopped.mode {
+            safety::PROTECTIVE_STOP => self.release(stopped.since),
+            safety::VIOLATION | safety::FAULT => {
+                let mut dashboard = self.dashboard()?;
+                let _ = dashboard.ask("close safety popup");
+                dashboard.order("restart safety", "restarting safety")?;
+                self.wait_until_safe(RESTART_LIMIT)
+            }
+            mode => Err(AdapterError::Rejected(format!(
+                "{}\nhint: end its cause, then reset the arm again",
+                safety_text(mode)
+            ))),
+        }
+    }
+
+    fn release(&mut self, since: Mono) -> AdapterResult<()> {
+        self.end_program()?;
+        let early = PROTECTED.saturating_sub(MonotonicClock.now().since(since));
+        self.wait(early, |session| Ok(session.stopped.is_none().then_some(())))?;
+        if self.stopped.is_none() {
+            return Ok(());
+        }
+        // It may have been paused after it was ended: by hand, at the pendant.
+        self.end_program()?;
+        let mut dashboard = self.dashboard()?;
+        let _ = dashboard.ask("close safety popup");
+        dashboard.order("unlock protective stop", "protective stop releasing")?;
+        self.wait_until_safe(RELEASE_LIMIT)
+    }
+
+    /// Ends a running or paused program, and verifies that.
+    fn end_program(&mut self) -> AdapterResult<()> {
+        if !self.program_runs() {
+            return Ok(());
+        }
+        self.dashboard()?.order("stop", "stopped")?;
+        let ended = self.wait(RELEASE_LIMIT, |session| Ok((!session.program_runs()).then_some(())))?;
+        ended.ok_or_else(|| {
+            AdapterError::Rejected(
+                "the paused program does not end, and would continue after the stop\nhint: end it at the pendant"
+                    .into(),
+            )
+        })
+    }
+
+    fn wait_until_safe(&mut self, limit: Duration) -> AdapterResult<()> {
+        let safe = self.wait(limit, |session| Ok(moves(session.state.safety_mode).then_some(())))?;
+        safe.ok_or_else(|| {
+            let text = safety_text(self.state.safety_mode);
+            AdapterError::Rejected(format!("{text}, still\nhint: the pendant shows what to do"))
+        })
+    }
+}

@@ -1,0 +1,82 @@
+//! The connection to the primary interface: programs out; identity and errors in.
+
+use std::time::Duration;
+
+use super::address::{Address, Service};
+use super::protocol::primary::{Configuration, Packet, WARNING, scan};
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::transport::tcp::TcpLink;
+
+/// Error code of a connection that was opened in local control: it takes no programs.
+const READ_ONLY: i32 = 210;
+
+/// A connection, and what was reported on it.
+pub struct Primary {
+    link: TcpLink,
+    /// The last error that stops the arm: C code and A argument, and when it came.
+    pub error: Option<(i32, i32, Mono)>,
+    /// Why the last program failed.
+    exception: Option<String>,
+    /// Whether the controller takes no programs on this connection.
+    read_only: bool,
+}
+
+impl Primary {
+    /// Connects, and waits for the version and the configuration.
+    pub fn connect(address: &Address, limit: Mono) -> AdapterResult<(Self, u8, Configuration)> {
+        let left = |most: Duration| limit.since(MonotonicClock.now()).min(most);
+        let most = Duration::from_millis(1500);
+        let link = TcpLink::connect("the primary interface of ur", &address.port(Service::Primary), left(most))?;
+        let mut primary = Self { link, error: None, exception: None, read_only: false };
+        let (mut major, mut configuration) = (None, None);
+        loop {
+            match primary.link.receive(left(most), scan)? {
+                Packet::Version(version, ..) => major = Some(version),
+                Packet::Configuration(found) => configuration = Some(found),
+                _ => {}
+            }
+            if let (Some(major), Some(configuration)) = (major, configuration) {
+                return Ok((primary, major, configuration));
+            }
+        }
+    }
+
+    /// Processes what has arrived, without waiting.
+    pub fn update(&mut self) -> AdapterResult<()> {
+        while let Some(packet) = self.link.poll(scan)? {
+            match packet {
+                Packet::Error { code: READ_ONLY, .. } => self.read_only = true,
+                Packet::Error { code, argument, level } if level >= WARNING => {
+                    self.error = Some((code, argument, MonotonicClock.now()));
+                }
+                Packet::Exception { line, text } => self.exception = Some(format!("line {line}: {text}")),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends a program, which replaces the running one; one that begins with `sec` runs beside it.
+    pub fn run(&mut self, program: &str) -> AdapterResult<()> {
+        self.exception = None;
+        self.link.send(program.as_bytes())
+    }
+
+    /// Processes what has arrived. Returns an error if the controller has refused the program that was sent.
+    pub fn check(&mut self) -> AdapterResult<()> {
+        self.update()?;
+        if let Some(why) = self.exception.take() {
+            return Err(AdapterError::Rejected(format!("the controller refuses the program of dimos: {why}")));
+        }
+        if self.read_only {
+            // A new connection is not read-only once the pendant is in remote control.
+            return Err(AdapterError::Io(
+                "the controller takes no programs from this connection: it was opened in local control\nhint: select \
+                 remote control at the pendant"
+                    .into(),
+            ));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,69 @@
+//! The programs that the adapter sends to the controller. The text is in `control.script`.
+
+use super::Options;
+
+/// The control program, with its constants to be filled in. A counter, checked in each step, ends it when orders no
+/// longer come: the controller's own watchdog would add nothing.
+const CONTROL: &str = include_str!("control.script");
+
+/// Returns the control program. `number` distinguishes its state from that of an earlier one.
+pub fn control(number: i32, options: &Options) -> String {
+    CONTROL
+        .replace("@NUMBER@", &number.to_string())
+        .replace("@LOOKAHEAD@", &options.lookahead_time.to_string())
+        .replace("@GAIN@", &options.gain.to_string())
+        .replace("@DECELERATION@", &options.stop_deceleration.to_string())
+}
+
+/// Returns a program that sets the payload: mass [kg] and centre of gravity [m], and its inertia (xx, yy, zz, xy, xz,
+/// yz [kg·m²]) if it is given.
+pub fn payload(mass: f64, cog: [f64; 3], inertia: Option<[f64; 6]>) -> String {
+    let list = |values: &[f64]| values.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
+    let call = match inertia {
+        Some(inertia) => format!("set_target_payload({mass}, [{}], [{}])", list(&cog), list(&inertia)),
+        None => format!("set_payload({mass}, [{}])", list(&cog)),
+    };
+    beside("dimos_payload", &call)
+}
+
+/// Returns a program that sets the tool's supply voltage [V].
+pub fn tool_voltage(volts: u8) -> String {
+    beside("dimos_tool", &format!("set_tool_voltage({volts})"))
+}
+
+/// Returns a program of one call that runs beside the main one.
+fn beside(name: &str, call: &str) -> String {
+    format!("sec {name}():\n  {call}\nend\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_control_program_is_complete() {
+        let text = control(7, &Options::default());
+        assert!(text.starts_with("def dimos_control():\n") && text.ends_with("\nend\n"));
+        assert!(text.contains("\n  number = 7\n") && !text.contains('@'), "{text}");
+        assert!(text.contains("servoj(q, 0, 0, step, 0.05, 500)") && text.contains("stopj(8)"), "{text}");
+        assert!(text.is_ascii() && text.lines().count() < 80);
+        // Every block is closed, and its lines are indented by two.
+        let mut depth = 0_usize;
+        for line in text.lines() {
+            let words = line.trim();
+            depth -= usize::from(["end", "else:"].contains(&words) || words.starts_with("elif "));
+            assert_eq!(line.len() - words.len(), 2 * depth, "{line:?}");
+            depth += usize::from(words.ends_with(':') && !words.starts_with('#'));
+        }
+        assert_eq!(depth, 0);
+    }
+
+    #[test]
+    fn programs_beside_it_are_single_calls() {
+        assert_eq!(tool_voltage(24), "sec dimos_tool():\n  set_tool_voltage(24)\nend\n");
+        let text = payload(1.5, [0.0, 0.01, 0.05], None);
+        assert_eq!(text, "sec dimos_payload():\n  set_payload(1.5, [0, 0.01, 0.05])\nend\n");
+        let text = payload(1.5, [0.0; 3], Some([0.1, 0.2, 0.3, 0.0, 0.0, 0.0]));
+        assert!(text.contains("set_target_payload(1.5, [0, 0, 0], [0.1, 0.2, 0.3, 0, 0, 0])"), "{text}");
+    }
+}

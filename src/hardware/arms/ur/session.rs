@@ -1,0 +1,302 @@
+//! A connection to a controller: keeps the arm's state up to date, and the program on the controller alive.
+
+use std::os::fd::{AsFd, BorrowedFd};
+use std::time::Duration;
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+use super::address::Address;
+use super::dashboard::Dashboard;
+use super::model::Model;
+use super::primary::Primary;
+use super::protocol::inputs::Order;
+use super::protocol::state::State;
+use super::protocol::status::{self, bits, program, robot};
+use super::rtde::Rtde;
+use super::safety::Stopped;
+use crate::clock::{Clock, Mono, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::transport::device_time::DeviceTime;
+use crate::joint::JointLimits;
+
+/// A live controller sends its state 125 or 500 times per second. Without one for this time the connection is lost,
+/// even if the socket is open.
+const STATE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Without a setpoint, the last order is repeated this often: the program ends when no orders come.
+const HEARTBEAT: Duration = Duration::from_millis(60);
+/// A last setpoint is kept for this time; then the arm holds without one.
+const SETTLED: Duration = Duration::from_secs(1);
+/// Bounds of the time without a velocity after which the arm is held.
+const HOLD_AFTER: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(150));
+/// A program that does not answer orders for this time has failed.
+const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
+/// Time between two reads of the primary interface.
+const PRIMARY_PERIOD: Duration = Duration::from_millis(20);
+/// Joint positions that jump by more than the arm can move plus this [rad] are accepted only when the next state
+/// agrees.
+const MAX_JUMP: f64 = 0.1;
+/// Joints slower than this are at rest [rad/s].
+const REST: f64 = 0.03;
+/// Slider positions from here on are full speed.
+pub(super) const FULL_SPEED: f64 = 0.999;
+
+/// What the arm is.
+pub struct Device {
+    /// Model.
+    pub model: Model,
+    /// Software of the controller.
+    pub software: String,
+    /// Serial number, if it is known.
+    pub serial: Option<String>,
+    /// Joint limits.
+    pub limits: JointLimits,
+}
+
+/// A connected arm.
+pub struct Session {
+    /// What it is.
+    pub device: Device,
+    pub(super) address: Address,
+    pub(super) rtde: Rtde,
+    pub(super) primary: Primary,
+    /// The newest state, when it was measured, and when it came.
+    pub(super) state: State,
+    stamp: Mono,
+    pub(super) fresh_at: Mono,
+    device_time: DeviceTime,
+    suspect: bool,
+    updated: Mono,
+    primary_at: Mono,
+    /// The present stop by the safety system.
+    pub(super) stopped: Option<Stopped>,
+    /// Number of our program, while it runs and takes orders.
+    pub(super) ready: Option<i32>,
+    /// Why it no longer does, if this run did not order that.
+    pub(super) ended: Option<&'static str>,
+    /// It is to end, in case that it is only paused: it would continue.
+    pub(super) end_due: bool,
+    /// The last order: its count, what it was, when it was sent, and since when none has been answered.
+    pub(super) count: i32,
+    pub(super) last: Order,
+    sent_at: Mono,
+    pub(super) unanswered: Option<Mono>,
+    /// When the last setpoint was sent, and the time between it and the one before.
+    setpoint_at: Mono,
+    interval: Duration,
+}
+
+impl Session {
+    /// Starts from a first state. The arm counts as stopped until it is activated.
+    pub fn new(device: Device, address: Address, rtde: Rtde, primary: Primary, first: State) -> Self {
+        let arrived = rtde.arrived;
+        let mut device_time = DeviceTime::default();
+        let stamp = device_time.translate(nanoseconds(first.time), arrived);
+        let mut session = Self {
+            device,
+            address,
+            rtde,
+            primary,
+            state: first,
+            stamp,
+            fresh_at: arrived,
+            device_time,
+            suspect: false,
+            updated: Mono::ZERO,
+            primary_at: Mono::ZERO,
+            stopped: None,
+            ready: None,
+            ended: None,
+            end_due: false,
+            // Not that of an order which the registers still hold.
+            count: first.count.wrapping_add(1000),
+            last: Order::Hold,
+            sent_at: Mono::ZERO,
+            unanswered: None,
+            setpoint_at: Mono::ZERO,
+            interval: HOLD_AFTER.1,
+        };
+        session.see_safety();
+        session
+    }
+
+    /// Returns the descriptor that becomes readable when a state has arrived.
+    pub fn fd(&self) -> BorrowedFd<'_> {
+        self.rtde.as_fd()
+    }
+
+    /// Returns the newest state, and when it was measured.
+    pub fn state(&self) -> (&State, Mono) {
+        (&self.state, self.stamp)
+    }
+
+    /// Returns whether the motors are on and the brakes released.
+    pub fn enabled(&self) -> bool {
+        self.state.robot_mode == robot::RUNNING
+    }
+
+    /// Returns whether a program runs or is paused.
+    pub(super) fn program_runs(&self) -> bool {
+        self.state.status & bits::PROGRAM_RUNNING != 0 && self.state.runtime != status::STOPPED
+    }
+
+    /// Returns whether all joints are at rest.
+    pub(super) fn at_rest(&self) -> bool {
+        self.state.velocity.iter().all(|v| v.abs() < REST)
+    }
+
+    /// Connects to the dashboard.
+    pub(super) fn dashboard(&self) -> AdapterResult<Dashboard> {
+        Dashboard::connect(&self.address, Duration::from_millis(800))
+    }
+
+    /// Processes all that has arrived, without waiting, and keeps the program alive. Does nothing within `age` of the
+    /// previous call.
+    pub fn update(&mut self, age: Duration) -> AdapterResult<()> {
+        let now = MonotonicClock.now();
+        if now.since(self.updated) < age {
+            return Ok(());
+        }
+        self.updated = now;
+        if let Some(state) = self.rtde.newest()? {
+            self.take(state);
+        }
+        let now = MonotonicClock.now();
+        if now.since(self.fresh_at) > STATE_TIMEOUT {
+            return Err(AdapterError::Io(format!("ur at {} sent no new state for {STATE_TIMEOUT:?}", self.address)));
+        }
+        if now.since(self.primary_at) > PRIMARY_PERIOD || self.stopped.is_some_and(|stopped| stopped.error.is_none()) {
+            self.primary_at = now;
+            self.primary.update()?;
+            self.see_error();
+        }
+        if self.unanswered.is_some_and(|since| now.since(since) > ANSWER_TIMEOUT) {
+            self.lose_program("the program on the controller does not answer");
+        }
+        if std::mem::take(&mut self.end_due) {
+            self.order(Order::Stop)?;
+            self.unanswered = None;
+        }
+        self.keep_alive(now)
+    }
+
+    /// Takes a state.
+    fn take(&mut self, state: State) {
+        if state.time == self.state.time {
+            return; // the same measurement again
+        }
+        let arrived = self.rtde.arrived;
+        let top = self.device.limits.velocity_max.iter().copied().fold(0.0, f64::max);
+        let reach = MAX_JUMP + 1.5 * top * arrived.since(self.fresh_at).as_secs_f64();
+        let jumps = state.position.iter().zip(&self.state.position).any(|(new, old)| (new - old).abs() > reach);
+        if jumps && !self.suspect {
+            self.suspect = true;
+            return;
+        }
+        self.suspect = false;
+        self.stamp = self.device_time.translate(nanoseconds(state.time), arrived);
+        (self.fresh_at, self.state) = (arrived, state);
+        if state.count == self.count {
+            self.unanswered = None;
+        }
+        self.see_safety();
+        self.see_program();
+    }
+
+    /// Checks that our program still runs.
+    fn see_program(&mut self) {
+        let Some(number) = self.ready else { return };
+        let state = &self.state;
+        if state.slider < FULL_SPEED {
+            self.lose_program("the pendant's speed slider was moved: setpoints would be followed late");
+        } else if !self.enabled() {
+            self.ready = None; // the motors' state says it
+        } else if state.number == number && state.program == program::SILENT {
+            self.lose_program("the program on the controller ended: no orders reached it in time");
+        } else if state.runtime == status::PAUSED {
+            self.lose_program("the program on the controller was paused");
+        } else if !self.program_runs() || state.number != number || state.program >= program::STOPPED {
+            self.lose_program("another client or the pendant ended the program on the controller");
+        }
+    }
+
+    /// Records that the program takes no more orders. It ends if it still runs.
+    fn lose_program(&mut self, why: &'static str) {
+        self.unanswered = None;
+        if self.ready.take().is_some() {
+            (self.ended, self.end_due) = (Some(why), true);
+        }
+    }
+
+    /// Repeats the last order where no setpoints come. The end of a stream of velocities is a hold.
+    fn keep_alive(&mut self, now: Mono) -> AdapterResult<()> {
+        if self.ready.is_none() {
+            return Ok(());
+        }
+        let idle = now.since(self.setpoint_at);
+        let next = match self.last {
+            Order::Speed(_) if idle > (5 * self.interval / 2).clamp(HOLD_AFTER.0, HOLD_AFTER.1) => Order::Hold,
+            Order::Speed(_) => return Ok(()),
+            _ if now.since(self.sent_at) < HEARTBEAT => return Ok(()),
+            Order::Servo(_) if idle > SETTLED => Order::Hold,
+            last => last,
+        };
+        self.order(next)
+    }
+
+    /// Sends an order.
+    pub(super) fn order(&mut self, order: Order) -> AdapterResult<()> {
+        self.count = self.count.wrapping_add(1);
+        self.rtde.order(self.count, order)?;
+        self.sent_at = MonotonicClock.now();
+        self.unanswered.get_or_insert(self.sent_at);
+        self.last = order;
+        Ok(())
+    }
+
+    /// Sends a setpoint.
+    pub(super) fn setpoint(&mut self, order: Order) -> AdapterResult<()> {
+        let now = MonotonicClock.now();
+        self.interval = now.since(self.setpoint_at).min(HOLD_AFTER.1);
+        self.setpoint_at = now;
+        self.order(order)
+    }
+
+    /// Waits for the next state, at most 5 ms.
+    fn pause(&self) {
+        let timeout = Timespec { tv_sec: 0, tv_nsec: 5_000_000 };
+        let _ = poll(&mut [PollFd::from_borrowed_fd(self.fd(), PollFlags::IN)], Some(&timeout));
+    }
+
+    /// Processes what arrives until `done` returns a value; `None` after `limit`.
+    pub(super) fn wait<T>(
+        &mut self,
+        limit: Duration,
+        mut done: impl FnMut(&mut Self) -> AdapterResult<Option<T>>,
+    ) -> AdapterResult<Option<T>> {
+        let until = MonotonicClock.now().after(limit);
+        loop {
+            self.update(Duration::ZERO)?;
+            if let Some(found) = done(self)? {
+                return Ok(Some(found));
+            }
+            if MonotonicClock.now() >= until {
+                return Ok(None);
+            }
+            self.pause();
+        }
+    }
+
+    /// Closes the connections, and discards unsent bytes.
+    pub fn abort(self) {
+        self.rtde.abort(self.count.wrapping_add(1));
+    }
+
+    /// Returns what another client, or a person at the pendant, changed. `None` during a stop by the safety system.
+    pub fn foreign_change(&self) -> Option<&'static str> {
+        self.ended.filter(|_| self.stopped.is_none())
+    }
+}
+
+fn nanoseconds(seconds: f64) -> u64 {
+    (seconds * 1e9) as u64
+}

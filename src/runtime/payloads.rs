@@ -1,0 +1,192 @@
+//! Loads at the flange: set by request, and with objects of known mass that a robot holds.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use super::arm_requests::{order, refused};
+use super::service::{Service, internal};
+use crate::arm::Load;
+use crate::control::request::Request;
+use crate::hardware::adapter::AdapterError;
+use crate::joint::STANDSTILL;
+use crate::rpc::api::{self, AttachReply, LoadReport, PayloadReply, Reply, Request as Call};
+use crate::rpc::{Code, RpcError};
+use crate::telemetry::describe::Severity;
+use crate::telemetry::{Phase, TaskState};
+
+/// How long a controller may refuse a load because the arm still moves, and the time between two tries.
+const SETTLING_LIMIT: Duration = Duration::from_millis(600);
+const RETRY_PERIOD: Duration = Duration::from_millis(100);
+
+/// The objects that an arm holds and whose mass is known.
+#[derive(Debug, Default)]
+pub(super) struct HeldLoads {
+    /// The load without them: read when the first one was attached.
+    base: Load,
+    /// By name.
+    objects: BTreeMap<String, Load>,
+}
+
+impl HeldLoads {
+    fn total(&self) -> Load {
+        self.objects.values().fold(self.base, |sum, load| sum.plus(load))
+    }
+}
+
+impl Service {
+    /// Reads the load that an arm's controller calculates with.
+    pub(super) async fn payload(&self, id: &str) -> Result<PayloadReply, RpcError> {
+        let arm = self.arm_index(id)?;
+        self.takes_payload(arm)?;
+        let load = order(self.device(arm)?.read_payload()).await;
+        let load = load.map_err(|e| refused(id, "did not report its payload", &e))?;
+        Ok(PayloadReply { payload: load.map(LoadReport::from) })
+    }
+
+    /// Sets the load at an arm's flange: all of it, with the objects that the arm holds.
+    pub(super) async fn set_payload(&self, call: api::ArmPayloadSet) -> Result<Reply, RpcError> {
+        let arm = self.arm_index(&call.arm)?;
+        self.takes_payload(arm)?;
+        let held = &mut *self.held_loads.get(arm as usize).ok_or_else(internal)?.lock().await;
+        let payload = self.write_payload(arm, &call.load()).await?;
+        held.objects.clear();
+        Ok(Reply::ArmPayloadSet(PayloadReply { payload }))
+    }
+
+    fn takes_payload(&self, arm: u16) -> Result<(), RpcError> {
+        if self.parts.connected.get(arm as usize).is_some_and(|connected| connected.has_payload) {
+            return Ok(());
+        }
+        let what = format!("the controller of {} takes no payload", self.parts.names.arm(arm));
+        Err(RpcError::new(Code::Unsupported, what).hint("its page in docs/arms lists what the adapter supports"))
+    }
+
+    /// Sets a load at rest, and returns what the controller reports.
+    async fn write_payload(&self, arm: u16, load: &Load) -> Result<Option<LoadReport>, RpcError> {
+        self.rests(arm)?;
+        let name = self.parts.names.arm(arm);
+        let resets = self.parts.connected.get(arm as usize).is_some_and(|connected| connected.payload_resets);
+        let again = resets && matches!(self.phase(arm as usize), Phase::Activating | Phase::Ready);
+        if again {
+            self.ask(Request::PrepareDisable { arm }).await?;
+            self.wait_for_rest(&name, arm, Instant::now() + self.braking_limit(arm)).await?;
+        }
+        let (device, limit) = (self.device(arm)?, Instant::now() + SETTLING_LIMIT);
+        let mut actual = order(device.set_payload(*load)).await;
+        // The controller may count the arm as moving for slightly longer than it does here.
+        while matches!(actual, Err(AdapterError::Rejected(_))) && Instant::now() < limit {
+            self.until(Instant::now() + RETRY_PERIOD, || None::<()>).await;
+            actual = order(device.set_payload(*load)).await;
+        }
+        if again {
+            self.enable(name.clone()).await?;
+        }
+        let actual = actual.map_err(|e| refused(&name, "did not take the payload", &e))?;
+        let [x, y, z] = load.center;
+        self.parts
+            .dispatcher
+            .log(Severity::Info, format!("{name}: payload set to {:.3} kg at {x:.4} {y:.4} {z:.4} m", load.mass));
+        // Each load is logged, also one that is soon replaced.
+        self.log_details();
+        Ok(actual.map(LoadReport::from))
+    }
+
+    /// Returns an error while an arm moves or executes a motion.
+    fn rests(&self, arm: u16) -> Result<(), RpcError> {
+        let joints = self.joints_of_arm(arm);
+        let tasks = self.parts.config.tasks.iter().enumerate();
+        let mut of_arm = tasks.filter(|(_, task)| task.joints.iter().any(|j| joints.contains(j)));
+        // A stream at rest does not move the arm.
+        let executes = |index| {
+            let view = self.task_view(index);
+            view.motion > 0 && matches!(view.state, TaskState::Executing | TaskState::Cancelling)
+        };
+        let busy = of_arm.find(|(index, _)| executes(*index)).map(|(_, task)| &task.name);
+        let (name, speed) = (self.parts.names.arm(arm), self.speed(arm));
+        let what = match busy {
+            Some(task) => format!("{name} moves: task {task} is executing"),
+            None if speed > STANDSTILL => format!("{name} moves at {speed:.2} rad/s"),
+            None => return Ok(()),
+        };
+        Err(RpcError::new(Code::ArmNotReady, what).hint("a payload is set at rest: wait, or end the motion first"))
+    }
+
+    /// Attaches an object to a robot; with a mass, the arm's controller is set to carry it.
+    pub(super) async fn attach(&self, call: api::Attach) -> Result<Reply, RpcError> {
+        let (name, robot) = (call.name.clone(), call.robot.clone());
+        let arm = match call.mass {
+            Some(_) => self.arm_of_robot(&robot).await?.filter(|arm| self.takes_payload(*arm).is_ok()),
+            None => None,
+        };
+        let Some(arm) = arm else { return self.planner_call(Call::Attach(call)).await };
+        let held = &mut *self.held_loads.get(arm as usize).ok_or_else(internal)?.lock().await;
+        self.rests(arm)?;
+        let Reply::Attach(attached) = self.planner_call(Call::Attach(call)).await? else { return Err(internal()) };
+        let Some(load) = attached.load else { return Err(internal()) };
+        let carried = self.carry(arm, held, &name, Some(load.into())).await;
+        match carried {
+            Ok(payload) => Ok(Reply::Attach(AttachReply { payload, ..attached })),
+            Err(error) => {
+                // An object that the controller does not carry stays in the world.
+                let _ = self.planner_call(Call::Detach(api::Detach { name })).await;
+                Err(error)
+            }
+        }
+    }
+
+    /// Detaches an object; the controller no longer carries its mass.
+    pub(super) async fn detach(&self, call: api::Detach) -> Result<Reply, RpcError> {
+        for (arm, held) in self.held_loads.iter().enumerate() {
+            let held = &mut *held.lock().await;
+            if held.objects.contains_key(&call.name) {
+                self.rests(arm as u16)?;
+                let name = call.name.clone();
+                let detached = self.planner_call(Call::Detach(call)).await?;
+                self.carry(arm as u16, held, &name, None).await?;
+                return Ok(detached);
+            }
+        }
+        self.planner_call(Call::Detach(call)).await
+    }
+
+    /// Adds or removes an object of an arm's load, and sets the load.
+    async fn carry(
+        &self,
+        arm: u16,
+        held: &mut HeldLoads,
+        object: &str,
+        load: Option<Load>,
+    ) -> Result<Option<LoadReport>, RpcError> {
+        if held.objects.is_empty() {
+            let name = self.parts.names.arm(arm);
+            let base = order(self.device(arm)?.read_payload()).await;
+            let base = base.map_err(|e| refused(&name, "did not report its payload", &e))?;
+            // A controller that reports none has what was set.
+            held.base = base.or(self.device(arm)?.health().details().payload).unwrap_or_default();
+        }
+        let before = match load {
+            Some(load) => held.objects.insert(object.to_owned(), load),
+            None => held.objects.remove(object),
+        };
+        let set = self.write_payload(arm, &held.total()).await;
+        if set.is_err() {
+            match before {
+                Some(before) => held.objects.insert(object.to_owned(), before),
+                None => held.objects.remove(object),
+            };
+        }
+        set
+    }
+
+    /// Returns the arm of a planning robot; `None` if it has no joints of an arm.
+    async fn arm_of_robot(&self, robot: &str) -> Result<Option<u16>, RpcError> {
+        let Reply::Planner(report) = self.planner_call(Call::Planner(api::Planner {})).await? else {
+            return Err(internal());
+        };
+        let joints = report.robots.into_iter().find(|found| found.name == robot).map(|found| found.joints);
+        let arms = self.parts.names.arms.iter();
+        Ok(joints.and_then(|joints| {
+            arms.zip(0..).find(|(arm, _)| joints.iter().any(|j| arm.joints.contains(j))).map(|(_, index)| index)
+        }))
+    }
+}

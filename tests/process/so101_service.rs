@@ -1,0 +1,150 @@
+//! `dimos arm find-port`, `setup-motors`, `calibrate` and `configure`, as a person uses them: in a terminal, with the
+//! emulated servos of an SO-101 on another one.
+
+use std::os::unix::fs::symlink;
+
+use dimos::hardware::arms::so101::calibration::{Calibration, NAMES};
+use dimos::hardware::arms::so101::emulator::{Servos, start};
+use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
+use dimos::hardware::sim::arm::HasArm;
+use dimos::hardware::sim::faults::{Fault, FaultKind};
+use dimos::hardware::sim::serial_server::SerialServer;
+use serde_json::{Value, json};
+
+use crate::support::program::{Home, eventually};
+use crate::support::terminal::Terminal;
+
+/// Starts the emulator with these settings.
+fn emulate(sim: Value) -> SerialServer<Servos> {
+    let options = json!({ "sim": sim });
+    let config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: 5, options };
+    start(&config, &EmulatorAddress::Pty).unwrap()
+}
+
+/// A hand moves a joint to an end of its range.
+fn push(servos: &dyn Emulator, joint: usize, amount: f64) {
+    servos.inject(Fault { joint, amount, ..Fault::new(FaultKind::Pushed) }).unwrap();
+}
+
+/// The same, until the table shows it.
+fn push_seen(terminal: &Terminal, servos: &dyn Emulator, joint: usize, amount: f64) {
+    let row = || terminal.text().lines().rfind(|line| line.starts_with(NAMES[joint - 1])).map(str::to_owned);
+    let before = row();
+    push(servos, joint, amount);
+    eventually("the table shows the joint's position", || row() != before);
+}
+
+#[test]
+fn an_arm_is_calibrated_by_hand_with_its_motors_off() {
+    let home = Home::new();
+    let servos = emulate(json!({"initial_positions": [0.1, -0.3, 0.2, 0.0, 0.5, 0.4]}));
+    let line = format!("arm calibrate so101 --address {} --file mine/arm.json", servos.address());
+    home.dimos(&line).with(2).says(&["stdin is not a terminal", "--yes asks nothing"]);
+
+    // Ctrl-C in the table changes nothing.
+    let terminal = Terminal::new(100, 30);
+    let begun = terminal.start(&home, &line);
+    terminal.until("Bring every joint to the middle of its range, then press Enter");
+    terminal.keys("\n");
+    terminal.until("shoulder_pan");
+    terminal.keys("\x03");
+    begun.wait().with(130);
+    assert_eq!(servos.with(|servos, _| servos.byte(0, 31)), 0);
+    assert!(!home.path().join("mine").exists());
+
+    let terminal = Terminal::new(100, 30);
+    let begun = terminal.start(&home, &line);
+    terminal.until("Bring every joint to the middle of its range, then press Enter");
+    terminal.keys("\n");
+    terminal.until("Move these joints through their whole range");
+    terminal.until("gripper        2047  2047  2047");
+    // Both ends of the first joint, as its encoder shows them with the new offset: the table shows them live.
+    push(&servos, 1, -10.0);
+    terminal.until("shoulder_pan    730   730  2047");
+    // A hand is slower than that: no joint turns by half a turn between two readings.
+    push_seen(&terminal, &servos, 1, 1.5);
+    push(&servos, 1, 10.0);
+    terminal.until("shoulder_pan    730  3234  3234");
+    for joint in [2, 3, 4, 6] {
+        [-10.0, 1.0, 10.0].into_iter().for_each(|amount| push_seen(&terminal, &servos, joint, amount));
+    }
+    terminal.until("gripper        1672  2924  2924");
+    terminal.keys("\n");
+    begun.wait().with(0);
+    terminal.until("written to the motors, read back, and saved: mine/arm.json");
+
+    let path = home.path().join("mine/arm.json");
+    let [pan, .., roll, gripper] = Calibration::read(&path).unwrap();
+    assert_eq!((pan.homing_offset, pan.range_min, pan.range_max), (66, 730, 3234));
+    assert_eq!((roll.range_min, roll.range_max), (0, 4095), "it has no end stops");
+    assert_eq!((gripper.id, gripper.range_min, gripper.range_max), (6, 1672, 2924));
+    let registers = servos.with(|servos, _| [31, 9, 10, 11, 12, 55].map(|address| servos.byte(0, address)));
+    assert_eq!(registers, [66, 730u16.to_le_bytes()[0], 730u16.to_le_bytes()[1], 3234u16.to_le_bytes()[0], 12, 1]);
+    assert!(!servos.with(|servos, _| servos.arm().enabled()), "no motor was switched on");
+    home.dimos(&line).with(2).says(&["mine/arm.json exists", "--force"]);
+
+    // A joint that was not moved has no range; nothing is written.
+    let again = format!("{line} --force --yes --record-for 100ms");
+    home.dimos(&again).with(1).says(&["shoulder_pan was not moved: its range is 0 counts", "nothing was written"]);
+    assert_eq!(Calibration::read(&path).unwrap()[0], pan);
+    let restore = format!("arm calibrate so101 --address {} --yes --restore mine/arm.json", servos.address());
+    home.dimos(&restore).with(0).says(&["the motors have the calibration of mine/arm.json already"]);
+}
+
+#[test]
+fn the_motors_of_a_new_arm_get_their_numbers() {
+    let home = Home::new();
+    let servos = emulate(json!({"ids": [1, 0, 0, 0, 0, 1], "factory": true}));
+    let terminal = Terminal::new(100, 40);
+    let begun = terminal.start(&home, &format!("arm setup-motors so101 --address {}", servos.address()));
+    terminal.until("Connect only the motor of gripper to the board, then press Enter");
+    terminal.keys("\n");
+    terminal.until("2 servos answer: [1, 1]");
+    for (motor, name) in NAMES.iter().enumerate().rev() {
+        servos.with(|servos, _| (0..6).for_each(|other| servos.plug(other, u8::from(other == motor))));
+        terminal.keys("\n");
+        terminal.until(&format!("{name}: number {} (was 1, at 1000000 bit/s)", motor + 1));
+    }
+    begun.wait().with(0);
+    let both = |motors: &str| format!("arm setup-motors so101 --address {} --yes {motors}", servos.address());
+    home.dimos(&both("--motor gripper --motor wrist_roll")).with(2);
+    home.dimos(&both("--motor elbow")).with(2).says(&["no motor named \"elbow\"", "elbow_flex"]);
+    home.dimos(&both("--motor shoulder_pan")).with(0);
+
+    // All together now, with the settings of the factory.
+    servos.with(|servos, _| (0..6).for_each(|servo| servos.plug(servo, servo as u8 + 1)));
+    let configure = |more: &str| home.dimos(&format!("arm configure so101 --address {} {more}", servos.address()));
+    let found = configure("--check --json").with(1).says(&["9 settings have another value"]).json();
+    assert_eq!(found[0], json!({"motor": "shoulder_pan", "name": "P coefficient", "found": 32, "wanted": 16}));
+    configure("").with(2).says(&["stdin is not a terminal"]);
+    configure("--yes").with(0).says(&["9 settings were written and read back"]);
+    configure("--check").with(0).says(&["all settings are as the adapter wants them"]);
+}
+
+#[test]
+fn the_port_of_an_arm_is_found() {
+    let home = Home::new();
+    let (servos, other) = (emulate(json!({})), emulate(json!({"ids": [0, 0, 0, 0, 0, 0]})));
+    let (here, there) = (servos.address(), other.address());
+    let ask = home.dimos(&format!("arm find-port --ask so101 --port {here} --port {there}")).with(0);
+    let answer = |port: &str| ask.out.lines().find(|line| line.split(' ').next() == Some(port)).unwrap().to_owned();
+    assert!(answer(&here).ends_with("SO-101: 6 servos STS3215, firmware 3.10"), "{}", ask.out);
+    assert!(answer(&there).contains("servo 1 (shoulder_pan)"), "{}", ask.out);
+    home.dimos(&format!("arm find-port --ask so101 --port {there}")).with(3).says(&["no so101 answers"]);
+    home.dimos(&format!("arm find-port --ask piper --port {there}")).with(2).says(&["adapters with such a bus: so101"]);
+
+    // The cable: a link that disappears, and comes back with another name.
+    let [first, second, third] = ["port-a", "port-b", "port-c"].map(|name| home.path().join(name));
+    symlink(&here, &first).unwrap();
+    symlink(&there, &second).unwrap();
+    let ports = [&first, &second, &third].map(|port| format!("--port {}", port.display())).join(" ");
+    let terminal = Terminal::new(140, 30);
+    let begun = terminal.start(&home, &format!("arm find-port {ports}"));
+    terminal.until("Unplug the arm's USB cable, then press Enter");
+    std::fs::remove_file(&first).unwrap();
+    terminal.keys("\n");
+    terminal.until("port-a is gone. Plug the arm in again");
+    symlink(&here, &third).unwrap();
+    terminal.until("port-c");
+    begun.wait().with(0);
+}

@@ -1,0 +1,1 @@
+../../../assets/templates/tcp/golden.rs

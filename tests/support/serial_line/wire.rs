@@ -1,0 +1,1 @@
+../../../assets/templates/serial/wire.rs
