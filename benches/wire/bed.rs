@@ -57,6 +57,7 @@ impl Arm {
             supervision: dimos::arm::Supervision::default(),
             setup: dimos::hardware::device::Setup::default(),
             beat: beat.clone(),
+            pace: None,
             clock: Arc::new(MonotonicClock),
             notes: Box::new(|_| {}),
         };

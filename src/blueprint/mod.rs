@@ -25,6 +25,7 @@ pub mod size;
 mod summary;
 mod task_robots;
 mod tasks;
+mod tick_clock;
 
 pub use catalog::Catalog;
 pub use json_schema::{full_schema, json_schema};
@@ -35,3 +36,4 @@ pub use registry::{FindError, Found, Listing, SearchPath, Source, embed, find, l
 pub use resolve::{Arm, Blueprint, Task, TaskRobot, UsedAsset};
 pub use schema::{CoordinatorConfig, OnExit, RecordingConfig, RpcConfig};
 pub use summary::{ArmSummary, JointSummary, Limit, Origin, Summary, TaskSummary};
+pub use tick_clock::TickClock;

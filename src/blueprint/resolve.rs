@@ -10,7 +10,7 @@ use crate::blueprint::limits::JointOverride;
 use crate::blueprint::planner::{ViewBackend, ViewConfig};
 use crate::blueprint::schema::{BlueprintFile, CoordinatorConfig, HardwareType, OnExit, RecordingConfig, RpcConfig};
 use crate::blueprint::task_robots::{self, Base};
-use crate::blueprint::{arms, assets, park, planner_check, planner_files, planner_models, tasks};
+use crate::blueprint::{arms, assets, park, planner_check, planner_files, planner_models, tasks, tick_clock};
 use crate::control::task_spec::TaskSpec;
 use crate::hardware::device::Setup;
 use crate::hardware::registry::AdapterSpec;
@@ -204,6 +204,7 @@ pub(super) fn resolve(mut checker: Checker<'_>, file: BlueprintFile, default_nam
     }
     let hardware = arms::resolve(&mut checker, &file.hardware);
     let mut tasks = tasks::resolve(&mut checker, &file.tasks, &hardware);
+    tick_clock::check(&mut checker, &file.coordinator.clock, &hardware);
     park::check_tasks(&mut checker, &file.hardware, &tasks, &hardware);
     checker.assets = Assets::of(file.assets);
     assets::check(&mut checker, &file.tasks, file.planner.as_ref());

@@ -11,6 +11,7 @@ use crate::blueprint::limits::LimitsEntry;
 use crate::blueprint::parts::{MountingEntry, PayloadEntry, StopInputEntry};
 use crate::blueprint::planner::{PlannerEntry, ViewConfig};
 use crate::blueprint::size::Size;
+use crate::blueprint::tick_clock::TickClock;
 use crate::yaml::range::{self, tick_rate};
 use crate::yaml::{Keyed, Located, Raw};
 
@@ -53,6 +54,9 @@ pub struct CoordinatorConfig {
     #[serde(deserialize_with = "tick_rate")]
     #[schemars(range(min = 1.0, max = 2000.0))]
     pub tick_rate: f64,
+    /// What starts a tick: `host`, this computer's clock, or `device(ARM)`: the states that this arm sends by itself, one
+    /// per cycle of its controller. Its rate is then `tick_rate` or a multiple of it. The other arms follow.
+    pub clock: TickClock,
     /// Whether the joint state is published to clients.
     pub publish_joint_state: bool,
     /// `frame_id` of published joint states.
@@ -61,7 +65,7 @@ pub struct CoordinatorConfig {
 
 impl Default for CoordinatorConfig {
     fn default() -> Self {
-        Self { tick_rate: 100.0, publish_joint_state: true, joint_state_frame_id: "coordinator".to_owned() }
+        Self { tick_rate: 100.0, clock: TickClock::Host, publish_joint_state: true, joint_state_frame_id: "coordinator".to_owned() }
     }
 }
 

@@ -37,7 +37,9 @@ pub fn text(report: &StatusReport, socket: &Path, end: &str) -> Vec<String> {
         row("arm", format!("{}: {standing}{}{address}, {}", arm.hardware_id, arm.adapter, arm.phase));
         row("", format!("at exit: {}", at_exit(arm)));
     }
-    row("tick", format!("{} Hz", report.tick_rate));
+    let clock = Some(&report.ticks.clock).filter(|clock| clock.starts_with("device"));
+    let clock = clock.map(|clock| format!(", clock: {clock}")).unwrap_or_default();
+    row("tick", format!("{} Hz{clock}", report.tick_rate));
     for (index, text) in report.realtime.iter().flat_map(realtime).enumerate() {
         row(if index == 0 { "real time" } else { "" }, text);
     }

@@ -180,7 +180,7 @@ fn terminal() -> Result<Terminal> {
 struct Keep {
     duration: Option<Duration>,
     json: bool,
-    /// Whether somebody learned that the run is up: otherwise nobody expects that its arms move at its end.
+    /// Whether a client or a terminal was shown that the run is up: otherwise no one expects its arms to move at its end.
     seen: bool,
 }
 

@@ -324,7 +324,8 @@ fn joints(names: &[String]) -> String {
 
 fn print_timing(r: &StatusReport) {
     let t = &r.ticks;
-    let heading = format!("TICK {:.0} Hz", r.tick_rate);
+    let clocked = if t.clock.starts_with("device") { format!(", {}", t.clock) } else { String::new() };
+    let heading = format!("TICK {:.0} Hz{clocked}", r.tick_rate);
     let mut table = Table::new(&[&heading, ">p50 µs", ">p99 µs", ">p99.9 µs", ">max µs"]);
     let mut row = |what: &str, p: &Percentiles| {
         let figures = [p.p50, p.p99, p.p99_9, p.max].map(|v| format!("{v:.1}"));
@@ -334,6 +335,9 @@ fn print_timing(r: &StatusReport) {
     row("compute", &t.compute_us);
     table.print();
     output::line(format_args!("  ticks: {}, overruns: {}, periods skipped: {}", t.count, t.overruns, t.skipped));
+    if !clocked.is_empty() {
+        output::line(format_args!("  ticks without a state of the arm that clocks them: {}", t.without_state));
+    }
     for text in r.realtime.iter().flat_map(super::banner::realtime) {
         output::line(format_args!("  {text}"));
     }

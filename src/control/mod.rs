@@ -14,6 +14,7 @@ pub mod estimate;
 pub mod failsafe;
 pub mod feedback;
 pub mod limit;
+pub mod pace;
 pub mod path_clock;
 pub mod plausibility;
 pub mod point_to_point;

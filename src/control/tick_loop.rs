@@ -1,4 +1,4 @@
-//! The thread that runs the coordinator: sleeps until each absolute deadline, reads the state slots, ticks, fills the
+//! The thread that runs the coordinator: waits for the start of each tick, reads the state slots, ticks, fills the
 //! command slots, wakes the device threads, then reports. It neither allocates, locks nor logs, and waits for no other
 //! thread.
 
@@ -6,10 +6,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::time::Duration;
 
-use super::coordinator::{Coordinator, TickTime};
+use super::coordinator::Coordinator;
+use super::pace::{Pacer, Source, Start};
 use super::request::{Envelope, Motion};
 use crate::arm::{ArmCommand, ArmState};
-use crate::clock::{Clock, Mono};
+use crate::clock::Clock;
 use crate::rt::due::Due;
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::histogram::Histogram;
@@ -31,6 +32,8 @@ pub struct Pulse {
     pub overruns: AtomicU64,
     /// Number of periods skipped.
     pub skipped: AtomicU64,
+    /// Number of ticks that this computer's clock began because the arm that clocks them was silent.
+    pub unprompted: AtomicU64,
     /// Whether the thread runs with SCHED_FIFO.
     pub fifo: AtomicBool,
     /// Whether no command moves an arm.
@@ -75,28 +78,14 @@ pub struct TickPorts {
     pub arm_views: Vec<SlotWriter<ArmSample>>,
     /// Latest views for rpc, one per task.
     pub task_views: Vec<SlotWriter<TaskView>>,
+    /// What starts the ticks.
+    pub source: Source,
     /// Shared with its observers.
     pub pulse: Arc<Pulse>,
 }
 
 /// Called at the start of each tick. Tests and benchmarks use it to delay, hang or end the thread.
 pub type Probe = Box<dyn FnMut(u64) + Send>;
-
-/// Returns the number of whole periods lost by a late wake-up. The tick then uses the last deadline before it as "now".
-pub fn missed_periods(deadline: Mono, woke: Mono, period: Duration) -> u32 {
-    let period = (period.as_nanos() as u64).max(1);
-    (woke.0.saturating_sub(deadline.0) / period).min(u32::MAX as u64) as u32
-}
-
-/// Returns the next deadline of the grid and the number of skipped ones: two ticks are at least half a period apart,
-/// and there is never a burst.
-pub fn next_deadline(deadline: Mono, woke: Mono, period: Duration) -> (Mono, u32) {
-    let period = (period.as_nanos() as u64).max(1);
-    let next = deadline.0.saturating_add(period);
-    let earliest = woke.0.saturating_add(period / 2);
-    let skipped = earliest.saturating_sub(next).div_ceil(period);
-    (Mono(next.saturating_add(skipped * period)), skipped.min(u32::MAX as u64) as u32)
-}
 
 /// Runs ticks until `pulse.stop`.
 pub fn run(
@@ -109,32 +98,21 @@ pub fn run(
     let pulse = ports.pulse.clone();
     pulse.fifo.store(host::enter_realtime(host::TICK_PRIORITY), Ordering::Relaxed);
     let mut states = vec![ArmState::default(); ports.states.len()];
-    let mut deadline = clock.now().after(period);
-    let (mut tick, mut skips_before, mut late_before, mut dropped) = (0u64, 0u32, 0u64, 0u32);
+    let mut pacer = Pacer::new(ports.source, clock.now(), period);
+    let (mut tick, mut dropped) = (0u64, 0u32);
     pulse.beat.adopt_thread();
     pulse.beat.beat(clock.now());
     while !pulse.stop.load(Ordering::Relaxed) {
-        pulse.beat.sleep_until(deadline);
-        host::sleep_until(deadline);
-        pulse.beat.awake();
-        let woke = clock.now();
+        let Start { time, woke, unprompted } = pacer.wait(clock, &pulse.beat, &mut ports.states);
         if let Some(probe) = &mut probe {
             probe(tick);
         }
-        let late_ns = woke.0.saturating_sub(deadline.0);
-        let missed = missed_periods(deadline, woke, period);
-        deadline = deadline.after(period * missed);
-        let skipped = skips_before + missed;
-        let (next, skips_after) = next_deadline(deadline, woke, period);
         pulse.begun.store(tick + 1, Ordering::SeqCst);
         for ((state, slot), due) in states.iter_mut().zip(&mut ports.states).zip(&ports.dues) {
             *state = slot.read();
             state.own_delay_ns = due.overdue(woke).as_nanos() as u64;
         }
         let requests = &mut ports.requests;
-        // What was skipped before this tick is reported with the lateness that caused it.
-        let worst = if skips_before > 0 { late_ns.max(late_before) } else { late_ns };
-        let time = TickTime { now: deadline, next, skipped, late_ns: worst, woke_late_ns: late_ns };
         let output = coordinator.tick(time, &states, || requests.pop().ok());
         let mut overwritten = 0;
         for (slot, command) in ports.commands.iter_mut().zip(&output.commands) {
@@ -153,8 +131,16 @@ pub fn run(
                 std::mem::forget(motion);
             }
         }
-        let timing =
-            TickSample { tick, deadline, next, late_ns, compute_ns, skipped, overrun_ns: time.late_ns, dropped };
+        let timing = TickSample {
+            tick,
+            deadline: time.now,
+            next: time.next,
+            late_ns: time.woke_late_ns,
+            compute_ns,
+            skipped: time.skipped,
+            overrun_ns: time.late_ns,
+            dropped,
+        };
         let wanted = output.arms.len() + output.events.len() + 1;
         if let Ok(chunk) = ports.samples.write_chunk_uninit(wanted) {
             let arms = output.arms.iter().map(|a| Sample::Arm(*a));
@@ -180,50 +166,17 @@ pub fn run(
             }
         }
         pulse.at_rest.store(coordinator.at_rest(), Ordering::Release);
-        pulse.lateness.record(late_ns);
+        pulse.lateness.record(time.woke_late_ns);
         pulse.compute.record(compute_ns);
         pulse.overwritten.fetch_add(overwritten, Ordering::Relaxed);
-        pulse.overruns.fetch_add(u64::from(skipped > 0), Ordering::Relaxed);
-        pulse.skipped.fetch_add(skipped as u64, Ordering::Relaxed);
+        pulse.overruns.fetch_add(u64::from(time.skipped > 0), Ordering::Relaxed);
+        pulse.skipped.fetch_add(time.skipped as u64, Ordering::Relaxed);
+        pulse.unprompted.fetch_add(u64::from(unprompted), Ordering::Relaxed);
         pulse.ticks.store(tick + 1, Ordering::Release);
         let watched = pulse.streaming.load(Ordering::Relaxed) || pulse.waiting.load(Ordering::Relaxed) > 0;
         if replied || watched {
             ports.reply_wake.raise();
         }
         tick += 1;
-        (skips_before, late_before) = (skips_after, late_ns);
-        deadline = next;
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    const P: Duration = Duration::from_millis(10);
-
-    fn ms(ms: f64) -> Mono {
-        Mono((ms * 1e6) as u64)
-    }
-
-    #[test]
-    fn f20_an_overrun_skips_whole_periods_and_never_bursts() {
-        for (woke, next, skipped) in [
-            (100.0, 110.0, 0),
-            (104.9, 110.0, 0),
-            (105.0, 110.0, 0),
-            (105.1, 120.0, 1),
-            (112.0, 120.0, 1),
-            (119.0, 130.0, 2),
-            (150.0, 160.0, 5),
-            (1234.0, 1240.0, 113),
-        ] {
-            let missed = missed_periods(ms(100.0), ms(woke), P);
-            let deadline = ms(100.0).after(P * missed);
-            let (n, s) = next_deadline(deadline, ms(woke), P);
-            assert_eq!((n, missed + s), (ms(next), skipped), "woke at {woke}");
-            assert!(deadline <= ms(woke) && ms(woke).since(deadline) < P);
-            assert!(n.since(ms(woke)) >= P / 2);
-        }
     }
 }

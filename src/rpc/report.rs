@@ -78,15 +78,21 @@ pub struct RealtimeReport {
 }
 
 /// Timing of the tick since the run's start.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct TickReport {
+    /// What starts them: `host`, or `device(ARM)`.
+    #[serde(default)]
+    pub clock: String,
     /// Number of ticks.
     pub count: u64,
     /// Ticks that began at least one period late.
     pub overruns: u64,
     /// Periods skipped after overruns.
     pub skipped: u64,
-    /// Delay of the wake-up after the deadline [µs].
+    /// Ticks that this computer's clock started because the arm that clocks them had sent no state.
+    #[serde(default)]
+    pub without_state: u64,
+    /// Delay of the wake-up after the deadline; with an arm as the clock, after its state came [µs].
     pub lateness_us: Percentiles,
     /// Time from wake-up to the last command passed on [µs].
     pub compute_us: Percentiles,

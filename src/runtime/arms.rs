@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::StartError;
 use super::device_lock::{self, DeviceLock};
 use crate::arm::{ArmCommand, ArmState};
-use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit};
+use crate::blueprint::{Arm, Blueprint, JointOverride, OnExit, TickClock};
 use crate::clock::MonotonicClock;
 use crate::hardware::adapter::AdapterError;
 use crate::hardware::device::{Connected, Device, DeviceConfig, Note};
@@ -15,6 +15,7 @@ use crate::joint::JointLimits;
 use crate::message::Message;
 use crate::rt::heartbeat::Heartbeat;
 use crate::rt::slot::{SlotReader, SlotWriter, slot};
+use crate::rt::wake::Wake;
 
 /// Timeout for an adapter to connect, with some margin for this computer.
 const CONNECT_LIMIT: Duration = Duration::from_millis(3_500);
@@ -27,6 +28,8 @@ const RELEASE_LIMIT: Duration = Duration::from_secs(2);
 pub struct Arms {
     /// Their device threads, in the blueprint's order.
     pub devices: Vec<Arc<Device>>,
+    /// Raised with each new state of the arm that clocks the ticks.
+    pub pace: Option<Wake>,
     disable: Vec<bool>,
     // Dropped after the device threads; the locks last.
     _emulators: Vec<Box<dyn Emulator>>,
@@ -59,7 +62,8 @@ pub fn bring_up(
     note: impl Fn(usize, Note) + Clone + Send + 'static,
 ) -> Result<BroughtUp, StartError> {
     let period = Duration::from_secs_f64(1.0 / blueprint.coordinator.tick_rate);
-    let mut arms = Arms { devices: Vec::new(), disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
+    let mut arms =
+        Arms { devices: Vec::new(), pace: None, disable: Vec::new(), _emulators: Vec::new(), _locks: Vec::new() };
     let mut slots = Slots::default();
     for (index, arm) in blueprint.arms.iter().enumerate() {
         let config = configure(arm, &mut arms)?;
@@ -67,6 +71,11 @@ pub fn bring_up(
         let (state_writer, state_reader) = slot(ArmState::default());
         let (command_writer, command_reader) = slot(ArmCommand::default());
         let note = note.clone();
+        let clocks = blueprint.coordinator.clock == TickClock::Device(arm.hardware_id.clone());
+        if clocks {
+            let no_event = |e| StartError::other(format!("no eventfd: {e}"), "see ulimit -n");
+            arms.pace = Some(Wake::new().map_err(no_event)?);
+        }
         let device = DeviceConfig {
             hardware_id: arm.hardware_id.clone(),
             dof: arm.joints.len(),
@@ -75,6 +84,7 @@ pub fn bring_up(
             supervision: arm.supervision,
             setup: arm.setup,
             beat: beat.clone(),
+            pace: arms.pace.clone().filter(|_| clocks),
             clock: Arc::new(MonotonicClock),
             notes: Box::new(move |what| note(index, what)),
         };

@@ -34,6 +34,7 @@ mod service_manager;
 mod start;
 mod stream_requests;
 mod tick;
+mod tick_source;
 mod waiting;
 mod watchdog;
 mod wires;

@@ -83,7 +83,7 @@ impl Run {
         (!self.rests(|| true)).then(|| "the arms are not at rest".to_owned())
     }
 
-    /// Returns why no arm goes on to its park pose, if so. What it takes from the endings is not seen again.
+    /// Returns why no further arm may move to its park pose, if so. What it takes from the endings is not seen again.
     fn interruption(&self) -> Option<String> {
         let why = match self.endings.1.try_recv() {
             Ok(Ending::Signal(_)) => "it was interrupted by a second signal",

@@ -42,6 +42,8 @@ impl Service {
                 })
                 .collect(),
             ticks: TickReport {
+                clock: parts.blueprint.coordinator.clock.to_string(),
+                without_state: pulse.unprompted.load(Relaxed),
                 count: pulse.ticks.load(Relaxed),
                 overruns: pulse.overruns.load(Relaxed),
                 skipped: pulse.skipped.load(Relaxed),

@@ -21,6 +21,7 @@ use super::planner_port::PlannerPort;
 use super::service::{Service, ServiceParts};
 use super::service_manager::ServiceManager;
 use super::tick::Tick;
+use super::tick_source::source;
 use super::watchdog::Watchdog;
 use super::wires::wires;
 use super::{Ending, Handle, Options, Run, StartError, in_process};
@@ -142,8 +143,9 @@ impl Connected<'_> {
     /// Starts the threads. If one cannot be started, the previous ones end.
     fn start(self) -> Result<(Claim, Run), StartError> {
         // Dropped in reverse order: the arms before the name.
-        let Self { prepared, arms, slots, connected, config, planner, pulse, notes, noted } = self;
-        let (ports, ends) = wires(&config, slots, &arms, pulse.clone())?;
+        let Self { prepared, mut arms, slots, connected, config, planner, pulse, notes, noted } = self;
+        let source = source(prepared.blueprint, &mut arms, &connected)?;
+        let (ports, ends) = wires(&config, slots, &arms, source, pulse.clone())?;
         let dispatcher = Arc::new(Dispatcher::new(ends.requests, notes));
         let (endings, ended) = channel();
         let parts = ServiceParts {

@@ -7,6 +7,7 @@ use super::arms::{Arms, Slots};
 use super::dispatch::REQUEST_RING;
 use crate::arm::{ArmCommand, ArmState};
 use crate::control::config::CoordinatorConfig;
+use crate::control::pace::Source;
 use crate::control::request::{Envelope, Motion};
 use crate::control::tick_loop::{Pulse, TickPorts};
 use crate::rt::host;
@@ -33,6 +34,7 @@ pub(super) fn wires(
     config: &CoordinatorConfig,
     slots: Slots,
     arms: &Arms,
+    source: Source,
     pulse: Arc<Pulse>,
 ) -> Result<(TickPorts, Ends), StartError> {
     let reply_wake = Wake::new().map_err(|e| StartError::other(format!("no eventfd: {e}"), "see ulimit -n"))?;
@@ -65,6 +67,7 @@ pub(super) fn wires(
         samples: sample_producer,
         arm_views: arm_writers,
         task_views: task_writers,
+        source,
         pulse,
     };
     Ok((ports, Ends { requests, replies, reply_wake, retired, samples, arm_views, task_views }))

@@ -1,5 +1,5 @@
-//! `docs/blueprint-reference.md` and `assets/blueprint.schema.json` are generated, so that they never differ from what
-//! is accepted. `DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference` writes them.
+//! `docs/blueprint-reference.md`, `assets/blueprint.schema.json` and `assets/rpc.schema.json` are generated, so that
+//! they never differ from what is accepted. `DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference` writes them.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -265,4 +265,9 @@ fn the_reference_names_every_key_of_the_schema() {
     for key in groups.filter_map(|g| g.get("properties")?.as_object()).flat_map(|keys| keys.keys()) {
         assert!(page.contains(&format!("`{key}`")), "{key} is not in the reference");
     }
+}
+
+#[test]
+fn the_schema_of_the_protocol_is_current() {
+    check("assets/rpc.schema.json", &format!("{}\n", dimos::rpc::schema::json_schema()));
 }

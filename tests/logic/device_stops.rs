@@ -75,6 +75,7 @@ fn spawn(
         supervision: Supervision { accept_zero_pose: true, ..Supervision::default() },
         setup: dimos::hardware::device::Setup::default(),
         beat: beat.clone(),
+        pace: None,
         clock,
         notes: Box::new(|_| {}),
     };

@@ -160,6 +160,7 @@ fn the_tick_loop_does_not_allocate() {
         samples,
         arm_views: vec![arm_view],
         task_views,
+        source: dimos::control::pace::Source::Host,
         pulse: pulse.clone(),
     };
     let counted = Arc::new(AtomicU64::new(u64::MAX));
@@ -273,6 +274,7 @@ fn a_healthy_device_thread_does_not_allocate() {
         supervision: dimos::arm::Supervision::default(),
         setup: dimos::hardware::device::Setup::default(),
         beat: beat.clone(),
+        pace: None,
         clock: Arc::new(MonotonicClock),
         notes: Box::new(|_| {}),
     };

@@ -177,7 +177,15 @@ pub fn status() -> StatusReport {
             granted: false,
             remedy: Some("ulimit -r 80".into()),
         }],
-        ticks: TickReport { count: 12340, overruns: 2, skipped: 3, lateness_us: figures, compute_us: figures },
+        ticks: TickReport {
+            clock: "host".to_owned(),
+            count: 12340,
+            overruns: 2,
+            skipped: 3,
+            without_state: 0,
+            lateness_us: figures,
+            compute_us: figures,
+        },
         recorder: Some(RecorderReport { messages: 5, dropped: 0, error: None }),
         arms: vec![ArmReport {
             hardware_id: "arm".into(),

@@ -52,6 +52,8 @@ pub struct DeviceConfig {
     pub setup: Setup,
     /// The tick's heartbeat.
     pub beat: Arc<Heartbeat>,
+    /// Raised with each new state, if this arm clocks the ticks.
+    pub pace: Option<Wake>,
     /// The clock.
     pub clock: Arc<dyn Clock>,
     /// Receives a note at the beginning and at the end of each episode of trouble.
@@ -107,6 +109,8 @@ pub struct Connected {
     pub io: Option<IoInfo>,
     /// Calibration offsets of its joints [rad], if it reports them.
     pub calibration_offsets: Option<Joints>,
+    /// Whether it sends its state by itself.
+    pub streams: bool,
     /// Whether its controller takes the load at the flange.
     pub has_payload: bool,
     /// Whether setting that load resets the controller, so that the arm must be enabled again.

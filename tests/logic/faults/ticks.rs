@@ -5,7 +5,7 @@ use std::time::Duration;
 use dimos::clock::Mono;
 use dimos::control::config::{CONFIG_VERSION, CoordinatorConfig};
 use dimos::control::coordinator::{Coordinator, TickTime};
-use dimos::control::tick_loop::{missed_periods, next_deadline};
+use dimos::control::pace::{missed_periods, next_deadline};
 use dimos::telemetry::{Cause, Event, Phase, Reason, TaskState};
 use proptest::prelude::*;
 

@@ -59,6 +59,7 @@ impl Worker {
             gripper_range,
             io,
             calibration_offsets,
+            streams: adapter.state_fd().is_some(),
             has_payload,
             payload_resets,
             read_period,

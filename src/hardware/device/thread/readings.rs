@@ -25,6 +25,7 @@ impl Worker {
             return;
         }
         let began = self.config.clock.now();
+        let before = self.state.seq;
         self.next_read = began.after(self.config.read_period());
         match self.read_all(adapter) {
             Ok(()) => {
@@ -50,6 +51,9 @@ impl Worker {
             }
         }
         self.states.write(&self.state);
+        if let Some(pace) = self.config.pace.as_ref().filter(|_| self.state.seq != before) {
+            pace.raise();
+        }
     }
 
     pub(super) fn read_all(&mut self, adapter: &mut dyn ManipulatorAdapter) -> AdapterResult<()> {

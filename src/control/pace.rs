@@ -1,0 +1,284 @@
+//! When a tick begins: on a grid of this computer's clock, or with each state that one arm sends by itself.
+//!
+//! An arm whose controller sends its state in every cycle and expects a setpoint for it, in the same cycle, is the
+//! clock of its run. The other arms follow. When it is silent, this computer's clock continues at the same rate, so
+//! that they are still commanded and watched.
+
+use std::time::Duration;
+
+use super::coordinator::TickTime;
+use crate::arm::ArmState;
+use crate::clock::{Clock, Mono};
+use crate::rt::heartbeat::Heartbeat;
+use crate::rt::host;
+use crate::rt::slot::SlotReader;
+use crate::rt::wake::Wake;
+
+/// What starts the ticks.
+#[derive(Debug)]
+pub enum Source {
+    /// This computer's clock.
+    Host,
+    /// The states of an arm.
+    Device {
+        /// Index of the arm.
+        arm: usize,
+        /// Raised by its device thread with each new state.
+        wake: Wake,
+        /// Time between two of its states.
+        cycle: Duration,
+    },
+}
+
+/// The start of a tick.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Start {
+    /// The times of the tick.
+    pub time: TickTime,
+    /// When the thread woke.
+    pub woke: Mono,
+    /// Whether the arm that clocks the ticks was silent.
+    pub unprompted: bool,
+}
+
+/// Waits for the start of each tick. Two ticks begin at least half a period apart: there is never a burst.
+#[derive(Debug)]
+pub struct Pacer {
+    source: Source,
+    period: Duration,
+    /// When the next tick is due.
+    due: Mono,
+    /// When the thread woke last.
+    woke: Mono,
+    /// With [`Source::Host`]: periods that the latest tick skipped, and its lateness [ns].
+    skipped: (u32, u64),
+    /// With [`Source::Device`]: number of the latest state that was considered.
+    seq: u64,
+    silent: bool,
+}
+
+impl Pacer {
+    /// Creates a pacer whose first tick is due a period after `now`.
+    pub fn new(source: Source, now: Mono, period: Duration) -> Self {
+        let period = period.max(Duration::from_nanos(1));
+        Self { source, period, due: now.after(period), woke: Mono::ZERO, skipped: (0, 0), seq: 0, silent: false }
+    }
+
+    /// Waits until the next tick begins. `beat` learns when the thread is due to wake.
+    pub fn wait(&mut self, clock: &dyn Clock, beat: &Heartbeat, states: &mut [SlotReader<ArmState>]) -> Start {
+        loop {
+            let latest = self.latest();
+            beat.sleep_until(latest);
+            let state = match &self.source {
+                Source::Host => {
+                    host::sleep_until(latest);
+                    None
+                }
+                Source::Device { arm, wake, .. } => {
+                    wake.wait(latest.since(clock.now()));
+                    states.get_mut(*arm).map(|slot| slot.read())
+                }
+            };
+            beat.awake();
+            if let Some(start) = self.begin(clock.now(), state.map(|state| (state.seq, state.stamp))) {
+                return start;
+            }
+        }
+    }
+
+    /// Returns when the next tick begins at the latest. A state may be late by half a period; an arm that has missed one
+    /// is not waited for.
+    fn latest(&self) -> Mono {
+        match self.source {
+            Source::Device { .. } if !self.silent => self.due.after(self.period / 2),
+            _ => self.due,
+        }
+    }
+
+    /// Returns the tick that begins now, if one does. `state`: number and time of the clocking arm's newest state.
+    fn begin(&mut self, woke: Mono, state: Option<(u64, Mono)>) -> Option<Start> {
+        let Source::Device { cycle, .. } = self.source else {
+            return Some(self.on_the_grid(woke));
+        };
+        if let Some((seq, stamp)) = state.filter(|(seq, _)| *seq != self.seq) {
+            self.seq = seq;
+            let early = stamp.after(cycle / 2) < self.due || woke < self.woke.after(self.period / 2);
+            if !early {
+                return Some(self.prompted(woke, stamp.min(woke)));
+            }
+        }
+        (woke >= self.latest()).then(|| self.unprompted(woke))
+    }
+
+    /// A tick for a state of the arm, measured at `stamp`.
+    fn prompted(&mut self, woke: Mono, stamp: Mono) -> Start {
+        let skipped = missed_periods(self.due, stamp.after(self.period / 2), self.period);
+        let late_ns = woke.0.saturating_sub(stamp.0);
+        let cause = if skipped > 0 { woke.0.saturating_sub(self.due.0) } else { late_ns };
+        let next = stamp.after(self.period);
+        let time = TickTime { now: stamp, next, skipped, late_ns: cause, woke_late_ns: late_ns };
+        (self.due, self.woke, self.silent) = (next, woke, false);
+        Start { time, woke, unprompted: false }
+    }
+
+    /// A tick without a state of the arm.
+    fn unprompted(&mut self, woke: Mono) -> Start {
+        // The wait for a state that did not come is no lateness of this computer.
+        let due = self.latest();
+        let skipped = missed_periods(due, woke, self.period);
+        let now = due.after(self.period * skipped);
+        let late_ns = woke.0.saturating_sub(due.0);
+        let next = now.after(self.period);
+        let time = TickTime { now, next, skipped, late_ns, woke_late_ns: late_ns };
+        (self.due, self.woke, self.silent) = (next, woke, true);
+        Start { time, woke, unprompted: true }
+    }
+
+    fn on_the_grid(&mut self, woke: Mono) -> Start {
+        let late_ns = woke.0.saturating_sub(self.due.0);
+        let missed = missed_periods(self.due, woke, self.period);
+        let now = self.due.after(self.period * missed);
+        let (next, skips_after) = next_deadline(now, woke, self.period);
+        let (skipped_before, late_before) = self.skipped;
+        // What was skipped before this tick is reported with the lateness that caused it.
+        let cause = if skipped_before > 0 { late_ns.max(late_before) } else { late_ns };
+        let time = TickTime { now, next, skipped: skipped_before + missed, late_ns: cause, woke_late_ns: late_ns };
+        (self.due, self.woke, self.skipped) = (next, woke, (skips_after, late_ns));
+        Start { time, woke, unprompted: false }
+    }
+}
+
+/// Returns the number of whole periods lost by a late wake-up. The tick then uses the last deadline before it as "now".
+pub fn missed_periods(deadline: Mono, woke: Mono, period: Duration) -> u32 {
+    let period = (period.as_nanos() as u64).max(1);
+    (woke.0.saturating_sub(deadline.0) / period).min(u32::MAX as u64) as u32
+}
+
+/// Returns the next deadline of the grid and the number of skipped ones: two ticks are at least half a period apart,
+/// and there is never a burst.
+pub fn next_deadline(deadline: Mono, woke: Mono, period: Duration) -> (Mono, u32) {
+    let period = (period.as_nanos() as u64).max(1);
+    let next = deadline.0.saturating_add(period);
+    let earliest = woke.0.saturating_add(period / 2);
+    let skipped = earliest.saturating_sub(next).div_ceil(period);
+    (Mono(next.saturating_add(skipped * period)), skipped.min(u32::MAX as u64) as u32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const P: Duration = Duration::from_millis(10);
+
+    fn ms(ms: f64) -> Mono {
+        Mono((ms * 1e6) as u64)
+    }
+
+    fn device(cycle: Duration) -> Pacer {
+        let source = Source::Device { arm: 0, wake: Wake::new().unwrap(), cycle };
+        Pacer::new(source, ms(90.0), P)
+    }
+
+    fn now_and_skipped(start: Option<Start>) -> Option<(Mono, u32, bool)> {
+        start.map(|start| (start.time.now, start.time.skipped, start.unprompted))
+    }
+
+    #[test]
+    fn f20_an_overrun_skips_whole_periods_and_never_bursts() {
+        for (woke, next, skipped) in [
+            (100.0, 110.0, 0),
+            (104.9, 110.0, 0),
+            (105.0, 110.0, 0),
+            (105.1, 120.0, 1),
+            (112.0, 120.0, 1),
+            (119.0, 130.0, 2),
+            (150.0, 160.0, 5),
+            (1234.0, 1240.0, 113),
+        ] {
+            let missed = missed_periods(ms(100.0), ms(woke), P);
+            let deadline = ms(100.0).after(P * missed);
+            let (n, s) = next_deadline(deadline, ms(woke), P);
+            assert_eq!((n, missed + s), (ms(next), skipped), "woke at {woke}");
+            assert!(deadline <= ms(woke) && ms(woke).since(deadline) < P);
+            assert!(n.since(ms(woke)) >= P / 2);
+        }
+    }
+
+    #[test]
+    fn each_state_begins_a_tick_at_its_own_time_whatever_its_rate() {
+        // A controller whose clock is 1 % slow, with arrivals that are up to 0.4 ms late.
+        let mut pacer = device(P);
+        for k in 0..500u32 {
+            let stamp = 100.3 + 10.1 * f64::from(k);
+            let woke = ms(stamp + 0.1 * f64::from(k % 5));
+            let start = pacer.begin(woke, Some((u64::from(k) + 1, ms(stamp)))).unwrap();
+            assert_eq!((start.time.now, start.time.skipped, start.unprompted), (ms(stamp), 0, false), "state {k}");
+            assert_eq!(start.time.woke_late_ns, woke.0 - ms(stamp).0);
+            assert_eq!(start.time.next, ms(stamp).after(P));
+        }
+    }
+
+    #[test]
+    fn the_same_state_begins_one_tick() {
+        let mut pacer = device(P);
+        assert!(pacer.begin(ms(100.1), Some((1, ms(100.0)))).is_some());
+        assert_eq!(pacer.begin(ms(106.0), Some((1, ms(100.0)))), None);
+    }
+
+    #[test]
+    fn a_tick_takes_every_second_state_of_an_arm_that_is_twice_as_fast() {
+        let mut pacer = device(P / 2);
+        let mut begun = Vec::new();
+        for k in 0..8u64 {
+            let stamp = ms(100.0 + 5.0 * k as f64);
+            begun.extend(pacer.begin(stamp, Some((k + 1, stamp))).map(|start| start.time.now));
+        }
+        assert_eq!(begun, [100.0, 110.0, 120.0, 130.0].map(ms));
+    }
+
+    #[test]
+    fn a_silent_arm_is_waited_for_once_and_then_this_computers_clock_continues() {
+        let mut pacer = device(P);
+        assert!(pacer.begin(ms(100.0), Some((1, ms(100.0)))).is_some());
+        assert_eq!(pacer.latest(), ms(115.0));
+        assert_eq!(pacer.begin(ms(114.9), Some((1, ms(100.0)))), None);
+        for k in 0..5 {
+            let at = ms(115.0 + 10.0 * f64::from(k));
+            assert_eq!(pacer.latest(), at);
+            assert_eq!(now_and_skipped(pacer.begin(at, Some((1, ms(100.0))))), Some((at, 0, true)));
+        }
+        // It sends again: within half a period of the latest tick nothing begins.
+        assert_eq!(pacer.begin(ms(157.0), Some((2, ms(157.0)))), None);
+        let start = pacer.begin(ms(163.0), Some((3, ms(163.0))));
+        assert_eq!(now_and_skipped(start), Some((ms(163.0), 0, false)));
+        assert_eq!(pacer.latest(), ms(178.0));
+    }
+
+    #[test]
+    fn lost_states_and_stalls_are_skipped_periods() {
+        let mut pacer = device(P);
+        pacer.begin(ms(100.0), Some((1, ms(100.0))));
+        // This computer stood still; the arm went on sending.
+        let start = pacer.begin(ms(151.0), Some((6, ms(150.0)))).unwrap();
+        assert_eq!(now_and_skipped(Some(start)), Some((ms(150.0), 4, false)));
+        assert_eq!((start.time.late_ns, start.time.woke_late_ns), (41_000_000, 1_000_000));
+        // It stood still without the arm.
+        let start = pacer.begin(ms(196.0), Some((6, ms(150.0)))).unwrap();
+        assert_eq!(now_and_skipped(Some(start)), Some((ms(195.0), 3, true)));
+    }
+
+    #[test]
+    fn a_state_that_waited_for_a_long_tick_begins_no_second_one_at_once() {
+        let mut pacer = device(P);
+        pacer.begin(ms(104.0), Some((1, ms(100.0))));
+        assert_eq!(pacer.begin(ms(108.9), Some((2, ms(106.0)))), None, "4.9 ms after the last");
+        assert!(pacer.begin(ms(116.0), Some((3, ms(116.0)))).is_some());
+    }
+
+    #[test]
+    fn a_stamp_in_the_future_is_taken_for_now() {
+        let mut pacer = device(P);
+        let start = pacer.begin(ms(100.0), Some((1, ms(400.0)))).unwrap();
+        assert_eq!(start.time.now, ms(100.0));
+    }
+}
