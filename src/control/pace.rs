@@ -86,11 +86,11 @@ impl Pacer {
         }
     }
 
-    /// Returns when the next tick begins at the latest. A state may be late by half a period; an arm that has missed one
-    /// is not waited for.
+    /// Returns when the next tick begins at the latest. A state may be late by a third of a period, so that the one after
+    /// it is not too early for a tick; an arm that has missed one is not waited for.
     fn latest(&self) -> Mono {
         match self.source {
-            Source::Device { .. } if !self.silent => self.due.after(self.period / 2),
+            Source::Device { .. } if !self.silent => self.due.after(self.period / 3),
             _ => self.due,
         }
     }
@@ -123,12 +123,12 @@ impl Pacer {
 
     /// A tick without a state of the arm.
     fn unprompted(&mut self, woke: Mono) -> Start {
-        // The wait for a state that did not come is no lateness of this computer.
-        let due = self.latest();
-        let skipped = missed_periods(due, woke, self.period);
-        let now = due.after(self.period * skipped);
-        let late_ns = woke.0.saturating_sub(due.0);
-        let next = now.after(self.period);
+        // The wait for a state that did not come is no lateness of this computer, and does not move the grid.
+        let latest = self.latest();
+        let skipped = missed_periods(latest, woke, self.period);
+        let now = latest.after(self.period * skipped);
+        let late_ns = woke.0.saturating_sub(latest.0);
+        let next = self.due.after(self.period * (skipped + 1));
         let time = TickTime { now, next, skipped, late_ns, woke_late_ns: late_ns };
         (self.due, self.woke, self.silent) = (next, woke, true);
         Start { time, woke, unprompted: true }
@@ -240,18 +240,30 @@ mod tests {
     fn a_silent_arm_is_waited_for_once_and_then_this_computers_clock_continues() {
         let mut pacer = device(P);
         assert!(pacer.begin(ms(100.0), Some((1, ms(100.0)))).is_some());
-        assert_eq!(pacer.latest(), ms(115.0));
-        assert_eq!(pacer.begin(ms(114.9), Some((1, ms(100.0)))), None);
-        for k in 0..5 {
-            let at = ms(115.0 + 10.0 * f64::from(k));
+        let latest = ms(110.0).after(P / 3);
+        assert_eq!(pacer.latest(), latest);
+        assert_eq!(pacer.begin(ms(113.3), Some((1, ms(100.0)))), None);
+        assert_eq!(now_and_skipped(pacer.begin(latest, Some((1, ms(100.0))))), Some((latest, 0, true)));
+        for k in 0..4 {
+            let at = ms(120.0 + 10.0 * f64::from(k));
             assert_eq!(pacer.latest(), at);
             assert_eq!(now_and_skipped(pacer.begin(at, Some((1, ms(100.0))))), Some((at, 0, true)));
         }
         // It sends again: within half a period of the latest tick nothing begins.
-        assert_eq!(pacer.begin(ms(157.0), Some((2, ms(157.0)))), None);
-        let start = pacer.begin(ms(163.0), Some((3, ms(163.0))));
-        assert_eq!(now_and_skipped(start), Some((ms(163.0), 0, false)));
-        assert_eq!(pacer.latest(), ms(178.0));
+        assert_eq!(pacer.begin(ms(154.0), Some((2, ms(154.0)))), None);
+        let start = pacer.begin(ms(156.0), Some((3, ms(156.0))));
+        assert_eq!(now_and_skipped(start), Some((ms(156.0), 0, false)));
+        assert_eq!(pacer.latest(), ms(166.0).after(P / 3));
+    }
+
+    #[test]
+    fn after_one_lost_state_the_next_begins_a_tick_again() {
+        let mut pacer = device(P);
+        pacer.begin(ms(100.0), Some((1, ms(100.0))));
+        let latest = pacer.latest();
+        assert_eq!(now_and_skipped(pacer.begin(latest, Some((1, ms(100.0))))), Some((latest, 0, true)));
+        let start = pacer.begin(ms(120.0), Some((3, ms(120.0))));
+        assert_eq!(now_and_skipped(start), Some((ms(120.0), 0, false)));
     }
 
     #[test]
@@ -264,7 +276,7 @@ mod tests {
         assert_eq!((start.time.late_ns, start.time.woke_late_ns), (41_000_000, 1_000_000));
         // It stood still without the arm.
         let start = pacer.begin(ms(196.0), Some((6, ms(150.0)))).unwrap();
-        assert_eq!(now_and_skipped(Some(start)), Some((ms(195.0), 3, true)));
+        assert_eq!(now_and_skipped(Some(start)), Some((ms(160.0).after(P / 3).after(P * 3), 3, true)));
     }
 
     #[test]
