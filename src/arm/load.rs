@@ -29,8 +29,15 @@ impl Load {
         if let Some(far) = self.center.iter().find(|v| !(-LARGEST.1..=LARGEST.1).contains(*v)) {
             return Err(format!("the centre is {far} m from the flange, must be within {} m", LARGEST.1));
         }
-        let [xx, _, _, yy, _, zz] = self.inertia;
-        if self.inertia.iter().any(|v| !v.is_finite()) || [xx, yy, zz].iter().any(|v| *v < 0.0) {
+        let [xx, xy, xz, yy, yz, zz] = self.inertia;
+        let determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz);
+        let minors = [xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz];
+        // A thin body has minors of zero, which rounding makes negative.
+        let size = 1e-3 * (xx + yy + zz);
+        let semidefinite = [xx, yy, zz].iter().all(|v| *v >= 0.0)
+            && minors.iter().all(|v| *v >= -size * size)
+            && determinant >= -size.powi(3);
+        if self.inertia.iter().any(|v| !v.is_finite()) || !semidefinite {
             return Err(format!("the inertia {:?} kg·m² is not that of a body", self.inertia));
         }
         Ok(())

@@ -78,6 +78,10 @@ pub struct RobotEntry {
     pub base_link: String,
     /// The link that pose goals refer to.
     pub end_effector_link: Located<String>,
+    /// The link whose frame is that of the arm's flange, in which the controller takes the centre of a load. Needed for
+    /// `attach` with a mass.
+    #[serde(default)]
+    pub flange_link: Option<Located<String>>,
     /// The planned joints by their names in the model, from the base; or `{group: NAME}`: a `group` of the SRDF.
     pub joint_names: Located<RobotJoints>,
     /// Shorthand for `joint_name_mapping`: the coordinator's joint `{joint_prefix}{joint}` is the model's `{joint}`.

@@ -58,6 +58,7 @@ fn robot(checker: &Checker<'_>, typed: &Located<RobotEntry>, described: &Describ
         base_pose: isometry(&typed.base_pose),
         base_link: typed.base_link.clone(),
         end_effector_link: typed.end_effector_link.value.clone(),
+        flange_link: typed.flange_link.as_ref().map(|link| link.value.clone()),
         coordinator_joints: joints.iter().map(ours).collect(),
         joints,
         joint_prefix: typed.joint_prefix.as_ref().map_or_else(String::new, |prefix| prefix.value.clone()),

@@ -183,6 +183,9 @@ fn names(checker: &mut Checker<'_>, robot: &Located<RobotEntry>, described: &Des
     if checker.has(robot.at, "end_effector_link") && !checker.lost.contains(robot.end_effector_link.at) {
         link(checker, robot.end_effector_link.at, &robot.end_effector_link, model);
     }
+    if let Some(flange) = robot.flange_link.as_ref().filter(|flange| !checker.lost.contains(flange.at)) {
+        link(checker, flange.at, flange, model);
+    }
     // If it is not written, the default applies, and a mistake is reported at the robot.
     let base = checker.tree.get(robot.at, "base_link");
     if base.is_none_or(|at| !checker.lost.contains(at)) {

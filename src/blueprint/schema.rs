@@ -65,7 +65,12 @@ pub struct CoordinatorConfig {
 
 impl Default for CoordinatorConfig {
     fn default() -> Self {
-        Self { tick_rate: 100.0, clock: TickClock::Host, publish_joint_state: true, joint_state_frame_id: "coordinator".to_owned() }
+        Self {
+            tick_rate: 100.0,
+            clock: TickClock::Host,
+            publish_joint_state: true,
+            joint_state_frame_id: "coordinator".to_owned(),
+        }
     }
 }
 

@@ -38,7 +38,9 @@ impl FromStr for TickClock {
         match (text, arm) {
             ("host", _) => Ok(Self::Host),
             (_, Some(arm)) if !arm.is_empty() => Ok(Self::Device(arm.to_owned())),
-            _ => Err(format!("{} is no clock\nhint: write host, or device(ARM) with an arm's hardware_id", quote(text))),
+            _ => {
+                Err(format!("{} is no clock\nhint: write host, or device(ARM) with an arm's hardware_id", quote(text)))
+            }
         }
     }
 }

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::text_log::Terminal;
 use crate::rpc::report::{ArmReport, RealtimeReport, StatusReport};
+use crate::runtime::Ended;
 
 /// Last line of the banner of a run with a terminal.
 pub const IN_A_TERMINAL: &str = "Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
@@ -67,9 +68,12 @@ pub fn parks(arm: &ArmReport) -> bool {
     arm.on_exit == "park"
 }
 
-/// Describes the motors now that the run has ended, from its last report, and from whether it was parked.
-pub fn after_exit(arm: &ArmReport, parked: bool) -> &'static str {
+/// Describes an arm's motors now that the run has ended, from the arm's last report.
+pub fn after_exit(arm: &ArmReport, ended: &Ended) -> &'static str {
+    let is_in = |list: &[String]| list.contains(&arm.hardware_id);
+    let parked = is_in(&ended.parked);
     match (arm.link.as_str(), arm.enabled, arm.holds_when_disabled) {
+        (_, true, _) if is_in(&ended.unreleased) => "its motors may be on: look at the warning",
         ("down" | "faulted", ..) => "it could not be reached: its motors are unchanged",
         (_, false, true) => "motors are off; it keeps its pose",
         (_, false, false) => "motors are off; it does not hold its pose",
@@ -136,14 +140,17 @@ Press Ctrl-C for a controlled stop. In a second terminal: dimos status";
         assert_eq!(text(&report, Path::new("/run/dimos.sock"), IN_A_TERMINAL).join("\n"), expected);
 
         assert_eq!(at_exit(&arm("park", false)), "it moves to its park pose, then motors off");
-        assert_eq!(after_exit(&arm("park", false), true), "parked; motors off");
-        assert_eq!(after_exit(&arm("park", false), false), "motors stay on and hold the pose");
-        assert_eq!(after_exit(&arm("park", true), false), "motors off; it keeps its pose");
-        assert_eq!(after_exit(&arm("hold", false), false), "motors stay on and hold the pose");
-        let off = |holds| after_exit(&ArmReport { enabled: false, ..arm("hold", holds) }, false);
+        let (normal, parked) = (Ended::default(), Ended { parked: vec!["arm".into()], ..Ended::default() });
+        assert_eq!(after_exit(&arm("park", false), &parked), "parked; motors off");
+        let unreleased = Ended { unreleased: vec!["arm".into()], ..Ended::default() };
+        assert_eq!(after_exit(&arm("disable", true), &unreleased), "its motors may be on: look at the warning");
+        assert_eq!(after_exit(&arm("park", false), &normal), "motors stay on and hold the pose");
+        assert_eq!(after_exit(&arm("park", true), &normal), "motors off; it keeps its pose");
+        assert_eq!(after_exit(&arm("hold", false), &normal), "motors stay on and hold the pose");
+        let off = |holds| after_exit(&ArmReport { enabled: false, ..arm("hold", holds) }, &normal);
         assert_eq!(off(false), "motors are off; it does not hold its pose", "as after its own E-stop");
         assert_eq!(off(true), "motors are off; it keeps its pose");
         let lost = ArmReport { link: "faulted".into(), ..arm("disable", true) };
-        assert_eq!(after_exit(&lost, false), "it could not be reached: its motors are unchanged");
+        assert_eq!(after_exit(&lost, &normal), "it could not be reached: its motors are unchanged");
     }
 }

@@ -280,8 +280,7 @@ fn print_summary(terminal: &Terminal, report: &StatusReport, ending: &Ending, en
         terminal.note(format_args!("warning: {trouble}"));
     }
     for arm in &ended.arms {
-        let parked = ended.parked.contains(&arm.hardware_id);
-        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm, parked)));
+        terminal.note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm, ended)));
     }
     match (&ended.log, &ended.log_cut) {
         (Some(_), Some(cut)) => terminal.note(format_args!("run {} ended; the log is incomplete: {cut}", report.run)),

@@ -47,6 +47,8 @@ pub struct RobotConfig {
     pub base_link: String,
     /// The link that pose goals refer to.
     pub end_effector_link: String,
+    /// The link of the arm's flange, where a load is measured from.
+    pub flange_link: Option<String>,
     /// Planned joints by their names in the model, from the base.
     pub joints: Vec<String>,
     /// Names of the same joints in the coordinator.
@@ -111,6 +113,7 @@ impl RobotConfig {
             base_pose: Isometry3::identity(),
             base_link: "base_link".into(),
             end_effector_link: "flange".into(),
+            flange_link: Some("flange".into()),
             coordinator_joints: joints.iter().map(|joint| format!("arm_{joint}")).collect(),
             joints,
             joint_prefix: String::new(),

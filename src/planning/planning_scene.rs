@@ -160,6 +160,7 @@ impl PlannedRobot {
             model.link_index(name).ok_or_else(|| format!("there is no link {name:?}; {}", hint()))
         };
         let (base, end_effector) = (link(&config.base_link)?, link(&config.end_effector_link)?);
+        config.flange_link.as_deref().map(link).transpose()?;
         let shape = |link: &str| config.shapes.get(link).copied().unwrap_or_default();
         let solids = solids_of(&model, shape).map_err(|e| e.to_string())?;
         let idle = idle(config, &model, &joints, &Measured::default());

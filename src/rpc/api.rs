@@ -51,6 +51,11 @@ pub trait Backend: Send + Sync + 'static {
         let _ = plan;
         Box::pin(async { Err(RpcError::new(Code::NoPlanner, "this run has no planner")) })
     }
+    /// Returns the arms whose load an `attach` or `detach` changes, by `hardware_id`.
+    fn arms_of_load<'a>(&'a self, request: &'a Request) -> BoxFuture<'a, Result<Vec<String>, RpcError>> {
+        let _ = request;
+        Box::pin(async { Ok(Vec::new()) })
+    }
     /// Attaches a planner in another process to the run; `proxy` sends it requests.
     fn register_planner(&self, planner: RegisterPlanner, proxy: Arc<PlannerProxy>) -> Result<Registered, RpcError> {
         let _ = (planner, proxy);

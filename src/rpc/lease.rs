@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use super::api::{Backend, ExecutePlan, Presence, Reply, Request};
+use super::api::{Attach, Backend, ExecutePlan, Presence, Reply, Request};
 use super::error::{Code, RpcError};
 use super::report::CommanderReport;
 use crate::sync::lock;
@@ -39,6 +39,8 @@ pub(super) enum Need<'a> {
     Plan(Option<u64>),
     /// No lease, but no other connection may hold it: the request changes whether the arm accepts motion.
     NoOtherHolder(Subject<'a>),
+    /// The same, for the arm whose load the request changes with an object of known mass.
+    NoOtherHolderOfLoad,
 }
 
 /// Returns the lease that a request requires.
@@ -55,14 +57,14 @@ pub(super) fn need(request: &Request) -> Need<'_> {
         Request::ArmEnable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmDisable(a) => Need::NoOtherHolder(Subject::Arm(&a.arm)),
         Request::ArmPayloadSet(p) => Need::NoOtherHolder(Subject::Arm(&p.arm)),
-        Request::Attach(a) if a.mass.is_some() => Need::NoOtherHolder(Subject::Arm(&a.robot)),
+        Request::Attach(Attach { mass: Some(_), .. }) | Request::Detach(_) => Need::NoOtherHolderOfLoad,
         Request::ArmIoSet(io) => Need::NoOtherHolder(Subject::Arm(&io.arm)),
         Request::Status(_) | Request::State(_) | Request::Motion(_) | Request::ArmIo(_) => Need::Nothing,
         Request::ArmPayload(_) => Need::Nothing,
         Request::ExecutePlan(e) => Need::Plan(e.plan),
         Request::Plan(_) | Request::Planning(_) | Request::Preview(_) | Request::Planner(_) => Need::Nothing,
         Request::World(_) | Request::WorldAdd(_) | Request::WorldMove(_) | Request::WorldRemove(_) => Need::Nothing,
-        Request::Attach(_) | Request::Detach(_) => Need::Nothing,
+        Request::Attach(_) => Need::Nothing,
         Request::Cancel(_) | Request::Stop(_) | Request::Shutdown(_) => Need::Nothing,
     }
 }
@@ -150,6 +152,10 @@ impl Lessee {
                 return Ok((request, arms));
             }
             Need::NoOtherHolder(subject) => self.check(&backend.arms_of(subject), &self.leases.lock())?,
+            Need::NoOtherHolderOfLoad => {
+                let arms = backend.arms_of_load(&request).await?;
+                self.check(&arms, &self.leases.lock())?;
+            }
             Need::Plan(plan) => {
                 let (plan, joints) = backend.plan_of(plan).await?;
                 let arms = backend.arms_of(Subject::Joints(&joints));

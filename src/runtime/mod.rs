@@ -182,6 +182,8 @@ pub struct Ended {
     pub troubles: Vec<String>,
     /// The arms that were parked ([`Run::park_and_stop`]).
     pub parked: Vec<String>,
+    /// The arms that were not released in order; [`troubles`](Self::troubles) say why.
+    pub unreleased: Vec<String>,
     /// The arms at rest, before they were released.
     pub arms: Vec<ArmReport>,
     /// The log, if one was written.
@@ -290,22 +292,23 @@ impl Run {
         if let Some(manager) = &self.manager {
             manager.stopping();
         }
-        // Before the run is closed: no stop is refused that comes before the motion.
-        self.handle.service.set_parking(park);
         self.handle.service.close();
         if park {
             self.park(&mut ended);
-            self.handle.service.set_parking(false);
         }
         self.come_to_rest(&mut ended);
         ended.arms = self.status().arms;
+        self.handle.service.end_stops();
         self.watchdog.stand_down();
         if !self.tick.end() {
             ended.troubles.push("the tick thread does not end; it is left behind".to_owned());
         }
         let unreleased = self.arms.release();
         ended.parked.retain(|arm| !unreleased.iter().any(|(name, _)| name == arm));
-        ended.troubles.extend(unreleased.into_iter().map(|(_, trouble)| trouble));
+        for (name, trouble) in unreleased {
+            ended.unreleased.push(name);
+            ended.troubles.push(trouble);
+        }
         self.outcomes = None;
         if let Err(e) = recorder.finish() {
             ended.log_cut = e.to_string().lines().next().map(str::to_owned);

@@ -54,6 +54,9 @@ impl Run {
         }
         for (Parking { arm, .. }, result) in under_way.iter().zip(self.finish(&under_way, prevented)) {
             match result {
+                Ok(()) if self.handle.service.phase(*arm) != Phase::Ready => {
+                    self.not_parked(ended, *arm, "it was held after it had arrived");
+                }
                 Ok(()) => {
                     self.arms.disable_at_release(*arm);
                     ended.parked.push(self.name_of(*arm));
@@ -85,13 +88,18 @@ impl Run {
 
     /// Returns why no further arm may move to its park pose, if so. What it takes from the endings is not seen again.
     fn interruption(&self) -> Option<String> {
-        let why = match self.endings.1.try_recv() {
-            Ok(Ending::Signal(_)) => "it was interrupted by a second signal",
-            Ok(Ending::Fault(_) | Ending::Log(_)) => UNCONTROLLED,
-            _ if !self.tick.is_alive() => "the tick has ended",
-            _ => return None,
+        let why = |ending| match ending {
+            Ending::Signal(_) => Some("it was interrupted by a second signal"),
+            Ending::Fault(_) | Ending::Log(_) => Some(UNCONTROLLED),
+            Ending::Duration | Ending::Asked => None,
         };
-        Some(why.to_owned())
+        let mut why = self.endings.1.try_iter().find_map(why);
+        if self.handle.service.was_cancelled() {
+            why = Some("it was cancelled");
+        } else if !self.tick.is_alive() {
+            why = Some("the tick has ended");
+        }
+        why.map(str::to_owned)
     }
 
     /// Returns which other arm is held: it may be in the way, or have touched this one.

@@ -14,17 +14,27 @@ use crate::rpc::{Code, RpcError};
 use crate::telemetry::describe::Severity;
 use crate::telemetry::{Phase, TaskState};
 
-/// How long a controller may refuse a load because the arm still moves, and the time between two tries.
-const SETTLING_LIMIT: Duration = Duration::from_millis(600);
-const RETRY_PERIOD: Duration = Duration::from_millis(100);
+/// How long a controller may count an arm as moving that is at rest here: after this time a refused load is tried once
+/// more. Not more often: a try may reset the controller.
+const SETTLING_TIME: Duration = Duration::from_millis(500);
 
 /// The objects that an arm holds and whose mass is known.
 #[derive(Debug, Default)]
 pub(super) struct HeldLoads {
-    /// The load without them: read when the first one was attached.
+    /// The load that was set without them, by this run.
+    set: Option<Load>,
+    /// The load without them, known when the first one was attached.
     base: Load,
     /// By name.
     objects: BTreeMap<String, Load>,
+}
+
+/// A load that the controller has taken.
+struct Written {
+    /// As the controller reports it.
+    payload: Option<LoadReport>,
+    /// Whether the arm is as ready as before: a controller may reset when its load is set.
+    ready: Result<(), RpcError>,
 }
 
 impl HeldLoads {
@@ -48,9 +58,11 @@ impl Service {
         let arm = self.arm_index(&call.arm)?;
         self.takes_payload(arm)?;
         let held = &mut *self.held_loads.get(arm as usize).ok_or_else(internal)?.lock().await;
-        let payload = self.write_payload(arm, &call.load()).await?;
+        let written = self.write_payload(arm, &call.load()).await?;
         held.objects.clear();
-        Ok(Reply::ArmPayloadSet(PayloadReply { payload }))
+        held.set = Some(call.load());
+        written.ready?;
+        Ok(Reply::ArmPayloadSet(PayloadReply { payload: written.payload }))
     }
 
     fn takes_payload(&self, arm: u16) -> Result<(), RpcError> {
@@ -61,8 +73,8 @@ impl Service {
         Err(RpcError::new(Code::Unsupported, what).hint("its page in docs/arms lists what the adapter supports"))
     }
 
-    /// Sets a load at rest, and returns what the controller reports.
-    async fn write_payload(&self, arm: u16, load: &Load) -> Result<Option<LoadReport>, RpcError> {
+    /// Sets a load at rest. After an error the controller has the load that it had.
+    async fn write_payload(&self, arm: u16, load: &Load) -> Result<Written, RpcError> {
         self.rests(arm)?;
         let name = self.parts.names.arm(arm);
         let resets = self.parts.connected.get(arm as usize).is_some_and(|connected| connected.payload_resets);
@@ -71,16 +83,14 @@ impl Service {
             self.ask(Request::PrepareDisable { arm }).await?;
             self.wait_for_rest(&name, arm, Instant::now() + self.braking_limit(arm)).await?;
         }
-        let (device, limit) = (self.device(arm)?, Instant::now() + SETTLING_LIMIT);
+        let device = self.device(arm)?;
         let mut actual = order(device.set_payload(*load)).await;
-        // The controller may count the arm as moving for slightly longer than it does here.
-        while matches!(actual, Err(AdapterError::Rejected(_))) && Instant::now() < limit {
-            self.until(Instant::now() + RETRY_PERIOD, || None::<()>).await;
+        if matches!(actual, Err(AdapterError::Rejected(_))) {
+            self.until(Instant::now() + SETTLING_TIME, || None::<()>).await;
+            self.rests(arm)?;
             actual = order(device.set_payload(*load)).await;
         }
-        if again {
-            self.enable(name.clone()).await?;
-        }
+        let ready = if again { self.enable(name.clone()).await.map(drop) } else { Ok(()) };
         let actual = actual.map_err(|e| refused(&name, "did not take the payload", &e))?;
         let [x, y, z] = load.center;
         self.parts
@@ -88,7 +98,7 @@ impl Service {
             .log(Severity::Info, format!("{name}: payload set to {:.3} kg at {x:.4} {y:.4} {z:.4} m", load.mass));
         // Each load is logged, also one that is soon replaced.
         self.log_details();
-        Ok(actual.map(LoadReport::from))
+        Ok(Written { payload: actual.map(LoadReport::from), ready })
     }
 
     /// Returns an error while an arm moves or executes a motion.
@@ -122,10 +132,15 @@ impl Service {
         let held = &mut *self.held_loads.get(arm as usize).ok_or_else(internal)?.lock().await;
         self.rests(arm)?;
         let Reply::Attach(attached) = self.planner_call(Call::Attach(call)).await? else { return Err(internal()) };
-        let Some(load) = attached.load else { return Err(internal()) };
-        let carried = self.carry(arm, held, &name, Some(load.into())).await;
+        let carried = match attached.load {
+            Some(load) => self.carry(arm, held, &name, Some(load.into())).await,
+            None => Err(internal()),
+        };
         match carried {
-            Ok(payload) => Ok(Reply::Attach(AttachReply { payload, ..attached })),
+            Ok(written) => {
+                written.ready?;
+                Ok(Reply::Attach(AttachReply { payload: written.payload, ..attached }))
+            }
             Err(error) => {
                 // An object that the controller does not carry stays in the world.
                 let _ = self.planner_call(Call::Detach(api::Detach { name })).await;
@@ -141,12 +156,35 @@ impl Service {
             if held.objects.contains_key(&call.name) {
                 self.rests(arm as u16)?;
                 let name = call.name.clone();
-                let detached = self.planner_call(Call::Detach(call)).await?;
-                self.carry(arm as u16, held, &name, None).await?;
-                return Ok(detached);
+                // One that no robot holds any longer, after an error or in a planner that was started again, still
+                // weighs on the controller.
+                let detached = match self.planner_call(Call::Detach(call)).await {
+                    Err(error) if !matches!(error.code, Code::UnknownObject | Code::InvalidParams) => {
+                        return Err(error);
+                    }
+                    detached => detached,
+                };
+                self.carry(arm as u16, held, &name, None).await?.ready?;
+                return detached;
             }
         }
         self.planner_call(Call::Detach(call)).await
+    }
+
+    /// Returns the arm whose load an `attach` or `detach` changes.
+    pub(super) async fn arm_of_load(&self, call: &Call) -> Result<Option<u16>, RpcError> {
+        match call {
+            Call::Attach(attach) if attach.mass.is_some() => self.arm_of_robot(&attach.robot).await,
+            Call::Detach(detach) => {
+                for (held, arm) in self.held_loads.iter().zip(0..) {
+                    if held.lock().await.objects.contains_key(&detach.name) {
+                        return Ok(Some(arm));
+                    }
+                }
+                Ok(None)
+            }
+            _ => Ok(None),
+        }
     }
 
     /// Adds or removes an object of an arm's load, and sets the load.
@@ -156,13 +194,18 @@ impl Service {
         held: &mut HeldLoads,
         object: &str,
         load: Option<Load>,
-    ) -> Result<Option<LoadReport>, RpcError> {
+    ) -> Result<Written, RpcError> {
         if held.objects.is_empty() {
             let name = self.parts.names.arm(arm);
-            let base = order(self.device(arm)?.read_payload()).await;
-            let base = base.map_err(|e| refused(&name, "did not report its payload", &e))?;
-            // A controller that reports none has what was set.
-            held.base = base.or(self.device(arm)?.health().details().payload).unwrap_or_default();
+            let configured = self.parts.blueprint.arms.get(arm as usize).and_then(|arm| arm.setup.payload);
+            // What was set counts, even if the controller has lost it since: it is set again with the motors.
+            held.base = match held.set.or(configured) {
+                Some(set) => set,
+                None => {
+                    let read = order(self.device(arm)?.read_payload()).await;
+                    read.map_err(|e| refused(&name, "did not report its payload", &e))?.unwrap_or_default()
+                }
+            };
         }
         let before = match load {
             Some(load) => held.objects.insert(object.to_owned(), load),

@@ -82,8 +82,10 @@ pub struct Service {
     pub(super) plan_requests: Mutex<BTreeMap<u64, api::Plan>>,
     pub(super) me: Weak<Self>,
     closed: AtomicBool,
-    /// Whether arms move to their park pose: stops are accepted although it is closed.
-    parking: AtomicBool,
+    /// Whether the tick still runs: stops are accepted although the run is closed.
+    stoppable: AtomicBool,
+    /// A client cancelled motion after the run was closed.
+    cancelled: AtomicBool,
     claim: Mutex<Option<Claim>>,
 }
 
@@ -106,7 +108,8 @@ impl Service {
             plan_requests: Mutex::default(),
             me,
             closed: AtomicBool::new(false),
-            parking: AtomicBool::new(false),
+            stoppable: AtomicBool::new(true),
+            cancelled: AtomicBool::new(false),
             claim: Mutex::new(None),
         }
     }
@@ -126,9 +129,14 @@ impl Service {
         self.closed.store(true, Ordering::Release);
     }
 
-    /// Accepts stops while arms move to their park pose, although the run is closed.
-    pub fn set_parking(&self, parking: bool) {
-        self.parking.store(parking, Ordering::Release);
+    /// Accepts no more stops: the tick ends.
+    pub fn end_stops(&self) {
+        self.stoppable.store(false, Ordering::Release);
+    }
+
+    /// Returns whether a client cancelled motion after the run was closed.
+    pub fn was_cancelled(&self) -> bool {
+        self.cancelled.load(Ordering::Acquire)
     }
 
     /// Returns whether the run is shutting down.
@@ -269,9 +277,15 @@ impl Service {
 
     async fn answer(&self, call: Call) -> Result<Reply, RpcError> {
         let changes = !matches!(call, Call::Status(_) | Call::State(_) | Call::Motion(_));
-        let stops = matches!(call, Call::Stop(_) | Call::Cancel(_)) && self.parking.load(Ordering::Acquire);
-        if changes && !stops && self.closed.load(Ordering::Acquire) {
-            return self.refusal(&Outcome::ShuttingDown).map_or_else(|| Err(internal()), Err);
+        if changes && self.is_closed() {
+            let stops = self.stoppable.load(Ordering::Acquire);
+            match call {
+                Call::Stop(_) if stops => {}
+                Call::Cancel(_) if stops => self.cancelled.store(true, Ordering::Release),
+                // It does.
+                Call::Shutdown(_) => return Ok(Reply::Shutdown(Done {})),
+                _ => return self.refusal(&Outcome::ShuttingDown).map_or_else(|| Err(internal()), Err),
+            }
         }
         match call {
             Call::Status(_) => {
@@ -320,6 +334,12 @@ impl Service {
 }
 
 impl Backend for Service {
+    fn arms_of_load<'a>(&'a self, request: &'a Call) -> BoxFuture<'a, Result<Vec<String>, RpcError>> {
+        Box::pin(async {
+            Ok(self.arm_of_load(request).await?.map(|arm| self.parts.names.arm(arm)).into_iter().collect())
+        })
+    }
+
     fn call(&self, request: Call) -> BoxFuture<'_, Result<Reply, RpcError>> {
         Box::pin(self.answer(request))
     }

@@ -33,6 +33,10 @@ impl PlannerPort {
             link_index(robot, link)?;
         }
         let at = link_pose(robot, &link, moment)?.inverse() * isometry(&object.pose);
+        let load = match call.mass {
+            Some(mass) => Some(load_of(&object.shape, mass, &(in_flange(robot, &link, moment)? * at))),
+            None => None,
+        };
         let held = |world: &mut World| {
             let stood = world.remove(&call.name)?;
             let solid = Solid { frame: frame(&at), ..stood.solid.clone() };
@@ -51,9 +55,6 @@ impl PlannerPort {
             taken
         };
         self.thread.world(held).map_err(|e| wrong(e.to_string()))?;
-        let flange = link_pose(robot, &robot.config.end_effector_link, moment)?;
-        let in_flange = flange.inverse() * link_pose(robot, &link, moment)? * at;
-        let load = call.mass.map(|mass| load_of(&object.shape, mass, &in_flange));
         object.pose = spec(&at);
         object.held_by = Some([call.robot.clone(), link]);
         objects.insert(call.name.clone(), object);
@@ -129,6 +130,15 @@ fn link_pose(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isomet
     let joints = positions_of(&robot.config.name, &robot.config.coordinator_joints, moment)?;
     kinematics.forward_from(&robot.body.base, &joints, &mut frames);
     Ok(pose(&kinematics.link_frame(index, &frames)))
+}
+
+/// Returns the present pose of a robot's link in the frame of its flange.
+fn in_flange(robot: &PlannedRobot, link: &str, moment: &Moment) -> Result<Isometry3<f64>, RpcError> {
+    let Some(flange) = &robot.config.flange_link else {
+        let what = format!("{} has no `flange_link`: a load is measured from the arm's flange", robot.config.name);
+        return Err(wrong(what).hint("name the flange's link in `planner.robots`, such as `flange_link: tool0`"));
+    };
+    Ok(link_pose(robot, flange, moment)?.inverse() * link_pose(robot, link, moment)?)
 }
 
 /// Returns a solid body of this shape and mass [kg] as a load; a mesh or a cloud is a point mass at its origin. `at`:
@@ -216,13 +226,17 @@ mod tests {
 
     /// A planner with the built-in robot and a ball in its world, and its present state.
     fn with_a_ball(at: [f64; 3]) -> (PlannerPort, Moment) {
+        with_robot(RobotConfig::yourarm(), at)
+    }
+
+    fn with_robot(robot: RobotConfig, at: [f64; 3]) -> (PlannerPort, Moment) {
         let ball = ObjectConfig {
             name: "ball".into(),
             shape: ObjectShape::Sphere(0.02),
             pose: Isometry3::translation(at[0], at[1], at[2]),
             padding: 0.0,
         };
-        let (robots, timeout) = (vec![RobotConfig::yourarm()], Duration::from_secs(1));
+        let (robots, timeout) = (vec![robot], Duration::from_secs(1));
         let config = PlannerConfig { timeout, padding: 0.0, robots, objects: vec![ball] };
         let setup = PlanningScene::load(&config).unwrap();
         let joints = setup.robots[0].config.coordinator_joints.iter();
@@ -236,6 +250,34 @@ mod tests {
         let robot = &port.thread.setup().robots[0];
         let at = link_pose(robot, &robot.config.end_effector_link, moment).unwrap() * held;
         at.translation.vector.into()
+    }
+
+    #[test]
+    fn a_load_is_measured_from_the_flange_whatever_the_link_of_pose_goals() {
+        let robot = RobotConfig {
+            model_path: "builtin:xarm6_gripper".into(),
+            base_link: "link_base".into(),
+            end_effector_link: "link_tcp".into(),
+            flange_link: Some("link_eef".into()),
+            ..RobotConfig::yourarm()
+        };
+        let (port, moment) = with_robot(robot.clone(), [9.0, 0.0, 0.0]);
+        let at_tool = link_pose(&port.thread.setup().robots[0], "link_tcp", &moment).unwrap();
+        port.move_to(&api::WorldMove { name: "ball".into(), pose: spec(&at_tool) }).unwrap();
+        let attach = |name: &str| api::Attach {
+            name: name.into(),
+            robot: "arm".into(),
+            link: None,
+            touch_links: Vec::new(),
+            mass: Some(2.0),
+        };
+        let load = port.attach(&attach("ball"), &moment).unwrap().load.unwrap();
+        assert!((load.center[2] - 0.172).abs() < 1e-9, "{:?}: its fingers are 172 mm in front of it", load.center);
+
+        let (port, moment) = with_robot(RobotConfig { flange_link: None, ..robot }, [0.9, 0.0, 0.0]);
+        let refused = port.attach(&attach("ball"), &moment).unwrap_err();
+        assert!(refused.message.contains("no `flange_link`"), "{refused}");
+        assert!(lock(&port.objects)["ball"].held_by.is_none(), "it was not attached");
     }
 
     #[test]

@@ -5,9 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-use dimos::arm::{ArmCommand, ArmState, Interference, Link, Supervision};
+use dimos::arm::{ArmCommand, ArmState, Interference, IoInfo, IoState, Link, Supervision};
 use dimos::clock::{Clock, Mono, MonotonicClock};
-use dimos::hardware::adapter::{AdapterError, ManipulatorAdapter};
+use dimos::hardware::adapter::{
+    AdapterError, AdapterResult, Io, ManipulatorAdapter, ManipulatorInfo, RobotState, Stop,
+};
 use dimos::hardware::arms::xarm::{self, emulator::XArmEmulator};
 use dimos::hardware::device::{Device, DeviceConfig};
 use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
@@ -17,6 +19,7 @@ use dimos::rt::host;
 use dimos::rt::slot::{SlotReader, SlotWriter, slot};
 use dimos::testing::{Call, MockAdapter};
 
+use crate::support::delegate::delegate;
 use crate::support::wire::watch::Watch;
 
 const LIMIT: Duration = Duration::from_secs(20);
@@ -354,5 +357,70 @@ fn a_gripper_that_goes_on_after_a_stop_is_held() {
         assert!((emulator.gripper() - held).abs() < 1e-6, "held");
         Ok(())
     });
+    bench.end();
+}
+
+/// An arm whose inputs take longer to read than a client takes to ask again.
+struct SlowInputs {
+    inner: MockAdapter,
+}
+
+impl ManipulatorAdapter for SlowInputs {
+    delegate!(
+        inner: connect, disconnect, is_connected, get_info, get_dof, get_limits, set_control_mode, get_control_mode,
+        read_joint_positions, read_state, read_error, read_enabled, write_joint_positions, write_joint_velocities,
+        write_stop, write_enable, write_clear_errors
+    );
+
+    fn io(&mut self) -> Option<&mut dyn Io> {
+        Some(self)
+    }
+}
+
+impl Io for SlowInputs {
+    fn get_io(&self) -> IoInfo {
+        IoInfo::default()
+    }
+
+    fn read_io(&mut self, _: &mut IoState) -> AdapterResult<()> {
+        std::thread::sleep(Duration::from_millis(5));
+        Ok(())
+    }
+
+    fn write_digital_output(&mut self, _: u8, _: bool) -> AdapterResult<()> {
+        Err(AdapterError::Unsupported)
+    }
+}
+
+#[test]
+fn clients_that_ask_without_a_pause_delay_no_stop() {
+    let mock = MockAdapter::new(6);
+    let mut bench = bench_of(Box::new(SlowInputs { inner: mock.clone() }), mock, 100.0);
+    let asking = AtomicU64::new(1);
+    let device = &bench.device;
+    let (stopped, asked) = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..3)
+            .map(|_| {
+                scope.spawn(|| {
+                    let mut asked = 0;
+                    while asking.load(Relaxed) == 1 {
+                        device.read_io().wait(LIMIT).unwrap();
+                        asked += 1;
+                    }
+                    asked
+                })
+            })
+            .collect();
+        std::thread::sleep(Duration::from_millis(200));
+        let stop = ArmCommand { seq: 1, stop_seq: 1, ..ArmCommand::default() };
+        bench.beat.beat(MonotonicClock.now());
+        bench.commands.write(&stop);
+        device.wake().raise();
+        std::thread::sleep(Duration::from_millis(500));
+        let stopped = device.health().stop_confirmed.load(Relaxed) == 1;
+        asking.store(0, Relaxed);
+        (stopped, clients.into_iter().map(|client| client.join().unwrap()).sum::<u32>())
+    });
+    assert!(stopped, "after {asked} answers to clients");
     bench.end();
 }

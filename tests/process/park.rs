@@ -5,6 +5,7 @@ use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::HasArm;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::hardware::sim::serial_server::SerialServer;
+use dimos::rpc::api::Shutdown;
 use rustix::process::Signal;
 use serde_json::json;
 
@@ -136,6 +137,12 @@ fn a_stop_and_a_second_signal_before_the_way_to_the_park_pose_are_not_lost() {
     run.until("decelerating to rest");
     run.signal(Signal::INT);
     rig.not_parked(run, 143, "it was interrupted by a second signal");
+
+    let (cancelled, run) = moving();
+    run.signal(Signal::TERM);
+    cancelled.home.dimos("cancel").with(0);
+    cancelled.not_parked(run, 143, "it was cancelled");
+
     // Its base turned towards the target of the motion; the park pose is on the other side.
     assert!(rig.servos.true_positions().unwrap()[0] > START[0], "{:?}", rig.servos.true_positions());
 }
@@ -154,6 +161,31 @@ fn a_stop_and_a_second_signal_end_the_way_to_the_park_pose() {
     run.signal(Signal::TERM);
     rig.leaves();
     rig.home.dimos("move arm 0 0 0 0 0").with(1).says(&["SHUTTING_DOWN"]);
+    rig.home.client().call(Shutdown {}).expect("it does shut down");
     rig.home.dimos("stop").with(0);
     rig.not_parked(run, 143, "arm is held (stopped by an operator)");
+}
+
+/// An arm that has arrived waits for another one, and is held meanwhile.
+#[test]
+fn an_arm_that_is_held_after_it_has_arrived_keeps_its_motors() {
+    let rig = Rig::new();
+    let text = "
+name: two
+include: [parked]
+hardware:
+  - {hardware_id: other, adapter_type: mock, joints: {prefix: other, count: 1}, on_exit: park, park_pose: [0]}
+tasks:
+  - {name: traj_other, type: trajectory, joint_names: {hardware: other}}
+";
+    rig.home.write("two.yaml", text);
+    let run = rig.home.run("two.yaml --no-record");
+    run.signal(Signal::TERM);
+    eventually("the other one, which is there already, has arrived", || {
+        let status = rig.home.status();
+        let task = status["tasks"].as_array().unwrap().iter().find(|task| task["name"] == "traj_other").unwrap();
+        rig.off(&START) > 0.05 && task["state"] == "COMPLETED"
+    });
+    rig.home.dimos("stop other").with(0);
+    run.wait().with(143).says(&["warning: other: not parked: it was held after it had arrived"]);
 }

@@ -7,7 +7,7 @@ use dimos::hardware::arms::yourarm::emulator::wire::Request;
 use dimos::hardware::arms::yourarm::emulator::{SimOptions, YourArmEmulator};
 use dimos::hardware::registry::Emulator;
 use dimos::recording::replay::{LogReader, Payload};
-use dimos::rpc::api::Move;
+use dimos::rpc::api::{Lease, Move};
 
 use crate::support::program::{Home, eventually};
 
@@ -57,6 +57,11 @@ fn an_attached_object_of_known_mass_is_carried_and_taken_back() {
     home.dimos("world detach ball").with(1).says(&["is executing", "hint: "]);
     home.dimos("arm payload arm --mass 1").with(1).says(&["is executing"]);
     assert_eq!(load(&arm)[0], 2.0);
+    let mut holder = home.client();
+    holder.call(Lease { arm: Some("arm".into()) }).unwrap();
+    home.dimos("world detach ball").with(1).says(&["arm is commanded by"]);
+    assert_eq!(load(&arm)[0], 2.0);
+    drop(holder);
     eventually("it is at rest", || home.status()["tasks"][0]["state"] == "COMPLETED");
     eventually("ball is let go of", || home.dimos("world detach ball").code == Some(0));
     assert_eq!(load(&arm), [0.8, 0.0, 0.0, 50.0]);

@@ -59,11 +59,7 @@ pub fn run(args: &ReplayArgs, onto: &str, log: &Path, span: &Span, catalog: Cata
     terminal.flush();
     print_summary(&result, &ended, args.json);
     for arm in ended.arms.iter().filter(|_| !args.json) {
-        output::note(format_args!(
-            "{}: {}",
-            arm.hardware_id,
-            banner::after_exit(arm, ended.parked.contains(&arm.hardware_id))
-        ));
+        output::note(format_args!("{}: {}", arm.hardware_id, banner::after_exit(arm, &ended)));
     }
     result.map(|_| Exit::Ok).or_else(|end| match end {
         End::Failed(failure) => Err(failure),

@@ -181,18 +181,18 @@ impl Worker {
         let woke = self.config.clock.now();
         self.late = woke.since(due);
         self.see_tick(woke, self.late);
-        loop {
-            match orders.try_recv() {
-                Ok(order) => {
-                    if self.execute_order(adapter, order) {
-                        return true;
-                    }
-                }
-                Err(TryRecvError::Empty) => break,
-                Err(TryRecvError::Disconnected) => {
-                    self.finish(adapter, false).ok();
+        // One per cycle: clients that ask without a pause delay no setpoint and no stop by more than one answer.
+        match orders.try_recv() {
+            Ok(order) => {
+                if self.execute_order(adapter, order) {
                     return true;
                 }
+                self.wake.raise();
+            }
+            Err(TryRecvError::Empty) => {}
+            Err(TryRecvError::Disconnected) => {
+                self.finish(adapter, false).ok();
+                return true;
             }
         }
         if self.connected {

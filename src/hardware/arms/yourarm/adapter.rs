@@ -386,7 +386,7 @@ impl JointMonitor for YourArmAdapter {
 
 impl Payload for YourArmAdapter {
     fn read_payload(&mut self) -> AdapterResult<Option<Load>> {
-        let [mass, x, y, z, inertia @ ..] = self.request(&Command::GetPayload, REPLY, protocol::decode_floats::<10>)?;
+        let [mass, x, y, z, inertia @ ..] = self.request(&Command::GetPayload, CYCLE, protocol::decode_floats::<10>)?;
         Ok(Some(Load { mass, center: [x, y, z].map(|v| v / MM_PER_M), inertia }))
     }
 

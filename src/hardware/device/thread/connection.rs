@@ -29,6 +29,8 @@ impl Worker {
         }
         let limits = adapter.get_limits().inspect_err(|_| adapter.disconnect())?;
         self.check_parts(adapter).inspect_err(|_| adapter.disconnect())?;
+        let calibration_offsets =
+            slow_readings::calibration_offsets(adapter, self.config.dof).inspect_err(|_| adapter.disconnect())?;
         self.whole_state_at_once = info.whole_state_at_once;
         // An older controller may deliver less often than its kind.
         self.config.native_rate = self.config.native_rate.min(info.native_rate);
@@ -50,7 +52,6 @@ impl Worker {
         let read_period = self.config.read_period();
         let gripper_range = adapter.gripper().and_then(|gripper| gripper.get_gripper_range());
         let io = adapter.io().map(|io| io.get_io());
-        let calibration_offsets = slow_readings::calibration_offsets(adapter, self.config.dof)?;
         let has_payload = adapter.payload().is_some();
         let payload_resets = adapter.payload().is_some_and(|payload| payload.resets_controller());
         Ok(Connected {
@@ -155,6 +156,9 @@ impl Worker {
         } else if ours && self.should_reconnect {
             let orders = if disable { "neither a stop nor a disable" } else { "no stop" };
             result = Err(AdapterError::Io(format!("the connection is lost: {orders} reached the arm")));
+        } else if self.connected {
+            let orders = if disable { "neither stopped nor disabled" } else { "not stopped" };
+            result = Err(AdapterError::Rejected(format!("another program commands it: it was {orders}")));
         }
         adapter.disconnect();
         self.connected = false;

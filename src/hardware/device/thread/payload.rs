@@ -38,7 +38,17 @@ impl Worker {
         if adapter.payload().is_some_and(|payload| payload.resets_controller()) {
             self.expect_nothing(self.ordered_power);
         }
-        let actual = self.while_connected(adapter, |adapter| write(adapter, load));
+        let actual = self.while_connected(adapter, |adapter| {
+            let before = read(adapter)?;
+            let actual = write(adapter, load);
+            // A load that is not the one ordered does not stay, nor one that may be.
+            if let (Err(_), Some(before)) = (&actual, before)
+                && read(adapter).is_ok_and(|present| present.is_none_or(|present| !is_set(&before, &present)))
+            {
+                write(adapter, &before)?;
+            }
+            actual
+        });
         // The state changes where setting the load resets the controller.
         self.read(adapter);
         let actual = actual?;
@@ -75,13 +85,21 @@ fn write(adapter: &mut dyn ManipulatorAdapter, load: &Load) -> AdapterResult<Opt
 
 fn mount(adapter: &mut dyn ManipulatorAdapter, gravity: [f64; 3]) -> AdapterResult<()> {
     let payload = adapter.payload().ok_or(AdapterError::Unsupported)?;
-    payload.write_mounting(gravity)?;
+    let differs = |actual: &[f64; 3]| actual.iter().zip(gravity).any(|(a, b)| (a - b).abs() > GRAVITY_TOLERANCE);
+    if matches!(payload.read_mounting(), Ok(Some(present)) if !differs(&present)) {
+        return Ok(());
+    }
+    payload.write_mounting(gravity).map_err(|error| match error {
+        AdapterError::Unsupported => AdapterError::Rejected(
+            "the mounting of this arm cannot be set\nhint: remove `mounting`, and set it with the vendor's program"
+                .into(),
+        ),
+        error => error,
+    })?;
     match payload.read_mounting()? {
-        Some(actual) if actual.iter().zip(gravity).any(|(a, b)| (a - b).abs() > GRAVITY_TOLERANCE) => {
-            Err(AdapterError::Rejected(format!(
-                "the controller reports gravity along {actual:.3?} of its base after {gravity:.3?} was set"
-            )))
-        }
+        Some(actual) if differs(&actual) => Err(AdapterError::Rejected(format!(
+            "the controller reports gravity along {actual:.3?} of its base after {gravity:.3?} was set"
+        ))),
         _ => Ok(()),
     }
 }

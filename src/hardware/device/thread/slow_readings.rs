@@ -7,7 +7,7 @@ use super::{Worker, payload};
 use crate::arm::{IoState, JointStatus, Load, OutputValue};
 use crate::clock::Mono;
 use crate::hardware::adapter::{AdapterError, AdapterResult, ManipulatorAdapter};
-use crate::hardware::device::Details;
+use crate::hardware::device::{Details, Note};
 use crate::joint::{Joints, MAX_DOF};
 
 /// Time between two slow readings. On some arms each costs a round trip.
@@ -31,8 +31,8 @@ pub(super) struct Slow {
     unpublished: bool,
     due: Mono,
     turn: usize,
-    /// A slow reading failed, and that was logged.
-    failing: bool,
+    /// Which readings failed the last time; the first failure of each was logged.
+    failing: [bool; TURNS.len()],
 }
 
 impl Slow {
@@ -99,12 +99,12 @@ impl Worker {
         let now = self.config.clock.now();
         if now >= self.slow.due {
             self.slow.due = now.after(PERIOD);
-            let turn = TURNS.get(self.slow.turn % TURNS.len());
-            self.slow.turn = self.slow.turn.wrapping_add(1);
-            let result = turn.map_or(Ok(()), |turn| self.slow_turn(adapter, *turn, now));
+            let index = self.slow.turn % TURNS.len();
+            self.slow.turn = index + 1;
+            let result = TURNS.get(index).map_or(Ok(()), |turn| self.slow_turn(adapter, *turn, now));
             // A lost connection is a failed read.
             let lost = matches!(result, Err(AdapterError::NotConnected)) || !adapter.is_connected();
-            self.log_slow_failure(&result);
+            self.log_slow_failure(index, &result);
             if lost {
                 return result;
             }
@@ -154,13 +154,15 @@ impl Worker {
         }
     }
 
-    /// Logs the first of consecutive failures.
-    fn log_slow_failure<T>(&mut self, result: &AdapterResult<T>) {
-        match result {
-            Err(error) if !self.slow.failing => self.trouble(&format!("status values cannot be read: {error}")),
-            _ => {}
+    /// Logs the first of consecutive failures. They are no trouble of the arm: its state comes.
+    fn log_slow_failure<T>(&mut self, index: usize, result: &AdapterResult<T>) {
+        let Some(failing) = self.slow.failing.get_mut(index) else { return };
+        let began = !std::mem::replace(failing, result.is_err());
+        if let Err(error) = result
+            && began
+        {
+            (self.config.notes)(Note::Began(format!("status values cannot be read: {error}")));
         }
-        self.slow.failing = result.is_err();
     }
 }
 
