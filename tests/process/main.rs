@@ -13,6 +13,7 @@ mod built_in_arms;
 mod changed_world;
 mod cli_verbs;
 mod daemon;
+mod device_clock;
 mod disk;
 mod fault_table;
 mod first_run;
