@@ -97,8 +97,8 @@ pub trait Service {
     fn find_single(&mut self) -> AdapterResult<Single> {
         Err(AdapterError::Unsupported)
     }
-    /// Gives the motor that [`Service::find_single`] found this number and the rate of the arm's address, and reads them
-    /// back.
+    /// Gives the motor that [`Service::find_single`] found this number and the rate of the arm's address, and reads
+    /// both back.
     fn assign(&mut self, _single: &Single, _motor: &Motor) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }

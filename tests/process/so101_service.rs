@@ -231,7 +231,7 @@ fn the_port_of_an_arm_is_found() {
     home.dimos(&format!("arm find-port --ask so101 --port {there}")).with(3).says(&["no so101 answers"]);
     home.dimos(&format!("arm find-port --ask piper --port {there}")).with(2).says(&["adapters with such a bus: so101"]);
 
-    // A port in use: by another verb, under another name of the same port, and by a program that knows no locks of ours.
+    // A port in use: by another verb under another name of the same port, and by a program without our locks.
     let link = home.path().join("pci-0000:00:14.0-usb-0:1:1.0-port0");
     symlink(&here, &link).unwrap();
     let terminal = Terminal::new(140, 30);

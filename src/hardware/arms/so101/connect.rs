@@ -1,5 +1,5 @@
-//! Connecting: checks that the servos are those of this arm, calibrated and set as the blueprint says. Enables and moves
-//! nothing.
+//! Connecting: checks that the servos are those of this arm, calibrated and set as the blueprint says. Enables and
+//! moves nothing.
 
 use super::adapter::So101Adapter;
 use super::bus::servo;

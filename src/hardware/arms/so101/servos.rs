@@ -122,9 +122,9 @@ pub(super) fn error_of(servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
     Some((servo.error.into(), format!("servo {} ({name}): {text}", i + 1)))
 }
 
-/// Returns whether a stop makes the position of servo `j` its goal: if it moves, or is a joint far from its goal. Joints
-/// that droop and a gripper on a workpiece rest away from their goals: with a goal at its position, the joint would sink
-/// further, and the gripper lose its grip. The device holds a gripper that starts after this.
+/// Returns whether a stop makes the position of servo `j` its goal: if it moves, or is a joint far from its goal.
+/// Joints that droop and a gripper on a workpiece rest away from their goals: with a goal at its position, the joint
+/// would sink further, and the gripper lose its grip. The device thread holds a gripper that starts after this.
 pub(super) fn must_stop(j: usize, servo: &Servo) -> bool {
     servo.moving || j < DOF && (!servo.on || (servo.goal - servo.position).abs() > DROOP)
 }
