@@ -85,6 +85,6 @@ pub fn interrupted(signals: &Signals) -> Failure {
     match signals.last() {
         Some(signal) => Failure::new(Exit::by_signal(signal), "interrupted"),
         None => Failure::new(Exit::Failed, "interrupted: the terminal is closed, or its input ended (Ctrl-D)")
-            .hint("start again, and answer with Enter; --yes asks nothing"),
+            .hint("start again, and answer with Enter"),
     }
 }
