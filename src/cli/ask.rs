@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
+use rustix::termios::{QueueSelector, tcflush};
 
 use super::exit::{Exit, Failure, Result};
 use super::follow::Signals;
@@ -65,8 +66,16 @@ pub fn needs_terminal(instead: &str) -> Result<()> {
     Err(Failure::usage("stdin is not a terminal: the questions cannot be answered").hint(instead))
 }
 
-/// Prints what to do, and waits for Enter. An error after a signal.
+/// Discards what was typed before a question: an Enter pressed too early must not answer it.
+pub fn discard_typed() {
+    // Only a terminal has a queue that can be discarded.
+    let _ = tcflush(io::stdin(), QueueSelector::IFlush);
+}
+
+/// Prints what to do, and waits for an Enter that is pressed after that. An error after a signal, and at the end of
+/// input.
 pub fn enter(signals: &Signals, what: &str) -> Result<()> {
+    discard_typed();
     output::note(format_args!("{what}, then press Enter (Ctrl-C ends this)"));
     line(signals).map(drop).ok_or_else(|| interrupted(signals))
 }
@@ -75,6 +84,7 @@ pub fn enter(signals: &Signals, what: &str) -> Result<()> {
 pub fn interrupted(signals: &Signals) -> Failure {
     match signals.last() {
         Some(signal) => Failure::new(Exit::by_signal(signal), "interrupted"),
-        None => Failure::new(Exit::Failed, "interrupted: the terminal is closed"),
+        None => Failure::new(Exit::Failed, "interrupted: the terminal is closed, or its input ended (Ctrl-D)")
+            .hint("start again, and answer with Enter"),
     }
 }

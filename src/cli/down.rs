@@ -39,11 +39,12 @@ pub fn run(args: &Args) -> Result {
         }
     };
     let mut client = Client::connect(&found.name, &found.socket)?;
-    // A run that cannot report its status can still be ended.
-    let parks = client.call(Status {}).is_ok_and(|status| status.arms.iter().any(|arm| arm.on_exit == "park"));
-    let timeout = if parks { PARKING_TIMEOUT } else { SHUTDOWN_TIMEOUT };
     client.call(Shutdown {})?;
     let requested = Instant::now();
+    // Afterwards, and over the same connection: a slow report delays no shutdown, and is that of the run that ends. One
+    // that has ended already reports nothing.
+    let parks = client.call(Status {}).is_ok_and(|status| status.arms.iter().any(|arm| arm.on_exit == "park"));
+    let timeout = if parks { PARKING_TIMEOUT } else { SHUTDOWN_TIMEOUT };
     // The name is free before the process has written its last lines.
     let recorded = || RunRecord::of(&found.name).filter(|record| record.pid == found.pid);
     let is_live = || recorded().is_some_and(|record| record.state() == RunState::Live);

@@ -32,6 +32,8 @@ pub struct Setting {
     pub motor: &'static str,
     /// What it sets.
     pub name: &'static str,
+    /// The motor's register that has it.
+    pub register: u16,
     /// Its value.
     pub found: u16,
     /// The value that the adapter wants.
@@ -68,14 +70,13 @@ pub trait Service {
     fn positions(&mut self) -> AdapterResult<Vec<i32>> {
         Err(AdapterError::Unsupported)
     }
-    /// Writes the middle that was taken and these ranges to the motors, and reads them back. Returns the text of the
-    /// calibration file.
-    fn write_calibration(&mut self, _ranges: &[(i32, i32)]) -> AdapterResult<String> {
+    /// Returns the text of the calibration file with the middle that was taken and these ranges. Writes nothing.
+    fn calibration(&self, _ranges: &[(i32, i32)]) -> AdapterResult<String> {
         Err(AdapterError::Unsupported)
     }
     /// Writes the calibration of a file to the motors, and reads it back. Returns the names of the motors that had
-    /// another one.
-    fn restore(&mut self, _file: &Path) -> AdapterResult<Vec<&'static str>> {
+    /// another one. After a failure some motors may have the new one: the same call again writes the others.
+    fn write_calibration(&mut self, _file: &Path) -> AdapterResult<Vec<&'static str>> {
         Err(AdapterError::Unsupported)
     }
 
@@ -96,7 +97,8 @@ pub trait Service {
     fn find_single(&mut self) -> AdapterResult<Single> {
         Err(AdapterError::Unsupported)
     }
-    /// Gives the motor that [`Service::find_single`] found this number and the arm's rate, and reads them back.
+    /// Gives the motor that [`Service::find_single`] found this number and the rate of the arm's address, and reads
+    /// both back.
     fn assign(&mut self, _single: &Single, _motor: &Motor) -> AdapterResult<()> {
         Err(AdapterError::Unsupported)
     }

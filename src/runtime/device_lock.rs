@@ -106,11 +106,12 @@ fn canonical_addresses(address: &str) -> BTreeSet<String> {
         // A bus in memory belongs to its process: others have their own with the same number.
         return BTreeSet::from([format!("{text} of process {}", std::process::id())]);
     }
+    // Names of serial devices may contain colons: `/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0`.
+    if text.starts_with('/') {
+        return BTreeSet::from([device_file(text)]);
+    }
     if let Some((kind, path)) = text.split_once(':').filter(|(_, path)| path.starts_with('/')) {
-        // The part after an `@` is the bit rate.
-        let path = path.split_once('@').map_or(path, |(path, _)| path);
-        let real = std::fs::canonicalize(path).unwrap_or_else(|_| path.into());
-        return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), real.display())]);
+        return BTreeSet::from([format!("{}:{}", kind.to_ascii_lowercase(), device_file(path))]);
     }
     let text = text.to_ascii_lowercase();
     let Some((host, port)) = host_and_port(text.strip_prefix("tcp:").unwrap_or(&text)) else {
@@ -125,6 +126,12 @@ fn canonical_addresses(address: &str) -> BTreeSet<String> {
         return BTreeSet::from([format!("{host}:{port}")]);
     }
     ips.into_iter().map(|ip| SocketIp::new(canonical(ip), port).to_string()).collect()
+}
+
+/// Returns the device file behind `PATH[@RATE]`; the path itself if there is no such file.
+fn device_file(text: &str) -> String {
+    let path = text.rsplit_once('@').map_or(text, |(path, _)| path);
+    std::fs::canonicalize(path).map_or_else(|_| path.to_owned(), |real| real.display().to_string())
 }
 
 /// Returns host and first port of `HOST:PORT` or `[HOST]:PORT`; further ports belong to the same device.
@@ -241,5 +248,12 @@ mod tests {
         std::os::unix::fs::symlink(&device, &link).unwrap();
         let at = |path: &std::path::Path, rate: &str| format!("slcan:{}{rate}", path.display());
         same(&[&at(&device, "@1000000"), &at(&link, "@1000000"), &at(&link, "@500000")]);
+        let by_path = folder.path().join("pci-0000:00:14.0-usb-0:1:1.0-port0");
+        std::os::unix::fs::symlink(&device, &by_path).unwrap();
+        let at = |path: &std::path::Path, rate: &str| format!("{}{rate}", path.display());
+        let port = same(&[&at(&device, "@1000000"), &at(&device, ""), &at(&link, "@500000"), &at(&by_path, "@9600")]);
+        assert_eq!(port, BTreeSet::from([std::fs::canonicalize(&device).unwrap().display().to_string()]));
+        // A port that is unplugged.
+        same(&["/dev/serial/by-path/pci-0000:00:14.0@9600", "/dev/serial/by-path/pci-0000:00:14.0"]);
     }
 }

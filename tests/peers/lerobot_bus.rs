@@ -84,7 +84,8 @@ fn lerobots_bus_uses_the_emulated_servos_and_its_packets_and_calibration_are_our
     let mut service = SPEC.service.unwrap()(&config).unwrap();
     service.take_middle().unwrap();
     let ranges = [(700, 3300), (800, 3200), (900, 3100), (1000, 3000), (0, 4095), (1900, 3100)];
-    std::fs::write(&ours, service.write_calibration(&ranges).unwrap()).unwrap();
+    std::fs::write(&ours, service.calibration(&ranges).unwrap()).unwrap();
+    service.write_calibration(&ours).unwrap();
     drop(service);
     assert_eq!(lerobot(&["calibrated", &config.address, ours.to_str().unwrap()]).as_deref(), Some("as it says\n"));
 }

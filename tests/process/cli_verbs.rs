@@ -239,6 +239,18 @@ fn stop_says_whether_it_was_confirmed() {
 }
 
 #[test]
+fn down_requests_the_end_before_it_asks_anything() {
+    let home = Home::new();
+    let (server, run) = start(&home.runs(), "test", FakeBackend::default());
+    let child = home.spawn("down");
+    eventually("both requests", || run.asked().len() == 2);
+    assert!(matches!(run.asked()[..], [Request::Shutdown(_), Request::Status(_)]), "{:?}", run.asked());
+    drop(server);
+    let ended = Ended::from(child.wait_with_output().unwrap()).with(0);
+    assert!(ended.err.contains("test ended"), "{}", ended.err);
+}
+
+#[test]
 fn arm_verbs_and_cancel_print_their_result() {
     let home = Home::new();
     let (_server, run) = start(&home.runs(), "test", FakeBackend::default());

@@ -9,6 +9,7 @@ use dimos::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use dimos::hardware::sim::arm::HasArm;
 use dimos::hardware::sim::faults::{Fault, FaultKind};
 use dimos::hardware::sim::serial_server::SerialServer;
+use dimos::hardware::transport::serial::SerialLink;
 use serde_json::{Value, json};
 
 use crate::support::program::{Home, eventually};
@@ -92,16 +93,112 @@ fn an_arm_is_calibrated_by_hand_with_its_motors_off() {
 }
 
 #[test]
+fn a_recording_outlives_a_failed_write() {
+    let home = Home::new();
+    let servos = emulate(json!({"initial_positions": [0.1, -0.3, 0.2, 0.0, 0.5, 0.4]}));
+    servos.with(|servos, _| servos.wear_out(2, true));
+    let terminal = Terminal::new(200, 30);
+    let begun = terminal.start(&home, &format!("arm calibrate so101 --address {} --file arm.json", servos.address()));
+    terminal.until("Bring every joint to the middle of its range, then press Enter");
+    terminal.keys("\n");
+    terminal.until("gripper        2047  2047  2047");
+    for joint in [1, 2, 3, 4, 6] {
+        [-10.0, 1.5, 10.0].into_iter().for_each(|amount| push_seen(&terminal, &servos, joint, amount));
+    }
+    terminal.keys("\n");
+    begun.wait().with(3);
+    terminal.until("servo 3 (elbow_flex) keeps");
+    terminal.until("the recording is saved: arm.json.part");
+    let restore = format!("arm calibrate so101 --address {} --restore arm.json.part", servos.address());
+    terminal.until(&format!("to write it again: dimos {restore}"));
+    assert!(!home.path().join("arm.json").exists());
+    assert!(servos.with(|servos, _| servos.stored(0, 31) != 0 && servos.stored(3, 31) == 0), "half written");
+
+    servos.with(|servos, _| servos.wear_out(2, false));
+    home.dimos(&format!("{restore} --yes"))
+        .with(0)
+        .says(&["written and read back: elbow_flex, ", "mv arm.json.part arm.json"]);
+    let [pan, _, elbow, ..] = Calibration::read(&home.path().join("arm.json.part")).unwrap();
+    let stored = |servo| servos.with(|servos, _| i32::from(servos.stored(servo, 9)));
+    assert_eq!((stored(0), stored(2)), (pan.range_min & 0xFF, elbow.range_min & 0xFF));
+}
+
+#[test]
+fn an_early_enter_and_the_end_of_input_renumber_no_motor() {
+    let home = Home::new();
+    let servos = emulate(json!({"ids": [0, 0, 0, 0, 0, 1]}));
+    let numbers = || servos.with(|servos, _| [4, 5].map(|servo| servos.stored(servo, 5)));
+    let terminal = Terminal::new(120, 40);
+    let begun = terminal.start(&home, &format!("arm setup-motors so101 --address {}", servos.address()));
+    terminal.until("Connect only the motor of gripper to the board, then press Enter");
+    // The second Enter comes while the first motor is set up.
+    terminal.keys("\n\n");
+    terminal.until("Connect only the motor of wrist_roll to the board, then press Enter");
+    std::thread::sleep(std::time::Duration::from_millis(1000));
+    assert!(!terminal.text().contains("wrist_roll: number"), "{}", terminal.text());
+    assert_eq!(numbers()[1], 6);
+    // The cable is still in the gripper's motor.
+    terminal.keys("\n");
+    terminal.until("the motor on the board is that of gripper, number 6, set up before");
+    terminal.until("connect the motor of wrist_roll instead");
+    assert_eq!(numbers()[1], 6);
+    servos.with(|servos, _| [(5, 0), (4, 1)].into_iter().for_each(|(servo, id)| servos.plug(servo, id)));
+    let question = || terminal.text().matches("Connect only the motor of wrist_roll").count();
+    eventually("the question again", || question() == 2);
+    terminal.keys("\n");
+    terminal.until("wrist_roll: number 5");
+    terminal.until("Connect only the motor of wrist_flex to the board, then press Enter");
+    terminal.keys("\x04");
+    begun.wait().with(1);
+    terminal.until("its input ended (Ctrl-D)");
+    assert_eq!(terminal.text().matches("Connect only the motor of wrist_flex").count(), 1);
+}
+
+#[test]
+fn motors_stay_on_until_the_settings_may_be_written() {
+    let home = Home::new();
+    let servos = emulate(json!({"factory": true}));
+    let on = |servos: &SerialServer<Servos>| servos.with(|servos, _| servos.arm().enabled());
+    servos.with(|servos, _| (1..=6).for_each(|id| servos.execute(id, 0x03, &[40, 1], &mut Vec::new())));
+    assert!(on(&servos));
+    let line = format!("arm configure so101 --address {}", servos.address());
+    let terminal = Terminal::new(120, 40);
+    let begun = terminal.start(&home, &line);
+    terminal.until("Check these settings, which are written with the motors off, then press Enter");
+    assert!(on(&servos));
+    terminal.keys("\x03");
+    begun.wait().with(130);
+    assert!(on(&servos), "without consent they stay on");
+
+    let terminal = Terminal::new(120, 40);
+    let begun = terminal.start(&home, &line);
+    terminal.until("Check these settings");
+    terminal.keys("\n");
+    terminal.until("Support the arm: it drops when its motors are switched off, then press Enter");
+    assert!(on(&servos));
+    terminal.keys("\n");
+    begun.wait().with(0);
+    terminal.until("9 settings were written and read back");
+    assert!(!on(&servos));
+}
+
+#[test]
 fn the_motors_of_a_new_arm_get_their_numbers() {
     let home = Home::new();
     let servos = emulate(json!({"ids": [1, 0, 0, 0, 0, 1], "factory": true}));
     let terminal = Terminal::new(100, 40);
     let begun = terminal.start(&home, &format!("arm setup-motors so101 --address {}", servos.address()));
-    terminal.until("Connect only the motor of gripper to the board, then press Enter");
+    let asked = |name: &str, times: usize| {
+        let question = format!("Connect only the motor of {name} to the board, then press Enter");
+        eventually("the question", || terminal.text().matches(&question).count() == times);
+    };
+    asked("gripper", 1);
     terminal.keys("\n");
     terminal.until("2 servos answer: [1, 1]");
+    asked("gripper", 2);
     for (motor, name) in NAMES.iter().enumerate().rev() {
         servos.with(|servos, _| (0..6).for_each(|other| servos.plug(other, u8::from(other == motor))));
+        asked(name, if *name == "gripper" { 2 } else { 1 });
         terminal.keys("\n");
         terminal.until(&format!("{name}: number {} (was 1, at 1000000 bit/s)", motor + 1));
     }
@@ -115,7 +212,8 @@ fn the_motors_of_a_new_arm_get_their_numbers() {
     servos.with(|servos, _| (0..6).for_each(|servo| servos.plug(servo, servo as u8 + 1)));
     let configure = |more: &str| home.dimos(&format!("arm configure so101 --address {} {more}", servos.address()));
     let found = configure("--check --json").with(1).says(&["9 settings have another value"]).json();
-    assert_eq!(found[0], json!({"motor": "shoulder_pan", "name": "P coefficient", "found": 32, "wanted": 16}));
+    let first = json!({"motor": "shoulder_pan", "name": "P coefficient", "register": 21, "found": 32, "wanted": 16});
+    assert_eq!(found[0], first);
     configure("").with(2).says(&["stdin is not a terminal"]);
     configure("--yes").with(0).says(&["9 settings were written and read back"]);
     configure("--check").with(0).says(&["all settings are as the adapter wants them"]);
@@ -132,6 +230,22 @@ fn the_port_of_an_arm_is_found() {
     assert!(answer(&there).contains("servo 1 (shoulder_pan)"), "{}", ask.out);
     home.dimos(&format!("arm find-port --ask so101 --port {there}")).with(3).says(&["no so101 answers"]);
     home.dimos(&format!("arm find-port --ask piper --port {there}")).with(2).says(&["adapters with such a bus: so101"]);
+
+    // A port in use: by another verb under another name of the same port, and by a program without our locks.
+    let link = home.path().join("pci-0000:00:14.0-usb-0:1:1.0-port0");
+    symlink(&here, &link).unwrap();
+    let terminal = Terminal::new(140, 30);
+    let holder = terminal.start(&home, &format!("arm setup-motors so101 --address {}@1000000", link.display()));
+    terminal.until("Connect only the motor of gripper");
+    let find = format!("arm find-port --ask so101 --port {here}");
+    let process = format!("is in use by process {}", holder.pid());
+    home.dimos(&find).with(3).shows(&[&process]).says(&["no so101 answers", "`dimos down` ends one"]);
+    terminal.keys("\x03");
+    holder.wait().with(130);
+    let taken = SerialLink::connect("test", &here, 1_000_000, std::time::Duration::from_secs(1)).unwrap();
+    home.dimos(&find).with(3).shows(&["another program uses it"]).says(&[&format!("`fuser -v {here}`")]);
+    drop(taken);
+    home.dimos(&find).with(0);
 
     // The cable: a link that disappears, and comes back with another name.
     let [first, second, third] = ["port-a", "port-b", "port-c"].map(|name| home.path().join(name));

@@ -32,8 +32,10 @@ const STATE_AGE: Duration = Duration::from_millis(5);
 const WRITABLE: Duration = Duration::from_millis(50);
 /// How often a request without a reply is sent until the servos show its effect.
 const WRITES: u32 = 4;
-/// A servo at rest this close to its goal has arrived [counts]: it droops under load. YOUR ARM.
+/// A joint at rest this close to its goal has arrived [counts]: it droops under load. YOUR ARM.
 const ARRIVED: i32 = 40;
+/// A joint this far outside its range is inside [counts]: encoders flicker. YOUR ARM.
+const SAME: i32 = 3;
 
 /// The state of all servos.
 type Servos = [Servo; SERVOS];
@@ -131,6 +133,23 @@ impl AcmeAdapter {
         Err(AdapterError::Protocol(format!("acme: the servos do not execute {request:?}")))
     }
 
+    /// Where each servo is, inside its range. A joint outside its range is an error: its servo would move there at once.
+    fn hold_goals(&self, servos: &Servos) -> AdapterResult<[i32; SERVOS]> {
+        let positions = servos.map(|servo| servo.position);
+        let goals = self.calibration.inside(positions);
+        for (j, (goal, position)) in goals.iter().zip(positions).take(DOF).enumerate() {
+            let outside = (goal - position).abs();
+            if outside > SAME {
+                return Err(AdapterError::Rejected(format!(
+                    "joint {} is {:.1}° outside its range\nhint: move it inside by hand, or correct the calibration",
+                    j + 1,
+                    f64::from(outside) * 360.0 / TURN
+                )));
+            }
+        }
+        Ok(goals)
+    }
+
     fn write_goals(&mut self, goals: [i32; SERVOS]) -> AdapterResult<()> {
         self.confirmed(Request::Goals(&goals, 0), |i, servo| goals.get(i) == Some(&servo.goal))
     }
@@ -147,6 +166,13 @@ impl AcmeAdapter {
 /// Velocity of a servo [rad/s].
 fn velocity(servo: &Servo) -> f64 {
     f64::from(servo.velocity) * TAU / TURN
+}
+
+/// Whether a stop makes the position of servo `i` its goal: if it moves, or is a joint far from its goal. A joint that
+/// droops and a gripper on a workpiece rest away from their goals: with a goal at its position, the joint would sink
+/// further, and the gripper lose its grip.
+fn must_stop(i: usize, servo: &Servo) -> bool {
+    servo.moving || i < DOF && (!servo.on || (servo.goal - servo.position).abs() > ARRIVED)
 }
 
 /// Code and text of the first servo in error.
@@ -280,15 +306,14 @@ impl ManipulatorAdapter for AcmeAdapter {
         self.tell(Request::Goals(&goals, speed))
     }
 
-    /// Makes the position of each servo that moves its goal; one at rest keeps its goal, above which it droops.
+    /// Makes the position of each servo that [`must_stop`] its goal; the others keep theirs.
     fn write_stop(&mut self) -> AdapterResult<Stop> {
         let servos = self.fetch()?;
-        let moves = |servo: &Servo| servo.moving || !servo.on || (servo.goal - servo.position).abs() > ARRIVED;
-        if servos.iter().any(|servo| servo.on && moves(servo)) {
+        if servos.iter().enumerate().any(|(i, servo)| servo.on && must_stop(i, servo)) {
             let here = self.calibration.inside(servos.map(|servo| servo.position));
             let mut goals = servos.map(|servo| servo.goal);
-            let stopped = goals.iter_mut().zip(here).zip(&servos).filter(|(_, servo)| moves(servo));
-            stopped.for_each(|((goal, here), _)| *goal = here);
+            let stopped = goals.iter_mut().zip(here).zip(&servos).enumerate();
+            stopped.filter(|(i, (_, servo))| must_stop(*i, servo)).for_each(|(_, ((goal, here), _))| *goal = here);
             self.write_goals(goals)?;
         }
         Ok(Stop::Confirmed)
@@ -298,7 +323,7 @@ impl ManipulatorAdapter for AcmeAdapter {
     fn write_enable(&mut self, enable: bool) -> AdapterResult<()> {
         let servos = self.fetch()?;
         if enable && !servos.iter().all(|servo| servo.on) {
-            let here = self.calibration.inside(servos.map(|servo| servo.position));
+            let here = self.hold_goals(&servos)?;
             let mut goals = servos.map(|servo| servo.goal);
             let off = goals.iter_mut().zip(here).zip(&servos).filter(|(_, servo)| !servo.on);
             off.for_each(|((goal, here), _)| *goal = here);
@@ -352,18 +377,25 @@ impl Gripper for AcmeAdapter {
 
 #[cfg(test)]
 mod tests {
+    use super::super::calibration::Range;
     use super::*;
-    use dimos::hardware::registry::EmulatorAddress;
+    use dimos::hardware::registry::{Emulator, EmulatorAddress};
     use dimos::hardware::sim::faults::{Fault, FaultKind};
 
-    #[test]
-    fn a_lost_a_damaged_and_a_late_reply_cost_no_reading() {
+    /// A connected adapter and its servos.
+    fn arm() -> (AcmeAdapter, Box<dyn Emulator>) {
         let (hardware_id, options) = ("arm".into(), Default::default());
         let mut config = AdapterConfig { hardware_id, address: String::new(), dof: DOF, options };
         let servos = super::super::emulator::start(&config, &EmulatorAddress::InProcess).unwrap();
         config.address = servos.address();
         let mut adapter = AcmeAdapter::new(&config).unwrap();
         adapter.connect().unwrap();
+        (adapter, servos)
+    }
+
+    #[test]
+    fn a_lost_a_damaged_and_a_late_reply_cost_no_reading() {
+        let (mut adapter, servos) = arm();
         let mut read = || {
             let mut positions = [0.0; DOF];
             adapter.read_joint_positions(&mut positions).map(|()| positions)
@@ -376,5 +408,30 @@ mod tests {
         }
         servos.inject(Fault::new(FaultKind::Stall).lasting(0.04)).unwrap();
         assert_eq!(read(), start, "late");
+    }
+
+    #[test]
+    fn a_joint_outside_its_range_is_not_enabled() {
+        let (mut adapter, _servos) = arm();
+        let before = adapter.fetch().unwrap();
+        // Its calibration says that the first joint ends 100 counts below the position that it has.
+        let high = before[0].position - 100;
+        let mut ranges = [Range { zero: 2048, low: 0, high: 4095 }; SERVOS];
+        ranges[0] = Range { zero: 0, low: 0, high };
+        adapter.calibration = Calibration::of(&ranges).unwrap();
+        let refused = adapter.activate().unwrap_err().to_string();
+        assert!(refused.starts_with("joint 1 is 8.8° outside its range\nhint: "), "{refused}");
+        let after = adapter.fetch().unwrap();
+        assert!(after.iter().all(|servo| !servo.on) && after.map(|s| s.goal) == before.map(|s| s.goal), "{after:?}");
+    }
+
+    #[test]
+    fn a_gripper_on_a_workpiece_and_a_joint_that_droops_keep_their_goals() {
+        let at_rest = |away: i32| Servo { on: true, goal: 2000, position: 2000 - away, ..Servo::default() };
+        let on_workpiece = at_rest(300);
+        assert!(!must_stop(DOF, &on_workpiece) && must_stop(0, &on_workpiece), "the joint has not started yet");
+        assert!(!must_stop(0, &at_rest(ARRIVED)), "it droops");
+        let moving = Servo { moving: true, ..at_rest(10) };
+        assert!(must_stop(0, &moving) && must_stop(DOF, &moving));
     }
 }

@@ -68,8 +68,10 @@ impl Calibration {
         if ranges.is_empty() {
             return Ok(Self::default());
         }
-        if let Some(wrong) = ranges.iter().position(|r| !(0 <= r.low && r.low < r.high && r.high < TURN as i32)) {
-            return Err(format!("servo {}: its range is not within 0 to {}", wrong + 1, TURN - 1.0));
+        let turn = 0..TURN as i32;
+        let within = |r: &Range| [r.zero, r.low, r.high].iter().all(|counts| turn.contains(counts));
+        if let Some(wrong) = ranges.iter().position(|r| !within(r) || r.low >= r.high) {
+            return Err(format!("servo {}: its zero and range are not within 0 to {}", wrong + 1, TURN - 1.0));
         }
         let ranges = ranges.try_into().map_err(|_| format!("{} servos are given, not {SERVOS}", ranges.len()))?;
         Ok(Self(ranges))
@@ -119,6 +121,8 @@ mod tests {
         assert_eq!(calibration.of_opening(OPEN / 2.0), 1750);
         assert_eq!(Calibration::of(&[]), Ok(Calibration::default()));
         assert!(Calibration::of(&[range]).is_err() == (SERVOS > 1));
-        assert!(Calibration::of(&[Range { low: 3000, ..range }; SERVOS]).unwrap_err().starts_with("servo 1: "));
+        for wrong in [Range { low: 3000, ..range }, Range { high: 4096, ..range }, Range { zero: -1, ..range }] {
+            assert!(Calibration::of(&[wrong; SERVOS]).unwrap_err().starts_with("servo 1: "), "{wrong:?}");
+        }
     }
 }

@@ -1,5 +1,7 @@
 //! Which arm, and its bus: what the verbs without a run share.
 
+use std::fmt;
+
 use super::super::adapter::choice::Choice;
 use super::super::ask;
 use super::super::exit::{Exit, Failure, Result};
@@ -31,6 +33,22 @@ pub struct Bus {
     _lock: DeviceLock,
 }
 
+/// As on the command line, for hints: `so101 --address /dev/ttyACM0`.
+impl fmt::Display for BusArgs {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} --address {}", self.name, self.address)?;
+        self.options.iter().try_for_each(|(key, value)| write!(f, " --option {key}={value}"))
+    }
+}
+
+/// Locks a device against runs and other verbs. `address` is complete.
+pub fn lock(row: &AdapterSpec, address: &str) -> Result<DeviceLock> {
+    device_lock::take(row.name, address).map_err(|e| {
+        let hint = "end the run or verb that uses it first: `dimos status` shows runs, `dimos down` ends one";
+        Failure::new(Exit::Hardware, e.to_string()).hint(hint)
+    })
+}
+
 /// Returns the row of an adapter with work to do outside a run, and its service.
 pub fn row(
     name: &str,
@@ -54,10 +72,7 @@ impl BusArgs {
         let full = (row.address.check)(&self.address)
             .map_err(|e| Failure::usage(format!("--address {}: {e}", self.address)).hint(row.address.form))?;
         let config = choice.config(&row, &full)?;
-        let lock = device_lock::take(row.name, &full).map_err(|e| {
-            let hint = "end the run first: `dimos status` shows it, `dimos down` ends it";
-            Failure::new(Exit::Hardware, e.to_string()).hint(hint)
-        })?;
+        let lock = lock(&row, &full)?;
         Ok(Bus { service: open(&config).map_err(failure)?, _lock: lock })
     }
 }

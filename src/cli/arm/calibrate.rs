@@ -11,13 +11,17 @@ use super::super::follow::Signals;
 use super::super::output;
 use super::bus::{self, failure};
 use super::live_table::{Place, Seen, lines};
+use crate::hardware::adapter::AdapterError;
 use crate::hardware::registry::Registry;
 use crate::hardware::service::{Motor, Service};
+use crate::message::Message;
 
 /// How often positions are read and shown.
 const PERIOD: Duration = Duration::from_millis(50);
 /// A smaller range was not recorded: the joint was not moved [counts].
 const SMALLEST: i32 = 100;
+/// End of the name of a calibration that is not written to the motors yet.
+const PART: &str = "part";
 /// A joint cannot turn this far between two readings: it passed the end of its turn [counts].
 const JUMP: i32 = 2048;
 
@@ -25,15 +29,15 @@ const JUMP: i32 = 2048;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "\
 The motors are off and nothing moves the arm: you do. Nothing is written before the ranges are complete; Ctrl-C changes nothing.
-Then offsets and ranges are written to the motors, read back, and written to the file, in LeRobot's format.
-A run uses the file with the adapter's option `calibration`.")]
+Then the calibration is saved as FILE.part in LeRobot's format, written to the motors, read back, and renamed to FILE.
+If writing fails, FILE.part remains: --restore FILE.part writes it again. A run uses the file with the adapter's option `calibration`.")]
 pub struct Args {
     #[command(flatten)]
     bus: bus::BusArgs,
     /// Calibration file to write
     #[arg(long, value_name = "FILE", required_unless_present = "restore")]
     file: Option<PathBuf>,
-    /// Write the calibration of this file to the motors instead, as after the exchange of one
+    /// Write the calibration of this file to the motors instead, as after the exchange of one or a failed write
     #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "force"])]
     restore: Option<PathBuf>,
     /// Overwrite the calibration file
@@ -69,10 +73,14 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
 }
 
 fn restore(arm: &mut dyn Service, file: &Path) -> Result {
-    let changed = arm.restore(file).map_err(failure)?;
+    let changed = arm.write_calibration(file).map_err(failure)?;
     match changed.as_slice() {
         [] => output::note(format_args!("the motors have the calibration of {} already", file.display())),
         changed => output::note(format_args!("written and read back: {}", changed.join(", "))),
+    }
+    if file.extension().is_some_and(|end| end == PART) {
+        let whole = file.with_extension("");
+        output::note(format_args!("now give the file its name: mv {} {}", file.display(), whole.display()));
     }
     Ok(Exit::Ok)
 }
@@ -100,22 +108,42 @@ impl Args {
             }
             ranges.push((low, high));
         }
-        let text = arm.write_calibration(&ranges).map_err(failure)?;
-        if let Err(error) = write(file, &text) {
-            // The motors have it: it must not be lost.
+        let text = arm.calibration(&ranges).map_err(failure)?;
+        let mut part = file.as_os_str().to_owned();
+        part.push(format!(".{PART}"));
+        let part = PathBuf::from(part);
+        if let Err(error) = write(&part, &text) {
+            // The recording must not be lost.
             output::line(text);
-            return Err(error.hint("the motors are calibrated; the file is above"));
+            let hint = "no motor was changed; save the text above as a file, and write it with --restore";
+            return Err(error.hint(hint));
         }
+        arm.write_calibration(&part).map_err(|error| self.not_written(error, &part))?;
+        std::fs::rename(&part, file)
+            .with_context(|| format!("the motors are calibrated, but {} cannot be renamed", part.display()))?;
         lines(arm.motors(), &seen).iter().for_each(output::line);
         output::note(format_args!("written to the motors, read back, and saved: {}", file.display()));
         output::note(format_args!("in a blueprint: options: {{calibration: {}}}", absolute(file).display()));
         Ok(Exit::Ok)
     }
 
+    /// The failure after a calibration was saved, and not or not completely written to the motors.
+    fn not_written(&self, error: AdapterError, part: &Path) -> Failure {
+        let Message { what, hint } = Message::of(&error);
+        let cause = hint.map_or_else(String::new, |hint| format!("{hint}; "));
+        let exit = failure(error).exit;
+        Failure::new(exit, format!("{what}; the recording is saved: {}", part.display())).hint(format!(
+            "{cause}to write it again: dimos arm calibrate {} --restore {}",
+            self.bus,
+            part.display()
+        ))
+    }
+
     /// Records positions until Enter, or for a time.
     fn record(&self, arm: &mut dyn Service, signals: &Signals) -> Result<Vec<Seen>> {
         let mut seen: Vec<Seen> = arm.positions().map_err(failure)?.into_iter().map(Seen::at).collect();
         let (began, mut place) = (Instant::now(), Place::default());
+        ask::discard_typed();
         loop {
             for ((motor, seen), position) in arm.motors().iter().zip(&mut seen).zip(arm.positions().map_err(failure)?) {
                 if seen.take(position) > JUMP && motor.range.is_none() {
@@ -145,15 +173,12 @@ impl Args {
     }
 }
 
-/// Writes the file as a whole, or not at all.
 fn write(file: &Path, text: &str) -> Result<()> {
-    let part = file.with_extension("json.part");
     let wrong = || file.display().to_string();
     if let Some(folder) = file.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).with_context(wrong)?;
     }
-    std::fs::write(&part, text).with_context(wrong)?;
-    Ok(std::fs::rename(&part, file).with_context(wrong)?)
+    Ok(std::fs::write(file, text).with_context(wrong)?)
 }
 
 fn absolute(file: &Path) -> PathBuf {

@@ -44,17 +44,18 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
         }
         count if args.check => {
             let what = format!("{count} settings have another value");
-            return Err(Failure::new(Exit::Failed, what).hint("without --check they are written"));
+            return Err(Failure::new(Exit::Failed, what).hint(format!("dimos arm configure {} writes them", args.bus)));
         }
         _ => {}
     }
     if !args.yes {
         ask::needs_terminal("--yes asks nothing")?;
     }
-    bus.release(&signals, args.yes)?;
+    // Before the motors are switched off: without the consent an arm must not fall.
     if !args.yes {
-        ask::enter(&signals, "To write these settings, press Enter; otherwise Ctrl-C. First read them")?;
+        ask::enter(&signals, "Check these settings, which are written with the motors off")?;
     }
+    bus.release(&signals, args.yes)?;
     bus.service.write_settings().map_err(failure)?;
     output::note(format_args!("{} settings were written and read back", found.len()));
     Ok(Exit::Ok)
@@ -65,7 +66,7 @@ fn print(found: &[Setting]) {
         return;
     }
     let mut table = Table::new(&["JOINT", "SETTING", ">FOUND", ">WANTED"]);
-    for Setting { motor, name, found, wanted } in found {
+    for Setting { motor, name, found, wanted, .. } in found {
         table.row([(*motor).to_owned(), (*name).to_owned(), found.to_string(), wanted.to_string()]);
     }
     table.print();

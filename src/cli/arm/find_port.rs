@@ -56,11 +56,19 @@ struct Row {
 /// Runs the verb.
 pub fn run(args: &Args, registry: &Registry) -> Result {
     let mut rows: Vec<Row> = args.present().into_iter().map(Row::of).collect();
+    let mut hints = Vec::new();
     if let Some(adapter) = &args.ask {
         for row in &mut rows {
-            let answer = identify(adapter, &row.port, registry)?;
-            row.found = answer.is_ok();
-            row.answer = Some(answer.unwrap_or_else(|why| why));
+            row.answer = Some(match identify(adapter, &row.port, registry)? {
+                Ok(arm) => {
+                    row.found = true;
+                    arm
+                }
+                Err(failure) => {
+                    hints.extend(failure.hint.filter(|hint| !hints.contains(hint)));
+                    failure.what
+                }
+            });
         }
     }
     if args.json {
@@ -73,18 +81,28 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
     match &args.ask {
         Some(_) if rows.iter().any(|row| row.found) => Ok(Exit::Ok),
-        Some(adapter) => Err(Failure::new(Exit::Hardware, format!("no {adapter} answers")).hint("is it powered?")),
+        Some(adapter) => {
+            let hint = if hints.is_empty() { "is it powered?".to_owned() } else { hints.join("; ") };
+            Err(Failure::new(Exit::Hardware, format!("no {adapter} answers")).hint(hint))
+        }
         None if args.list || args.json || ask::needs_terminal("").is_err() => Ok(Exit::Ok),
         None => args.unplugged(),
     }
 }
 
-/// Asks the arm at a port which one it is. The error is for the table.
-fn identify(adapter: &str, port: &str, registry: &Registry) -> Result<std::result::Result<String, String>> {
+/// Asks the arm at a port which one it is. The inner error is for the table: a run may use the port, for example.
+fn identify(adapter: &str, port: &str, registry: &Registry) -> Result<Result<String>> {
     let (row, open, choice) = bus::row(adapter, &[], registry)?;
-    let config = choice.config(&row, port)?;
-    let answer = open(&config).and_then(|mut arm| arm.identify());
-    Ok(answer.map_err(|error| error.to_string().lines().next().unwrap_or_default().to_owned()))
+    let full = match (row.address.check)(port) {
+        Ok(full) => full,
+        Err(why) => return Ok(Err(Failure::usage(why))),
+    };
+    let config = choice.config(&row, &full)?;
+    let ask = || {
+        let _lock = bus::lock(&row, &full)?;
+        open(&config).and_then(|mut arm| arm.identify()).map_err(bus::failure)
+    };
+    Ok(ask())
 }
 
 impl Args {

@@ -34,15 +34,20 @@ pub fn run(args: &Args, registry: &Registry) -> Result {
     }
     let signals = Signals::watch_with_hangup();
     let mut bus = args.bus.open(registry)?;
-    let chosen = args.chosen(bus.service.motors())?;
-    for motor in chosen {
-        while let Err(failure) = set_up(&mut *bus.service, &motor, &signals, args.yes) {
-            if args.yes || signals.last().is_some() {
-                return Err(failure);
+    let mut done = Vec::new();
+    for motor in args.chosen(bus.service.motors())? {
+        loop {
+            if !args.yes {
+                ask::enter(&signals, &format!("Connect only the motor of {} to the board", motor.name))?;
             }
-            // Somebody is there: the cable can be plugged in, and the motor tried again.
-            output::failure(&failure);
+            match set_up(&mut *bus.service, &motor, &done) {
+                Ok(()) => break,
+                Err(failure) if args.yes => return Err(failure),
+                // The next Enter tries again: the cable can be plugged in until then.
+                Err(failure) => output::failure(&failure),
+            }
         }
+        done.push(motor);
     }
     Ok(Exit::Ok)
 }
@@ -59,11 +64,13 @@ impl Args {
     }
 }
 
-fn set_up(arm: &mut dyn Service, motor: &Motor, signals: &Signals, yes: bool) -> Result<()> {
-    if !yes {
-        ask::enter(signals, &format!("Connect only the motor of {} to the board", motor.name))?;
-    }
+/// Sets the motor on the bus up as `motor`, unless it is one of those that are `done`.
+fn set_up(arm: &mut dyn Service, motor: &Motor, done: &[Motor]) -> Result<()> {
     let single = arm.find_single().map_err(failure)?;
+    if let Some(set_up) = done.iter().find(|other| other.id == single.id && other.id != motor.id) {
+        let what = format!("the motor on the board is that of {}, number {}, set up before", set_up.name, set_up.id);
+        return Err(Failure::new(Exit::Failed, what).hint(format!("connect the motor of {} instead", motor.name)));
+    }
     arm.assign(&single, motor).map_err(failure)?;
     output::line(format_args!("{}: number {} (was {}, at {} bit/s)", motor.name, motor.id, single.id, single.baud));
     Ok(())

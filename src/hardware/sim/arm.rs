@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 pub use super::delivery::Delivery;
-pub use super::options::{SimOptions, check_pose};
+pub use super::options::{SimOptions, check_pose, check_range};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
 use crate::hardware::sim::faults::{FaultKind, FaultScript};

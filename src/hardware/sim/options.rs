@@ -1,5 +1,7 @@
 //! Options of every emulated arm: the `sim` part of its options.
 
+use std::ops::RangeInclusive;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -52,9 +54,9 @@ impl SimOptions {
     pub fn check(&self, name: &str, limits: &JointLimits, playable: &[FaultKind]) -> Result<(), ConfigError> {
         check_script(&format!("the {name} emulator"), &self.faults, playable)
             .and_then(|()| check_pose(&self.initial_positions, limits))
-            .and_then(|()| within("lag", self.lag, MAX_LAG, "s"))
-            .and_then(|()| within("droop", self.droop, MAX_DROOP, "rad"))
             .map_err(|error| error.within("sim"))
+            .and_then(|()| check_range("lag", self.lag, 0.0..=MAX_LAG, "s"))
+            .and_then(|()| check_range("droop", self.droop, 0.0..=MAX_DROOP, "rad"))
     }
 }
 
@@ -75,10 +77,12 @@ pub fn check_pose(positions: &[f64], limits: &JointLimits) -> Result<(), ConfigE
     }
 }
 
-fn within(name: &str, value: f64, most: f64, unit: &str) -> Result<(), ConfigError> {
-    if (0.0..=most).contains(&value) {
-        Ok(())
-    } else {
-        Err(ConfigError::new(name, format!("{name} must be 0 to {most} {unit}, not {value} {unit}")))
+/// Returns an error for a setting of the `sim` part outside `range`. `unit` is for the message, empty for a number.
+pub fn check_range(name: &str, value: f64, range: RangeInclusive<f64>, unit: &str) -> Result<(), ConfigError> {
+    if range.contains(&value) {
+        return Ok(());
     }
+    let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
+    let what = format!("{name} must be {} to {}{unit}, not {value}{unit}", range.start(), range.end());
+    Err(ConfigError::new(format!("sim.{name}"), what))
 }

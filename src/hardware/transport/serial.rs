@@ -145,13 +145,13 @@ impl AsFd for SerialLink {
 pub(super) fn open_line(device: &str, path: &str, baud: u32) -> AdapterResult<OwnedFd> {
     let failed = |why: String| AdapterError::Io(format!("cannot open serial device {path} for {device}: {why}"));
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
-    let line = open(path, flags, Mode::empty()).map_err(|e| failed(open_error(e)))?;
+    let line = open(path, flags, Mode::empty()).map_err(|e| failed(open_error(path, e)))?;
     if !isatty(&line) {
         return Err(failed("it is not a serial device".to_owned()));
     }
     // The first lock excludes programs without locks, except those of root; the second excludes programs that check it.
     ioctl_tiocexcl(&line).map_err(|e| failed(e.to_string()))?;
-    flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|e| failed(open_error(e)))?;
+    flock(&line, FlockOperation::NonBlockingLockExclusive).map_err(|e| failed(open_error(path, e)))?;
     let prepare = || -> rustix::io::Result<u32> {
         let mut settings = tcgetattr(&line)?;
         make_raw(&mut settings);
@@ -206,13 +206,15 @@ pub(super) fn broken(peer: &str, error: Errno) -> AdapterError {
 }
 
 /// Returns why a serial device cannot be opened, with a hint.
-fn open_error(error: Errno) -> String {
+fn open_error(path: &str, error: Errno) -> String {
     match error {
         Errno::NOENT | Errno::NODEV | Errno::NXIO => format!("there is no such device\nhint: {}", list_devices()),
         Errno::ACCESS | Errno::PERM => "permission denied\nhint: join the group that owns serial devices: \
                                         sudo usermod -aG dialout $USER; then log in again"
             .to_owned(),
-        Errno::BUSY | Errno::AGAIN => "another program uses it".to_owned(),
+        Errno::BUSY | Errno::AGAIN => {
+            format!("another program uses it\nhint: end it: `dimos status` shows runs, `fuser -v {path}` any program")
+        }
         error => error.to_string(),
     }
 }
@@ -307,7 +309,9 @@ mod tests {
         let pty = Pty::open().unwrap();
         let first = link(&pty, 9600);
         let error = SerialLink::connect("test", pty.path(), 9600, WAIT).unwrap_err().to_string();
-        assert_eq!(error, format!("cannot open serial device {} for test: another program uses it", pty.path()));
+        let what =
+            format!("cannot open serial device {} for test: another program uses it\nhint: end it: ", pty.path());
+        assert!(error.starts_with(&what), "{error}");
         drop(first);
         link(&pty, 9600);
     }
@@ -376,6 +380,7 @@ mod tests {
             missing.starts_with("cannot open serial device /dev/ttyUSB77 for test: there is no such device\nhint: ")
         );
         assert_eq!(error("/dev/null"), "cannot open serial device /dev/null for test: it is not a serial device");
-        assert!(open_error(Errno::ACCESS).contains("\nhint: ") && open_error(Errno::ACCESS).contains("dialout"));
+        let denied = open_error("/dev/ttyUSB0", Errno::ACCESS);
+        assert!(denied.contains("\nhint: ") && denied.contains("dialout"));
     }
 }

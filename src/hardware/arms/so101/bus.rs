@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::calibration::NAMES;
-use super::protocol::{self, Instruction, MAX_INSTRUCTION, register};
+use super::protocol::{self, Instruction, MAX_INSTRUCTION, MODEL, register};
 use super::{BAUD, Options};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::AdapterConfig;
@@ -53,6 +53,18 @@ impl Bus {
     /// The device and its rate, for messages.
     pub fn address(&self) -> &SerialAddress {
         &self.address
+    }
+
+    /// Reads the model of a servo and returns its firmware version; `Rejected` for another model.
+    pub fn identify(&mut self, id: u8) -> AdapterResult<(u8, u8)> {
+        let [major, minor, _, m0, m1] = self.read::<5>(id, 0)?;
+        match u16::from_le_bytes([m0, m1]) {
+            MODEL => Ok((major, minor)),
+            model => Err(AdapterError::Rejected(format!(
+                "so101 at {}: servo {id} is model {model}, expected {MODEL} (STS3215)",
+                self.address
+            ))),
+        }
     }
 
     /// Reads registers of one servo.

@@ -1,14 +1,18 @@
 //! SO-101 (and SO-100): five joints and a gripper of Feetech STS3215 servos on one half-duplex serial line.
 //!
-//! `protocol.rs` has the bytes, `bus.rs` the line, `calibration.rs` what counts mean, `adapter.rs` the lifecycle,
-//! `service.rs` and `settings.rs` the work outside a run, `emulator/` the servos' side of the line.
+//! `protocol.rs` has the bytes, `bus.rs` the line, `calibration.rs` what counts mean, `servos.rs` the state of all
+//! servos and writes to them, `connect.rs` the checks when connecting, `adapter.rs` the lifecycle, `parts.rs` gripper
+//! and joint status, `service.rs` and `settings.rs` the work outside a run, `emulator/` the servos' side of the line.
 
 pub mod adapter;
 mod bus;
 pub mod calibration;
+mod connect;
 pub mod emulator;
+mod parts;
 pub mod protocol;
 mod service;
+mod servos;
 mod settings;
 #[cfg(test)]
 mod tests;

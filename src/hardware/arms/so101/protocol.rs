@@ -33,6 +33,8 @@ pub mod register {
     pub const RANGE: u8 = 9;
     /// Homing offset, two bytes with the sign in bit 11.
     pub const OFFSET: u8 = 31;
+    /// Control mode: 0 is position. In another mode goals mean something else.
+    pub const MODE: u8 = 33;
     /// Torque: 0 off, 1 on. The first of the state.
     pub const TORQUE: u8 = 40;
     /// Acceleration [100 counts/s²]; then the goal's position, time and velocity, two bytes each.

@@ -1,14 +1,15 @@
 //! The servos outside a run: numbers, settings, and a calibration that LeRobot and dimos share.
 //!
 //! As in LeRobot, the homing offset of each servo makes the middle pose read 2047, and the ranges are recorded by hand.
-//! Unlike there, nothing is written before all of it is known: an interrupted calibration changes no servo.
+//! Unlike there, nothing is written before all of it is known and saved: an interrupted calibration changes no servo,
+//! and one that failed halfway is written again from its file.
 
 use std::path::Path;
 use std::time::Duration;
 
 use super::bus::{Bus, servo};
 use super::calibration::{Calibration, NAMES, Servo, file};
-use super::protocol::{self, BROADCAST, Instruction, MAX_INSTRUCTION, MODEL, SERVOS, register, signed, with_sign};
+use super::protocol::{self, BROADCAST, Instruction, MAX_INSTRUCTION, SERVOS, register, signed, with_sign};
 use super::settings;
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::registry::AdapterConfig;
@@ -66,6 +67,16 @@ impl Servos {
         Ok(signed(u16::from_le_bytes(self.bus.read(id, register::OFFSET)?), 11))
     }
 
+    /// Returns the arm's rate: that of the address [bit/s], and the value that selects it in the servos.
+    fn own_rate(&self) -> AdapterResult<(u8, u32)> {
+        let wanted = self.bus.address().baud;
+        let found = (0..).zip(RATES).find(|(_, rate)| *rate == wanted);
+        found.ok_or_else(|| {
+            let rates = RATES.map(|rate| rate.to_string()).join(", ");
+            AdapterError::Rejected(format!("the servos have no rate of {wanted} bit/s\nhint: their rates: {rates}"))
+        })
+    }
+
     fn refuse_while_on(&mut self) -> AdapterResult<()> {
         match self.powered()?.as_slice() {
             [] => Ok(()),
@@ -88,17 +99,6 @@ impl Servos {
         if turned.abs() > MOVED {
             let what = format!("{} reads {turned} counts more than its new offset makes", servo(id));
             return Err(AdapterError::Protocol(what));
-        }
-        Ok(changed)
-    }
-
-    fn write_all(&mut self, calibration: &[Servo; SERVOS]) -> AdapterResult<Vec<&'static str>> {
-        self.refuse_while_on()?;
-        let mut changed = Vec::new();
-        for (motor, to) in MOTORS.iter().zip(calibration) {
-            if self.write_servo(motor.id, to)? {
-                changed.push(motor.name);
-            }
         }
         Ok(changed)
     }
@@ -127,17 +127,11 @@ impl Service for Servos {
     }
 
     fn identify(&mut self) -> AdapterResult<String> {
-        let mut firmware = [0; 2];
+        let mut firmware = (0, 0);
         for motor in MOTORS {
-            let [major, minor, _, m0, m1] = self.bus.read::<5>(motor.id, 0)?;
-            let model = u16::from_le_bytes([m0, m1]);
-            if model != MODEL {
-                let what = format!("{} is model {model}, expected {MODEL} (STS3215)", servo(motor.id));
-                return Err(AdapterError::Rejected(what));
-            }
-            firmware = [major, minor];
+            firmware = self.bus.identify(motor.id)?;
         }
-        Ok(format!("SO-101: {SERVOS} servos STS3215, firmware {}.{}", firmware[0], firmware[1]))
+        Ok(format!("SO-101: {SERVOS} servos STS3215, firmware {}.{}", firmware.0, firmware.1))
     }
 
     fn powered(&mut self) -> AdapterResult<Vec<&'static str>> {
@@ -173,22 +167,28 @@ impl Service for Servos {
         MOTORS.iter().zip(offsets).map(position).collect()
     }
 
-    fn write_calibration(&mut self, ranges: &[(i32, i32)]) -> AdapterResult<String> {
+    fn calibration(&self, ranges: &[(i32, i32)]) -> AdapterResult<String> {
         let offsets = self.offsets.ok_or_else(|| AdapterError::Rejected("no middle pose was taken".into()))?;
         let mut servos = [Servo::default(); SERVOS];
         for (((servo, motor), offset), (low, high)) in servos.iter_mut().zip(MOTORS).zip(offsets).zip(ranges) {
             *servo = Servo { id: motor.id, drive_mode: 0, homing_offset: offset, range_min: *low, range_max: *high };
         }
         let text = file(&servos);
-        // What the adapter would not read is not written.
+        // What the adapter would not read is not saved.
         Calibration::parse(&text).map_err(AdapterError::Rejected)?;
-        self.write_all(&servos)?;
         Ok(text)
     }
 
-    fn restore(&mut self, path: &Path) -> AdapterResult<Vec<&'static str>> {
+    fn write_calibration(&mut self, path: &Path) -> AdapterResult<Vec<&'static str>> {
         let servos = Calibration::read(path).map_err(AdapterError::Rejected)?;
-        self.write_all(&servos)
+        self.refuse_while_on()?;
+        let mut changed = Vec::new();
+        for (motor, to) in MOTORS.iter().zip(&servos) {
+            if self.write_servo(motor.id, to)? {
+                changed.push(motor.name);
+            }
+        }
+        Ok(changed)
     }
 
     fn settings(&mut self) -> AdapterResult<Vec<Setting>> {
@@ -201,19 +201,18 @@ impl Service for Servos {
     }
 
     fn find_single(&mut self) -> AdapterResult<Single> {
-        for baud in RATES {
+        let (_, own) = self.own_rate()?;
+        // The arm's rate comes first: a port that cannot be opened at that one is an error.
+        self.bus.open_at(own)?;
+        for baud in std::iter::once(own).chain(RATES.into_iter().filter(|baud| *baud != own)) {
             // A rate that the port cannot have is one that no servo on it has.
-            if self.bus.open_at(baud).is_err() && baud != RATES[0] {
+            if baud != own && self.bus.open_at(baud).is_err() {
                 continue;
             }
             match self.ping()?.as_slice() {
                 [] => {}
                 [id] => {
-                    let model = u16::from_le_bytes(self.bus.read(*id, 3)?);
-                    if model != MODEL {
-                        let what = format!("servo {id} is model {model}, expected {MODEL} (STS3215)");
-                        return Err(AdapterError::Rejected(what));
-                    }
+                    self.bus.identify(*id)?;
                     return Ok(Single { id: *id, baud });
                 }
                 several => {
@@ -228,6 +227,7 @@ impl Service for Servos {
 
     fn assign(&mut self, single: &Single, motor: &Motor) -> AdapterResult<()> {
         let (old, new) = (single.id, motor.id);
+        let (code, rate) = self.own_rate()?;
         self.bus.set(old, register::TORQUE, [0])?;
         self.bus.set(old, register::LOCK, [0])?;
         if old != new {
@@ -236,12 +236,12 @@ impl Service for Servos {
             std::thread::sleep(SETTLE);
             self.bus.read::<1>(new, register::ID)?;
         }
-        if single.baud != RATES[0] {
-            let _ = self.bus.write(new, register::RATE, &[0]);
+        if single.baud != rate {
+            let _ = self.bus.write(new, register::RATE, &[code]);
             std::thread::sleep(SETTLE);
-            self.bus.open_at(RATES[0])?;
+            self.bus.open_at(rate)?;
         }
-        self.bus.set(new, register::RATE, [0])?;
+        self.bus.set(new, register::RATE, [code])?;
         self.bus.set(new, register::LOCK, [1])?;
         match self.ping()?.as_slice() {
             [id] if *id == new => Ok(()),

@@ -3,14 +3,16 @@
 
 use super::bus::Bus;
 use super::calibration::NAMES;
-use super::protocol::SERVOS;
+use super::protocol::{SERVOS, register};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::service;
 
 /// The gripper's number.
 const GRIPPER: u8 = 6;
-/// Control mode: 0 is position. With another value goals have another meaning.
-pub const MODE: &str = "control mode";
+/// Registers of all settings but the maximum acceleration are read at once: the first one, and how many.
+const BLOCK: (u8, usize) = (7, 30);
+/// Maximum acceleration.
+const MAX_ACCELERATION: u8 = 85;
 
 /// A setting.
 struct Setting {
@@ -42,19 +44,34 @@ const SETTINGS: [Setting; 10] = [
     Setting::of_all("P coefficient", 21, 16),
     Setting::of_all("D coefficient", 22, 32),
     Setting::of_all("I coefficient", 23, 0),
-    Setting::of_all(MODE, 33, 0),
-    Setting::of_all("maximum acceleration [100 counts/s²]", 85, 254),
+    Setting::of_all("control mode", register::MODE, 0),
+    Setting::of_all("maximum acceleration [100 counts/s²]", MAX_ACCELERATION, 254),
     Setting::of_gripper("maximum torque [0.1 %]", 16, true, 500),
     Setting::of_gripper("protection current [6.5 mA]", 28, true, 250),
     Setting::of_gripper("overload torque [%]", 36, false, 25),
 ];
 
-/// Reads a setting of a servo: the register.
-fn read(bus: &mut Bus, id: u8, setting: &Setting) -> AdapterResult<u16> {
-    Ok(match setting.wide {
-        true => u16::from_le_bytes(bus.read(id, setting.address)?),
-        false => u16::from(bus.read::<1>(id, setting.address)?[0]),
-    })
+/// The registers of a servo that have settings.
+struct Registers {
+    block: [u8; BLOCK.1],
+    max_acceleration: u8,
+}
+
+impl Registers {
+    fn read(bus: &mut Bus, id: u8) -> AdapterResult<Self> {
+        let [max_acceleration] = bus.read(id, MAX_ACCELERATION)?;
+        Ok(Self { block: bus.read(id, BLOCK.0)?, max_acceleration })
+    }
+
+    /// Returns the register of a setting.
+    fn of(&self, setting: &Setting) -> u16 {
+        if setting.address == MAX_ACCELERATION {
+            return self.max_acceleration.into();
+        }
+        let byte = |at: u8| self.block.get(usize::from(at - BLOCK.0)).copied().unwrap_or_default();
+        let high = if setting.wide { byte(setting.address + 1) } else { 0 };
+        u16::from_le_bytes([byte(setting.address), high])
+    }
 }
 
 /// Calls `each` for every setting of every servo that has another value than wanted: the servo, the setting, its
@@ -64,8 +81,9 @@ fn differing(
     mut each: impl FnMut(&mut Bus, u8, &Setting, u16) -> AdapterResult<()>,
 ) -> AdapterResult<()> {
     for id in 1..=SERVOS as u8 {
+        let registers = Registers::read(bus, id)?;
         for setting in SETTINGS.iter().filter(|setting| !setting.gripper || id == GRIPPER) {
-            let register = read(bus, id, setting)?;
+            let register = registers.of(setting);
             if register & setting.mask != setting.value {
                 each(bus, id, setting, register)?;
             }
@@ -79,8 +97,8 @@ pub fn check(bus: &mut Bus) -> AdapterResult<Vec<service::Setting>> {
     let mut found = Vec::new();
     differing(bus, |_, id, setting, register| {
         let motor = usize::from(id).checked_sub(1).and_then(|i| NAMES.get(i)).copied().unwrap_or_default();
-        let (name, wanted) = (setting.name, setting.value);
-        found.push(service::Setting { motor, name, found: register & setting.mask, wanted });
+        let Setting { name, address, value: wanted, .. } = *setting;
+        found.push(service::Setting { motor, name, register: address.into(), found: register & setting.mask, wanted });
         Ok(())
     })?;
     Ok(found)

@@ -5,19 +5,26 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use super::adapter::So101Adapter;
-use super::emulator::start;
+use super::emulator::{Servos, start};
 use super::{DOF, SPEC};
 use crate::hardware::adapter::{AdapterError, Gripper, ManipulatorAdapter, Stop};
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
 use crate::hardware::sim::faults::{Fault, FaultKind};
+use crate::hardware::sim::serial_server::SerialServer;
 use crate::joint::ControlMode;
 
 /// An adapter and its servos.
-fn arm(options: serde_json::Value) -> (So101Adapter, Box<dyn Emulator>) {
+fn arm(options: serde_json::Value) -> (So101Adapter, SerialServer<Servos>) {
     let mut config = AdapterConfig { hardware_id: "arm".into(), address: String::new(), dof: DOF, options };
     let servos = start(&config, &EmulatorAddress::InProcess).unwrap();
     config.address = servos.address();
-    (So101Adapter::new(&config).unwrap(), Box::new(servos))
+    (So101Adapter::new(&config).unwrap(), servos)
+}
+
+/// The goals that the servos have received [counts].
+fn goals(servos: &SerialServer<Servos>) -> [u16; 6] {
+    let goal = |servos: &Servos, i| u16::from_le_bytes([servos.byte(i, 42), servos.byte(i, 43)]);
+    servos.with(|servos, _| [0, 1, 2, 3, 4, 5].map(|i| goal(servos, i)))
 }
 
 fn positions(adapter: &mut So101Adapter) -> [f64; DOF] {
@@ -126,4 +133,45 @@ fn an_overload_is_reported_and_ends_when_the_goal_is_where_the_joint_is() {
     adapter.write_clear_errors().unwrap();
     assert_eq!(adapter.read_error().unwrap(), (0, String::new()));
     adapter.write_joint_positions(&here, 1.0).unwrap();
+}
+
+#[test]
+fn a_stop_leaves_the_gripper_its_grip_and_joints_that_droop_their_goals() {
+    let (mut adapter, servos) = arm(json!({"sim": {"droop": 0.05}}));
+    adapter.connect().unwrap();
+    adapter.activate().unwrap();
+    adapter.set_control_mode(ControlMode::Position).unwrap();
+    adapter.write_joint_positions(&[0.2, -0.3, 0.4, -0.1, 0.5], 1.0).unwrap();
+    adapter.write_gripper_position(0.08).unwrap();
+    until(|| adapter.read_state().unwrap().state >> 8 != 0);
+    until(|| adapter.read_state().unwrap().state >> 8 == 0);
+    // A workpiece in the gripper: it cannot close.
+    servos.inject(Fault { joint: 6, ..Fault::new(FaultKind::Blocked).lasting(60.0) }).unwrap();
+    adapter.write_gripper_position(0.0).unwrap();
+    until(|| adapter.read_state().unwrap().state >> 8 == 0);
+    let held = goals(&servos);
+    assert!(adapter.read_gripper_position().unwrap().unwrap() > 0.06, "the workpiece keeps it open");
+    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    assert_eq!(goals(&servos), held, "at rest");
+    // The same while a joint moves.
+    let start = positions(&mut adapter);
+    adapter.write_joint_positions(&[-1.5, -0.3, 0.4, -0.1, 0.5], 0.3).unwrap();
+    until(|| (positions(&mut adapter)[0] - start[0]).abs() > 0.1);
+    assert_eq!(adapter.write_stop(), Ok(Stop::Confirmed));
+    let stopped = goals(&servos);
+    assert!(stopped[0] > 1500 && stopped[0] < held[0], "{stopped:?}");
+    assert_eq!(stopped[1..], held[1..]);
+}
+
+#[test]
+fn a_reconnect_takes_few_requests_and_writes_no_settings() {
+    let (mut adapter, servos) = arm(json!({"write_settings": true, "sim": {"factory": true}}));
+    adapter.connect().unwrap();
+    let requests = || servos.with(|servos, _| servos.instructions());
+    let before = requests();
+    adapter.disconnect();
+    adapter.connect().unwrap();
+    // Five for each servo and one for the state of all, but for repetitions on a busy computer.
+    let made = requests() - before;
+    assert!(made < 40, "{made}");
 }

@@ -26,6 +26,12 @@ fn open(config: &AdapterConfig) -> Box<dyn Service> {
     SPEC.service.unwrap()(config).unwrap()
 }
 
+/// Saves a calibration with these ranges, and writes it to the servos.
+fn calibrate(arm: &mut dyn Service, ranges: &[(i32, i32)], path: &Path) -> Result<Vec<&'static str>, AdapterError> {
+    std::fs::write(path, arm.calibration(ranges).unwrap()).unwrap();
+    arm.write_calibration(path)
+}
+
 fn push(servos: &dyn Emulator, joint: usize, amount: f64) {
     servos.inject(Fault { joint, amount, ..Fault::new(FaultKind::Pushed) }).unwrap();
 }
@@ -62,7 +68,7 @@ fn a_calibration_is_that_of_lerobot_and_outlives_a_power_loss() {
     assert_eq!(servos.with(|servos, _| servos.stored(0, 31)), 0);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("arm.json");
-    std::fs::write(&path, arm.write_calibration(&ranges).unwrap()).unwrap();
+    calibrate(&mut *arm, &ranges, &path).unwrap();
     let file = Calibration::read(&path).unwrap();
     // 0.1 rad is 65 counts from 2048: 2113 − 2047.
     assert_eq!((file[0].homing_offset, file[1].homing_offset), (66, 1852 - 2047));
@@ -92,7 +98,7 @@ fn joints_move_by_the_offset_and_range_of_their_calibration() {
     ranges[4] = (0, 4095);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("arm.json");
-    std::fs::write(&path, arm.write_calibration(&ranges).unwrap()).unwrap();
+    calibrate(&mut *arm, &ranges, &path).unwrap();
     drop(arm);
     let mut adapter = So101Adapter::new(&AdapterConfig { options: json!({"calibration": path}), ..config }).unwrap();
     adapter.connect().unwrap();
@@ -121,10 +127,10 @@ fn a_calibration_is_refused_while_a_motor_is_on_and_restored_from_its_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("arm.json");
     arm.take_middle().unwrap();
-    let text = arm.write_calibration(&[(700, 3300), (700, 3300), (900, 3100), (900, 3100), (0, 4095), (1900, 3200)]);
-    let text = text.unwrap();
-    std::fs::write(&path, &text).unwrap();
-    assert_eq!(arm.restore(&path), Ok(vec![]), "nothing is written twice");
+    let ranges = [(700, 3300), (700, 3300), (900, 3100), (900, 3100), (0, 4095), (1900, 3200)];
+    assert_eq!(calibrate(&mut *arm, &ranges, &path).unwrap().len(), 6);
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert_eq!(arm.write_calibration(&path), Ok(vec![]), "nothing is written twice");
     std::fs::write(&path, text.replace("3100", "3050")).unwrap();
     drop(arm);
     let mut adapter = So101Adapter::new(&config).unwrap();
@@ -133,14 +139,14 @@ fn a_calibration_is_refused_while_a_motor_is_on_and_restored_from_its_file() {
     adapter.disconnect();
     let mut arm = open(&config);
     assert_eq!(arm.powered().unwrap().len(), 6);
-    let refused = arm.restore(&path).unwrap_err();
+    let refused = arm.write_calibration(&path).unwrap_err();
     assert!(matches!(&refused, AdapterError::Rejected(what) if what.starts_with("motors are on: shoulder_pan, ")));
     assert!(matches!(arm.write_settings(), Err(AdapterError::Rejected(_))));
     arm.release().unwrap();
     assert_eq!(arm.powered(), Ok(vec![]));
-    assert_eq!(arm.restore(&path), Ok(vec!["elbow_flex", "wrist_flex"]));
+    assert_eq!(arm.write_calibration(&path), Ok(vec!["elbow_flex", "wrist_flex"]));
     assert_eq!(servos.with(|servos, _| servos.stored(2, 11)), 3050u16.to_le_bytes()[0]);
-    assert!(arm.restore(Path::new("/no/such/file")).is_err());
+    assert!(arm.write_calibration(Path::new("/no/such/file")).is_err());
 }
 
 #[test]
@@ -166,7 +172,8 @@ fn settings_of_the_factory_are_listed_and_written_once() {
     servos.with(|servos, _| servos.execute(3, 0x03, &[33, 1], &mut Vec::new()));
     drop(arm);
     let error = So101Adapter::new(&config).unwrap().connect().unwrap_err().to_string();
-    assert!(error.contains("elbow_flex is in control mode 1, not 0 (position)\nhint: dimos arm configure"), "{error}");
+    let hint = format!("hint: dimos arm configure so101 --address {}@1000000", servos.path());
+    assert!(error.contains("elbow_flex is in control mode 1, not 0 (position)\n") && error.ends_with(&hint), "{error}");
 }
 
 #[test]
@@ -189,4 +196,48 @@ fn new_servos_get_their_numbers_one_at_a_time() {
     servos.with(|servos, _| (0..6).for_each(|servo| servos.plug(servo, servo as u8 + 1)));
     drop(arm);
     assert!(open(&config).identify().is_ok());
+}
+
+#[test]
+fn a_calibration_that_failed_halfway_is_written_again_from_its_file() {
+    let (config, servos) = line(json!({"sim": {"initial_positions": [0.1, -0.3, 0.2, 0.0, 0.5, 0.4]}}));
+    let mut arm = open(&config);
+    arm.take_middle().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("arm.json");
+    let ranges = [(700, 3300), (700, 3300), (900, 3100), (900, 3100), (0, 4095), (1900, 3200)];
+    servos.with(|servos, _| servos.wear_out(2, true));
+    let error = calibrate(&mut *arm, &ranges, &path).unwrap_err().to_string();
+    assert!(error.starts_with("servo 3 (elbow_flex) keeps [0, 0] in register 31 instead of ["), "{error}");
+    let offset = |servo| servos.with(|servos, _| servos.stored(servo, 31));
+    assert!(offset(0) != 0 && offset(3) == 0, "half written");
+    servos.with(|servos, _| servos.wear_out(2, false));
+    let written = arm.write_calibration(&path).unwrap();
+    assert_eq!(written, ["elbow_flex", "wrist_flex", "wrist_roll", "gripper"]);
+    drop(arm);
+    let options = json!({"calibration": path});
+    assert_eq!(So101Adapter::new(&AdapterConfig { options, ..config }).unwrap().connect(), Ok(()));
+}
+
+#[test]
+fn a_servo_gets_the_rate_of_the_address() {
+    let (config, servos) = line(json!({"sim": {"ids": [0, 0, 0, 0, 0, 1]}}));
+    let at = |rate: u32| AdapterConfig { address: format!("{}@{rate}", servos.path()), ..config.clone() };
+    let mut arm = open(&at(500_000));
+    let (single, gripper) = (arm.find_single().unwrap(), arm.motors()[5]);
+    arm.assign(&single, &gripper).unwrap();
+    assert_eq!(servos.with(|servos, _| (servos.stored(5, 5), servos.stored(5, 6))), (6, 1));
+    drop(arm);
+    let mut arm = open(&at(9600));
+    let error = arm.find_single().unwrap_err().to_string();
+    assert!(error.starts_with("the servos have no rate of 9600 bit/s\nhint: their rates: 1000000, "), "{error}");
+}
+
+#[test]
+fn a_port_that_cannot_be_opened_is_named_when_a_motor_is_searched() {
+    let (config, servos) = line(json!({"sim": {"ids": [0, 0, 0, 0, 0, 1]}}));
+    let mut arm = open(&config);
+    drop(servos);
+    let error = arm.find_single().unwrap_err().to_string();
+    assert!(error.starts_with(&format!("cannot open serial device {}", config.address)), "{error}");
 }

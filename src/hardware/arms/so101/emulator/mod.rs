@@ -83,19 +83,13 @@ impl Default for SimOptions {
 
 impl SimOptions {
     fn common(&self) -> arm::SimOptions {
-        arm::SimOptions {
-            initial_positions: self.initial_positions.clone(),
-            lag: self.lag,
-            droop: self.droop,
-            faults: self.faults.clone(),
-        }
+        let Self { initial_positions, lag, droop, faults, .. } = self.clone();
+        arm::SimOptions { initial_positions, lag, droop, faults }
     }
 
     /// Returns an error for values that the emulator cannot have.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
-        if !(4.0..=14.0).contains(&self.voltage) {
-            return Err(ConfigError::new("sim.voltage", format!("{} is not between 4 and 14 V", self.voltage)));
-        }
+        arm::check_range("voltage", self.voltage, 4.0..=14.0, "V")?;
         if self.ids.len() > RANGES.len() || self.ids.iter().any(|id| *id > 252) {
             return Err(ConfigError::new("sim.ids", "at most six servos have a number, 0 to 252"));
         }

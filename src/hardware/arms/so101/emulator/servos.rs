@@ -52,6 +52,10 @@ pub struct Servos {
     voltage: u8,
     /// The fault of a wrong model.
     wrong_model: bool,
+    /// Which servos have a worn-out EEPROM, which keeps its values.
+    worn: [bool; SERVOS],
+    /// Instructions since the start.
+    instructions: u64,
 }
 
 impl Servos {
@@ -91,6 +95,8 @@ impl Servos {
             echo: options.echo,
             voltage: (options.voltage * 10.0).round() as u8,
             wrong_model: false,
+            worn: [false; SERVOS],
+            instructions: 0,
         };
         for (servo, id) in options.ids.iter().take(SERVOS).enumerate() {
             servos.plug(servo, *id);
@@ -105,6 +111,16 @@ impl Servos {
         for bank in [&mut self.registers, &mut self.stored] {
             bank.iter_mut().skip(servo).take(1).for_each(|registers| registers[ID] = id.max(1));
         }
+    }
+
+    /// Wears out the EEPROM of a servo (index from 0), which then keeps its values, or replaces it.
+    pub fn wear_out(&mut self, servo: usize, worn: bool) {
+        self.worn.iter_mut().skip(servo).take(1).for_each(|state| *state = worn);
+    }
+
+    /// Returns how many instructions have arrived.
+    pub fn instructions(&self) -> u64 {
+        self.instructions
     }
 
     /// Returns a register of a servo (index from 0) as it is after the next power loss.
@@ -190,7 +206,8 @@ impl Servos {
             return;
         };
         let makes_middle = address == TORQUE && values.first() == Some(&MAKE_MIDDLE);
-        for (i, value) in (address..).zip(values).filter(|(i, _)| !READ_ONLY.contains(i)) {
+        let lowest = if self.worn.get(servo) == Some(&true) { RAM } else { 0 };
+        for (i, value) in (address..).zip(values).filter(|(i, _)| *i >= lowest && !READ_ONLY.contains(i)) {
             if let Some(register) = registers.get_mut(i).filter(|_| !(makes_middle && i == TORQUE)) {
                 *register = *value;
             }
@@ -253,6 +270,7 @@ impl Servos {
 
     /// Executes an instruction; puts statuses into `answer`.
     pub fn execute(&mut self, id: u8, instruction: u8, parameters: &[u8], answer: &mut Vec<u8>) {
+        self.instructions += 1;
         let (ids, plugged) = (self.registers.map(|registers| registers[ID]), self.plugged);
         let on_line = (0..SERVOS).zip(ids).filter(|(servo, _)| plugged.get(*servo) == Some(&true));
         let listed = |id: u8| { on_line.clone() }.find(|(_, own)| *own == id).map(|(servo, _)| servo);

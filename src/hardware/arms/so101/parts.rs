@@ -1,0 +1,64 @@
+//! Optional parts: status of the joints, and the gripper.
+
+use std::f64::consts::TAU;
+
+use super::adapter::So101Adapter;
+use super::protocol::TURN;
+use super::{DOF, GRIPPER_MAX};
+use crate::arm::JointStatus;
+use crate::hardware::adapter::{AdapterError, AdapterResult, Gripper, JointMonitor};
+use crate::hardware::adapter_util::fill;
+
+/// Unit of the servos' currents [A].
+const AMPERE: f64 = 6.5e-3;
+
+impl JointMonitor for So101Adapter {
+    /// The load is the duty cycle of the motor: the servos measure no torque.
+    fn read_joint_status(&mut self, joints: &mut [JointStatus]) -> AdapterResult<()> {
+        for (joint, servo) in joints.iter_mut().zip(&self.recent()?) {
+            *joint = JointStatus {
+                temperature: Some(servo.temperature.into()),
+                current: Some(f64::from(servo.current) * AMPERE),
+                voltage: Some(f64::from(servo.voltage) * 0.1),
+                load: Some(f64::from(servo.load) * 1e-3),
+                error: Some(servo.error.into()),
+            };
+        }
+        Ok(())
+    }
+
+    fn read_calibration_offsets(&mut self, offsets: &mut [f64]) -> AdapterResult<bool> {
+        fill(offsets, &self.offsets.map(|offset| f64::from(offset) * TAU / TURN));
+        Ok(true)
+    }
+}
+
+impl Gripper for So101Adapter {
+    fn read_gripper_position(&mut self) -> AdapterResult<Option<f64>> {
+        let position = self.recent()?.get(DOF).map_or(0, |servo| servo.position);
+        let range = self.range(DOF);
+        Ok(Some(f64::from(position - range.low) / f64::from(range.high - range.low) * GRIPPER_MAX))
+    }
+
+    fn write_gripper_position(&mut self, position: f64) -> AdapterResult<()> {
+        if !(0.0..=GRIPPER_MAX).contains(&position) {
+            return Err(AdapterError::Rejected(format!("the gripper opens 0 to {GRIPPER_MAX} m, not {position} m")));
+        }
+        // Goals that were written since the last state are in the servos only.
+        let servos = self.fetch()?;
+        if !servos.get(DOF).is_some_and(|servo| servo.on) {
+            return Err(AdapterError::Rejected("the motor of the gripper is off".into()));
+        }
+        let range = self.range(DOF);
+        let goal = f64::from(range.low) + position / GRIPPER_MAX * f64::from(range.high - range.low);
+        let goal = goal.round() as i32;
+        self.gripper_goal = Some(goal);
+        let mut goals = servos.map(|servo| servo.goal);
+        goals.iter_mut().skip(DOF).for_each(|to| *to = goal);
+        self.write_goals(goals)
+    }
+
+    fn get_gripper_range(&mut self) -> Option<(f64, f64)> {
+        Some((0.0, GRIPPER_MAX))
+    }
+}

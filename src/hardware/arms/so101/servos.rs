@@ -1,0 +1,130 @@
+//! The state of all servos and writes to all of them: one request reads the state; what is written has no answer, so it
+//! is read back where it matters.
+
+use std::time::Duration;
+
+use super::DOF;
+use super::adapter::So101Adapter;
+use super::calibration::NAMES;
+use super::protocol::{self, Instruction, MAX_DATA, MAX_INSTRUCTION, SERVOS, STATE, Servo, TURN, register};
+use crate::clock::{Clock, MonotonicClock};
+use crate::hardware::adapter::{AdapterError, AdapterResult};
+use crate::hardware::transport::request_reply::Retry;
+
+/// Longest wait for the state of all servos. All attempts together stay below `stale_after`.
+const CYCLE: Retry = Retry { each: Duration::from_millis(30), times: 3 };
+/// A state answers further questions for this time.
+const STATE_AGE: Duration = Duration::from_millis(5);
+/// How often torque and goals are written until the servos show them: nothing acknowledges a write to all.
+const WRITES: u32 = 4;
+/// A goal this far from the joint is that joint's position [counts]: encoders flicker.
+const SAME: i32 = 3;
+/// A joint at rest further than this from its goal has not started yet, or is blocked [counts]; nearer, it droops.
+const DROOP: i32 = 40;
+
+impl So101Adapter {
+    /// Writes the same registers of all servos.
+    pub(super) fn write<const N: usize>(&mut self, address: u8, values: [[u8; N]; SERVOS]) -> AdapterResult<()> {
+        let mut frame = [0; MAX_INSTRUCTION];
+        let values = values.as_flattened();
+        self.state = None;
+        self.bus.line.tell(protocol::encode(Instruction::WriteAll(address, N as u8, values), &mut frame))
+    }
+
+    /// Asks for the state of all servos.
+    pub(super) fn fetch(&mut self) -> AdapterResult<[Servo; SERVOS]> {
+        self.state = None;
+        let asked = MonotonicClock.now();
+        let mut frame = [0; MAX_INSTRUCTION];
+        let frame = protocol::encode(Instruction::ReadAll(STATE.0, STATE.1), &mut frame);
+        let mut servos: [Option<Servo>; SERVOS] = [None; SERVOS];
+        let scan = |bytes: &[u8]| {
+            protocol::scan(bytes, 1..=SERVOS as u8, usize::from(STATE.1)).map(|status| {
+                let mut data = [0; MAX_DATA];
+                data.iter_mut().zip(status.data).for_each(|(to, byte)| *to = *byte);
+                (status.id, data)
+            })
+        };
+        let result = self.bus.line.gather(frame, CYCLE, SERVOS, scan, |(id, data)| {
+            let slot = usize::from(id).checked_sub(1).and_then(|servo| servos.get_mut(servo));
+            slot.is_some_and(|slot| slot.replace(Servo::decode(&data).unwrap_or_default()).is_none())
+        });
+        if let (Err(AdapterError::Timeout(text)), Some(missing)) = (&result, servos.iter().position(Option::is_none)) {
+            let name = NAMES.get(missing).copied().unwrap_or_default();
+            return Err(AdapterError::Timeout(format!("{text}; servo {} ({name}) did not", missing + 1)));
+        }
+        result?;
+        let servos = servos.map(Option::unwrap_or_default);
+        self.state = Some((servos, asked));
+        Ok(servos)
+    }
+
+    /// Returns the last state, or a new one when that is too old.
+    pub(super) fn recent(&mut self) -> AdapterResult<[Servo; SERVOS]> {
+        self.not_older(STATE_AGE)
+    }
+
+    pub(super) fn not_older(&mut self, age: Duration) -> AdapterResult<[Servo; SERVOS]> {
+        match self.state {
+            Some((servos, at)) if self.bus.line.is_open() && MonotonicClock.now().since(at) <= age => Ok(servos),
+            _ => self.fetch(),
+        }
+    }
+
+    /// Writes goals until the servos show them.
+    pub(super) fn write_goals(&mut self, goals: [i32; SERVOS]) -> AdapterResult<()> {
+        for _ in 0..WRITES {
+            self.write(register::GOAL, goals.map(|goal| (goal.max(0) as u16).to_le_bytes()))?;
+            if self.fetch()?.iter().zip(&goals).all(|(servo, goal)| servo.goal == *goal) {
+                return Ok(());
+            }
+        }
+        Err(AdapterError::Protocol("so101: the servos do not take their goals".into()))
+    }
+
+    /// Switches all motors on or off until the servos show it.
+    pub(super) fn write_torque(&mut self, on: bool) -> AdapterResult<()> {
+        for _ in 0..WRITES {
+            self.write(register::TORQUE, [[u8::from(on)]; SERVOS])?;
+            if self.fetch()?.iter().all(|servo| servo.on == on) {
+                return Ok(());
+            }
+        }
+        let what = if on { "on" } else { "off" };
+        Err(AdapterError::Protocol(format!("so101: not all motors can be switched {what}")))
+    }
+
+    /// Returns where each servo is, inside its range. A servo goes to its goal when its motor comes on, and some when a
+    /// goal is written.
+    pub(super) fn hold_goals(&self, servos: &[Servo; SERVOS]) -> AdapterResult<[i32; SERVOS]> {
+        let mut goals = servos.map(|servo| servo.position);
+        for (j, goal) in goals.iter_mut().enumerate() {
+            let (range, position) = (self.range(j), *goal);
+            *goal = position.max(range.low).min(range.high);
+            if (*goal - position).abs() > SAME && j < DOF {
+                let degrees = |counts: i32| f64::from(counts) * 360.0 / TURN;
+                return Err(AdapterError::Rejected(format!(
+                    "joint {} ({}) is {:.1}° outside its range\nhint: move it inside by hand, or calibrate the arm",
+                    j + 1,
+                    NAMES.get(j).copied().unwrap_or_default(),
+                    degrees((*goal - position).abs())
+                )));
+            }
+        }
+        Ok(goals)
+    }
+}
+
+/// Returns code and text of the first servo in error; the text names it.
+pub(super) fn error_of(servos: &[Servo; SERVOS]) -> Option<(i32, String)> {
+    let (i, servo) = servos.iter().enumerate().find(|(_, servo)| servo.error != 0)?;
+    let (name, text) = (NAMES.get(i).copied().unwrap_or_default(), protocol::error_text(servo.error));
+    Some((servo.error.into(), format!("servo {} ({name}): {text}", i + 1)))
+}
+
+/// Returns whether a stop makes the position of servo `j` its goal: if it moves, or is a joint far from its goal.
+/// Joints that droop and a gripper on a workpiece rest away from their goals: with a goal at its position, the joint
+/// would sink further, and the gripper lose its grip. The device thread holds a gripper that starts after this.
+pub(super) fn must_stop(j: usize, servo: &Servo) -> bool {
+    servo.moving || j < DOF && (!servo.on || (servo.goal - servo.position).abs() > DROOP)
+}
