@@ -54,8 +54,8 @@ pub struct CoordinatorConfig {
     #[serde(deserialize_with = "tick_rate")]
     #[schemars(range(min = 1.0, max = 2000.0))]
     pub tick_rate: f64,
-    /// What starts a tick: `host`, this computer's clock, or `device(ARM)`: the states that this arm sends by itself, one
-    /// per cycle of its controller. Its rate is then `tick_rate` or a multiple of it. The other arms follow.
+    /// What starts a tick: `host`, this computer's clock, or `device(ARM)`: the states that this arm streams, one per
+    /// cycle of its controller. Their rate is then `tick_rate` or a multiple of it. The other arms follow.
     pub clock: TickClock,
     /// Whether the joint state is published to clients.
     pub publish_joint_state: bool,

@@ -17,7 +17,7 @@ pub enum TickClock {
     /// The clock of this computer.
     #[default]
     Host,
-    /// The states that the arm with this `hardware_id` sends by itself.
+    /// The states that the arm with this `hardware_id` streams.
     Device(String),
 }
 

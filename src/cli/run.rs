@@ -180,7 +180,8 @@ fn terminal() -> Result<Terminal> {
 struct Keep {
     duration: Option<Duration>,
     json: bool,
-    /// Whether a client or a terminal was shown that the run is up: otherwise no one expects its arms to move at its end.
+    /// Whether a client or a terminal was shown that the run is up: otherwise no one expects its arms to move at
+    /// its end.
     seen: bool,
 }
 

@@ -1,4 +1,4 @@
-//! When a tick begins: on a grid of this computer's clock, or with each state that one arm sends by itself.
+//! When a tick begins: on a grid of this computer's clock, or with each state that one arm streams.
 //!
 //! An arm whose controller sends its state in every cycle and expects a setpoint for it, in the same cycle, is the
 //! clock of its run. The other arms follow. When it is silent, this computer's clock continues at the same rate, so
@@ -86,8 +86,8 @@ impl Pacer {
         }
     }
 
-    /// Returns when the next tick begins at the latest. A state may be late by a third of a period, so that the one after
-    /// it is not too early for a tick; an arm that has missed one is not waited for.
+    /// Returns when the next tick begins at the latest. A state may be late by a third of a period, so that the one
+    /// after it is not too early for a tick; an arm that has missed one is not waited for.
     fn latest(&self) -> Mono {
         match self.source {
             Source::Device { .. } if !self.silent => self.due.after(self.period / 3),
@@ -270,11 +270,11 @@ mod tests {
     fn lost_states_and_stalls_are_skipped_periods() {
         let mut pacer = device(P);
         pacer.begin(ms(100.0), Some((1, ms(100.0))));
-        // This computer stood still; the arm went on sending.
+        // This computer was stalled; the arm continued to send.
         let start = pacer.begin(ms(151.0), Some((6, ms(150.0)))).unwrap();
         assert_eq!(now_and_skipped(Some(start)), Some((ms(150.0), 4, false)));
         assert_eq!((start.time.late_ns, start.time.woke_late_ns), (41_000_000, 1_000_000));
-        // It stood still without the arm.
+        // It was stalled, and the arm silent.
         let start = pacer.begin(ms(196.0), Some((6, ms(150.0)))).unwrap();
         assert_eq!(now_and_skipped(Some(start)), Some((ms(160.0).after(P / 3).after(P * 3), 3, true)));
     }

@@ -11,8 +11,8 @@ use crate::hardware::device::Connected;
 /// Maximum ratio between the arm's rate and the tick's.
 const MAX_RATIO: f64 = 100.0;
 
-/// Returns the source of the ticks. An arm that cannot clock them is an error: its states must come by themselves, at
-/// the tick's rate or a multiple of it.
+/// Returns the source of the ticks. An arm that cannot clock them is an error: it must stream its state,
+/// at the tick's rate or a multiple of it.
 pub(super) fn source<'a>(
     blueprint: &Blueprint,
     arms: &mut Arms,
@@ -24,7 +24,7 @@ pub(super) fn source<'a>(
     let (Some((arm, (_, connected))), Some(wake)) = (found, arms.pace.take()) else { return Ok(Source::Host) };
     let wrong = |what: String, hint: String| Err(StartError::Hardware { arm: id.clone(), what, hint });
     if !connected.streams {
-        let what = "it cannot clock the ticks: its state is asked for, not sent by itself".to_owned();
+        let what = "it cannot clock the ticks: its state is asked for, not streamed".to_owned();
         return wrong(what, "remove `coordinator.clock`, or write `clock: host`".to_owned());
     }
     let (own, rate) = (connected.info.native_rate, blueprint.coordinator.tick_rate);

@@ -1,5 +1,6 @@
 //! `docs/blueprint-reference.md`, `assets/blueprint.schema.json` and `assets/rpc.schema.json` are generated, so that
-//! they never differ from what is accepted. `DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference` writes them.
+//! they never differ from what is accepted. `DIMOS_REGENERATE=1 cargo test --test logic blueprint_reference` writes
+//! them.
 
 use std::fmt::Write;
 use std::path::Path;

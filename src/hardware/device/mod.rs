@@ -109,7 +109,7 @@ pub struct Connected {
     pub io: Option<IoInfo>,
     /// Calibration offsets of its joints [rad], if it reports them.
     pub calibration_offsets: Option<Joints>,
-    /// Whether it sends its state by itself.
+    /// Whether it streams its state.
     pub streams: bool,
     /// Whether its controller takes the load at the flange.
     pub has_payload: bool,
