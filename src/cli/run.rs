@@ -202,7 +202,9 @@ fn keep_up(
     let how_to_end = if in_terminal { banner::IN_A_TERMINAL } else { daemon::HOW_TO_END };
     banner::print(terminal, &report, run.socket().unwrap_or_else(|| Path::new("none")), how_to_end, json);
     let ending = run.wait_for_end(duration);
-    let parks = seen && !matches!(ending, Ending::Fault(_) | Ending::Log(_)) && report.arms.iter().any(banner::parks);
+    // A terminal that is lost has no one before it who expects a motion.
+    let unwatched = matches!(ending, Ending::Fault(_) | Ending::Log(_) | Ending::Signal(SIGHUP));
+    let parks = seen && !unwatched && report.arms.iter().any(banner::parks);
     if !json {
         let then = if parks { banner::PARKING } else { "then releasing the arms" };
         terminal.note(format_args!("{}: decelerating to rest, {then}", why(&ending)));

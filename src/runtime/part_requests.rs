@@ -27,9 +27,14 @@ impl Service {
         self.io_info(arm)?;
         let device = self.device(arm)?;
         let values = call.values().map_err(|what| RpcError::new(Code::InvalidParams, what))?;
+        let mut done = Vec::new();
         for (value, (name, level)) in values.into_iter().zip(&call.outputs) {
             let set = order(device.set_output(value)).await;
-            set.map_err(|e| refused(&call.arm, &format!("did not set {name}"), &e))?;
+            set.map_err(|e| {
+                let before = if done.is_empty() { String::new() } else { format!(" ({} was set)", done.join(", ")) };
+                refused(&call.arm, &format!("did not set {name}{before}"), &e)
+            })?;
+            done.push(name.as_str());
             self.parts.dispatcher.log(Severity::Info, format!("{}: {name} set to {level}", call.arm));
         }
         self.io(&call.arm).await.map(Reply::ArmIoSet)

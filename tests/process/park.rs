@@ -166,6 +166,14 @@ fn a_stop_and_a_second_signal_end_the_way_to_the_park_pose() {
     rig.not_parked(run, 143, "arm is held (stopped by an operator)");
 }
 
+#[test]
+fn a_lost_terminal_parks_nothing() {
+    let rig = Rig::new();
+    let ended = rig.home.run("parked.yaml --no-record").end(Signal::HUP);
+    ended.with(129).says(&["SIGHUP: decelerating to rest, then releasing", "arm: motors stay on and hold the pose"]);
+    assert!(rig.motors_on() && rig.off(&START) < 0.01);
+}
+
 /// An arm that has arrived waits for another one, and is held meanwhile.
 #[test]
 fn an_arm_that_is_held_after_it_has_arrived_keeps_its_motors() {

@@ -10,7 +10,9 @@ use crate::arm::{IoInfo, IoState};
 pub trait Io {
     /// Returns the number of channels and their units, known once connected.
     fn get_io(&self) -> IoInfo;
-    /// Fills in the levels of all channels. Must not allocate: with a stop input it is called in every cycle.
+    /// Fills in the levels of all channels, no older than the joint state that is read in the same cycle; an error if
+    /// they are: a stop input must not seem closed because its report has ended. Must not allocate: with a stop input
+    /// it is called in every cycle.
     fn read_io(&mut self, state: &mut IoState) -> AdapterResult<()>;
     /// Sets a digital output (number from 0). `Rejected` for one that the controller lacks.
     fn write_digital_output(&mut self, output: u8, high: bool) -> AdapterResult<()>;
