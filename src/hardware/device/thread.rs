@@ -5,6 +5,8 @@ mod connection;
 mod payload;
 mod readings;
 mod slow_readings;
+#[cfg(test)]
+mod tests;
 mod tick_monitor;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};

@@ -1,5 +1,8 @@
 //! Monitors the tick's heartbeat: without it, the device thread holds the arm.
 
+#[cfg(test)]
+mod tests;
+
 use std::time::Duration;
 
 use super::Worker;
