@@ -154,11 +154,7 @@ impl Client {
     pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
         let id = self.next;
         self.next += 1;
-        let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
-        if line.len() > MAX_LINE {
-            let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
-            return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());
-        }
+        let line = request(id, &params)?;
         let deadline = Instant::now() + self.timeout;
         if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
             // A run that refuses the connection sends the reason before it closes it.
@@ -208,6 +204,31 @@ impl Client {
         self.buffered.pop_front()
     }
 
+    /// Returns a sender of requests on this connection that does not wait for replies: [`Client::reply`] returns them.
+    /// Only one of both can then send.
+    pub fn sender(&self) -> Result<Sender, ClientError> {
+        let to = self.from.get_ref().try_clone().map_err(|error| self.io(error))?;
+        Ok(Sender { run: self.run.clone(), to, next: self.next })
+    }
+
+    /// Waits for the next reply to a request of [`Client::sender`], at most 12 s: its number, and the result. `None`:
+    /// no reply came.
+    pub fn reply(&mut self) -> Result<Option<(u64, Result<Value, RpcError>)>, ClientError> {
+        let deadline = Instant::now() + self.timeout;
+        loop {
+            match self.read(deadline) {
+                Ok(Incoming { stream: Some(_), .. }) => {}
+                Ok(Incoming { id: Some(id), result, error, .. }) => return Ok(Some((id, error.map_or(Ok(result), Err)))),
+                // The run refuses the connection.
+                Ok(Incoming { error, .. }) => {
+                    return Err(error.map_or_else(|| self.protocol("a reply without id".into()), Into::into));
+                }
+                Err(ClientError::Io { error, .. }) if error.kind() == io::ErrorKind::TimedOut => return Ok(None),
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
     fn read(&mut self, deadline: Instant) -> Result<Incoming, ClientError> {
         let line = self.read_line(deadline).map_err(|error| self.io(error))?;
         serde_json::from_slice(&line).map_err(|e| self.protocol(e.to_string()))
@@ -253,6 +274,40 @@ impl Client {
     fn protocol(&self, what: String) -> ClientError {
         ClientError::Protocol { run: self.run.clone(), what }
     }
+}
+
+/// Sends requests without waiting for replies: from [`Client::sender`].
+#[derive(Debug)]
+pub struct Sender {
+    run: String,
+    to: UnixStream,
+    next: u64,
+}
+
+impl Sender {
+    /// Sends a request; returns its number.
+    pub fn send<M: Method>(&mut self, params: &M) -> Result<u64, ClientError> {
+        let id = self.next;
+        self.next += 1;
+        let line = request(id, params)?;
+        let sent = self.to.write_all(line.as_bytes());
+        sent.map(|()| id).map_err(|error| ClientError::Io { run: self.run.clone(), error })
+    }
+
+    /// Ends the connection: [`Client::reply`] fails.
+    pub fn close(&self) {
+        let _ = self.to.shutdown(std::net::Shutdown::Both);
+    }
+}
+
+/// Encodes a request as a line.
+fn request<M: Method>(id: u64, params: &M) -> Result<String, ClientError> {
+    let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
+    if line.len() > MAX_LINE {
+        let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
+        return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());
+    }
+    Ok(line)
 }
 
 fn message(incoming: Incoming) -> Message {

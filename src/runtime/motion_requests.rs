@@ -11,6 +11,7 @@ use crate::control::limit::Bounds;
 use crate::control::point_to_point::{MotionError, point_to_point};
 use crate::control::request::Motion;
 use crate::control::task_body::TargetKind;
+use crate::joint::JointLimits;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
@@ -61,7 +62,8 @@ impl Service {
         let start = if from_command { view.command.values } else { view.state.position };
         let start = start.get(..config.dof).unwrap_or_default().to_vec();
         let names = self.parts.names.arms[arm as usize].joints.clone();
-        let motion = point_to_point(&names, &start, &call.target, &config.limits, call.speed).map_err(|e| match e {
+        let limits = capped(&config.limits, call.max_velocity, call.max_acceleration);
+        let motion = point_to_point(&names, &start, &call.target, &limits, call.speed).map_err(|e| match e {
             MotionError::OutOfLimits { ref joint, excess, .. } => {
                 let data = json!({"joint": joint, "by": excess});
                 RpcError::new(Code::OutOfLimits, e.to_string())
@@ -200,6 +202,16 @@ impl Service {
         }
         Ok(())
     }
+}
+
+/// Returns the limits, with velocities [rad/s] and accelerations [rad/s²] of at most these.
+fn capped(limits: &JointLimits, velocity: Option<f64>, acceleration: Option<f64>) -> JointLimits {
+    let mut limits = limits.clone();
+    let caps = [(&mut limits.velocity_max, velocity), (&mut limits.acceleration_max, acceleration)];
+    for (values, cap) in caps {
+        values.iter_mut().for_each(|value| *value = cap.map_or(*value, |cap| value.min(cap)));
+    }
+    limits
 }
 
 fn trajectory_of(given: api::Trajectory) -> JointTrajectory {
