@@ -132,9 +132,10 @@ fn choose<'a>(status: &'a StatusReport, wanted: Option<&str>) -> Result<&'a ArmR
             let failure = Failure::usage(format!("run {} has the arms {}", status.run, names.join(", ")));
             Err(failure.hint("name one: dimos proxy xarm ARM"))
         }
-        (Some(name), arms) => arms.iter().find(|arm| arm.hardware_id == name).ok_or_else(|| {
-            ClientError::Refused(RpcError::unknown(Code::UnknownArm, "arm", name, &names)).into()
-        }),
+        (Some(name), arms) => arms
+            .iter()
+            .find(|arm| arm.hardware_id == name)
+            .ok_or_else(|| ClientError::Refused(RpcError::unknown(Code::UnknownArm, "arm", name, &names)).into()),
     }
 }
 
@@ -169,7 +170,8 @@ fn model_of(wanted: Option<Model>, info: &ArmInfo) -> Result<Model> {
     match wanted.or_else(|| Model::of_dof(joints)) {
         Some(model) if model.axes() == joints => Ok(model),
         Some(model) => {
-            let what = format!("{} has {joints} joints, {} {} has {}", info.arm, model.article(), model.name(), model.axes());
+            let what =
+                format!("{} has {joints} joints, {} {} has {}", info.arm, model.article(), model.name(), model.axes());
             Err(Failure::usage(what).hint("omit --model, or choose one with as many joints"))
         }
         None => {
@@ -185,7 +187,8 @@ fn announce(run: &str, model: Model, info: &ArmInfo, address: &str) {
     output::line(format_args!("{} at {address}: {arm} of run {run}", model.name()));
     let servo = info.servo.as_ref().map(|task| task.name.clone());
     let velocity = info.velocity.as_ref().map(|task| task.name.clone());
-    for (mode, kind, task) in [(0, "trajectory", info.trajectory.clone()), (1, "servo", servo), (4, "velocity", velocity)]
+    for (mode, kind, task) in
+        [(0, "trajectory", info.trajectory.clone()), (1, "servo", servo), (4, "velocity", velocity)]
     {
         match task {
             Some(task) => output::line(format_args!("  mode {mode}  {task}")),

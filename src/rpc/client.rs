@@ -218,7 +218,9 @@ impl Client {
         loop {
             match self.read(deadline) {
                 Ok(Incoming { stream: Some(_), .. }) => {}
-                Ok(Incoming { id: Some(id), result, error, .. }) => return Ok(Some((id, error.map_or(Ok(result), Err)))),
+                Ok(Incoming { id: Some(id), result, error, .. }) => {
+                    return Ok(Some((id, error.map_or(Ok(result), Err))));
+                }
                 // The run refuses the connection.
                 Ok(Incoming { error, .. }) => {
                     return Err(error.map_or_else(|| self.protocol("a reply without id".into()), Into::into));

@@ -116,7 +116,8 @@ def session(host):
     # What it cannot do is refused.
     check(arm.set_mode(5) != 0, "Cartesian velocity")
     check(arm.get_forward_kinematics(start)[0] != 0, "forward kinematics")
-    ok(arm.clean_warn(), "clean_warn")
+    check(arm.set_collision_sensitivity(5) != 0, "a setting of the box")
+    check(arm.error_code == 0, "a refused setting is no error")
     ok(arm.set_gripper_enable(True), "set_gripper_enable")
     ok(arm.set_gripper_mode(0), "set_gripper_mode")
     ok(arm.set_gripper_position(400, wait=True), "set_gripper_position")
@@ -227,9 +228,23 @@ def other_make(host):
     goal = [angle + 0.1 for angle in angles(arm)]
     ok(arm.set_servo_angle(angle=goal, speed=0.5, wait=True), "set_servo_angle")
     check(near(angles(arm), goal, 2e-3), f"it is at {angles(arm)}")
+    check(arm.get_position()[0] == 0, "get_position")
     arm.disconnect()
 
 
-SCENARIOS = [session, limits, leased, stream, other_stop, seven, other_make]
+def no_kinematics(host):
+    """A run that does not know where the tool is, and has no tasks for streams."""
+    arm = connect(host)
+    check(arm.get_position()[0] == 10, f"get_position without kinematics: {arm.get_position()}")
+    check(arm.set_mode(1) == 10 and arm.set_mode(4) == 10, "modes without a task")
+    enable(arm, 0)
+    check(arm.set_position(300, 0, 300, 3.1, 0, 0, speed=100) == 10, "set_position")
+    goal = [0.3, -0.2, -0.5, 0.1, 0.4]
+    ok(arm.set_servo_angle(angle=goal, speed=1, wait=True), "set_servo_angle")
+    check(near(angles(arm), goal, 2e-3), f"it is at {angles(arm)}")
+    arm.disconnect()
+
+
+SCENARIOS = [session, limits, leased, stream, other_stop, seven, other_make, no_kinematics]
 {scenario.__name__: scenario for scenario in SCENARIOS}[sys.argv[1]](sys.argv[2])
 print("all is as it should be")

@@ -22,8 +22,6 @@ const ROUNDING: f64 = 2e-5;
 const REPEAT_PERIOD: Duration = Duration::from_millis(50);
 /// Time after which the status shows that a stream has begun.
 const BEGIN_TIME: Duration = Duration::from_millis(200);
-/// Warning: a parameter is wrong.
-const BAD_PARAMETER: u8 = 12;
 
 /// A task that follows a stream.
 #[derive(Debug, Clone)]
@@ -287,7 +285,7 @@ impl ControlledArm for RunArm {
         let arm = self.info.arm.clone();
         match (joint, on) {
             // A run switches all motors at once.
-            (Some(_), _) => Err(Refusal::Warning(BAD_PARAMETER)),
+            (Some(_), _) => Err(Refusal::NotNow),
             (None, true) if self.view.ready && self.changed.is_none() => Ok(()),
             (None, true) => self.change(&ArmEnable { arm }),
             (None, false) if !self.view.enabled && self.changed.is_none() => Ok(()),
@@ -406,8 +404,8 @@ impl ControlledArm for RunArm {
         let center = [x, y, z].map(|value| f64::from(value) / 1000.0);
         let load = ArmPayloadSet { arm: self.info.arm.clone(), mass: mass.into(), center, inertia: [0.0; 6] };
         match self.ask(&load) {
-            // The controller's word for what it cannot set.
-            Err(Refusal::Error(_)) => Err(Refusal::Warning(BAD_PARAMETER)),
+            // The arm takes no load, or not this one: no reason to stop.
+            Err(Refusal::Error(_)) => Err(Refusal::NotNow),
             result => result.map(drop),
         }
     }

@@ -224,9 +224,11 @@ impl RunLink {
         start("proxy-state", &shared, move |shared| watch_state(&mut state, shared))?;
         start("proxy-stops", &shared, move |shared| take_urgent_replies(&mut urgent, shared))?;
         let taker = commands.clone();
-        start("proxy-replies", &shared, move |shared| loop {
-            if let Some((id, result)) = replies.reply()? {
-                lock(&taker).take_reply(id, result, shared);
+        start("proxy-replies", &shared, move |shared| {
+            loop {
+                if let Some((id, result)) = replies.reply()? {
+                    lock(&taker).take_reply(id, result, shared);
+                }
             }
         })?;
         Ok(Self { shared, commands, urgent: to_urgent })

@@ -196,7 +196,12 @@ impl<C: Controller, Client> Shared<C, Client> {
             }
             Delivery::Disconnect(_) => return Err(Ending::Cut(Duration::ZERO)),
             Delivery::PowerLoss(time) => return Err(Ending::Cut(time)),
-            Delivery::Send | Delivery::Pending | Delivery::HangUp | Delivery::Frozen | Delivery::BusOff | Delivery::NoBuffers(_) => {}
+            Delivery::Send
+            | Delivery::Pending
+            | Delivery::HangUp
+            | Delivery::Frozen
+            | Delivery::BusOff
+            | Delivery::NoBuffers(_) => {}
         }
         Ok(true)
     }

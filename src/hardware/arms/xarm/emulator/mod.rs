@@ -37,8 +37,8 @@ use crate::hardware::sim::faults::Fault;
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
 pub use controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
-use controller::{Controller, introduce};
 pub use controller::Received;
+use controller::{Controller, introduce};
 use report::Kind;
 
 /// Prefix of messages.

@@ -32,7 +32,7 @@ impl<A: ControlledArm> Controller<A> {
             position: self.seven().map(|v| v as f32),
             velocity: first(&self.arm.joints().1).map(|v| v as f32),
             torque: self.torques().map(|v| v * scale),
-            pose: self.pose().as_ref().map(to_wire).unwrap_or_default(),
+            pose: self.pose().as_ref().map_or([f32::NAN; 6], to_wire),
             enabled: self.motors(),
             error: self.error(),
             warning: self.warning,

@@ -22,10 +22,21 @@ const TOOL_SILENT: u8 = 19;
 
 /// The state byte's bit "no valid result": a command that the mode does not know (our choice).
 const INVALID: u8 = 0x08;
+/// Length of a response without a payload.
+const HEADER: usize = 8;
 /// The bus number of the tool flange.
 const TOOL: u8 = 9;
 
 use Refusal::{Error, NotNow, Pending, Warning};
+
+/// How many numbers the result of a query has: a pose, or joints.
+fn numbers_of(register: u8) -> Option<usize> {
+    match register {
+        41 | 44 | 91 => Some(6),
+        43 => Some(7),
+        _ => None,
+    }
+}
 
 impl<A: ControlledArm> Controller<A> {
     /// Does what a request asks; answers the state byte of the response in `out`. `None`: the outcome is not known yet.
@@ -38,6 +49,10 @@ impl<A: ControlledArm> Controller<A> {
             Err(Error(code)) => self.fail(code),
             Err(NotNow) => extra = INVALID,
             Err(Pending) => return None,
+        }
+        if let Some(missing) = numbers_of(request.register).filter(|_| out.len() == HEADER) {
+            // Clients expect all numbers of a result, also of one that there is not.
+            put_numbers(out, std::iter::repeat_n(f32::NAN, missing));
         }
         let status = self.status() | extra;
         wire::end(out, status);
@@ -60,14 +75,13 @@ impl<A: ControlledArm> Controller<A> {
             (15, _) => out.extend([self.error(), self.warning]),
             (16, _) => self.clear_error()?,
             (17, _) => self.warning = 0,
-            (19, [mode, ..]) if *mode <= 11 && self.arm.has_mode(*mode) => self.set_mode(*mode),
+            (19, [mode, ..]) if !self.arm.has_mode(*mode) => return Err(NotNow),
+            (19, [mode, ..]) if *mode <= 11 => self.set_mode(*mode),
             (31..=34, _) => self.put_queue(out),
-            // Settings that the arm does not know are refused, except those that change nothing.
+            // Settings that the arm does not have are refused, except those that change nothing.
             (35, _) if !self.arm.takes_settings() && data.iter().all(|byte| *byte == 0) => self.put_queue(out),
-            (35 | 37 | 38 | 206, _) if !self.arm.takes_settings() => return Err(Warning(BAD_PARAMETER)),
-            (201, _) if !self.arm.takes_settings() && self.arm.wrench().is_none() => {
-                return Err(Warning(BAD_PARAMETER));
-            }
+            (35 | 37 | 38 | 206, _) if !self.arm.takes_settings() => return Err(NotNow),
+            (201, _) if !self.arm.takes_settings() && self.arm.wrench().is_none() => return Err(NotNow),
             (35, _) => self.setting(|s| s.offset = numbers(data).unwrap_or(s.offset), out),
             (36, _) => {
                 let load = numbers(data).ok_or(Warning(BAD_PARAMETER))?;
