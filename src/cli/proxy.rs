@@ -187,14 +187,14 @@ fn announce(run: &str, model: Model, info: &ArmInfo, address: &str) {
     output::line(format_args!("{} at {address}: {arm} of run {run}", model.name()));
     let servo = info.servo.as_ref().map(|task| task.name.clone());
     let velocity = info.velocity.as_ref().map(|task| task.name.clone());
-    for (mode, kind, task) in
-        [(0, "trajectory", info.trajectory.clone()), (1, "servo", servo), (4, "velocity", velocity)]
-    {
+    let tasks =
+        [(0, "trajectory", 10, info.trajectory.clone()), (1, "servo", 12, servo), (4, "velocity", 14, velocity)];
+    for (mode, kind, priority, task) in tasks {
         match task {
             Some(task) => output::line(format_args!("  mode {mode}  {task}")),
             None => output::line(format_args!(
                 "  mode {mode}  none; add to the blueprint's `tasks`: {{name: {kind}_{arm}, type: {kind}, joint_names: \
-                 {{hardware: {arm}}}, priority: 20}}"
+                 {{hardware: {arm}}}, priority: {priority}}}"
             )),
         }
     }

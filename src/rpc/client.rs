@@ -99,6 +99,9 @@ pub struct Message {
     pub data: Value,
 }
 
+/// Reply to a request of a [`Sender`]: the request's number, and the result.
+pub type Answer = (u64, Result<Value, RpcError>);
+
 /// A connection to a run.
 #[derive(Debug)]
 pub struct Client {
@@ -213,7 +216,7 @@ impl Client {
 
     /// Waits for the next reply to a request of [`Client::sender`], at most 12 s: its number, and the result. `None`:
     /// no reply came.
-    pub fn reply(&mut self) -> Result<Option<(u64, Result<Value, RpcError>)>, ClientError> {
+    pub fn reply(&mut self) -> Result<Option<Answer>, ClientError> {
         let deadline = Instant::now() + self.timeout;
         loop {
             match self.read(deadline) {
@@ -357,6 +360,24 @@ mod tests {
             assert_eq!(error.to_string(), "run \"test\": no answer within 0.2 s");
             assert!(error.hint().unwrap().contains("does not answer"));
         }
+    }
+
+    #[test]
+    fn replies_to_a_sender_have_the_number_of_their_request() {
+        let (mut run, client) = UnixStream::pair().unwrap();
+        let mut client = Client::over(client, "test", TIMEOUT).unwrap();
+        let mut sender = client.sender().unwrap();
+        assert!(client.reply().unwrap().is_none(), "nothing was asked");
+        let (first, second) = (sender.send(&Status {}).unwrap(), sender.send(&Status {}).unwrap());
+        let lines = format!(
+            "{{\"stream\": \"events\", \"data\": 1}}\n{{\"id\": {first}, \"result\": 5}}\n\
+             {{\"id\": {second}, \"error\": {{\"code\": \"LEASE_HELD\", \"message\": \"held\"}}}}\n"
+        );
+        run.write_all(lines.as_bytes()).unwrap();
+        assert_eq!(client.reply().unwrap(), Some((first, Ok(Value::from(5)))));
+        assert_eq!(client.reply().unwrap(), Some((second, Err(RpcError::new(Code::LeaseHeld, "held")))));
+        sender.close();
+        assert!(client.reply().is_err(), "closed");
     }
 
     #[test]

@@ -223,3 +223,17 @@ fn trajectory_of(given: api::Trajectory) -> JointTrajectory {
     });
     JointTrajectory { points: points.collect(), joint_names: given.joint_names }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn caps_narrow_the_limits_and_never_widen_them() {
+        let limits = JointLimits::uniform(2, 2.0, 1.5).with_defaults();
+        let [speed, acceleration] = [limits.velocity_max[0], limits.acceleration_max[0]];
+        let narrow = capped(&limits, Some(speed / 2.0), Some(acceleration * 2.0));
+        assert_eq!((narrow.velocity_max[1], narrow.acceleration_max[1]), (speed / 2.0, acceleration));
+        assert_eq!(capped(&limits, None, None).velocity_max, limits.velocity_max);
+    }
+}

@@ -167,3 +167,82 @@ pub fn refusal(error: &RpcError) -> Refusal {
         _ => Refusal::Error(code::REFUSED),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufRead, BufReader, Lines};
+    use std::os::unix::net::{UnixListener, UnixStream};
+
+    use serde_json::json;
+
+    use super::*;
+    use crate::rpc::client::Client;
+
+    /// A connection, and the lines that the run receives.
+    fn connected() -> (Commands, Client, Lines<BufReader<UnixStream>>, Shared) {
+        let folder = tempfile::tempdir().unwrap();
+        let socket = folder.path().join("s");
+        let listener = UnixListener::bind(&socket).unwrap();
+        let client = Client::connect("test", &socket).unwrap();
+        let (run, _) = listener.accept().unwrap();
+        let commands = Commands::new(client.sender().unwrap());
+        (commands, client, BufReader::new(run).lines(), Shared::new("arm", [None, None]))
+    }
+
+    fn target(position: f64) -> Target {
+        Target::Positions(Servo { task: "servo_arm".into(), positions: vec![position] })
+    }
+
+    fn next(lines: &mut Lines<BufReader<UnixStream>>) -> Value {
+        serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap()
+    }
+
+    #[test]
+    fn of_targets_that_the_run_has_no_room_for_the_newest_is_sent() {
+        let (mut commands, _client, mut lines, shared) = connected();
+        (0..MAX_UNANSWERED + 5).for_each(|i| commands.stream(target(i as f64), &shared));
+        let first: Vec<Value> = (0..MAX_UNANSWERED).map(|_| next(&mut lines)).collect();
+        let id = first[0]["id"].as_u64().unwrap();
+        commands.take_reply(id, Ok(json!({})), &shared);
+        assert_eq!(next(&mut lines)["params"]["positions"][0], (MAX_UNANSWERED + 4) as f64);
+        let refused = RpcError::new(Code::StartStateMismatch, "too far");
+        commands.stream(target(99.0), &shared);
+        commands.take_reply(id + 1, Err(refused.clone()), &shared);
+        assert_eq!(commands.take_refused(), Some(refused));
+        commands.take_reply(id + 2, Ok(json!({})), &shared);
+        commands.stream(target(1.0), &shared);
+        assert_eq!(next(&mut lines)["params"]["positions"][0], 1.0, "a refused stream sends nothing that waited");
+    }
+
+    #[test]
+    fn a_reply_is_for_the_request_that_asked_for_it() {
+        let (mut commands, _client, mut lines, shared) = connected();
+        let go = |to: f64| Move::new("arm", [to], 1.0);
+        assert_eq!(commands.ask(&go(0.1), &shared), Err(Refusal::Pending));
+        assert_eq!(commands.ask(&go(0.1), &shared), Err(Refusal::Pending), "it is sent once");
+        let id = next(&mut lines)["id"].as_u64().unwrap();
+        let reply = json!({"motion": 7, "task": "t", "duration": 1.0, "joints": [], "start": [], "target": []});
+        commands.take_reply(id, Ok(reply), &shared);
+        assert!(commands.is_asking_for_move());
+        assert_eq!(commands.ask(&go(0.2), &shared), Err(Refusal::Pending), "another client's waits");
+        assert_eq!(commands.ask(&go(0.1), &shared).unwrap().motion, 7);
+        assert_eq!(commands.ask(&go(0.2), &shared), Err(Refusal::Pending));
+        let second = next(&mut lines);
+        assert_eq!((second["params"]["target"][0].as_f64(), second["id"].as_u64()), (Some(0.2), Some(id + 1)));
+        commands.take_reply(id + 1, Err(RpcError::new(Code::OutOfLimits, "beyond")), &shared);
+        assert_eq!(commands.ask(&go(0.2), &shared), Err(Refusal::Error(JOINT_LIMIT)));
+        assert_eq!(shared.take_notes(), ["move refused: beyond"]);
+    }
+
+    #[test]
+    fn a_forgotten_move_is_asked_for_again() {
+        let (mut commands, _client, mut lines, shared) = connected();
+        let go = Move::new("arm", [0.1], 1.0);
+        assert_eq!(commands.ask(&go, &shared), Err(Refusal::Pending));
+        let id = next(&mut lines)["id"].as_u64().unwrap();
+        assert!(commands.forget_move() && !commands.forget_move());
+        commands.take_reply(id, Err(RpcError::new(Code::AlreadyExecuting, "late")), &shared);
+        assert_eq!(commands.ask(&go, &shared), Err(Refusal::Pending), "the late reply is not its own");
+        assert_eq!(next(&mut lines)["id"], id + 1);
+    }
+}

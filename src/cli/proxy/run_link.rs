@@ -157,6 +157,18 @@ pub struct Shared {
 }
 
 impl Shared {
+    /// Creates what the threads of an arm share.
+    pub fn new(arm: &str, streams: [Option<String>; 2]) -> Self {
+        Self {
+            arm: arm.to_owned(),
+            streams,
+            view: Mutex::new(View::new()),
+            lost: Mutex::new(None),
+            notes: Mutex::new(Vec::new()),
+            ending: AtomicBool::new(false),
+        }
+    }
+
     pub fn view(&self) -> MutexGuard<'_, View> {
         lock(&self.view)
     }
@@ -212,10 +224,7 @@ impl RunLink {
     /// Connects to a run, and returns once an arm's state is known.
     pub fn open(run: &str, arm: &str, streams: [Option<String>; 2]) -> Result<Self> {
         let connect = || Client::find(&RunDir::standard(), Some(run));
-        let view = Mutex::new(View::new());
-        let (lost, notes) = (Mutex::new(None), Mutex::new(Vec::new()));
-        let ending = AtomicBool::new(false);
-        let shared = Arc::new(Shared { arm: arm.to_owned(), streams, view, lost, notes, ending });
+        let shared = Arc::new(Shared::new(arm, streams));
         let (mut state, mut urgent, mut replies) = (connect()?, connect()?, connect()?);
         read_state(&mut state, &shared)?;
         shared.keep_status(&state.call(Status {})?, Instant::now());

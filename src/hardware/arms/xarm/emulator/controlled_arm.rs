@@ -32,7 +32,7 @@ pub trait ControlledArm: Send + 'static {
     fn now(&self) -> Mono;
     /// Advances to `now`, or takes the latest measurements.
     fn integrate(&mut self, now: Mono);
-    /// Plays what is due by itself. Returns whether the arm has just stopped without having been asked.
+    /// Plays what is due. Returns whether the arm has stopped since the last call without a request.
     fn has_stopped(&mut self) -> bool;
     /// Returns the time since power-up.
     fn uptime(&self) -> Duration;
@@ -69,7 +69,7 @@ pub trait ControlledArm: Send + 'static {
     fn operational_stop(&mut self) {
         self.stop();
     }
-    /// The controller is not ready any more, until the next [`ControlledArm::begin`].
+    /// The controller is no longer ready, until the next [`ControlledArm::begin`].
     fn end(&mut self) {}
     /// Moves to a target [rad] with at most this speed [rad/s] and acceleration [rad/s²].
     fn go(&mut self, target: &[f64; 7], speed: f64, acceleration: f64) -> Result<(), Refusal>;

@@ -189,8 +189,8 @@ impl<A: ControlledArm> Controller<A> {
             self.current = None;
             let Some(next) = self.queue.front().copied() else { return };
             match self.arm.go(&next.target, next.speed, next.acceleration) {
-                Err(Refusal::Pending) => return,
-                Err(Refusal::Error(code)) => return self.fail(code),
+                Err(Refusal::Pending) => {}
+                Err(Refusal::Error(code)) => self.fail(code),
                 Ok(()) | Err(Refusal::NotNow | Refusal::Warning(_)) => self.current = self.queue.pop_front(),
             }
         }
