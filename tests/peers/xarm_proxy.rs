@@ -173,6 +173,17 @@ fn the_end_of_the_run_closes_the_clients_connection() {
 }
 
 #[test]
+fn a_run_that_hangs_is_an_arm_that_is_not_ready() {
+    let Some(cell) = Cell::start("coordinator-xarm6", "--no-record") else { return };
+    let (client, mut answer) = cell.client("hung");
+    client.until("ready\n");
+    cell.run.signal(Signal::STOP);
+    proceed(&mut answer);
+    ends_well(client);
+    cell.run.signal(Signal::CONT);
+}
+
+#[test]
 fn a_stop_by_another_program_ends_the_wait_of_the_client() {
     let Some(cell) = Cell::start("coordinator-xarm6", "") else { return };
     let (client, _answer) = cell.client("other_stop");

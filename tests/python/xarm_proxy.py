@@ -211,6 +211,18 @@ def other_stop(host):
     arm.disconnect()
 
 
+def hung(host):
+    """The run stops answering."""
+    arm = connect(host)
+    enable(arm, 1)
+    here = angles(arm)
+    ok(arm.set_servo_angle_j(here), "set_servo_angle_j")
+    meet("ready")
+    until("state 4", lambda: arm.get_state()[1] == 4, 3)
+    check(arm.set_servo_angle_j(here) != 0, "no setpoint")
+    arm.disconnect()
+
+
 def seven(host):
     arm = connect(host)
     check(arm.axis == 7, f"{arm.axis} axes")
@@ -245,6 +257,6 @@ def no_kinematics(host):
     arm.disconnect()
 
 
-SCENARIOS = [session, limits, leased, stream, other_stop, seven, other_make, no_kinematics]
+SCENARIOS = [session, limits, leased, stream, other_stop, hung, seven, other_make, no_kinematics]
 {scenario.__name__: scenario for scenario in SCENARIOS}[sys.argv[1]](sys.argv[2])
 print("all is as it should be")

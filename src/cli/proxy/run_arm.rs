@@ -20,6 +20,8 @@ use crate::sync::lock;
 const ROUNDING: f64 = 2e-5;
 /// Period in which a velocity is repeated, within the timeout of the task.
 const REPEAT_PERIOD: Duration = Duration::from_millis(50);
+/// Age of the joints from which the arm counts as not ready.
+const MAX_AGE: Duration = Duration::from_millis(500);
 /// Time after which the status shows that a stream has begun.
 const BEGIN_TIME: Duration = Duration::from_millis(200);
 
@@ -226,6 +228,8 @@ impl ControlledArm for RunArm {
     fn integrate(&mut self, now: Mono) {
         self.now = now;
         self.view = *self.link.shared.view();
+        // A run that hangs takes no commands.
+        self.view.ready &= self.view.read_at.elapsed() < MAX_AGE;
         self.repeat_velocity();
         if self.orphaned && self.leased && !self.moving() {
             self.end();

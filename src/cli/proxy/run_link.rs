@@ -53,6 +53,8 @@ pub struct View {
     pub effort: Joints,
     pub pose: Option<Isometry3<f64>>,
     pub wrench: Option<[f32; 6]>,
+    /// When the joints were read.
+    pub read_at: Instant,
     /// Opening of the gripper [m], and when it last changed.
     pub gripper: Option<(f64, Instant)>,
     pub enabled: bool,
@@ -82,6 +84,7 @@ impl View {
             effort: zero,
             pose: None,
             wrench: None,
+            read_at: now,
             gripper: None,
             enabled: false,
             ready: false,
@@ -104,6 +107,7 @@ impl View {
     }
 
     fn take_state(&mut self, arm: &ArmStateReport) {
+        self.read_at = Instant::now();
         for (i, joint) in arm.joints.iter().enumerate() {
             let values = [
                 (&mut self.position, joint.position),
