@@ -1,6 +1,8 @@
 //! `make bench`: cost of talking to a run: a stop during a flood of requests, the round trip, and the effect of readers
-//! on the tick. Prints and judges figures; no figure fails it. `cargo bench --bench rpc -- stops` measures stops only.
+//! on the tick, and what `dimos proxy` adds. Prints and judges figures; no figure fails it. `cargo bench --bench rpc --
+//! stops` measures stops only, `-- proxy` the proxy.
 
+mod proxy;
 mod stops;
 #[path = "../support/mod.rs"]
 #[allow(dead_code, reason = "shared with the other benchmarks")]
@@ -24,24 +26,32 @@ const READERS: usize = 4;
 /// Requests per second in the flood.
 const FLOOD: f64 = 10_000.0;
 
+/// A part of the benchmark, by name.
+type Part = (&'static str, fn(Effort) -> Result<(), String>);
+
 fn main() -> ExitCode {
     let effort = Effort::from_environment();
     println!("\ndimos: cost of talking to a run{}\n", effort.of(" (quick)", ""));
     machine::print();
-    let all = || {
-        stops::measure(effort)
-            .and_then(|()| round_trip(effort))
-            .and_then(|()| readers(effort))
-            .and_then(|()| python(effort))
-    };
-    // `-- stops`: only those.
-    let only_stops = std::env::args().any(|argument| argument == "stops");
-    if let Err(e) = if only_stops { stops::measure(effort) } else { all() } {
-        support::skipped(&e);
+    let parts: [Part; 5] = [
+        ("stops", stops::measure),
+        ("proxy", proxy::measure),
+        ("round-trip", round_trip),
+        ("readers", readers),
+        ("python", python),
+    ];
+    let named: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    for (name, part) in parts {
+        if (named.is_empty() || named.iter().any(|n| n == name))
+            && let Err(why) = part(effort)
+        {
+            support::skipped(&format!("{name}: {why}"));
+        }
     }
     effort.end()
 }
 
+/// Starts a run whose tick is 1 kHz.
 fn fast_run() -> Result<LiveRun, String> {
     LiveRun::start("coordinator-mock", &["--set", "coordinator.tick_rate=1000"]).map_err(|e| e.to_string())
 }

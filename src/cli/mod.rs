@@ -28,6 +28,7 @@ mod other_users;
 pub mod output;
 pub mod plan;
 pub mod preview;
+pub mod proxy;
 pub mod replay;
 pub mod run;
 pub mod run_record;
@@ -100,6 +101,8 @@ enum Command {
     Jog(jog::Args),
     /// List tasks, query one, or stream targets to it
     Task(task::Args),
+    /// Serve an arm of a run to programs that were written for a vendor's SDK
+    Proxy(proxy::Args),
     /// Shut down a run: decelerate, release the arms, close the log
     Down(down::Args),
     /// Show the text log of a run that was started with --daemon, live or dead
@@ -266,6 +269,7 @@ fn built_in(cli: &Cli, catalog: Catalog<'_>) -> exit::Result {
         Command::Arm(args) => arm::run(args, registry),
         Command::Jog(args) => jog::run(args),
         Command::Task(args) => task::run(args),
+        Command::Proxy(args) => proxy::run(args),
         Command::Down(args) => down::run(args),
         Command::Logs(args) => logs::run(args),
         Command::Adapter(args) => adapter::run(args, registry),

@@ -99,6 +99,9 @@ pub struct Message {
     pub data: Value,
 }
 
+/// Reply to a request of a [`Sender`]: the request's number, and the result.
+pub type Answer = (u64, Result<Value, RpcError>);
+
 /// A connection to a run.
 #[derive(Debug)]
 pub struct Client {
@@ -154,11 +157,7 @@ impl Client {
     pub fn call<M: Method>(&mut self, params: M) -> Result<M::Reply, ClientError> {
         let id = self.next;
         self.next += 1;
-        let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
-        if line.len() > MAX_LINE {
-            let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
-            return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());
-        }
+        let line = request(id, &params)?;
         let deadline = Instant::now() + self.timeout;
         if let Err(error) = self.from.get_mut().write_all(line.as_bytes()) {
             // A run that refuses the connection sends the reason before it closes it.
@@ -208,6 +207,33 @@ impl Client {
         self.buffered.pop_front()
     }
 
+    /// Returns a sender of requests on this connection that does not wait for replies: [`Client::reply`] returns them.
+    /// Only one of both can then send.
+    pub fn sender(&self) -> Result<Sender, ClientError> {
+        let to = self.from.get_ref().try_clone().map_err(|error| self.io(error))?;
+        Ok(Sender { run: self.run.clone(), to, next: self.next })
+    }
+
+    /// Waits for the next reply to a request of [`Client::sender`], at most 12 s: its number, and the result. `None`:
+    /// no reply came.
+    pub fn reply(&mut self) -> Result<Option<Answer>, ClientError> {
+        let deadline = Instant::now() + self.timeout;
+        loop {
+            match self.read(deadline) {
+                Ok(Incoming { stream: Some(_), .. }) => {}
+                Ok(Incoming { id: Some(id), result, error, .. }) => {
+                    return Ok(Some((id, error.map_or(Ok(result), Err))));
+                }
+                // The run refuses the connection.
+                Ok(Incoming { error, .. }) => {
+                    return Err(error.map_or_else(|| self.protocol("a reply without id".into()), Into::into));
+                }
+                Err(ClientError::Io { error, .. }) if error.kind() == io::ErrorKind::TimedOut => return Ok(None),
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
     fn read(&mut self, deadline: Instant) -> Result<Incoming, ClientError> {
         let line = self.read_line(deadline).map_err(|error| self.io(error))?;
         serde_json::from_slice(&line).map_err(|e| self.protocol(e.to_string()))
@@ -255,6 +281,40 @@ impl Client {
     }
 }
 
+/// Sends requests without waiting for replies: from [`Client::sender`].
+#[derive(Debug)]
+pub struct Sender {
+    run: String,
+    to: UnixStream,
+    next: u64,
+}
+
+impl Sender {
+    /// Sends a request; returns its number.
+    pub fn send<M: Method>(&mut self, params: &M) -> Result<u64, ClientError> {
+        let id = self.next;
+        self.next += 1;
+        let line = request(id, params)?;
+        let sent = self.to.write_all(line.as_bytes());
+        sent.map(|()| id).map_err(|error| ClientError::Io { run: self.run.clone(), error })
+    }
+
+    /// Ends the connection: [`Client::reply`] fails.
+    pub fn close(&self) {
+        let _ = self.to.shutdown(std::net::Shutdown::Both);
+    }
+}
+
+/// Encodes a request as a line.
+fn request<M: Method>(id: u64, params: &M) -> Result<String, ClientError> {
+    let line = json!({"id": id, "method": M::NAME, "params": params}).to_string() + "\n";
+    if line.len() > MAX_LINE {
+        let text = format!("the request has {} bytes (limit {MAX_LINE})", line.len());
+        return Err(RpcError::new(Code::TooLarge, text).hint("send fewer points at once").into());
+    }
+    Ok(line)
+}
+
 fn message(incoming: Incoming) -> Message {
     Message {
         stream: incoming.stream.unwrap_or_default(),
@@ -300,6 +360,24 @@ mod tests {
             assert_eq!(error.to_string(), "run \"test\": no answer within 0.2 s");
             assert!(error.hint().unwrap().contains("does not answer"));
         }
+    }
+
+    #[test]
+    fn replies_to_a_sender_have_the_number_of_their_request() {
+        let (mut run, client) = UnixStream::pair().unwrap();
+        let mut client = Client::over(client, "test", TIMEOUT).unwrap();
+        let mut sender = client.sender().unwrap();
+        assert!(client.reply().unwrap().is_none(), "nothing was asked");
+        let (first, second) = (sender.send(&Status {}).unwrap(), sender.send(&Status {}).unwrap());
+        let lines = format!(
+            "{{\"stream\": \"events\", \"data\": 1}}\n{{\"id\": {first}, \"result\": 5}}\n\
+             {{\"id\": {second}, \"error\": {{\"code\": \"LEASE_HELD\", \"message\": \"held\"}}}}\n"
+        );
+        run.write_all(lines.as_bytes()).unwrap();
+        assert_eq!(client.reply().unwrap(), Some((first, Ok(Value::from(5)))));
+        assert_eq!(client.reply().unwrap(), Some((second, Err(RpcError::new(Code::LeaseHeld, "held")))));
+        sender.close();
+        assert!(client.reply().is_err(), "closed");
     }
 
     #[test]

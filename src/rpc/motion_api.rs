@@ -20,6 +20,12 @@ pub struct Move {
     /// Fraction of the velocity and acceleration limits to use, 0.1–1.
     #[serde(default = "default_speed")]
     pub speed: f64,
+    /// Velocity that no joint exceeds [rad/s], besides the limits; `speed` scales it too.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_velocity: Option<f64>,
+    /// Acceleration that no joint exceeds [rad/s²], besides the limits; scaled by the square of `speed`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_acceleration: Option<f64>,
 }
 
 /// Default fraction of the limits for a motion.
@@ -36,12 +42,22 @@ pub(super) fn valid_speed(speed: f64) -> Result<(), String> {
 }
 
 impl Move {
+    /// Creates a request without further caps.
+    pub fn new(arm: impl Into<String>, target: impl Into<Vec<f64>>, speed: f64) -> Self {
+        Self { arm: arm.into(), target: target.into(), speed, max_velocity: None, max_acceleration: None }
+    }
+
     pub(super) fn valid(&self) -> Result<(), String> {
         let count = self.target.len();
         if !(1..=MAX_DOF).contains(&count) {
             return Err(format!("target has {count} values, must have 1 to {MAX_DOF}"));
         }
         finite("target", &self.target)?;
+        for (field, cap) in [("max_velocity", self.max_velocity), ("max_acceleration", self.max_acceleration)] {
+            if let Some(cap) = cap.filter(|cap| !(cap.is_finite() && *cap > 0.0)) {
+                return Err(format!("{field} is {cap}, must be above 0"));
+            }
+        }
         valid_speed(self.speed)
     }
 }

@@ -45,7 +45,7 @@ impl Handle {
     /// fraction of the velocity and acceleration limits, 0.1–1. Returns when the motion begins; [`wait`](Self::wait)
     /// waits for its end. An error if a limit is exceeded, the arm is not ready, or its task is executing already.
     pub fn move_arm(&self, arm: &str, target: &[f64], speed: f64) -> Result<MoveReply, RpcError> {
-        self.call(Move { arm: arm.to_owned(), target: target.to_vec(), speed })
+        self.call(Move::new(arm, target, speed))
     }
 
     /// Executes a trajectory with the task that covers its joints. Returns when the motion begins. An error if it does

@@ -11,6 +11,7 @@ use crate::control::limit::Bounds;
 use crate::control::point_to_point::{MotionError, point_to_point};
 use crate::control::request::Motion;
 use crate::control::task_body::TargetKind;
+use crate::joint::JointLimits;
 use crate::rpc::api::{self, Reply};
 use crate::rpc::{Code, RpcError};
 use crate::sync::lock;
@@ -61,7 +62,8 @@ impl Service {
         let start = if from_command { view.command.values } else { view.state.position };
         let start = start.get(..config.dof).unwrap_or_default().to_vec();
         let names = self.parts.names.arms[arm as usize].joints.clone();
-        let motion = point_to_point(&names, &start, &call.target, &config.limits, call.speed).map_err(|e| match e {
+        let limits = capped(&config.limits, call.max_velocity, call.max_acceleration);
+        let motion = point_to_point(&names, &start, &call.target, &limits, call.speed).map_err(|e| match e {
             MotionError::OutOfLimits { ref joint, excess, .. } => {
                 let data = json!({"joint": joint, "by": excess});
                 RpcError::new(Code::OutOfLimits, e.to_string())
@@ -202,6 +204,16 @@ impl Service {
     }
 }
 
+/// Returns the limits, with velocities [rad/s] and accelerations [rad/s²] of at most these.
+fn capped(limits: &JointLimits, velocity: Option<f64>, acceleration: Option<f64>) -> JointLimits {
+    let mut limits = limits.clone();
+    let caps = [(&mut limits.velocity_max, velocity), (&mut limits.acceleration_max, acceleration)];
+    for (values, cap) in caps {
+        values.iter_mut().for_each(|value| *value = cap.map_or(*value, |cap| value.min(cap)));
+    }
+    limits
+}
+
 fn trajectory_of(given: api::Trajectory) -> JointTrajectory {
     let points = given.points.into_iter().map(|p| TrajectoryPoint {
         time_from_start: p.time_from_start,
@@ -210,4 +222,18 @@ fn trajectory_of(given: api::Trajectory) -> JointTrajectory {
         accelerations: p.accelerations.unwrap_or_default(),
     });
     JointTrajectory { points: points.collect(), joint_names: given.joint_names }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn caps_narrow_the_limits_and_never_widen_them() {
+        let limits = JointLimits::uniform(2, 2.0, 1.5).with_defaults();
+        let [speed, acceleration] = [limits.velocity_max[0], limits.acceleration_max[0]];
+        let narrow = capped(&limits, Some(speed / 2.0), Some(acceleration * 2.0));
+        assert_eq!((narrow.velocity_max[1], narrow.acceleration_max[1]), (speed / 2.0, acceleration));
+        assert_eq!(capped(&limits, None, None).velocity_max, limits.velocity_max);
+    }
 }

@@ -117,7 +117,7 @@ impl Run {
             return Err(format!("the arm is {}", phase.name()));
         }
         let target = service.parts.blueprint.arms.get(arm).map(|arm| arm.park_pose.clone()).unwrap_or_default();
-        let call = Move { arm: self.name_of(arm), target, speed: SPEED };
+        let call = Move::new(self.name_of(arm), target, SPEED);
         match in_process::wait_for(service.move_within(call, LONGEST)) {
             Some(Ok(Reply::Move(reply))) => Ok(Parking { arm, motion: reply.motion, duration: reply.duration }),
             Some(Err(error)) => Err(error.message),

@@ -66,7 +66,7 @@ fn requests_are_answered_in_order_with_their_ids() {
     assert_eq!((&status["id"], &status["result"]["arms"][0]["phase"]), (&json!("b"), &json!("held")));
 
     let mut client = Client::connect("test", server.socket()).unwrap();
-    let begun = client.call(Move { arm: "arm".into(), target: vec![0.3, -0.2], speed: 1.0 }).unwrap();
+    let begun = client.call(Move::new("arm", [0.3, -0.2], 1.0)).unwrap();
     assert_eq!((begun.motion, begun.target), (7, vec![0.3, -0.2]));
 }
 
@@ -110,7 +110,7 @@ fn what_is_no_request_is_refused_and_the_connection_lives() {
 
 #[test]
 fn infinities_from_within_the_process_are_refused() {
-    let bad = Move { arm: "arm".into(), target: vec![f64::INFINITY], speed: 0.5 };
+    let bad = Move::new("arm", [f64::INFINITY], 0.5);
     assert!(dimos::rpc::Method::check(&bad).unwrap_err().contains("not finite"));
 }
 

@@ -374,7 +374,7 @@ fn exercise(name: &str, dof: usize) {
     });
     let (run, mut client) = start(folder.path(), &blueprint(name, &[]), Some(probe));
     let begin = |client: &mut Client, target: Vec<f64>| {
-        client.call(api::Move { arm: "arm".into(), target, speed: 0.8 }).ok().map(|begun| begun.motion)
+        client.call(api::Move::new("arm", target, 0.8)).ok().map(|begun| begun.motion)
     };
     let goal: Vec<f64> = (0..dof).map(|j| 0.1 + 0.02 * j as f64).collect();
     let motion = begin(&mut client, goal.clone()).expect("the arm is ready");

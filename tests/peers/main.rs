@@ -9,4 +9,5 @@ mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;
 mod ur_rtde;
+mod xarm_proxy;
 mod xarm_sdk;

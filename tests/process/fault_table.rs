@@ -19,7 +19,7 @@ fn f03_an_adapter_that_panics_costs_its_own_arm_only() {
     );
     let run = home.run("two.yaml --no-record");
     for arm in ["a", "b"] {
-        home.client().call(Move { arm: arm.into(), target: vec![1.5, 0.0], speed: 0.15 }).unwrap();
+        home.client().call(Move::new(arm, [1.5, 0.0], 0.15)).unwrap();
     }
     eventually("arm a is held", || home.status()["arms"][0]["phase"] == "held");
     eventually("its link is faulted", || home.status()["arms"][0]["link"] == "faulted");

@@ -158,7 +158,7 @@ fn arms_have_leases_of_their_own() {
     let home = Home::new();
     let _run = home.run("coordinator-dual-mock --no-record");
     let (mut left, mut right) = (home.client(), home.client());
-    let motion = |arm: &str, dof| Move { arm: arm.into(), target: vec![0.3; dof], speed: 0.3 };
+    let motion = |arm: &str, dof| Move::new(arm, vec![0.3; dof], 0.3);
     left.call(motion("left_arm", 7)).unwrap();
     right.call(motion("right_arm", 6)).unwrap();
     assert!(matches!(right.call(Lease::default()), Err(ClientError::Refused(e)) if e.message.contains("left_arm")));

@@ -75,7 +75,7 @@ fn a_handle_may_be_used_on_a_thread_of_an_async_program() {
     let asynchronous = tokio::runtime::Builder::new_current_thread().build().unwrap();
     let moved = asynchronous.block_on(async move {
         let target = vec![0.05; 7];
-        handle.call(Move { arm: "arm".into(), target, speed: 1.0 })
+        handle.call(Move::new("arm", target, 1.0))
     });
     assert_eq!(run.wait(moved.unwrap().motion).unwrap().state, "COMPLETED");
 }

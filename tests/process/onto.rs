@@ -123,7 +123,7 @@ impl Home {
 
 /// Moves the arm; an error unless the move is completed.
 fn moved(run: &Run, target: &[f64]) -> Result<(), String> {
-    let begun = run.call(Move { arm: "arm".into(), target: target.to_vec(), speed: 0.7 }).map_err(|e| e.to_string())?;
+    let begun = run.call(Move::new("arm", target, 0.7)).map_err(|e| e.to_string())?;
     let limit = Instant::now() + Duration::from_secs(30);
     loop {
         let report = run.call(Motion { motion: begun.motion }).unwrap();

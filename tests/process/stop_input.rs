@@ -37,7 +37,7 @@ fn opening_the_stop_input_holds_within_two_periods_and_closing_it_moves_nothing(
     let (home, arm) = (Home::new(), YourArmEmulator::with(&SimOptions::default()).unwrap());
     let run = up(&home, &arm, "{input: di2}", "");
     arm.record();
-    home.client().call(Move { arm: "arm".into(), target: vec![2.0, -0.3, 0.6, 0.0, 0.8, 0.0], speed: 0.2 }).unwrap();
+    home.client().call(Move::new("arm", [2.0, -0.3, 0.6, 0.0, 0.8, 0.0], 0.2)).unwrap();
     eventually("it moves", || arm.joints().0[0] > 0.6);
     let opened = MonotonicClock.now();
     arm.set_input(2, false);

@@ -307,7 +307,7 @@ fn a_refused_request_takes_no_lease() {
     let mismatch = refusal(one.call(Execute { trajectory: elsewhere(2), task: None }));
     assert_eq!(mismatch.code, Code::StartStateMismatch);
     assert!(two.call(Status {}).unwrap().arms[0].commander.is_none(), "the refused request kept the lease");
-    let far = dimos::rpc::api::Move { arm: "arm".into(), target: vec![99.0; 6], speed: 1.0 };
+    let far = dimos::rpc::api::Move::new("arm", [99.0; 6], 1.0);
     assert_eq!(refusal(one.call(far)).code, Code::OutOfLimits);
     let wrong = Servo { task: "velocity_arm".into(), positions: vec![0.0; 6] };
     assert_eq!(refusal(one.call(wrong)).code, Code::WrongTask);

@@ -10,6 +10,8 @@ pub(super) const MIN_CUT: Duration = Duration::from_millis(800);
 pub enum Delivery {
     /// Sent normally.
     Send,
+    /// Not known yet: the request is served again a little later, with all that follows it on the same connection.
+    Pending,
     /// Sent after this delay, together with later responses on the same connection.
     Late(Duration),
     /// Sent, then the connection is closed.

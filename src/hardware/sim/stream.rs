@@ -12,6 +12,8 @@ use crate::sync::lock;
 
 /// Line noise, with the beginning of a frame in it.
 const NOISE: &[u8] = b"\x00\xffgarbage\x59";
+/// Time until a pending request is served again.
+const PENDING_PERIOD: Duration = Duration::from_micros(500);
 /// Maximum number of bytes of an incomplete request.
 const MAX_PENDING: usize = 32_768;
 
@@ -154,6 +156,13 @@ impl<C: Controller, Client> Shared<C, Client> {
             match self.with(|controller, now| controller.serve_client(port, client, bytes, now, answer)) {
                 Scan::More => break,
                 Scan::Skip(n) => used += n.max(1),
+                Scan::Take(_, Delivery::Pending) => {
+                    let due = Instant::now() + PENDING_PERIOD;
+                    self.wait(|_| due);
+                    if self.closing() {
+                        return Err(Ending::Closed);
+                    }
+                }
                 Scan::Take(n, delivery) => {
                     used += n.max(1);
                     // A client that is gone gets no response; its earlier requests still count.
@@ -187,7 +196,12 @@ impl<C: Controller, Client> Shared<C, Client> {
             }
             Delivery::Disconnect(_) => return Err(Ending::Cut(Duration::ZERO)),
             Delivery::PowerLoss(time) => return Err(Ending::Cut(time)),
-            Delivery::Send | Delivery::HangUp | Delivery::Frozen | Delivery::BusOff | Delivery::NoBuffers(_) => {}
+            Delivery::Send
+            | Delivery::Pending
+            | Delivery::HangUp
+            | Delivery::Frozen
+            | Delivery::BusOff
+            | Delivery::NoBuffers(_) => {}
         }
         Ok(true)
     }

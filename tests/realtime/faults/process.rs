@@ -163,9 +163,7 @@ fn f24_what_was_logged_before_kill_9_can_be_read() {
         let arm = arm();
         arm.record();
         let run = home.run(&format!("{} --record log.mcap", at(&arm)));
-        home.client()
-            .call(Move { arm: "arm".into(), target: vec![2.5, -0.3, 0.6, 0.0, 0.8, 0.0], speed: 0.3 })
-            .unwrap();
+        home.client().call(Move::new("arm", [2.5, -0.3, 0.6, 0.0, 0.8, 0.0], 0.3)).unwrap();
         std::thread::sleep(Duration::from_secs_f64(0.05 + 0.9 * random.unit()));
         run.signal(Signal::KILL);
         assert_eq!(run.wait().signal, Some(9));

@@ -1,19 +1,20 @@
-//! The emulated controller: modes, states, errors, and what moves the joints. Time is passed in and nothing here knows
-//! of sockets; what a request means is in `registers`, what comes and goes at the ports in `ports`.
+//! The emulated controller: modes, states, errors, and when the arm behind it moves. Time is passed in and nothing here
+//! knows of sockets; what a request means is in `registers`, what comes and goes at the ports in `ports`.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use nalgebra::Isometry3;
 
-use super::super::model::{Identity, Model, VELOCITY};
+use super::super::model::{Identity, Model};
 use super::super::protocol::gripper::GripperKind;
+use super::controlled_arm::{ControlledArm, Refusal};
 use super::kinematics::Links;
 use super::tool::Tool;
 use super::{SimOptions, SlowReply, Withhold};
 use crate::clock::Mono;
 use crate::hardware::adapter::AdapterResult;
-use crate::hardware::sim::arm::{HasArm, PLAYABLE, SimArm};
+use crate::hardware::sim::arm::{PLAYABLE, SimArm};
 use crate::hardware::sim::reach::Chain;
 use crate::hardware::sim::trace::Trace;
 use crate::joint::Joints;
@@ -66,16 +67,19 @@ impl Received {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Move {
     pub target: [f64; 7],
-    /// Fraction of the top speed.
+    /// Highest speed [rad/s] and acceleration [rad/s²] of a joint.
     pub speed: f64,
+    /// See `speed`.
+    pub acceleration: f64,
 }
 
-/// The controller's memory.
-pub struct Controller {
+/// The controller's memory, and the arm behind it.
+pub struct Controller<A> {
     pub(super) identity: Identity,
     pub(super) firmware: [u16; 3],
-    pub(super) chain: Links,
-    pub(super) arm: SimArm,
+    /// The kinematics; without them, poses are those that the arm itself knows.
+    pub(super) chain: Option<Links>,
+    pub(super) arm: A,
     pub(super) tool: Tool,
     pub(super) mode: u8,
     pub(super) state: u8,
@@ -107,8 +111,8 @@ pub(super) struct Settings {
     pub wrench_zero: [f32; 6],
 }
 
-impl Controller {
-    /// A controller that was just switched on: disabled, stopped, in mode 0.
+impl Controller<SimArm> {
+    /// A controller with a simulated arm that was just switched on: disabled, stopped, in mode 0.
     pub fn new(
         model: Model,
         firmware: [u16; 3],
@@ -120,12 +124,27 @@ impl Controller {
         let mut limits = identity.limits().unwrap_or_else(|| model.limits());
         limits.acceleration_max.iter_mut().for_each(|a| *a = ACCELERATION);
         let arm = SimArm::new("xarm", &limits, &options.common().starting_at(at_home(model)), PLAYABLE, now)?;
-        Ok(Self {
+        // Its modes are its own.
+        let arm = arm.without_modes().with_tolerance(TOLERANCE);
+        let slow = options.slow_replies.clone();
+        Ok(Self { chain: Some(Links::of(model)), slow, ..Self::around(identity, firmware, gripper, arm) })
+    }
+
+    /// Pushes the E-stop button: error, motors off.
+    pub fn press_estop(&mut self) {
+        self.arm.press_estop();
+        self.halt(state::STOPPED);
+    }
+}
+
+impl<A: ControlledArm> Controller<A> {
+    /// A controller of an arm without kinematics, stopped, in mode 0.
+    pub fn around(identity: Identity, firmware: [u16; 3], gripper: GripperKind, arm: A) -> Self {
+        Self {
             identity,
             firmware,
-            chain: Links::of(model),
-            // Its modes are its own.
-            arm: arm.without_modes().with_tolerance(TOLERANCE),
+            chain: None,
+            arm,
             tool: Tool::new(gripper),
             mode: 0,
             state: state::STOPPED,
@@ -136,10 +155,26 @@ impl Controller {
             keeps_mode: false,
             condition_muted: false,
             withhold: Withhold::No,
-            slow: options.slow_replies.clone(),
+            slow: Vec::new(),
             counter: 0,
             trace: Trace::default(),
-        })
+        }
+    }
+
+    /// Advances everything to `now`.
+    pub fn advance(&mut self, now: Mono) {
+        while self.arm.now() < now {
+            let before = self.arm.now();
+            self.arm.integrate(now.min(before.after(SLICE)));
+            match self.arm.gripper() {
+                Some((opening, moving)) => self.tool.show(opening, moving),
+                None => self.tool.advance(self.arm.now().seconds_since(before)),
+            }
+            self.next_move();
+        }
+        if self.arm.has_stopped() {
+            self.halt(state::STOPPED);
+        }
     }
 
     /// Begins the next planned move when the one before it is done.
@@ -151,9 +186,12 @@ impl Controller {
             self.state = state::STOPPED;
         }
         if self.state == state::STANDING {
-            self.current = self.queue.pop_front();
-            if let Some(Move { target, speed }) = self.current {
-                let _refusal = self.arm.move_to(&target, speed);
+            self.current = None;
+            let Some(next) = self.queue.front().copied() else { return };
+            match self.arm.go(&next.target, next.speed, next.acceleration) {
+                Err(Refusal::Pending) => {}
+                Err(Refusal::Error(code)) => self.fail(code),
+                Ok(()) | Err(Refusal::NotNow | Refusal::Warning(_)) => self.current = self.queue.pop_front(),
             }
         }
     }
@@ -168,12 +206,6 @@ impl Controller {
         self.arm.error().min(255) as u8
     }
 
-    /// Pushes the E-stop button: error, motors off.
-    pub fn press_estop(&mut self) {
-        self.arm.press_estop();
-        self.halt(state::STOPPED);
-    }
-
     /// Goes into error: everything stops.
     pub(super) fn fail(&mut self, code: u8) {
         self.arm.fail(code.into());
@@ -186,17 +218,22 @@ impl Controller {
         self.queue.clear();
         self.current = None;
         self.arm.stop();
+        self.arm.end();
     }
 
-    pub(super) fn clear_error(&mut self) {
-        if self.arm.clear_error().is_ok() {
-            self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED });
+    pub(super) fn clear_error(&mut self) -> Result<(), Refusal> {
+        match self.arm.clear() {
+            Ok(()) => self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED }),
+            // The cause is still there, and so is the error.
+            Err(Refusal::NotNow) => {}
+            Err(refusal) => return Err(refusal),
         }
+        Ok(())
     }
 
     /// The state byte of responses.
     pub(super) fn status(&self) -> u8 {
-        let ready = self.state <= state::STANDING && self.arm.ready().is_ok();
+        let ready = self.state <= state::STANDING && self.arm.is_ready();
         u8::from(!ready) << 4 | u8::from(self.warning != 0) << 5 | u8::from(self.error() != 0) << 6
     }
 
@@ -206,9 +243,9 @@ impl Controller {
         if self.state == state::STANDING && moving { state::MOVING } else { self.state }
     }
 
-    /// The tool's pose.
-    pub(super) fn pose(&self) -> Isometry3<f64> {
-        self.chain.forward(&self.seven())
+    /// The tool's pose, if it is known.
+    pub(super) fn pose(&self) -> Option<Isometry3<f64>> {
+        self.chain.map_or_else(|| self.arm.pose(), |chain| Some(chain.forward(&self.seven())))
     }
 
     /// The joints as the wire has them.
@@ -218,7 +255,10 @@ impl Controller {
 
     /// What the force/torque sensor shows: without the tool's weight, and with it.
     pub(super) fn wrench(&self) -> ([f32; 6], [f32; 6]) {
-        if !self.settings.wrench_on {
+        if let Some(measured) = self.arm.wrench() {
+            return (measured, measured);
+        }
+        if !self.settings.wrench_on || !self.arm.takes_settings() {
             return ([0.0; 6], [0.0; 6]);
         }
         let mut net = TOOL_WEIGHT;
@@ -238,28 +278,8 @@ impl Controller {
     }
 }
 
-impl HasArm for Controller {
-    fn arm(&mut self) -> &mut SimArm {
-        &mut self.arm
-    }
-
-    fn advance(&mut self, now: Mono) {
-        while self.arm.now() < now {
-            let before = self.arm.now();
-            self.arm.integrate(now.min(before.after(SLICE)));
-            self.tool.advance(self.arm.now().seconds_since(before));
-            self.next_move();
-        }
-        let before = (self.arm.error(), self.arm.estop_open());
-        self.arm.apply_faults();
-        if self.arm.error() != 0 && before != (self.arm.error(), self.arm.estop_open()) {
-            self.halt(state::STOPPED);
-        }
-    }
-}
-
 /// How an arm of a model introduces itself.
-fn introduce(model: Model) -> Identity {
+pub(super) fn introduce(model: Model) -> Identity {
     let (kind, serial) = match model {
         Model::Xarm5 => (5, "XF1305"),
         Model::Xarm6 => (6, "XI1305"),
@@ -283,9 +303,4 @@ fn at_home(model: Model) -> &'static [f64] {
 
 pub(super) fn first(joints: &Joints) -> [f64; 7] {
     joints.first_chunk().copied().unwrap_or_default()
-}
-
-/// A speed [rad/s] as a fraction of the top speed.
-pub(super) fn fraction(speed: f32) -> f64 {
-    (f64::from(speed) / VELOCITY).clamp(0.0, 1.0)
 }

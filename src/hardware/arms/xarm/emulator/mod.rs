@@ -3,8 +3,9 @@
 //!
 //! The sockets, the arm and its faults are those of the simulation kit ([`crate::hardware::sim`]); here is what the
 //! controller makes of a request (`wire`, `registers`), what it reports (`report`), and its modes, states and errors
-//! (`controller`).
+//! (`controller`). The arm behind the controller is simulated, or one of a run ([`ControlBox`], for `dimos proxy`).
 
+mod controlled_arm;
 mod controller;
 mod kinematics;
 mod ports;
@@ -31,12 +32,13 @@ use crate::clock::{Clock, MonotonicClock};
 use crate::hardware::adapter::{AdapterError, AdapterResult};
 use crate::hardware::check::ConfigError;
 use crate::hardware::registry::{AdapterConfig, Emulator, EmulatorAddress};
-use crate::hardware::sim::arm::{self, HasArm, PLAYABLE};
+use crate::hardware::sim::arm::{self, HasArm, PLAYABLE, SimArm};
 use crate::hardware::sim::faults::Fault;
 use crate::hardware::sim::tcp_server::{Port, TcpServer, cannot_listen, ports_in_a_row};
 use crate::joint::{JointLimits, Joints};
-use controller::Controller;
+pub use controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
 pub use controller::Received;
+use controller::{Controller, introduce};
 use report::Kind;
 
 /// Prefix of messages.
@@ -125,7 +127,7 @@ impl SimOptions {
 
 /// A running emulator. Ends when it is dropped.
 pub struct XArmEmulator {
-    server: TcpServer<Controller>,
+    server: TcpServer<Controller<SimArm>>,
     address: String,
 }
 
@@ -148,29 +150,9 @@ impl XArmEmulator {
     ) -> AdapterResult<Self> {
         options.check(&model.limits())?;
         let firmware = options.firmware()?;
-        let (control, reports) = if in_process {
-            let free = |_| {
-                let control = ports_in_a_row(ip, 0, 1 + u16::from(options.port_503)).ok()?;
-                Some((control, ports_in_a_row(ip, 0, REPORT_PORTS).ok()?))
-            };
-            let found = (0..ATTEMPTS).find_map(free);
-            found.ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))?
-        } else {
-            let at = |first, count| {
-                let failed = |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, first), &e);
-                ports_in_a_row(ip, first, count).map_err(failed)
-            };
-            (at(CONTROL_PORT, 1 + u16::from(options.port_503))?, at(REPORT_PORT, REPORT_PORTS)?)
-        };
-        let failed = |e: io::Error| AdapterError::Io(format!("{WHO}: cannot serve: {e}"));
-        let port = |listeners: &[TcpListener]| {
-            listeners.first().map_or(Ok(0), |first| first.local_addr().map(|at| at.port())).map_err(failed)
-        };
-        let address = format!("{}:{}", SocketAddr::new(ip, port(&control)?), port(&reports)?);
-        let periods = Kind::ALL.map(|kind| Port::Reports(Duration::from_micros(kind.period_us())));
-        let ports = reports.into_iter().zip(periods).chain(control.into_iter().map(|port| (port, Port::Requests)));
+        let (ports, address) = listen(ip, in_process, options.port_503)?;
         let controller = Controller::new(model, firmware, gripper, options, MonotonicClock.now())?;
-        let server = TcpServer::with_ports("xarm", controller, ports.collect(), CLIENTS).map_err(failed)?;
+        let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS).map_err(cannot_serve)?;
         Ok(Self { server, address })
     }
 
@@ -209,7 +191,7 @@ impl XArmEmulator {
 
     /// True joint positions [rad] and velocities [rad/s] now.
     pub fn joints(&self) -> (Joints, Joints) {
-        self.server.with(Controller::joints_at)
+        self.server.with(HasArm::joints_at)
     }
 
     /// Whether all motors are on.
@@ -248,6 +230,67 @@ impl Emulator for XArmEmulator {
     fn true_positions(&self) -> Option<Joints> {
         self.server.true_positions()
     }
+}
+
+/// The control box with another arm behind it than the simulated one. Ends when it is dropped.
+pub struct ControlBox<A: ControlledArm> {
+    server: TcpServer<Controller<A>>,
+    address: String,
+}
+
+impl<A: ControlledArm> ControlBox<A> {
+    /// Serves `arm` as a `model` with the default firmware, at the arm's own ports of a loopback
+    /// address.
+    pub fn start(model: Model, gripper: GripperKind, arm: A, ip: IpAddr) -> AdapterResult<Self> {
+        let ip = EmulatorAddress::Bind(ip).tcp(CONTROL_PORT)?.ip();
+        let (ports, address) = listen(ip, false, true)?;
+        let firmware = SimOptions::default().firmware()?;
+        let controller = Controller::around(introduce(model), firmware, gripper, arm);
+        let server = TcpServer::with_ports("xarm", controller, ports, CLIENTS).map_err(cannot_serve)?;
+        Ok(Self { server, address })
+    }
+
+    /// Returns its address: host, control port and first report port.
+    pub fn address(&self) -> &str {
+        &self.address
+    }
+
+    /// Begins queued moves that are due, and calls `f` with the arm.
+    pub fn with<T>(&self, f: impl FnOnce(&mut A) -> T) -> T {
+        self.server.with(|controller, now| {
+            controller.advance(now);
+            f(&mut controller.arm)
+        })
+    }
+}
+
+fn cannot_serve(error: io::Error) -> AdapterError {
+    AdapterError::Io(format!("{WHO}: cannot serve: {error}"))
+}
+
+/// Listens at the arm's own ports, or at free ones. Returns the ports and their address.
+fn listen(ip: IpAddr, free: bool, second: bool) -> AdapterResult<(Vec<(TcpListener, Port)>, String)> {
+    let (control, reports) = if free {
+        let free = |_| {
+            let control = ports_in_a_row(ip, 0, 1 + u16::from(second)).ok()?;
+            Some((control, ports_in_a_row(ip, 0, REPORT_PORTS).ok()?))
+        };
+        let found = (0..ATTEMPTS).find_map(free);
+        found.ok_or_else(|| AdapterError::Io(format!("{WHO}: no free ports at {ip}")))?
+    } else {
+        let at = |first, count| {
+            let failed = |e: io::Error| cannot_listen(WHO, SocketAddr::new(ip, first), &e);
+            ports_in_a_row(ip, first, count).map_err(failed)
+        };
+        (at(CONTROL_PORT, 1 + u16::from(second))?, at(REPORT_PORT, REPORT_PORTS)?)
+    };
+    let port = |listeners: &[TcpListener]| {
+        listeners.first().map_or(Ok(0), |first| first.local_addr().map(|at| at.port())).map_err(cannot_serve)
+    };
+    let address = format!("{}:{}", SocketAddr::new(ip, port(&control)?), port(&reports)?);
+    let periods = Kind::ALL.map(|kind| Port::Reports(Duration::from_micros(kind.period_us())));
+    let ports = reports.into_iter().zip(periods).chain(control.into_iter().map(|port| (port, Port::Requests)));
+    Ok((ports.collect(), address))
 }
 
 /// Fault of the reports of port 30000.

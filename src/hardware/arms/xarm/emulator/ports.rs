@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
+use super::controlled_arm::ControlledArm;
 use super::controller::{Controller, Received, first, state};
 use super::kinematics::to_wire;
 use super::report::{Kind, Snapshot};
 use super::wire::{self, Request};
 use super::{SECOND, Withhold};
 use crate::clock::Mono;
-use crate::hardware::sim::arm::{Delivery, HasArm};
+use crate::hardware::sim::arm::Delivery;
 use crate::hardware::sim::faults::FaultKind;
 use crate::hardware::sim::stream;
 use crate::hardware::transport::Scan;
@@ -16,7 +17,7 @@ use crate::hardware::transport::Scan;
 /// What noise looks like: among it the beginning of a header.
 const NOISE: &[u8] = b"\x00\xffnoise\x00\x02\x00\x00\x00\x00";
 
-impl Controller {
+impl<A: ControlledArm> Controller<A> {
     /// What reports show now.
     pub fn snapshot(&mut self, now: Mono) -> Snapshot {
         self.advance(now);
@@ -31,7 +32,7 @@ impl Controller {
             position: self.seven().map(|v| v as f32),
             velocity: first(&self.arm.joints().1).map(|v| v as f32),
             torque: self.torques().map(|v| v * scale),
-            pose: to_wire(&self.pose()),
+            pose: self.pose().as_ref().map_or([f32::NAN; 6], to_wire),
             enabled: self.motors(),
             error: self.error(),
             warning: self.warning,
@@ -45,9 +46,9 @@ impl Controller {
             wrench_raw,
             counter: self.counter,
         };
-        if self.arm.take_fault(FaultKind::Nan).is_some() {
+        if self.arm.due_fault(FaultKind::Nan).is_some() {
             snapshot.position = [f32::NAN; 7];
-        } else if self.arm.take_fault(FaultKind::ZeroState).is_some() {
+        } else if self.arm.due_fault(FaultKind::ZeroState).is_some() {
             // A controller that has not measured yet has no pose either.
             (snapshot.position, snapshot.velocity, snapshot.pose) = ([0.0; 7], [0.0; 7], [0.0; 6]);
         }
@@ -58,7 +59,7 @@ impl Controller {
     pub fn handle(&mut self, request: &Request<'_>, second: bool, now: Mono, out: &mut Vec<u8>) -> Delivery {
         self.advance(now);
         self.arm.client_came();
-        let status = self.respond(request, out);
+        let Some(status) = self.respond(request, out) else { return Delivery::Pending };
         let Request { protocol, register, payload, .. } = *request;
         self.trace.push(|| Received { at: now, protocol, register, payload: payload.to_vec(), status, second });
         match (self.delivery(), self.reply_time(register)) {
@@ -75,7 +76,7 @@ impl Controller {
 
     /// Faults of the wire that also strike at the slow reports.
     fn lasting(&self) -> Delivery {
-        match (self.arm.fault_lasts(FaultKind::Silent), self.arm.fault_lasts(FaultKind::Frozen)) {
+        match (self.arm.lasts(FaultKind::Silent), self.arm.lasts(FaultKind::Frozen)) {
             (true, _) => Delivery::Silent,
             (_, true) => Delivery::Frozen,
             _ => Delivery::Send,
@@ -84,20 +85,20 @@ impl Controller {
 
     /// Faults of the wire, for the next response or report.
     fn delivery(&mut self) -> Delivery {
-        let delivery = self.arm.delivery();
+        let delivery = self.arm.next_delivery();
         match delivery {
             Delivery::PowerLoss(_) => {
                 self.halt(state::STOPPED);
                 (self.mode, self.warning) = (0, 0);
             }
-            Delivery::Send if self.arm.take_fault(FaultKind::Frozen).is_some() => return Delivery::Frozen,
+            Delivery::Send if self.arm.due_fault(FaultKind::Frozen).is_some() => return Delivery::Frozen,
             _ => {}
         }
         delivery
     }
 }
 
-impl stream::Controller for Controller {
+impl<A: ControlledArm> stream::Controller for Controller<A> {
     fn serve(&mut self, bytes: &[u8], now: Mono, answer: &mut Vec<u8>) -> Scan<Delivery> {
         self.serve_port(0, bytes, now, answer)
     }
@@ -113,8 +114,10 @@ impl stream::Controller for Controller {
         }
     }
 
-    /// The arm continues.
-    fn client_gone(&mut self, _now: Mono) {}
+    /// A planned move continues.
+    fn client_gone(&mut self, _now: Mono) {
+        self.arm.client_gone();
+    }
 
     fn damage(&self, delivery: Delivery, packet: &mut Vec<u8>) {
         // The highest byte of the first measured joint in a full report; the state byte of a response.

@@ -1,7 +1,9 @@
 //! What each register of the control port does. Where the vendor's pages do not say what happens, a comment says that
 //! the choice is ours.
 
-use super::controller::{Controller, Move, QUEUE, fraction, state};
+use super::super::model::VELOCITY;
+use super::controlled_arm::{ControlledArm, JOINT_LIMIT, Refusal};
+use super::controller::{Controller, Move, QUEUE, state};
 use super::kinematics::{from_wire, to_wire};
 use super::wire::{self, Request, number, numbers, put_numbers};
 use crate::hardware::sim::faults::FaultKind;
@@ -13,30 +15,32 @@ const QUEUE_FULL: u8 = 11;
 const BAD_PARAMETER: u8 = 12;
 const UNKNOWN: u8 = 13;
 const NO_SOLUTION: u8 = 14;
+/// Acceleration of a move that has none [rad/s²].
+const ACCELERATION: f64 = 20.0;
 /// Errors.
 const TOOL_SILENT: u8 = 19;
-const JOINT_LIMIT: u8 = 23;
 
 /// The state byte's bit "no valid result": a command that the mode does not know (our choice).
 const INVALID: u8 = 0x08;
+/// Length of a response without a payload.
+const HEADER: usize = 8;
 /// The bus number of the tool flange.
 const TOOL: u8 = 9;
 
-/// Why a request is not done.
-enum Refusal {
-    /// It raises a warning.
-    Warning(u8),
-    /// It raises an error.
-    Error(u8),
-    /// The arm is not ready, or in another mode.
-    NotNow,
+use Refusal::{Error, NotNow, Pending, Warning};
+
+/// How many numbers the result of a query has: a pose, or joints.
+fn numbers_of(register: u8) -> Option<usize> {
+    match register {
+        41 | 44 | 91 => Some(6),
+        43 => Some(7),
+        _ => None,
+    }
 }
 
-use Refusal::{Error, NotNow, Warning};
-
-impl Controller {
-    /// Does what a request asks; answers the state byte of the response in `out`.
-    pub(super) fn respond(&mut self, request: &Request<'_>, out: &mut Vec<u8>) -> u8 {
+impl<A: ControlledArm> Controller<A> {
+    /// Does what a request asks; answers the state byte of the response in `out`. `None`: the outcome is not known yet.
+    pub(super) fn respond(&mut self, request: &Request<'_>, out: &mut Vec<u8>) -> Option<u8> {
         wire::begin(out, request);
         let mut extra = 0;
         match self.execute(request.register, request.payload, out) {
@@ -44,10 +48,15 @@ impl Controller {
             Err(Warning(code)) => self.warning = code,
             Err(Error(code)) => self.fail(code),
             Err(NotNow) => extra = INVALID,
+            Err(Pending) => return None,
+        }
+        if let Some(missing) = numbers_of(request.register).filter(|_| out.len() == HEADER) {
+            // Clients expect all numbers of a result, also of one that there is not.
+            put_numbers(out, std::iter::repeat_n(f32::NAN, missing));
         }
         let status = self.status() | extra;
         wire::end(out, status);
-        status
+        Some(status)
     }
 
     fn execute(&mut self, register: u8, data: &[u8], out: &mut Vec<u8>) -> Result<(), Refusal> {
@@ -59,22 +68,31 @@ impl Controller {
             }
             (5, _) => out.push(u8::from(self.settings.currents)),
             (70, [kind]) => self.settings.currents = *kind == 1,
-            (11, [joint, on]) => self.switch(*joint, *on == 1),
-            (12, [wanted]) => self.set_state(*wanted),
+            (11, [joint, on]) => self.switch(*joint, *on == 1)?,
+            (12, [wanted]) => self.set_state(*wanted)?,
             (13, _) => out.push(self.reported_state()),
             (14, _) => self.put_queue(out),
             (15, _) => out.extend([self.error(), self.warning]),
-            (16, _) => self.clear_error(),
+            (16, _) => self.clear_error()?,
             (17, _) => self.warning = 0,
+            (19, [mode, ..]) if !self.arm.has_mode(*mode) => return Err(NotNow),
             (19, [mode, ..]) if *mode <= 11 => self.set_mode(*mode),
             (31..=34, _) => self.put_queue(out),
+            // Settings that the arm does not have are refused, except those that change nothing.
+            (35, _) if !self.arm.takes_settings() && data.iter().all(|byte| *byte == 0) => self.put_queue(out),
+            (35 | 37 | 38 | 206, _) if !self.arm.takes_settings() => return Err(NotNow),
+            (201, _) if !self.arm.takes_settings() && self.arm.wrench().is_none() => return Err(NotNow),
             (35, _) => self.setting(|s| s.offset = numbers(data).unwrap_or(s.offset), out),
-            (36, _) => self.setting(|s| s.load = numbers(data).unwrap_or(s.load), out),
+            (36, _) => {
+                let load = numbers(data).ok_or(Warning(BAD_PARAMETER))?;
+                self.arm.set_load(load)?;
+                self.setting(|s| s.load = load, out);
+            }
             (37, [level @ 0..=5]) => self.setting(|s| s.sensitivity = [*level, s.sensitivity[1]], out),
             (38, [level @ 1..=5]) => self.setting(|s| s.sensitivity = [s.sensitivity[0], *level], out),
             (18 | 39 | 40 | 254, _) => {}
             (253, _) => out.push(0),
-            (41, _) => put_numbers(out, to_wire(&self.pose())),
+            (41, _) => put_numbers(out, to_wire(&self.pose().ok_or(NotNow)?)),
             (42, [wanted @ 1..=3, ..]) => {
                 put_numbers(out, self.seven().map(|v| v as f32));
                 let (_, velocity) = self.arm.joints();
@@ -85,20 +103,20 @@ impl Controller {
             (42, _) => put_numbers(out, self.seven().map(|v| v as f32)),
             (43, _) => {
                 let goal = from_wire(numbers(data).ok_or(Warning(BAD_PARAMETER))?);
-                let joints = self.chain.inverse(&goal, &self.seven()).ok_or(Warning(NO_SOLUTION))?;
+                let joints = self.chain.ok_or(NotNow)?.inverse(&goal, &self.seven()).ok_or(Warning(NO_SOLUTION))?;
                 put_numbers(out, joints.map(|v| v as f32));
             }
             (44, _) => {
                 let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);
-                put_numbers(out, to_wire(&self.chain.forward(&joints)));
+                put_numbers(out, to_wire(&self.chain.ok_or(NotNow)?.forward(&joints)));
             }
             (45, _) => {
                 let joints = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from);
-                out.push(u8::from(self.arm.within(&joints).is_err()));
+                out.push(u8::from(!self.arm.is_within(&joints)));
             }
             (55, _) => put_numbers(out, self.torques()),
             (91, _) => {
-                let pose = self.pose();
+                let pose = self.pose().ok_or(NotNow)?;
                 let (place, turn) = (pose.translation.vector * 1000.0, pose.rotation.scaled_axis());
                 put_numbers(out, place.iter().chain(turn.iter()).map(|v| *v as f32));
             }
@@ -108,6 +126,9 @@ impl Controller {
             }
             (124, [TOOL, telegram @ ..]) => {
                 let answer = self.tool.telegram(telegram).ok_or(Error(TOOL_SILENT))?;
+                if let Some(opening) = self.tool.take_order() {
+                    self.arm.move_gripper(opening);
+                }
                 out.extend([TOOL].into_iter().chain(answer));
             }
             (125, _) => out.extend([0, self.tool.error as u8]),
@@ -130,8 +151,8 @@ impl Controller {
     }
 
     fn version(&mut self, out: &mut Vec<u8>) {
-        let axes = self.arm.claimed_dof();
-        let another = self.arm.take_fault(FaultKind::WrongModel).is_some();
+        let axes = self.identity.axes + usize::from(self.arm.due_fault(FaultKind::WrongDof).is_some());
+        let another = self.arm.due_fault(FaultKind::WrongModel).is_some();
         let kind = match self.identity.kind {
             6 if another => 9, // a Lite 6
             _ if another => 6,
@@ -155,21 +176,23 @@ impl Controller {
         self.put_queue(out);
     }
 
-    fn switch(&mut self, joint: u8, on: bool) {
+    fn switch(&mut self, joint: u8, on: bool) -> Result<(), Refusal> {
         if on && self.error() != 0 {
-            return;
+            return Ok(());
         }
         match joint {
-            8 => (0..self.identity.axes).for_each(|joint| self.arm.enable_joint(joint, on)),
-            1..=7 => self.arm.enable_joint(usize::from(joint - 1), on),
+            8 => self.arm.switch(None, on)?,
+            1..=7 => self.arm.switch(Some(usize::from(joint - 1)), on)?,
             _ => {}
         }
         self.halt(if self.arm.enabled() { state::CHANGED } else { state::STOPPED });
+        Ok(())
     }
 
-    fn set_state(&mut self, wanted: u8) {
+    fn set_state(&mut self, wanted: u8) -> Result<(), Refusal> {
         match wanted {
-            0 if self.arm.ready().is_ok() => {
+            0 if self.arm.is_ready() => {
+                self.arm.begin()?;
                 if self.state == state::PAUSED
                     && let Some(halted) = self.current.take()
                 {
@@ -181,10 +204,14 @@ impl Controller {
                 self.state = state::PAUSED;
                 self.arm.stop();
             }
-            4 => self.halt(state::STOPPED),
+            4 => {
+                self.arm.operational_stop();
+                self.halt(state::STOPPED);
+            }
             6 => self.halt(state::STOPPING),
             _ => {}
         }
+        Ok(())
     }
 
     fn set_mode(&mut self, mode: u8) {
@@ -206,7 +233,7 @@ impl Controller {
             81 => 4,
             _ => 0,
         };
-        if self.arm.ready().is_err() || self.state != state::STANDING || self.mode != mode {
+        if !self.arm.is_ready() || self.state != state::STANDING || self.mode != mode {
             return Err(NotNow);
         }
         match register {
@@ -214,7 +241,7 @@ impl Controller {
                 let [pose @ .., speed] = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?;
                 let target = self.inverse(pose)?;
                 // The tool's way is not straight here: the joints go together (our choice).
-                self.plan(target, (f64::from(speed) / 1000.0).clamp(0.01, 1.0), out)
+                self.plan(target, (f64::from(speed) / 1000.0).clamp(0.01, 1.0) * VELOCITY, None, out)
             }
             23 | 24 => {
                 let [joints @ .., speed] = numbers::<8>(data).ok_or(Warning(BAD_PARAMETER))?;
@@ -222,20 +249,20 @@ impl Controller {
                 for (value, now) in target.iter_mut().zip(self.seven()) {
                     *value = if *value == f64::INFINITY { now } else { *value };
                 }
-                self.plan(target, fraction(speed), out)
+                self.plan(target, speed.into(), number(data, 0, 8), out)
             }
             25 => {
                 let speed = number(data, 0, 0).ok_or(Warning(BAD_PARAMETER))?;
-                self.plan([0.0; 7], fraction(speed), out)
+                self.plan([0.0; 7], speed.into(), number(data, 0, 1), out)
             }
             29 => {
                 let target = self.checked(numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?.map(f64::from))?;
-                self.arm.servo(&target).map_err(|_| NotNow)
+                self.arm.follow(&target)
             }
             30 => {
                 let target = self.inverse(numbers(data).ok_or(Warning(BAD_PARAMETER))?)?;
                 let target = self.checked(target)?;
-                self.arm.servo(&target).map_err(|_| NotNow)
+                self.arm.follow(&target)
             }
             81 => {
                 let speeds = numbers::<7>(data).ok_or(Warning(BAD_PARAMETER))?;
@@ -244,19 +271,34 @@ impl Controller {
                 }
                 let duration = number(data, 29, 0).filter(|duration| *duration > 0.0);
                 let duration = duration.map(|duration| Duration::from_secs_f32(duration.min(3600.0)));
-                self.arm.velocity_for(&speeds.map(f64::from), duration).map_err(|_| NotNow)
+                self.arm.keep_velocity(&speeds.map(f64::from), duration)
             }
             _ => Err(Warning(UNKNOWN)),
         }
     }
 
-    fn plan(&mut self, target: [f64; 7], speed: f64, out: &mut Vec<u8>) -> Result<(), Refusal> {
+    fn plan(
+        &mut self,
+        target: [f64; 7],
+        speed: f64,
+        acceleration: Option<f32>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), Refusal> {
         let target = self.checked(target)?;
         if self.queue.len() >= QUEUE {
             return Err(Warning(QUEUE_FULL));
         }
-        self.queue.push_back(Move { target, speed });
-        self.put_queue(out);
+        let acceleration = acceleration.filter(|value| *value > 0.0).map_or(ACCELERATION, f64::from);
+        let speed = if speed.is_nan() { 0.0 } else { speed };
+        if self.queue.is_empty() && !self.arm.moving() {
+            // Begins at once, so that the response says whether the arm takes it.
+            self.arm.go(&target, speed, acceleration)?;
+            self.current = Some(Move { target, speed, acceleration });
+        } else {
+            self.queue.push_back(Move { target, speed, acceleration });
+        }
+        let count = self.queue.len() + usize::from(self.current.is_some());
+        out.extend((count as u16).to_be_bytes());
         Ok(())
     }
 
@@ -264,13 +306,13 @@ impl Controller {
         if !pose.iter().all(|value| value.is_finite()) {
             return Err(Warning(BAD_PARAMETER));
         }
-        self.chain.inverse(&from_wire(pose), &self.seven()).ok_or(Warning(NO_SOLUTION))
+        self.chain.ok_or(NotNow)?.inverse(&from_wire(pose), &self.seven()).ok_or(Warning(NO_SOLUTION))
     }
 
     fn checked(&self, target: [f64; 7]) -> Result<[f64; 7], Refusal> {
         if !target.iter().all(|value| value.is_finite()) {
             return Err(Warning(BAD_PARAMETER));
         }
-        self.arm.within(&target).map(|()| target).map_err(|_| Error(JOINT_LIMIT))
+        if self.arm.is_within(&target) { Ok(target) } else { Err(Error(JOINT_LIMIT)) }
     }
 }

@@ -8,12 +8,12 @@ use crate::clock::Mono;
 use crate::hardware::arms::xarm::golden::{self, DEGREES, POSE, TORQUES, VELOCITIES, WRENCH, bytes};
 use crate::hardware::transport::tcp::Scan;
 
-fn controller() -> Controller {
+fn controller() -> Controller<SimArm> {
     Controller::new(Model::Xarm6, [2, 5, 1], GripperKind::Xarm, &SimOptions::default(), Mono(1)).unwrap()
 }
 
 /// The response to a golden request, at a time [s].
-fn answer(controller: &mut Controller, request: &[u8], at: f64) -> Vec<u8> {
+fn answer(controller: &mut Controller<SimArm>, request: &[u8], at: f64) -> Vec<u8> {
     assert_eq!(wire::scan(&request[..request.len() - 1]), Scan::More);
     assert_eq!(wire::scan(request), Scan::Take(request.len(), ()));
     let mut out = Vec::new();
@@ -22,14 +22,14 @@ fn answer(controller: &mut Controller, request: &[u8], at: f64) -> Vec<u8> {
 }
 
 /// A request to a register.
-fn ask(controller: &mut Controller, register: u8, payload: &[u8], at: f64) -> (u8, Vec<u8>) {
+fn ask(controller: &mut Controller<SimArm>, register: u8, payload: &[u8], at: f64) -> (u8, Vec<u8>) {
     let request = [&[0, 1, 0, 3, 0, payload.len() as u8 + 1, register], payload].concat();
     let reply = answer(controller, &request, at);
     (reply[7], reply[8..].to_vec())
 }
 
 /// Motors on, ready in a mode.
-fn ready(controller: &mut Controller, mode: u8) {
+fn ready(controller: &mut Controller<SimArm>, mode: u8) {
     ask(controller, 11, &[8, 1], 0.0);
     ask(controller, 19, &[mode, 0], 0.0);
     ask(controller, 12, &[0], 0.0);

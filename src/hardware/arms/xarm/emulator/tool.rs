@@ -15,6 +15,8 @@ pub struct Tool {
     baud: i32,
     enabled: bool,
     speed: u16,
+    /// Opening that a telegram has just ordered [m].
+    order: Option<f64>,
     /// The gripper's error.
     pub error: u16,
 }
@@ -23,12 +25,25 @@ impl Tool {
     /// A flange with this gripper, half open.
     pub fn new(kind: GripperKind) -> Self {
         let gripper = Gripper::new(kind.widest().unwrap_or(0.0), 0.1);
-        Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, error: 0 }
+        Self { kind, gripper, baud: TWO_MBIT, enabled: false, speed: 1500, order: None, error: 0 }
     }
 
     /// Lets `dt` [s] pass.
     pub fn advance(&mut self, dt: f64) {
         self.gripper.advance(dt);
+    }
+
+    /// Shows the gripper of an arm that has its own: its opening [m], and whether it moves.
+    pub fn show(&mut self, opening: f64, moving: bool) {
+        self.gripper.position = opening;
+        if !moving {
+            self.gripper.stop();
+        }
+    }
+
+    /// Takes the opening that a telegram has ordered [m].
+    pub fn take_order(&mut self) -> Option<f64> {
+        self.order.take()
     }
 
     /// The gripper's opening [m].
@@ -111,6 +126,7 @@ impl Tool {
             GripperKind::XarmG2 => (f64::from(pulses) / 18.28 - 8.33).to_radians().sin() * 110.0 + 16.0,
             _ => f64::from(pulses) / 10.0,
         };
+        self.order = Some(millimetres / 1000.0);
         self.gripper.move_to(millimetres / 1000.0);
     }
 }
