@@ -86,7 +86,8 @@ pub fn io(args: &IoArgs) -> Result {
     Ok(Exit::Ok)
 }
 
-/// Returns the condition of joints as lines of text: one per quantity, the joints in order.
+/// Returns the condition of joints as lines of text: one per quantity, the joints in order; errors of the drives only if
+/// one has an error.
 pub fn joint_lines(joints: &[JointStatusReport]) -> Vec<String> {
     type Value = fn(&JointStatusReport) -> Option<f64>;
     let quantities: [(&str, usize, Value); 6] = [
@@ -101,7 +102,8 @@ pub fn joint_lines(joints: &[JointStatusReport]) -> Vec<String> {
         let cells = joints.iter().map(|j| value(j).map_or_else(|| "-".to_owned(), |v| output::fixed(v, digits)));
         joints.iter().any(|j| value(j).is_some()).then(|| format!("{name}: {}", cells.collect::<Vec<_>>().join(" ")))
     };
-    quantities.into_iter().filter_map(line).collect()
+    let healthy = joints.iter().all(|j| j.error.is_none_or(|code| code == 0));
+    quantities.into_iter().filter(|(name, ..)| !(healthy && *name == "drive error")).filter_map(line).collect()
 }
 
 /// Returns inputs and outputs as lines of text.
