@@ -8,5 +8,6 @@ mod feetech_sdk;
 mod lerobot_bus;
 mod piper_kernel;
 mod piper_sdk;
+mod ur_control;
 mod ur_rtde;
 mod xarm_sdk;

@@ -14,15 +14,22 @@ mod golden;
 mod io;
 pub mod model;
 mod motion;
+mod outputs;
 mod power;
 mod primary;
-mod program;
+pub mod program;
 pub mod protocol;
 mod rtde;
 mod safety;
 mod session;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_others;
+#[cfg(test)]
+mod tests_power;
+#[cfg(test)]
+mod tests_stream;
 
 use std::time::Duration;
 

@@ -58,7 +58,7 @@ impl Session {
         let done = |session: &mut Self| {
             let (state, measured) = session.state();
             let echoed = state.count == count && state.program >= program::STOPPED;
-            let still = session.at_rest() && (!session.program_runs() || session.stopped.is_some());
+            let still = session.at_rest() && (!session.program_exists() || session.stopped.is_some());
             Ok((echoed || (still && measured > sent)).then_some(()))
         };
         if self.wait(STOP_LIMIT, done)?.is_some() {
@@ -66,9 +66,11 @@ impl Session {
         }
         // Another program, or ours does not run as it should.
         let asked = self.dashboard().and_then(|mut dashboard| dashboard.order("stop", "stopped"));
+        // The primary interface takes the same order.
+        let asked = asked.or_else(|error| self.run_program("stop program\n").map_err(|_| error));
         let sent = MonotonicClock.now();
         let done = |session: &mut Self| {
-            let still = session.at_rest() && !session.program_runs() && session.state().1 > sent;
+            let still = session.at_rest() && !session.program_exists() && session.state().1 > sent;
             Ok(still.then_some(()))
         };
         match self.wait(DASHBOARD_LIMIT, done)? {

@@ -40,7 +40,8 @@ impl Session {
 
     /// Finds the error of the present stop.
     pub(super) fn see_error(&mut self) {
-        if let (Some(stopped), Some((code, argument, at))) = (&mut self.stopped, self.primary.error)
+        if let (Some(stopped), Some((code, argument, at))) =
+            (&mut self.stopped, self.primary.as_ref().and_then(|primary| primary.error))
             && stopped.error.is_none()
             && stopped.since.since(at) < ERROR_AGE
         {
