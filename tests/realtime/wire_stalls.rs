@@ -1,4 +1,4 @@
-//! Commands to an arm whose wire stalls at full speed, judged on the wire: five arms, every kind of stall,
+//! Commands to an arm whose wire stalls at full speed, judged on the wire: six arms, every kind of stall,
 //! from 20 ms to 3 s. `DIMOS_WIRE=full` tries every kind with every length; otherwise each arm gets every kind and
 //! every length at least once. `DIMOS_WIRE_ARM=xarm` tries only that arm, and prints what went over the wire at a
 //! failure.
@@ -11,7 +11,7 @@ use dimos::hardware::sim::faults::{Fault, FaultKind};
 
 use crate::serial;
 use crate::support::wire;
-use crate::support::wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, XARM, YOURARM};
+use crate::support::wire::arms::{Arm, Bed, PERIOD, PIPER, REMOTE, Setup, UR, XARM, YOURARM};
 use crate::support::wire::watch::Watch;
 use crate::support::wire::{Stall, now};
 
@@ -39,7 +39,7 @@ const SPOILT: Duration = Duration::from_millis(4);
 const REPETITIONS: usize = 5;
 
 fn arms() -> Vec<Arm> {
-    let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC)];
+    let all = [YOURARM, XARM, PIPER, REMOTE, wire::arms::serial(&serial::SPEC), UR];
     let only = std::env::var("DIMOS_WIRE_ARM").ok();
     all.into_iter().filter(|arm| only.as_ref().is_none_or(|only| only == arm.name)).collect()
 }

@@ -68,6 +68,15 @@ pub const REMOTE: Arm = Arm {
     time_limit: Some(0.5),
 };
 
+/// Universal Robots' arm: a program on its controller follows registers.
+pub const UR: Arm = Arm {
+    name: "ur",
+    row: None,
+    ends: [[-2.7, -1.4, 1.5, -2.5, -1.5, -2.7], [2.7, -1.0, 1.9, 2.5, -1.1, 2.7]],
+    rounding: 1e-9,
+    time_limit: Some(0.2),
+};
+
 /// An arm on a serial line (`tests/support/serial_line`).
 pub fn serial(row: &'static AdapterSpec) -> Arm {
     Arm {
@@ -144,6 +153,7 @@ impl World {
         let (proxy, address): (Box<dyn Any>, String) = match arm.name {
             "yourarm" => boxed(Proxy::tcp(&address, &gate, decode::yourarm())),
             "xarm" => boxed(Proxy::xarm(&address, &gate, decode::xarm(6))),
+            "ur" => boxed(Proxy::ur(&address, &gate, decode::ur())),
             "remote" => {
                 let proxy = Proxy::tcp(address.trim_start_matches("tcp:"), &gate, decode::remote());
                 let address = format!("tcp:{}", proxy.address);
